@@ -89,6 +89,7 @@ lint: lint-code lint-types lint-size lint-words
 lint-tools: $(STAMP)-lint
 
 lint-code: $(STAMP)-lint
+	$(VENV)/bin/ruff format --check --quiet .
 	$(VENV)/bin/ruff check .
 
 lint-types: $(STAMP)-lint

@@ -8,7 +8,13 @@ from setuptools.command.develop import develop
 from setuptools.command.install_scripts import install_scripts
 
 NAME = 'imu_calibration'
-NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
+NODES = (
+    'calibration_node',
+    'compensator_node',
+    'simulator_node',
+    'bag_player_node',
+    'planner_node',
+)
 
 
 class _OnPathToo:
@@ -39,9 +45,15 @@ setup(
     long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
-    classifiers=['Development Status :: 4 - Beta', 'Intended Audience :: Science/Research', 'Operating System :: POSIX :: Linux',
-                 'Programming Language :: Python :: 3.11', 'Programming Language :: Python :: 3.12',
-                 'Programming Language :: Python :: 3.13', 'Topic :: Scientific/Engineering'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
+        'Topic :: Scientific/Engineering',
+    ],
     maintainer='imu_calibration maintainers',
     maintainer_email='imu_calibration@users.noreply.github.com',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_adapters', 'msg_adapters.*']),
@@ -55,12 +67,22 @@ setup(
     python_requires='>=3.11',
     install_requires=[
         # The oldest versions that are tested, constraints/oldest.txt; a test compares.
-        'numpy>=1.26', 'scipy>=1.11', 'PyYAML>=6.0.1', 'matplotlib>=3.6', 'Jinja2>=3.1.2', 'tqdm>=4.66', 'rosbags>=0.11',
-        'lz4>=4.4', 'backports.zstd>=1.8; python_version < "3.14"',
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'PyYAML>=6.0.1',
+        'matplotlib>=3.6',
+        'Jinja2>=3.1.2',
+        'tqdm>=4.66',
+        'rosbags>=0.11',
+        'lz4>=4.4',
+        'backports.zstd>=1.8; python_version < "3.14"',
     ],
     # urdfdom-py brings lxml (12 MB), which only robot descriptions need.
-    extras_require={'arm': ['urdfdom-py>=1.2', 'xacro>=2.1'], 'view': ['foxglove-sdk>=0.30'],
-                    'dask': ['dask>=2026.8', 'distributed>=2026.8']},
+    extras_require={
+        'arm': ['urdfdom-py>=1.2', 'xacro>=2.1'],
+        'view': ['foxglove-sdk>=0.30'],
+        'dask': ['dask>=2026.8', 'distributed>=2026.8'],
+    },
     zip_safe=False,
     cmdclass={'install_scripts': InstallScripts, 'develop': Develop},
     entry_points={

@@ -20,19 +20,22 @@ PAUSE_NS = 2_000_000_000
 """Hole between the repetitions, so that the jump of the joints back to the start lies in no window."""
 ITERATED_SECONDS = 1.0
 """Processor time over which a bare iteration is averaged."""
-RUNNER = '''
+RUNNER = """
 import os, subprocess, sys
 child = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 _, status, usage = os.wait4(child.pid, 0)
 print(usage.ru_utime + usage.ru_stime, usage.ru_maxrss, os.waitstatus_to_exitcode(status))
-'''
+"""
 """Runs a command from a small process: the peak memory of a child begins with that of its parent."""
 
 
 def bench_table():
     """Return the three-axis Table that the sessions run on."""
     import yaml
-    return Table.from_mapping(yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8')))
+
+    return Table.from_mapping(
+        yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8'))
+    )
 
 
 def long_session(minutes, imu_rate=1000.0, joint_rate=200.0):
@@ -43,23 +46,37 @@ def long_session(minutes, imu_rate=1000.0, joint_rate=200.0):
     """
     table = bench_table()
     profile = make_profile('calibration', 0, table, duration=60.0 * PIECE_MINUTES)
-    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=table.joint_names)
-    imu, joints, _ = simulate(model, random_values(model), table, profile=profile, options=SimulationOptions(imu_rate, joint_rate), seed=0)
+    model = SensorModel(
+        accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=table.joint_names
+    )
+    imu, joints, _ = simulate(
+        model,
+        random_values(model),
+        table,
+        profile=profile,
+        options=SimulationOptions(imu_rate, joint_rate),
+        seed=0,
+    )
     span = int(imu.stamp_ns[-1] - imu.stamp_ns[0]) + PAUSE_NS
     repeats = range(ceil(60e9 * minutes / span))
     end = imu.stamp_ns[0] + int(60e9 * minutes)
-    return tuple(_until(type(samples).concatenate(_shifted(samples, k * span) for k in repeats), end) for samples in (imu, joints))
+    return tuple(
+        _until(type(samples).concatenate(_shifted(samples, k * span) for k in repeats), end)
+        for samples in (imu, joints)
+    )
 
 
 def hand_session():
     """Return (ImuSamples, None) of ten minutes by hand at 200 Hz: 25 poses of 22 s, random turns of 2 s between them."""
     from worlds.hand_sessions import simulate as simulate_by_hand
+
     return simulate_by_hand(0, 25, period=0.005, still=22.0, duration=2.0)[0], None
 
 
 def iterate(bag):
     """Return the processor time of rosbags for all raw messages of a bag, s."""
     from rosbags.highlevel import AnyReader
+
     start, count = time.process_time(), 0
     while (spent := time.process_time() - start) < ITERATED_SECONDS:
         with AnyReader([bag]) as reader:
@@ -71,10 +88,18 @@ def iterate(bag):
 
 def run_verb(command, codes=(0, 3, 4)):
     """Return (processor seconds, peak memory in MB) of a command in a process of its own; RuntimeError unless it ends with one of `codes`."""
-    found = subprocess.run([sys.executable, '-c', RUNNER, *command], cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        [sys.executable, '-c', RUNNER, *command],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     seconds, kilobytes, code = found.stdout.split()
     if int(code) not in codes:
-        raise RuntimeError(f'the command must end with one of {codes}, it ended with {code}; run it by hand: {" ".join(command)}')
+        raise RuntimeError(
+            f'the command must end with one of {codes}, it ended with {code}; run it by hand: {" ".join(command)}'
+        )
     return float(seconds), float(kilobytes) / 1024
 
 

@@ -48,40 +48,83 @@ def bench_calibrate(minutes=MINUTES, repetitions=REPETITIONS):
     """Return the rows: time against bare iteration, growth with the length, and peak memory, per storage."""
     with TemporaryDirectory() as folder:
         session, rows = long_session(minutes), []
-        short = tuple(samples.select(samples.stamp_ns - samples.stamp_ns[0] < 60e9 * minutes / GROWTH) for samples in session)
+        short = tuple(
+            samples.select(samples.stamp_ns - samples.stamp_ns[0] < 60e9 * minutes / GROWTH)
+            for samples in session
+        )
         for storage, limit in LIMITS.items():
-            long_bag = write_bench_bag(Path(folder, f'long_{storage}'), minutes, storage, session=session)
-            short_bag = write_bench_bag(Path(folder, f'short_{storage}'), minutes / GROWTH, storage, session=short)
+            long_bag = write_bench_bag(
+                Path(folder, f'long_{storage}'), minutes, storage, session=session
+            )
+            short_bag = write_bench_bag(
+                Path(folder, f'short_{storage}'), minutes / GROWTH, storage, session=short
+            )
             rows += _measure(long_bag, short_bag, storage, limit, repetitions)
     return rows
 
 
 def _measure(long_bag, short_bag, storage, limit, repetitions):
-    iterate(long_bag)   # reads the file into the page cache, so that both find it there
-    runs = [(iterate(long_bag), *calibrate(long_bag), *calibrate(short_bag)) for _ in range(repetitions)]
+    iterate(long_bag)  # reads the file into the page cache, so that both find it there
+    runs = [
+        (iterate(long_bag), *calibrate(long_bag), *calibrate(short_bag)) for _ in range(repetitions)
+    ]
     bare, long, long_mb, short, short_mb = (median(column) for column in zip(*runs, strict=True))
     return [
-        Row(f'calibrate against bare iteration, {storage}', median(run[1] / run[0] for run in runs), 'x', limit, f'{long:.1f} s against {bare:.1f} s'),
-        Row(f'time at {GROWTH:g} x the length, {storage}', median(run[1] / run[3] for run in runs), 'x', GROWTH_LIMIT, f'{long:.1f} s against {short:.1f} s'),
-        Row(f'peak memory, {storage}', max(run[2] for run in runs), 'MB', MEMORY_LIMIT_MB, f'{short_mb:.0f} MB at a quarter of the length'),
+        Row(
+            f'calibrate against bare iteration, {storage}',
+            median(run[1] / run[0] for run in runs),
+            'x',
+            limit,
+            f'{long:.1f} s against {bare:.1f} s',
+        ),
+        Row(
+            f'time at {GROWTH:g} x the length, {storage}',
+            median(run[1] / run[3] for run in runs),
+            'x',
+            GROWTH_LIMIT,
+            f'{long:.1f} s against {short:.1f} s',
+        ),
+        Row(
+            f'peak memory, {storage}',
+            max(run[2] for run in runs),
+            'MB',
+            MEMORY_LIMIT_MB,
+            f'{short_mb:.0f} MB at a quarter of the length',
+        ),
     ]
 
 
 def calibrate(bag):
     """Return (processor seconds, peak memory in MB) of calibrating a bag into a folder beside it, without a report."""
-    return run_verb([sys.executable, '-m', 'imu_calibration', 'calibrate', str(bag), '--table', str(config_file('table_simulated.yaml')),
-                     '--output', f'{bag}_result', '--no-report'])
+    return run_verb(
+        [
+            sys.executable,
+            '-m',
+            'imu_calibration',
+            'calibrate',
+            str(bag),
+            '--table',
+            str(config_file('table_simulated.yaml')),
+            '--output',
+            f'{bag}_result',
+            '--no-report',
+        ]
+    )
 
 
 def main():
     """Print the rows; exit code 1 when a limit is passed."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--minutes', type=float, default=MINUTES, help='length of the bags at 1 kHz, default 60')
+    parser.add_argument(
+        '--minutes', type=float, default=MINUTES, help='length of the bags at 1 kHz, default 60'
+    )
     parser.add_argument('--repetitions', type=int, default=REPETITIONS)
     options = parser.parse_args()
     rows = bench_calibrate(options.minutes, options.repetitions)
     for row in rows:
-        print(f'{row.name:50s} {row.value:7.2f} {row.unit:2s} (at most {row.limit:g} {row.unit})  {row.note}')
+        print(
+            f'{row.name:50s} {row.value:7.2f} {row.unit:2s} (at most {row.limit:g} {row.unit})  {row.note}'
+        )
     return 1 if any(row.value > row.limit for row in rows) else 0
 
 

@@ -34,7 +34,10 @@ TURN = 5.0
 """Duration of one measurement of each node, s."""
 RATES = (2000, 3000, 4000, 5000, 6000, 7000, 8000, 10000)
 TARGETS = {'CPU time per message': 0.4, 'median added latency': 0.5}
-MEANING = {'plain relay': 'rclpy node that republishes each message', 'compensator': 'bias, matrix and nine lever arms'}
+MEANING = {
+    'plain relay': 'rclpy node that republishes each message',
+    'compensator': 'bias, matrix and nine lever arms',
+}
 
 
 def bench_calibration():
@@ -43,23 +46,38 @@ def bench_calibration():
     values = random_values(model, seed=1)
     noise = {'accelerometer': {'noise_sd': [0.04] * 3}, 'gyroscope': {'noise_sd': [0.004] * 3}}
     covariance, status = 1e-8 * np.eye(len(values)), ('determined',) * len(values)
-    return calibration_to_text(Calibration(model, values, covariance, status, 'imu_link', statistics=noise))
+    return calibration_to_text(
+        Calibration(model, values, covariance, status, 'imu_link', statistics=noise)
+    )
 
 
 class Process:
     """A node under test, on separate topics."""
 
     def __init__(self, name, command, environment):
-        self.name, self.topics = name, tuple(f'/bench_{name.replace(" ", "_")}/{end}' for end in ('raw', 'corrected'))
-        remap = ['--ros-args', '-r', f'imu/data_raw:={self.topics[0]}', '-r', f'imu/data_corrected:={self.topics[1]}']
+        self.name, self.topics = (
+            name,
+            tuple(f'/bench_{name.replace(" ", "_")}/{end}' for end in ('raw', 'corrected')),
+        )
+        remap = [
+            '--ros-args',
+            '-r',
+            f'imu/data_raw:={self.topics[0]}',
+            '-r',
+            f'imu/data_corrected:={self.topics[1]}',
+        ]
         with_more = command[:-1] + remap + command[-1]
-        self.process = subprocess.Popen(with_more, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self.process = subprocess.Popen(
+            with_more, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         self.cpu, self.messages, self.medians, self.tails, self.lost = 0.0, 0, [], [], 0
 
     def cpu_seconds(self):
         """Return the CPU time of all its threads until now."""
         tasks = Path(f'/proc/{self.process.pid}/task')
-        return sum(int((task / 'schedstat').read_text().split()[0]) for task in tasks.iterdir()) * 1e-9
+        return (
+            sum(int((task / 'schedstat').read_text().split()[0]) for task in tasks.iterdir()) * 1e-9
+        )
 
     def stop(self):
         """End the process."""
@@ -69,7 +87,12 @@ class Process:
 
 def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0):
     """Send messages to `raw` and receive them from `corrected`; return (report of the source, report of the sink, CPU seconds)."""
-    sink = subprocess.Popen([sys.executable, ENDS, 'sink', corrected], env=environment, stdout=subprocess.PIPE, text=True)
+    sink = subprocess.Popen(
+        [sys.executable, ENDS, 'sink', corrected],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     source = _source(raw, rate, seconds, environment) if raw == corrected else None
     sink.stdout.readline()
     source = source or _source(raw, rate, seconds, environment)
@@ -91,13 +114,19 @@ def compare(nodes, seconds, environment, rate=1000.0):
     direct = []
     for _ in range(max(1, round(seconds / TURN))):
         for node in nodes:
-            sent, came, used = run_once(*node.topics, rate, min(TURN, seconds), environment, node.cpu_seconds)
+            sent, came, used = run_once(
+                *node.topics, rate, min(TURN, seconds), environment, node.cpu_seconds
+            )
             node.cpu += used
             node.messages += came['came']
             node.lost += sent['sent'] - came['came']
             node.medians.append(came['late_us'][50])
             node.tails.append(came['late_us'][99])
-        direct.append(run_once('/bench_direct', '/bench_direct', rate, min(TURN, seconds), environment)[1]['late_us'][50])
+        direct.append(
+            run_once('/bench_direct', '/bench_direct', rate, min(TURN, seconds), environment)[1][
+                'late_us'
+            ][50]
+        )
     return median(direct)
 
 
@@ -114,38 +143,72 @@ def highest_rate(node, environment, seconds):
 
 def bench_compensator(seconds=30.0):
     """Return (figures, ratios): a dict per node, and ratios by name."""
-    environment = os.environ | {'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-                                'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', '83')}
+    environment = os.environ | {
+        'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}',
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'ROS_DOMAIN_ID': os.environ.get('ROS_DOMAIN_ID', '83'),
+    }
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'calibration.yaml')
         path.write_text(bench_calibration())
-        nodes = [Process('plain relay', [sys.executable, ENDS, 'relay', []], environment),
-                 Process('compensator', [sys.executable, '-m', 'imu_calibration.nodes.compensator_node',
-                                         ['-p', f'calibration_file:={path}', '-p', 'anyway:=true']], environment)]
+        nodes = [
+            Process('plain relay', [sys.executable, ENDS, 'relay', []], environment),
+            Process(
+                'compensator',
+                [
+                    sys.executable,
+                    '-m',
+                    'imu_calibration.nodes.compensator_node',
+                    ['-p', f'calibration_file:={path}', '-p', 'anyway:=true'],
+                ],
+                environment,
+            ),
+        ]
         try:
             time.sleep(4.0)
             direct = compare(nodes, seconds, environment)
-            figures = {node.name: _figures(node, direct) | {'rates': highest_rate(node, environment, min(5.0, seconds))} for node in nodes}
+            figures = {
+                node.name: _figures(node, direct)
+                | {'rates': highest_rate(node, environment, min(5.0, seconds))}
+                for node in nodes
+            }
         finally:
             for node in nodes:
                 node.stop()
     relay, ours = figures['plain relay'], figures['compensator']
-    keys = ('CPU time per message', 'median latency', 'median added latency', '99th percentile of latency')
+    keys = (
+        'CPU time per message',
+        'median latency',
+        'median added latency',
+        '99th percentile of latency',
+    )
     return figures | {'direct': direct}, {key: ours[key] / relay[key] for key in keys}
 
 
 def _figures(node, direct):
-    return {'CPU time per message': node.cpu / max(node.messages, 1) * 1e6, 'median latency': median(node.medians),
-            'median added latency': median(node.medians) - direct, '99th percentile of latency': median(node.tails), 'lost': node.lost}
+    return {
+        'CPU time per message': node.cpu / max(node.messages, 1) * 1e6,
+        'median latency': median(node.medians),
+        'median added latency': median(node.medians) - direct,
+        '99th percentile of latency': median(node.tails),
+        'lost': node.lost,
+    }
 
 
 def main():
     """Print the figures; exit code 1 when a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--seconds', type=float, default=30.0, help='duration of the measurement of each node at 1 kHz, default 30')
+    parser.add_argument(
+        '--seconds',
+        type=float,
+        default=30.0,
+        help='duration of the measurement of each node at 1 kHz, default 30',
+    )
     options = parser.parse_args()
     figures, ratios = bench_compensator(options.seconds)
-    print(f'at 1 kHz, reliable, depth 1000; direct connection from source to sink {figures["direct"]:.0f} us')
+    print(
+        f'at 1 kHz, reliable, depth 1000; direct connection from source to sink {figures["direct"]:.0f} us'
+    )
     for name, text in MEANING.items():
         shown = ', '.join(f'{key} {figures[name][key]:.0f} us' for key in ratios)
         print(f'{name:12s} ({text}): {shown}, {figures[name]["lost"]} lost')
@@ -157,9 +220,18 @@ def main():
     for name in MEANING:
         rows = figures[name]['rates']
         held = [sent for _, sent, lost in rows if not lost]
-        print(f'{name}: ' + (f'{max(held):.0f} Hz without loss' if held else 'loss at every rate') +
-              (f', {rows[-1][2]} lost at {rows[-1][1]:.0f} Hz' if rows[-1][2] else ' (largest rate of the source)'))
-        missed |= name == 'compensator' and not any(asked >= 6000 and not lost for asked, _, lost in rows)
+        print(
+            f'{name}: '
+            + (f'{max(held):.0f} Hz without loss' if held else 'loss at every rate')
+            + (
+                f', {rows[-1][2]} lost at {rows[-1][1]:.0f} Hz'
+                if rows[-1][2]
+                else ' (largest rate of the source)'
+            )
+        )
+        missed |= name == 'compensator' and not any(
+            asked >= 6000 and not lost for asked, _, lost in rows
+        )
     return 1 if missed else 0
 
 

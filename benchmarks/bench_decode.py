@@ -43,21 +43,48 @@ def bench_decode(minutes=3.0, repetitions=REPETITIONS):
     """Return the rows: decoding of Imu per storage, and of all messages against the bare iteration of rosbags."""
     with TemporaryDirectory() as folder:
         session = long_session(minutes)
-        bags = {'sqlite3': ('sqlite3', True), 'mcap': ('mcap', True), 'mcap, Imu only': ('mcap', False)}
-        paths = {name: write_bench_bag(Path(folder, f'bag{k}'), minutes, storage, joints, session)
-                 for k, (name, (storage, joints)) in enumerate(bags.items())}
-        rows = [_compare(f'Imu to arrays, {name}', lambda path=path: _deserialize(path), lambda path=path: _decode(path, False), target,
-                         repetitions)
-                for (name, path), target in zip(paths.items(), (15, 15, 25), strict=True)]
-        rows += [_compare(f'Imu and JointState to arrays against bare iteration, {name}', lambda path=path: _iterate(path),
-                          lambda path=path: _decode(path, True), 0, repetitions) for name, path in list(paths.items())[:2]]
+        bags = {
+            'sqlite3': ('sqlite3', True),
+            'mcap': ('mcap', True),
+            'mcap, Imu only': ('mcap', False),
+        }
+        paths = {
+            name: write_bench_bag(Path(folder, f'bag{k}'), minutes, storage, joints, session)
+            for k, (name, (storage, joints)) in enumerate(bags.items())
+        }
+        rows = [
+            _compare(
+                f'Imu to arrays, {name}',
+                lambda path=path: _deserialize(path),
+                lambda path=path: _decode(path, False),
+                target,
+                repetitions,
+            )
+            for (name, path), target in zip(paths.items(), (15, 15, 25), strict=True)
+        ]
+        rows += [
+            _compare(
+                f'Imu and JointState to arrays against bare iteration, {name}',
+                lambda path=path: _iterate(path),
+                lambda path=path: _decode(path, True),
+                0,
+                repetitions,
+            )
+            for name, path in list(paths.items())[:2]
+        ]
     return rows
 
 
 def _compare(name, theirs, ours, target, repetitions):
-    ours()   # reads the file into the page cache, so that both find it there
+    ours()  # reads the file into the page cache, so that both find it there
     speeds = [(_speed(ours), _speed(theirs)) for _ in range(repetitions)]
-    return Row(name, median(s[0] for s in speeds), median(s[1] for s in speeds), median(s[0] / s[1] for s in speeds), target)
+    return Row(
+        name,
+        median(s[0] for s in speeds),
+        median(s[1] for s in speeds),
+        median(s[0] / s[1] for s in speeds),
+        target,
+    )
 
 
 def _speed(function):
@@ -68,7 +95,12 @@ def _speed(function):
 
 def _decode(path, with_joints):
     with open_recording(path, want_joints=with_joints, want_temperature=False) as recording:
-        return sum(len(samples) for block in recording.blocks() for samples in (block.imu, block.joints) if samples is not None)
+        return sum(
+            len(samples)
+            for block in recording.blocks()
+            for samples in (block.imu, block.joints)
+            if samples is not None
+        )
 
 
 def _deserialize(path):
@@ -88,13 +120,17 @@ def _iterate(path):
 def main():
     """Print the rows; exit code 1 when a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--minutes', type=float, default=3.0, help='length of the bags at 1 kHz, default 3')
+    parser.add_argument(
+        '--minutes', type=float, default=3.0, help='length of the bags at 1 kHz, default 3'
+    )
     parser.add_argument('--repetitions', type=int, default=REPETITIONS)
     options = parser.parse_args()
     rows = bench_decode(options.minutes, options.repetitions)
     for row in rows:
         target = f'  (at least {row.target:g})' if row.target else ''
-        print(f'{row.name:60s} {row.ours / 1e6:7.3f} M/s against {row.theirs / 1e6:7.3f} M/s: {row.ratio:6.1f} x{target}')
+        print(
+            f'{row.name:60s} {row.ours / 1e6:7.3f} M/s against {row.theirs / 1e6:7.3f} M/s: {row.ratio:6.1f} x{target}'
+        )
     return 1 if any(row.ratio < row.target for row in rows) else 0
 
 

@@ -15,7 +15,9 @@ import sys
 import time
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # small matrices: a second thread only waits for the first
+os.environ.setdefault(
+    'OPENBLAS_NUM_THREADS', '1'
+)  # small matrices: a second thread only waits for the first
 
 import numpy as np  # noqa: E402
 
@@ -56,11 +58,20 @@ def fixed_profile(problem, table):
     """Return (times, standard deviations of all parameters at each) of the fixed profile."""
     profile = make_profile('calibration', 0, table)
     windows = problem.predictor.predict([profile.segments])[0]
-    times, prior = np.array([window.middle for window in windows]), problem.coordinates.prior_information
+    times, prior = (
+        np.array([window.middle for window in windows]),
+        problem.coordinates.prior_information,
+    )
     found = []
     for mark in MARKS:
         known = int(np.searchsorted(times, mark * profile.duration))
-        found.append(problem.coordinates.sd(np.linalg.inv(prior + exact_information(windows[:known], times[:known], problem.noise))))
+        found.append(
+            problem.coordinates.sd(
+                np.linalg.inv(
+                    prior + exact_information(windows[:known], times[:known], problem.noise)
+                )
+            )
+        )
     return MARKS * profile.duration, np.array(found)
 
 
@@ -69,24 +80,40 @@ def drawn_tolerances(rng, model, sd):
     drawn = {}
     for effect in model.effects:
         factor = rng.uniform(2.0, 4.0) if effect.name == 'bias' else rng.uniform(1.0, 3.0)
-        drawn.setdefault(effect.sensor, {})[effect.name] = float(factor * sd[model.slices[effect.key]].max())
+        drawn.setdefault(effect.sensor, {})[effect.name] = float(
+            factor * sd[model.slices[effect.key]].max()
+        )
     return drawn
 
 
 def followed(plan, table, grade, seed):
     """Return (calibration, true values by name) of a simulated session that follows the plan."""
-    profile = Profile('plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names))
+    profile = Profile(
+        'plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names)
+    )
     model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names)
     values = random_values(model, grade, seed)
-    samples = simulate(model, values, table, profile=profile, options=SimulationOptions(noise=GRADES[grade].noise), seed=seed)
-    return calibrate(SampleBlock(*samples), table).calibration, dict(zip(model.param_names, values, strict=True))
+    samples = simulate(
+        model,
+        values,
+        table,
+        profile=profile,
+        options=SimulationOptions(noise=GRADES[grade].noise),
+        seed=seed,
+    )
+    return calibrate(SampleBlock(*samples), table).calibration, dict(
+        zip(model.param_names, values, strict=True)
+    )
 
 
 def achieved(plan, table, grade, seed):
     """Return (errors, reported standard deviations), both over predicted ones, of one simulated session that follows the plan."""
     found, truth = followed(plan, table, grade, seed)
-    rows = [(found.values[k] - truth[name], found.sd[k], plan.sd[plan.model.param_names.index(name)])
-            for k, name in enumerate(found.param_names) if name in truth and name in plan.model.param_names]
+    rows = [
+        (found.values[k] - truth[name], found.sd[k], plan.sd[plan.model.param_names.index(name)])
+        for k, name in enumerate(found.param_names)
+        if name in truth and name in plan.model.param_names
+    ]
     error, reported, predicted = np.array(rows).T
     return error / predicted, reported / predicted
 
@@ -95,8 +122,13 @@ def one_table(number, seeds):
     """Return one row of figures."""
     rng = np.random.default_rng([number, 14])
     table, grade = random_table(rng, speeds_deg=(200, 400)), list(GRADES)[number % len(GRADES)]
-    noise, model = noise_of_grade(GRADES[grade].noise, RATE), choose_model(CalibrationOptions(), table)
-    problem = PlanningProblem(MotionLibrary(table, limits_of(table)), Coordinates(model, tolerances_of(model)), noise)
+    noise, model = (
+        noise_of_grade(GRADES[grade].noise, RATE),
+        choose_model(CalibrationOptions(), table),
+    )
+    problem = PlanningProblem(
+        MotionLibrary(table, limits_of(table)), Coordinates(model, tolerances_of(model)), noise
+    )
     times, sd = fixed_profile(problem, table)
     tolerances = drawn_tolerances(rng, model, sd[-1])
     began = time.process_time()
@@ -105,41 +137,70 @@ def one_table(number, seeds):
     taken = time.process_time() - began
     enough = np.all(sd[:, plan.wanted] <= plan.tolerances[plan.wanted], axis=1)
     fixed = float(times[np.argmax(enough)]) if enough.any() else np.inf
-    errors, reported = zip(*(achieved(plan, table, grade, 1000 * number + seed) for seed in range(seeds)), strict=True) if seeds else ([], [])
-    return {'grade': grade, 'met': not plan.missing, 'plan': plan.seconds, 'bound': plan.lower_bound_seconds, 'fixed': fixed,
-            'rms': float(np.sqrt(np.mean(np.square(errors)))) if seeds else np.nan,
-            'reported': float(np.median(reported)) if seeds else np.nan, 'planning': taken, 'motions': len(plan.motions)}
+    errors, reported = (
+        zip(
+            *(achieved(plan, table, grade, 1000 * number + seed) for seed in range(seeds)),
+            strict=True,
+        )
+        if seeds
+        else ([], [])
+    )
+    return {
+        'grade': grade,
+        'met': not plan.missing,
+        'plan': plan.seconds,
+        'bound': plan.lower_bound_seconds,
+        'fixed': fixed,
+        'rms': float(np.sqrt(np.mean(np.square(errors)))) if seeds else np.nan,
+        'reported': float(np.median(reported)) if seeds else np.nan,
+        'planning': taken,
+        'motions': len(plan.motions),
+    }
 
 
 def planned_session(plan, table, seed):
     """Return the parameters that are not determined and the sensors that do not help in a simulated session that follows the plan."""
     found, _ = followed(plan, table, 'industrial', seed)
     wanted = {name for name, flag in zip(plan.model.param_names, plan.wanted, strict=True) if flag}
-    weak = [name for name, status in zip(found.param_names, found.status, strict=True) if name in wanted and status != 'determined']
+    weak = [
+        name
+        for name, status in zip(found.param_names, found.status, strict=True)
+        if name in wanted and status != 'determined'
+    ]
     return weak + [sensor for sensor in SENSORS if found.decision.get(sensor) != 'helps']
 
 
 def stands(sessions, first, names):
     """Print the targets of the six stands: time over the bound at a quarter of the default tolerances, memory, and planned sessions."""
     noise, passed = noise_of_grade(GRADES['industrial'].noise, RATE), 0
-    print('stand                 plan s  bound s  ratio  planning s  most MB  default plan s  bound s')
+    print(
+        'stand                 plan s  bound s  ratio  planning s  most MB  default plan s  bound s'
+    )
     plans = {}
     for name in names:
         table = stand(name)
         tolerances, began = quarter_tolerances(table), time.process_time()
         plan = make_planner(table, noise=noise, tolerances=tolerances).plan()
-        taken, memory = time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        taken, memory = (
+            time.process_time() - began,
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        )
         plans[name] = make_planner(table, noise=noise).plan()
-        print(f'{name:<21} {plan.seconds:6.1f}  {plan.lower_bound_seconds:7.1f}  {plan.seconds / plan.lower_bound_seconds:5.2f}  {taken:10.1f}  '
-              f'{memory:7.0f}  {plans[name].seconds:14.1f}  {plans[name].lower_bound_seconds:7.1f}', flush=True)
+        print(
+            f'{name:<21} {plan.seconds:6.1f}  {plan.lower_bound_seconds:7.1f}  {plan.seconds / plan.lower_bound_seconds:5.2f}  {taken:10.1f}  '
+            f'{memory:7.0f}  {plans[name].seconds:14.1f}  {plans[name].lower_bound_seconds:7.1f}',
+            flush=True,
+        )
     for number in range(sessions):
         name = list(plans)[number % len(plans)]
         weak = planned_session(plans[name], stand(name), first + number)
         passed += not weak
         if weak:
             print(f'session {first + number} on {name}: {", ".join(weak)}', flush=True)
-    print(f'{passed} of {sessions} planned sessions with every parameter determined and both sensors of help (target 35 of 40); ratio at most 1.25; '
-          'seven joints at most 500 MB and 10 s')
+    print(
+        f'{passed} of {sessions} planned sessions with every parameter determined and both sensors of help (target 35 of 40); ratio at most 1.25; '
+        'seven joints at most 500 MB and 10 s'
+    )
 
 
 def main():
@@ -148,25 +209,39 @@ def main():
     parser.add_argument('--tables', type=int, default=20)
     parser.add_argument('--seeds', type=int, default=5)
     parser.add_argument('--first', type=int, default=0)
-    parser.add_argument('--sessions', type=int, default=0, help='print the targets of the six stands with so many sessions instead')
+    parser.add_argument(
+        '--sessions',
+        type=int,
+        default=0,
+        help='print the targets of the six stands with so many sessions instead',
+    )
     parser.add_argument('--stands', nargs='*', choices=STANDS, default=STANDS)
     options = parser.parse_args()
     if options.sessions:
         return stands(options.sessions, options.first, options.stands)
     rows = []
-    print('table grade       met  plan s  bound s  ratio  fixed s  share  achieved/predicted  reported/predicted  planning s')
+    print(
+        'table grade       met  plan s  bound s  ratio  fixed s  share  achieved/predicted  reported/predicted  planning s'
+    )
     for number in range(options.first, options.first + options.tables):
         row = one_table(number, options.seeds)
         rows.append(row)
-        print(f"{number:5d} {row['grade']:<11} {'yes' if row['met'] else 'NO ':<4}{row['plan']:7.1f}  {row['bound']:7.1f}  "
-              f"{row['plan'] / row['bound']:5.2f}  {row['fixed']:7.1f}  {row['plan'] / row['fixed']:5.2f}  {row['rms']:18.2f}  "
-              f"{row['reported']:18.2f}  {row['planning']:10.1f}", flush=True)
-    ratio, share = (np.array([row['plan'] / row[name] for row in rows]) for name in ('bound', 'fixed'))
+        print(
+            f'{number:5d} {row["grade"]:<11} {"yes" if row["met"] else "NO ":<4}{row["plan"]:7.1f}  {row["bound"]:7.1f}  '
+            f'{row["plan"] / row["bound"]:5.2f}  {row["fixed"]:7.1f}  {row["plan"] / row["fixed"]:5.2f}  {row["rms"]:18.2f}  '
+            f'{row["reported"]:18.2f}  {row["planning"]:10.1f}',
+            flush=True,
+        )
+    ratio, share = (
+        np.array([row['plan'] / row[name] for row in rows]) for name in ('bound', 'fixed')
+    )
     rms = np.array([row['rms'] for row in rows])
-    print(f'tolerances met on {sum(row["met"] for row in rows)} of {len(rows)}; plan over bound: median {np.median(ratio):.2f}, '
-          f'largest {ratio.max():.2f}; plan over fixed profile: median {np.median(share):.2f}, largest {share.max():.2f}; achieved over '
-          f'predicted: median {np.nanmedian(rms):.2f}, {np.nanmin(rms):.2f} to {np.nanmax(rms):.2f}; processor time: largest '
-          f'{max(row["planning"] for row in rows):.1f} s')
+    print(
+        f'tolerances met on {sum(row["met"] for row in rows)} of {len(rows)}; plan over bound: median {np.median(ratio):.2f}, '
+        f'largest {ratio.max():.2f}; plan over fixed profile: median {np.median(share):.2f}, largest {share.max():.2f}; achieved over '
+        f'predicted: median {np.nanmedian(rms):.2f}, {np.nanmin(rms):.2f} to {np.nanmax(rms):.2f}; processor time: largest '
+        f'{max(row["planning"] for row in rows):.1f} s'
+    )
 
 
 if __name__ == '__main__':

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
-    sys.path[:0] = [str(ROOT), str(ROOT / 'test')]   # simulated worlds of the tests
+    sys.path[:0] = [str(ROOT), str(ROOT / 'test')]  # simulated worlds of the tests
 
 from benchmarks.bags import hand_session, iterate, long_session, run_verb, write_bench_bag  # noqa: E402
 from imu_calibration.use_cases.resources import config_file  # noqa: E402
@@ -52,31 +52,52 @@ class Case(NamedTuple):
 
 
 SESSIONS = {
-    '5 min at 100 Hz': Session(lambda: long_session(5.0, imu_rate=100.0, joint_rate=100.0), 300 * 200),
+    '5 min at 100 Hz': Session(
+        lambda: long_session(5.0, imu_rate=100.0, joint_rate=100.0), 300 * 200
+    ),
     '10 min by hand at 200 Hz': Session(hand_session, 600 * 200),
-    'an hour at 1 kHz': Session(lambda: long_session(60.0), 3600 * 1200)}
+    'an hour at 1 kHz': Session(lambda: long_session(60.0), 3600 * 1200),
+}
 CASES = (
     Case('calibrate', '5 min at 100 Hz', ('--table', 'TABLE', '--output', 'OUTPUT'), 1.5, 200),
     Case('diagnose', '5 min at 100 Hz', ('--table', 'TABLE', '--output', 'OUTPUT'), 5, 500),
     Case('calibrate', '10 min by hand at 200 Hz', ('--output', 'OUTPUT'), 4, 200),
     Case('calibrate', 'an hour at 1 kHz', ('--table', 'TABLE', '--output', 'OUTPUT'), 8, 300),
     Case('inspect', 'an hour at 1 kHz', (), 10, 250),
-    Case('compensate', 'an hour at 1 kHz', ('--calibration', 'CALIBRATION', '--output', 'OUTPUT'), 10, 200),
-    Case('diagnose', 'an hour at 1 kHz', ('--table', 'TABLE', '--output', 'OUTPUT'), 15, 500))
+    Case(
+        'compensate',
+        'an hour at 1 kHz',
+        ('--calibration', 'CALIBRATION', '--output', 'OUTPUT'),
+        10,
+        200,
+    ),
+    Case('diagnose', 'an hour at 1 kHz', ('--table', 'TABLE', '--output', 'OUTPUT'), 15, 500),
+)
 
 
 def bench_verbs(repetitions=REPETITIONS, only=''):
     """Yield (case, multiples of a bare iteration, seconds, MB, limit as multiple); multiples, seconds and MB of each repetition."""
     with TemporaryDirectory() as folder:
         for number, (name, session) in enumerate(SESSIONS.items()):
-            cases = [case for case in CASES if case.session == name and only in f'{case.verb} {name}']
+            cases = [
+                case for case in CASES if case.session == name and only in f'{case.verb} {name}'
+            ]
             if not cases:
                 continue
             bag = write_bench_bag(Path(folder, f'bag{number}'), session=session.make())
             limit = 1 / (SECONDS_PER_MESSAGE * session.messages)
             for case in cases:
-                runs = [_measure(case, bag, Path(folder, f'{case.verb}{number}_{k}')) for k in range(repetitions)]
-                yield case, [run[1] / run[0] for run in runs], [run[1] for run in runs], [run[2] for run in runs], limit * case.seconds
+                runs = [
+                    _measure(case, bag, Path(folder, f'{case.verb}{number}_{k}'))
+                    for k in range(repetitions)
+                ]
+                yield (
+                    case,
+                    [run[1] / run[0] for run in runs],
+                    [run[1] for run in runs],
+                    [run[2] for run in runs],
+                    limit * case.seconds,
+                )
 
 
 def _measure(case, bag, output):
@@ -84,9 +105,15 @@ def _measure(case, bag, output):
     iteration, table = iterate(bag), config_file('table_simulated.yaml')
     calibration = bag.parent / f'calibration_{bag.name}'
     if case.verb == 'compensate' and not calibration.exists():
-        run_verb(_command('calibrate', bag, '--table', str(table), '--output', str(calibration), '--no-report'))
+        run_verb(
+            _command(
+                'calibrate', bag, '--table', str(table), '--output', str(calibration), '--no-report'
+            )
+        )
     paths = {'TABLE': table, 'OUTPUT': output, 'CALIBRATION': calibration / 'calibration.yaml'}
-    seconds, memory = run_verb(_command(case.verb, bag, *(str(paths.get(each, each)) for each in case.arguments)))
+    seconds, memory = run_verb(
+        _command(case.verb, bag, *(str(paths.get(each, each)) for each in case.arguments))
+    )
     return iteration, seconds, memory
 
 
@@ -104,8 +131,11 @@ def main():
     for case, multiples, seconds, memory, limit in bench_verbs(options.repetitions, options.only):
         multiple = median(multiples)
         missed |= multiple > limit or max(memory) > case.memory_mb
-        print(f'{case.verb + ", " + case.session:40s} {multiple:6.1f} iterations (at most {limit:.1f}: {case.seconds:g} s)  '
-              f'{median(seconds):5.1f} s  {max(memory):4.0f} MB (at most {case.memory_mb:g})', flush=True)
+        print(
+            f'{case.verb + ", " + case.session:40s} {multiple:6.1f} iterations (at most {limit:.1f}: {case.seconds:g} s)  '
+            f'{median(seconds):5.1f} s  {max(memory):4.0f} MB (at most {case.memory_mb:g})',
+            flush=True,
+        )
     return 1 if missed else 0
 
 

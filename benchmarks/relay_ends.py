@@ -27,7 +27,12 @@ END = 2.0**40
 
 def template():
     """Return one serialized message of an IMU in motion, and the offset of the number that identifies each message."""
-    imu = ImuSamples(np.zeros(1, np.int64), np.array([[0.3, -0.2, 9.8]]), np.array([[0.4, -0.7, 0.2]]), 'imu_link')
+    imu = ImuSamples(
+        np.zeros(1, np.int64),
+        np.array([[0.3, -0.2, 9.8]]),
+        np.array([[0.4, -0.7, 0.2]]),
+        'imu_link',
+    )
     data = bytearray(encode_imu(imu)[0].tobytes())
     return data, find_imu_layout(bytes(data)).offsets[ORIENTATION][0]
 
@@ -50,7 +55,9 @@ def source(topic, rate, seconds):
         if wait > 0:
             time.sleep(wait * 1e-9)
         struct.pack_into('<d', data, number_at, float(k))
-        struct.pack_into('<iI', data, STAMP_AT, *divmod(time.clock_gettime_ns(time.CLOCK_MONOTONIC), 10**9))
+        struct.pack_into(
+            '<iI', data, STAMP_AT, *divmod(time.clock_gettime_ns(time.CLOCK_MONOTONIC), 10**9)
+        )
         publish(bytes(data))
     lasted = (time.clock_gettime_ns(time.CLOCK_MONOTONIC) - start) * 1e-9
     time.sleep(0.5)
@@ -80,7 +87,9 @@ def sink(topic):
         late.append(now - seconds * 10**9 - nanoseconds)
 
     group = relay_loop.OutsideExecutor()
-    subscription = node.create_subscription(Imu, topic, record, input_qos(reliable=True), raw=True, callback_group=group)
+    subscription = node.create_subscription(
+        Imu, topic, record, input_qos(reliable=True), raw=True, callback_group=group
+    )
     nowhere = node.create_publisher(Imu, topic + '/nowhere', output_qos())
     deadline = time.monotonic() + 20.0
     while subscription.get_publisher_count() < 1 and time.monotonic() < deadline:
@@ -91,8 +100,18 @@ def sink(topic):
     except _Ended:
         pass
     late = np.array(late) * 1e-3
-    print(json.dumps({'came': len(set(numbers)), 'doubled': len(numbers) - len(set(numbers)),
-                      'late_us': np.round(np.percentile(late, np.arange(0, 101)), 1).tolist() if len(late) else []}), flush=True)
+    print(
+        json.dumps(
+            {
+                'came': len(set(numbers)),
+                'doubled': len(numbers) - len(set(numbers)),
+                'late_us': np.round(np.percentile(late, np.arange(0, 101)), 1).tolist()
+                if len(late)
+                else [],
+            }
+        ),
+        flush=True,
+    )
 
 
 def plain_relay():

@@ -36,9 +36,13 @@ def run(command: str) -> str:
                 imu_calibration(arguments)
             output = stream.getvalue()
         elif name in FILTERS:
-            output = subprocess.run([name, *arguments], input=output, capture_output=True, text=True, check=False).stdout
+            output = subprocess.run(
+                [name, *arguments], input=output, capture_output=True, text=True, check=False
+            ).stdout
         else:
-            raise ValueError(f'a command of a page must be one of {("imu_calibration", *FILTERS)}, got {name}')
+            raise ValueError(
+                f'a command of a page must be one of {("imu_calibration", *FILTERS)}, got {name}'
+            )
     if target:
         Path(target).write_text(output)
     return '' if target else output
@@ -46,17 +50,24 @@ def run(command: str) -> str:
 
 def commands(text: str) -> list[str]:
     """Return the commands of a page."""
-    return [line[2:] for block in BLOCK.findall(text) for line in block.splitlines() if line.startswith('$ ')]
+    return [
+        line[2:]
+        for block in BLOCK.findall(text)
+        for line in block.splitlines()
+        if line.startswith('$ ')
+    ]
 
 
 def worked_through(text: str) -> str:
     """Return a page with the output of its commands in the current folder."""
+
     def block(match):
         parts = []
         for command in (line for line in match.group(1).splitlines() if line.startswith('$ ')):
             printed = '\n'.join(line.rstrip() for line in run(command[2:]).splitlines())
             parts.append(f'{command}\n{printed}\n' if printed else f'{command}\n')
         return '```console\n' + ''.join(parts) + '```'
+
     return BLOCK.sub(block, text)
 
 
@@ -81,6 +92,7 @@ def main() -> None:
     """Write all pages and their pictures."""
     argparse.ArgumentParser(description=__doc__).parse_args()
     from answer_pictures import PICTURES
+
     with tempfile.TemporaryDirectory() as folder, inside(Path(folder)):
         for page in pages():
             page.write_text(worked_through(page.read_text()))

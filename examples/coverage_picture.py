@@ -22,7 +22,10 @@ MINIMUM = 8.0
 def states():
     """Yield a Coverage at the beginning, after six poses and at the end of a session that follows the recommended motions."""
     up = np.array([0.0, 0.0, 1.0])
-    knowledge, seen = knowledge_of(EMPTY_SCAN, None, HandOptions(gravity=9.81)).then(HandStep(up)), [up]
+    knowledge, seen = (
+        knowledge_of(EMPTY_SCAN, None, HandOptions(gravity=9.81)).then(HandStep(up)),
+        [up],
+    )
     yield shown(knowledge, seen)
     for step in foretold(knowledge)[:6]:
         knowledge = knowledge.then(step)
@@ -36,7 +39,13 @@ def shown(knowledge, seen):
     """Return the Coverage as published by calibration_node."""
     steps = foretold(knowledge)
     first, seconds = steps[0], sum(step.seconds for step in steps)
-    return Coverage(knowledge.best()[1], np.array(seen), seen[-1], Step(first.words, first.up, first.axis, first.angle), seconds)
+    return Coverage(
+        knowledge.best()[1],
+        np.array(seen),
+        seen[-1],
+        Step(first.words, first.up, first.axis, first.angle),
+        seconds,
+    )
 
 
 def draw(axes, coverage):
@@ -48,11 +57,22 @@ def draw(axes, coverage):
         if marker.action == Marker.DELETEALL:
             continue
         if marker.type == Marker.SPHERE:
-            axes.scatter(*place, s=(MINIMUM + 170 * marker.scale.x)**2 / 2.5, color=color, edgecolors='none')
+            axes.scatter(
+                *place,
+                s=(MINIMUM + 170 * marker.scale.x) ** 2 / 2.5,
+                color=color,
+                edgecolors='none',
+            )
         elif marker.type == Marker.SPHERE_LIST:
             axes.scatter(*points.T, s=14, color=color)
         elif marker.type == Marker.ARROW:
-            axes.quiver(*points[0], *(points[1] - points[0]), color=color, linewidth=2.5, arrow_length_ratio=0.18)
+            axes.quiver(
+                *points[0],
+                *(points[1] - points[0]),
+                color=color,
+                linewidth=2.5,
+                arrow_length_ratio=0.18,
+            )
         elif marker.type == Marker.LINE_STRIP:
             axes.plot(*points.T, color=color, linewidth=2.5)
         elif marker.type == Marker.TEXT_VIEW_FACING:
@@ -65,7 +85,9 @@ def draw(axes, coverage):
 
 def main():
     """Write the picture."""
-    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), subplot_kw={'projection': '3d'}, layout='constrained')
+    figure, axes = plt.subplots(
+        1, 3, figsize=(11, 3.6), subplot_kw={'projection': '3d'}, layout='constrained'
+    )
     for part, coverage in zip(axes, states(), strict=True):
         draw(part, coverage)
     figure.savefig(PICTURE, dpi=85)

@@ -35,33 +35,64 @@ def run(folder):
     verb('simulate', '--profile', 'calibration', '--seed', 1, '--imu-seed', 5, '--output', first)
     verb('calibrate', first, '--table', first / 'table.yaml', '--output', folder)
     verb('simulate', '--profile', 'navigation', '--seed', 2, '--imu-seed', 5, '--output', second)
-    verb('compensate', second, '--calibration', folder / 'calibration.yaml', '--output', folder / 'other_session_corrected')
-    table, calibration = files.read_table(second / 'table.yaml'), files.read_calibration(folder / 'calibration.yaml')
+    verb(
+        'compensate',
+        second,
+        '--calibration',
+        folder / 'calibration.yaml',
+        '--output',
+        folder / 'other_session_corrected',
+    )
+    table, calibration = (
+        files.read_table(second / 'table.yaml'),
+        files.read_calibration(folder / 'calibration.yaml'),
+    )
     truth = session_truth(source_of(second, joint_names=table.joint_names)(), table)
     show(before_and_after(*truth, calibration))
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
-    print('not determined by this recording: ' + (', '.join(lacking) if lacking else 'none; every parameter is within its tolerance'))
+    print(
+        'not determined by this recording: '
+        + (', '.join(lacking) if lacking else 'none; every parameter is within its tolerance')
+    )
     print(f'report: {(folder / "report.html").resolve()}')
 
 
 def show(figures):
     """Print the table of errors on the other session."""
     numbers = ('accelerometer', 'gyroscope', 'velocity after 50 s', 'position after 50 s')
-    rows = [(name, error_text(f.force, 'm/s^2'), error_text(f.rate, 'rad/s'), f'{significant(f.velocity)} m/s', f'{significant(f.position)} m')
-            for name, f in zip(('before', 'after'), figures)]
+    rows = [
+        (
+            name,
+            error_text(f.force, 'm/s^2'),
+            error_text(f.rate, 'rad/s'),
+            f'{significant(f.velocity)} m/s',
+            f'{significant(f.position)} m',
+        )
+        for name, f in zip(('before', 'after'), figures)
+    ]
     print('\nErrors on a different session of the same IMU')
     show_table(Terminal.of(), ('', *numbers), rows, numbers=numbers)
 
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--output', default='demo', help='output folder; an earlier demonstration in it is replaced')
+    parser.add_argument(
+        '--output', default='demo', help='output folder; an earlier demonstration in it is replaced'
+    )
     target = Path(parser.parse_args().output)
     if target.exists():
-        known = {'session', 'other_session', 'other_session_corrected', 'calibration.yaml', 'report.html'}
+        known = {
+            'session',
+            'other_session',
+            'other_session_corrected',
+            'calibration.yaml',
+            'report.html',
+        }
         strangers = sorted(p.name for p in target.iterdir() if p.name not in known)
         if strangers:
-            raise SystemExit(f'{target} must be empty or contain an earlier demonstration, it contains {strangers[0]}; choose another --output')
+            raise SystemExit(
+                f'{target} must be empty or contain an earlier demonstration, it contains {strangers[0]}; choose another --output'
+            )
         shutil.rmtree(target)
     target.mkdir(parents=True)
     run(target)

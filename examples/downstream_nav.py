@@ -47,13 +47,20 @@ def drive(seed, seconds):
     """Return (time, true rate, true force, path) of a robot that drives curves on a floor and stops before each leg."""
     rng, time_ = np.random.default_rng(seed), np.arange(0, seconds, 1 / RATE)
     phase, leg = time_ % LEG, (time_ // LEG).astype(int)
-    moving = np.clip(np.minimum(phase - STOP, LEG - phase), 0, 1)   # each leg begins at rest
+    moving = np.clip(np.minimum(phase - STOP, LEG - phase), 0, 1)  # each leg begins at rest
     speed = moving * rng.uniform(0.5, 1.2, leg[-1] + 1)[leg]
     turn = moving * rng.uniform(-0.5, 0.5, leg[-1] + 1)[leg]
     heading = np.cumsum(turn) / RATE
-    path = np.cumsum(speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) / RATE
-    force = np.stack([np.gradient(speed, 1 / RATE), speed * turn, np.full(len(time_), GRAVITY)], axis=1)
-    floor = moving[:, None] * rng.normal(0, 0.8, (len(time_), 3))   # vibration that distinguishes a slow drive from rest
+    path = (
+        np.cumsum(speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+        / RATE
+    )
+    force = np.stack(
+        [np.gradient(speed, 1 / RATE), speed * turn, np.full(len(time_), GRAVITY)], axis=1
+    )
+    floor = moving[:, None] * rng.normal(
+        0, 0.8, (len(time_), 3)
+    )  # vibration that distinguishes a slow drive from rest
     return time_, np.stack([0 * turn, 0 * turn, turn], axis=1), force + floor, path
 
 
@@ -62,9 +69,20 @@ def measured(time_, rate, force, seed):
     truth, rng = files.read_calibration(SESSION / 'truth.yaml'), np.random.default_rng(seed)
     alpha = np.gradient(rate, 1 / RATE, axis=0)
     temperature = np.full(len(time_), truth.model.temperature_ref_c)
-    ref = Reference(time_, np.broadcast_to(np.eye(3), (len(time_), 3, 3)), force, rate, alpha, GRAVITY, temperature)
-    read = {sensor: sensor_output(truth.model, sensor, truth.values, ref=ref) + rng.normal(0, sd, (len(time_), 3))
-            for sensor, sd in NOISE.items()}
+    ref = Reference(
+        time_,
+        np.broadcast_to(np.eye(3), (len(time_), 3, 3)),
+        force,
+        rate,
+        alpha,
+        GRAVITY,
+        temperature,
+    )
+    read = {
+        sensor: sensor_output(truth.model, sensor, truth.values, ref=ref)
+        + rng.normal(0, sd, (len(time_), 3))
+        for sensor, sd in NOISE.items()
+    }
     stamps = 1_800_000_000 * 10**9 + np.round(time_ * 1e9).astype(np.int64)
     return ImuSamples(stamps, read['accelerometer'], read['gyroscope'], 'imu_link')
 
@@ -85,7 +103,7 @@ class DeadReckoning:
         if self.attitude is None:
             if stop is not None:
                 up = stop.mean[:3] / np.linalg.norm(stop.mean[:3])
-                self.attitude = Rotation.from_matrix(align(up))   # the heading is that of the start
+                self.attitude = Rotation.from_matrix(align(up))  # the heading is that of the start
         else:
             seconds = now - self._before
             self.attitude = self.attitude * Rotation.from_rotvec(np.array(rate) * seconds)
@@ -106,10 +124,15 @@ class Navigator:
         from sensor_msgs.msg import Imu
 
         from imu_calibration.nodes.inputs import BatchInput
+
         self.node = rclpy.create_node(f'navigate_by_{imu_topic.replace("/", "_")}')
         self._reckoning, self._stream, self._message = DeadReckoning(), ImuStream(), Odometry
         self.publisher = self.node.create_publisher(Odometry, odometry_topic, 10)
-        self.input, self.path, self.last = BatchInput(self.node, Imu, imu_topic, add=self._take, depth=DEPTH), [], time.monotonic()
+        self.input, self.path, self.last = (
+            BatchInput(self.node, Imu, imu_topic, add=self._take, depth=DEPTH),
+            [],
+            time.monotonic(),
+        )
 
     def _take(self, data, _):
         if not self._stream.heads(data):
@@ -123,7 +146,9 @@ class Navigator:
         message.header.frame_id, message.child_frame_id = 'odom', 'imu_link'
         pose = message.pose.pose
         pose.position.x, pose.position.y, pose.position.z = found.position.tolist()
-        pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = found.attitude.as_quat().tolist()
+        pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = (
+            found.attitude.as_quat().tolist()
+        )
         self.publisher.publish(message)
         self.path.append((stamp_ns, *found.position))
 
@@ -132,26 +157,48 @@ def navigate(bag, calibration, domain_id):
     """Play the bag through a compensator and two navigators; return {topic: path, rows of stamp and position}."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
+
     os.environ |= {'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     with NodeProcesses(domain_id) as processes:
-        processes.start('compensator_node', {'calibration_file': calibration, 'anyway': True}, remappings={'imu/data_corrected': 'imu/data'})
+        processes.start(
+            'compensator_node',
+            {'calibration_file': calibration, 'anyway': True},
+            remappings={'imu/data_corrected': 'imu/data'},
+        )
         rclpy.init()
         try:
-            navigators, executor = [Navigator(*names) for names in TOPICS.items()], SingleThreadedExecutor()
+            navigators, executor = (
+                [Navigator(*names) for names in TOPICS.items()],
+                SingleThreadedExecutor(),
+            )
             corrected = navigators[-1]
             for navigator in navigators:
                 executor.add_node(navigator.node)
             end = time.monotonic() + PATIENCE
             while not corrected.node.count_publishers(corrected.input.topic_name):
                 if time.monotonic() > end:
-                    raise SystemExit('the compensator did not start within the time limit; run it again on an idle machine')
-                executor.spin_once(timeout_sec=0.1)   # a subscriber that misses the first rest is levelled at the second
-            player = processes.start('bag_player_node', {'bag': bag, 'rate': FACTOR, 'wait_for_subscribers': 2})
-            while player.poll() is None or time.monotonic() - max(navigator.last for navigator in navigators) < 2.0:
+                    raise SystemExit(
+                        'the compensator did not start within the time limit; run it again on an idle machine'
+                    )
+                executor.spin_once(
+                    timeout_sec=0.1
+                )  # a subscriber that misses the first rest is levelled at the second
+            player = processes.start(
+                'bag_player_node', {'bag': bag, 'rate': FACTOR, 'wait_for_subscribers': 2}
+            )
+            while (
+                player.poll() is None
+                or time.monotonic() - max(navigator.last for navigator in navigators) < 2.0
+            ):
                 if time.monotonic() > end:
-                    raise SystemExit('the drive did not end within the time limit; run it again on an idle machine')
+                    raise SystemExit(
+                        'the drive did not end within the time limit; run it again on an idle machine'
+                    )
                 executor.spin_once(timeout_sec=0.1)
-            return {name: np.array(navigator.path, dtype=object) for name, navigator in zip(TOPICS, navigators, strict=True)}
+            return {
+                name: np.array(navigator.path, dtype=object)
+                for name, navigator in zip(TOPICS, navigators, strict=True)
+            }
         finally:
             rclpy.try_shutdown()
 
@@ -170,13 +217,22 @@ def errors_of(paths, stamps, path):
 def draw(found, path, picture):
     """Draw the paths."""
     import matplotlib
+
     matplotlib.use('Agg')
     import matplotlib.pyplot as plt
+
     figure, axes = plt.subplots(figsize=(8, 3.2), layout='constrained')
     axes.plot(*(path - path[0]).T, color='0.3', linewidth=3, label='true')
-    for (topic, (_, last, positions)), color in zip(found.items(), ('tab:red', 'tab:blue'), strict=True):
+    for (topic, (_, last, positions)), color in zip(
+        found.items(), ('tab:red', 'tab:blue'), strict=True
+    ):
         axes.plot(*positions.T, color=color, label=f'/{topic}: error {last:.1f} m at the end')
-    axes.set(xlabel='x [m]', ylabel='y [m]', aspect='equal', title=f'Dead reckoning for {len(path) / RATE:.0f} s, at rest every {LEG:.0f} s')
+    axes.set(
+        xlabel='x [m]',
+        ylabel='y [m]',
+        aspect='equal',
+        title=f'Dead reckoning for {len(path) / RATE:.0f} s, at rest every {LEG:.0f} s',
+    )
     axes.legend(loc='lower left', fontsize=8)
     figure.savefig(picture, dpi=90)
 
@@ -190,12 +246,16 @@ def run(domain_id, picture, seconds, folder):
     paths = navigate(folder / 'drive', folder / 'calibration.yaml', domain_id)
     lost = {topic: len(imu) - len(rows) for topic, rows in paths.items()}
     if max(lost.values()) > MOST_LOST:
-        raise SystemExit(f'too many messages were lost for a comparison: {lost}; run it again on an idle machine')
+        raise SystemExit(
+            f'too many messages were lost for a comparison: {lost}; run it again on an idle machine'
+        )
     found = errors_of(paths, imu.stamp_ns, path)
     for topic, (most, last, _) in found.items():
         print(f'/{topic}: error {last:.2f} m at the end, largest {most:.2f} m')
     (_, raw, _), (_, corrected, _) = found.values()
-    print(f'the calibration reduces the position error after {seconds:.0f} s by {raw - corrected:.2f} m')
+    print(
+        f'the calibration reduces the position error after {seconds:.0f} s by {raw - corrected:.2f} m'
+    )
     if picture:
         draw(found, path, picture)
         print(f'written: {picture}')
@@ -204,9 +264,21 @@ def run(domain_id, picture, seconds, folder):
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--domain-id', type=int, default=1 + os.getpid() % 100, help='ROS_DOMAIN_ID, default one of its own')
-    parser.add_argument('--picture', metavar='FILE', default=str(ROOT / 'docs' / 'downstream_nav.png'), help='file of the figure')
-    parser.add_argument('--seconds', type=float, default=120.0, help='length of the drive, default 120')
+    parser.add_argument(
+        '--domain-id',
+        type=int,
+        default=1 + os.getpid() % 100,
+        help='ROS_DOMAIN_ID, default one of its own',
+    )
+    parser.add_argument(
+        '--picture',
+        metavar='FILE',
+        default=str(ROOT / 'docs' / 'downstream_nav.png'),
+        help='file of the figure',
+    )
+    parser.add_argument(
+        '--seconds', type=float, default=120.0, help='length of the drive, default 120'
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         sys.exit(run(options.domain_id, options.picture, options.seconds, Path(temporary)))

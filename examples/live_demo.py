@@ -28,8 +28,17 @@ FACTOR = 4.0
 """Simulated seconds per second."""
 HIDDEN, PROFILE = 'soft_spring', 'six_faces'
 """Physical fault of the simulated IMU; first motion."""
-SIMULATOR = {'table_file': TABLE, 'seed': 1, 'imu_seed': 5, 'imu_rate': 100.0, 'joint_rate': 100.0, 'time_factor': FACTOR, 'truth': True,
-             'hide': HIDDEN, 'hide_size': 2.0}
+SIMULATOR = {
+    'table_file': TABLE,
+    'seed': 1,
+    'imu_seed': 5,
+    'imu_rate': 100.0,
+    'joint_rate': 100.0,
+    'time_factor': FACTOR,
+    'truth': True,
+    'hide': HIDDEN,
+    'hide_size': 2.0,
+}
 START = 1_800_000_000.0
 PATIENCE = 240.0
 
@@ -45,24 +54,43 @@ class Watcher:
 
         from imu_calibration.nodes.inputs import BatchInput, latched_qos
         from msg_adapters.live import LiveGatherer
+
         self._rclpy, self._processes = rclpy, processes
         rclpy.init()
         self.node = rclpy.create_node('live_demo')
-        self.streams = {topic: LiveGatherer() for topic in ('imu/data_raw', 'imu/data_corrected', 'imu/truth')}
+        self.streams = {
+            topic: LiveGatherer() for topic in ('imu/data_raw', 'imu/data_corrected', 'imu/truth')
+        }
         for topic, gatherer in self.streams.items():
             BatchInput(self.node, Imu, topic, add=gatherer.add_imu, depth=20_000)
-        BatchInput(self.node, JointState, 'joint_states', add=self.streams['imu/data_raw'].add_joints, depth=20_000)
+        BatchInput(
+            self.node,
+            JointState,
+            'joint_states',
+            add=self.streams['imu/data_raw'].add_joints,
+            depth=20_000,
+        )
         self.documents, self.status, self.drive, self.stamp = [], {}, [], 0.0
         self.node.create_subscription(JointState, 'joint_states', self._joints, 100)
-        self.node.create_subscription(String, 'imu/calibration', lambda message: self.documents.append((time.monotonic(), message.data)),
-                                      latched_qos())
+        self.node.create_subscription(
+            String,
+            'imu/calibration',
+            lambda message: self.documents.append((time.monotonic(), message.data)),
+            latched_qos(),
+        )
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._note, 100)
 
     def _note(self, message):
         self.status |= {status.name: status for status in message.status}
         for status in message.status:
             if status.name == 'planner_node: drive':
-                self.drive.append((time.monotonic(), status.message, {pair.key: pair.value for pair in status.values}))
+                self.drive.append(
+                    (
+                        time.monotonic(),
+                        status.message,
+                        {pair.key: pair.value for pair in status.values},
+                    )
+                )
 
     def _joints(self, message):
         self.stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
@@ -72,14 +100,19 @@ class Watcher:
         while not until():
             for process in self._processes.running:
                 if process.poll():
-                    raise SystemExit(f'a node ended with exit code {process.returncode}: {" ".join(process.args[1:4])}')
+                    raise SystemExit(
+                        f'a node ended with exit code {process.returncode}: {" ".join(process.args[1:4])}'
+                    )
             if time.monotonic() > deadline:
-                raise SystemExit('the demonstration did not end within its time limit; run it again on an idle machine')
+                raise SystemExit(
+                    'the demonstration did not end within its time limit; run it again on an idle machine'
+                )
             self._rclpy.spin_once(self.node, timeout_sec=0.1)
 
     def call(self, service, deadline):
         """Call a Trigger service and return its response."""
         from std_srvs.srv import Trigger
+
         client = self.node.create_client(Trigger, service)
         self.spin(client.service_is_ready, deadline)
         future = client.call_async(Trigger.Request())
@@ -106,8 +139,12 @@ def differences(samples, truth):
     _, here, there = np.intersect1d(samples.stamp_ns, truth.stamp_ns, return_indices=True)
     rate = int(SIMULATOR['imu_rate'])
     count = len(here) // rate * rate
-    means = [(getattr(samples, name)[here[:count]] - getattr(truth, name)[there[:count]]).reshape(-1, rate, 3).mean(axis=1)
-             for name in ('force_s', 'rate_s')]
+    means = [
+        (getattr(samples, name)[here[:count]] - getattr(truth, name)[there[:count]])
+        .reshape(-1, rate, 3)
+        .mean(axis=1)
+        for name in ('force_s', 'rate_s')
+    ]
     return np.arange(count // rate, dtype=float), *means
 
 
@@ -117,11 +154,29 @@ def run(domain_id, folder, output):
     deadline = begin + PATIENCE
     os.environ |= {'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     with NodeProcesses(domain_id) as processes:
-        print(f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and planner_node; hidden effect of the IMU: {HIDDEN}', flush=True)
-        calibration_node = processes.start('calibration_node', {'table_file': TABLE, 'save_file': folder / 'live.yaml', 'diagnosis_period': 3600.0})
-        planner = processes.start('planner_node', {'table_file': TABLE, 'time_limit': 900.0, 'first_speed': 0.6, 'stall_patience': 15.0, 'silence': 5.0})
+        print(
+            f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and planner_node; hidden effect of the IMU: {HIDDEN}',
+            flush=True,
+        )
+        calibration_node = processes.start(
+            'calibration_node',
+            {'table_file': TABLE, 'save_file': folder / 'live.yaml', 'diagnosis_period': 3600.0},
+        )
+        planner = processes.start(
+            'planner_node',
+            {
+                'table_file': TABLE,
+                'time_limit': 900.0,
+                'first_speed': 0.6,
+                'stall_patience': 15.0,
+                'silence': 5.0,
+            },
+        )
         watcher = Watcher(processes)
-        simulator = processes.start('simulator_node', {**SIMULATOR, 'profile': PROFILE, 'start_time': START, 'wait_for_subscribers': 2})
+        simulator = processes.start(
+            'simulator_node',
+            {**SIMULATOR, 'profile': PROFILE, 'start_time': START, 'wait_for_subscribers': 2},
+        )
         try:
             first_motion(watcher, deadline)
             drive(watcher, deadline)
@@ -129,7 +184,9 @@ def run(domain_id, folder, output):
             print(f'~/save: {saved.message}')
             codes = [processes.end(node) for node in (planner, calibration_node, simulator)]
             calibration = files.read_calibration(folder / 'live.yaml')
-            compensator = processes.start('compensator_node', {'calibration_file': folder / 'live.yaml'})
+            compensator = processes.start(
+                'compensator_node', {'calibration_file': folder / 'live.yaml'}
+            )
             errors = compare(watcher, processes, deadline)
             codes.append(processes.end(compensator))
         finally:
@@ -138,13 +195,17 @@ def run(domain_id, folder, output):
         picture(output / 'live_demo.png', watcher, calibration, errors)
         print(f'written: {output / "live_demo.png"}')
     print(f'exit codes of the nodes: {codes}; {time.monotonic() - begin:.0f} s')
-    separated = any(values.get('separating') == 'True' for _, _, values in watcher.drive) and watcher.drive[-1][2].get('mates', '') == ''
+    separated = (
+        any(values.get('separating') == 'True' for _, _, values in watcher.drive)
+        and watcher.drive[-1][2].get('mates', '') == ''
+    )
     return 0 if saved.success and separated and errors is not None and codes == [0] * 4 else 1
 
 
 def first_motion(watcher, deadline):
     """Wait until the profile is over, by the stamps of the joint states."""
     from imu_calibration.simulation.profiles import make_profile
+
     seconds = make_profile(PROFILE, SIMULATOR['seed'], files.read_table(TABLE)).duration
     watcher.spin(lambda: watcher.stamp > START + seconds, deadline)
     print(f'{PROFILE}: {seconds:.0f} s; the planner starts', flush=True)
@@ -152,12 +213,15 @@ def first_motion(watcher, deadline):
 
 def drive(watcher, deadline):
     """Start the planner and wait until it has finished."""
-    while not watcher.call('/planner_node/start', deadline).success:   # until DDS discovery is complete
+    while not watcher.call(
+        '/planner_node/start', deadline
+    ).success:  # until DDS discovery is complete
         pause = time.monotonic() + 0.5
         watcher.spin(lambda end=pause: time.monotonic() > end, deadline)
 
     def ended():
         return watcher.drive and watcher.drive[-1][2]['state'] in ('done', 'stopped')
+
     watcher.spin(ended, deadline)
     if watcher.drive[-1][2]['state'] == 'stopped':
         raise SystemExit(f'the planner stopped: {watcher.drive[-1][1]}')
@@ -168,8 +232,17 @@ def compare(watcher, processes, deadline):
     for topic in watcher.streams:
         watcher.take(topic)
     print('compensating another motion of the same IMU', flush=True)
-    simulator = processes.start('simulator_node', {**SIMULATOR, 'profile': 'tumbling', 'seed': 4, 'start_time': START + 10_000.0, 'stop_at_end': True,
-                                                   'wait_for_subscribers': 2})
+    simulator = processes.start(
+        'simulator_node',
+        {
+            **SIMULATOR,
+            'profile': 'tumbling',
+            'seed': 4,
+            'start_time': START + 10_000.0,
+            'stop_at_end': True,
+            'wait_for_subscribers': 2,
+        },
+    )
     watcher.spin(lambda: simulator.poll() is not None, deadline)
     end = time.monotonic() + 1.0
     watcher.spin(lambda: time.monotonic() > end, deadline)
@@ -178,9 +251,13 @@ def compare(watcher, processes, deadline):
         print('compensator_node published nothing')
         return None
     before, after = differences(once(raw), once(truth)), differences(once(corrected), once(truth))
-    print(f'\nErrors against the truth over {len(after[0])} s, root mean square of one-second means')
+    print(
+        f'\nErrors against the truth over {len(after[0])} s, root mean square of one-second means'
+    )
     for name, (_, force, rate) in (('before', before), ('after', after)):
-        print(f'  {name:7} accelerometer {np.sqrt((force**2).mean()) / (G * 1e-3):9.4f} mg    gyroscope {np.sqrt((rate**2).mean()) / DEG:9.5f} deg/s')
+        print(
+            f'  {name:7} accelerometer {np.sqrt((force**2).mean()) / (G * 1e-3):9.4f} mg    gyroscope {np.sqrt((rate**2).mean()) / DEG:9.5f} deg/s'
+        )
     return before, after
 
 
@@ -188,9 +265,18 @@ def events(drive):
     """Yield (time, text) of the diagnosis requests, separations and findings of the planner."""
     previous = None
     for at, text, values in drive:
-        candidates, found = (values.get(key, '').replace(' ', ', ') for key in ('told apart', 'found'))
-        event = ('waits for the diagnosis' if text == 'diagnosing' else f'separates {candidates}' if values.get('separating') == 'True' else
-                 f'found: {found}' if values['state'] == 'done' and found else '')
+        candidates, found = (
+            values.get(key, '').replace(' ', ', ') for key in ('told apart', 'found')
+        )
+        event = (
+            'waits for the diagnosis'
+            if text == 'diagnosing'
+            else f'separates {candidates}'
+            if values.get('separating') == 'True'
+            else f'found: {found}'
+            if values['state'] == 'done' and found
+            else ''
+        )
         if event and event != previous:
             yield at, event
         previous = event or previous
@@ -199,35 +285,70 @@ def events(drive):
 def picture(path, watcher, calibration, errors):
     """Draw standard deviations over time, the actions of the planner, and the errors before and after compensation."""
     import matplotlib
+
     matplotlib.use('Agg')
     import matplotlib.pyplot as plt
 
     from imu_calibration.document.calibration_text import calibration_from_text
     from imu_calibration.estimation.solution import tolerances_of
+
     start = next(at for at, text, _ in watcher.drive if not text.startswith('idle'))
     figure, (known, errors_axes) = plt.subplots(2, 1, figsize=(9, 7), constrained_layout=True)
     usual, lines = files.read_tolerances(ROOT / 'config' / 'tolerances.yaml'), {}
     for at, text in watcher.documents:
         found = calibration_from_text(text)
-        for name, value in zip(found.param_names, np.sqrt(np.diag(found.covariance)) / tolerances_of(found.model, usual), strict=True):
+        for name, value in zip(
+            found.param_names,
+            np.sqrt(np.diag(found.covariance)) / tolerances_of(found.model, usual),
+            strict=True,
+        ):
             if not name.startswith('reference'):
                 lines.setdefault(name, []).append((at - start, value))
     for name, points in lines.items():
-        known.semilogy(*zip(*points, strict=True), color='tab:blue' if name.startswith('accel') else 'tab:orange', lw=0.8)
+        known.semilogy(
+            *zip(*points, strict=True),
+            color='tab:blue' if name.startswith('accel') else 'tab:orange',
+            lw=0.8,
+        )
     known.axhline(1.0, color='k', lw=1)
     end = max(at for at, _, _ in watcher.drive)
     for row, (at, event) in enumerate(events(watcher.drive)):
         known.axvline(at - start, color='tab:red', lw=1)
         side = 'left' if at - start < 0.5 * (end - start) else 'right'
-        known.text(at - start, 0.93 - 0.09 * row, f' {event} ', color='tab:red', ha=side, fontsize=8, transform=known.get_xaxis_transform(), in_layout=False,
-                   bbox={'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.8, 'pad': 0.5})
-    known.set(xlabel='s since the planner started', ylabel='standard deviation / tolerance',
-              title=f'{PROFILE}, then {watcher.drive[-1][2]["motion"]} planned motions: parameters of accelerometer (blue) and gyroscope (orange)')
-    found = [effect.name for effect in calibration.model.effects if effect.sensor == 'accelerometer' and effect.name not in ('bias', 'matrix')]
-    for label, (seconds, force, _), color in (('as measured', errors[0], 'tab:gray'), ('compensated', errors[1], 'tab:green')):
-        errors_axes.plot(seconds, np.linalg.norm(force, axis=1) / (1e-3 * G), color=color, label=label)
-    errors_axes.set(xlabel='s of another motion', ylabel='error of the accelerometer, mg', yscale='log',
-             title=f'hidden effect: {HIDDEN}; effects in the final model: {", ".join(found) or "none"}')
+        known.text(
+            at - start,
+            0.93 - 0.09 * row,
+            f' {event} ',
+            color='tab:red',
+            ha=side,
+            fontsize=8,
+            transform=known.get_xaxis_transform(),
+            in_layout=False,
+            bbox={'facecolor': 'white', 'edgecolor': 'none', 'alpha': 0.8, 'pad': 0.5},
+        )
+    known.set(
+        xlabel='s since the planner started',
+        ylabel='standard deviation / tolerance',
+        title=f'{PROFILE}, then {watcher.drive[-1][2]["motion"]} planned motions: parameters of accelerometer (blue) and gyroscope (orange)',
+    )
+    found = [
+        effect.name
+        for effect in calibration.model.effects
+        if effect.sensor == 'accelerometer' and effect.name not in ('bias', 'matrix')
+    ]
+    for label, (seconds, force, _), color in (
+        ('as measured', errors[0], 'tab:gray'),
+        ('compensated', errors[1], 'tab:green'),
+    ):
+        errors_axes.plot(
+            seconds, np.linalg.norm(force, axis=1) / (1e-3 * G), color=color, label=label
+        )
+    errors_axes.set(
+        xlabel='s of another motion',
+        ylabel='error of the accelerometer, mg',
+        yscale='log',
+        title=f'hidden effect: {HIDDEN}; effects in the final model: {", ".join(found) or "none"}',
+    )
     errors_axes.legend(loc='upper right')
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
@@ -235,8 +356,15 @@ def picture(path, watcher, calibration, errors):
 
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
-    parser.add_argument('--domain-id', type=int, default=1 + os.getpid() % 100, help='ROS_DOMAIN_ID, default derived from the process id')
-    parser.add_argument('--output', type=Path, default=Path('demo'), help='folder for the picture, default demo')
+    parser.add_argument(
+        '--domain-id',
+        type=int,
+        default=1 + os.getpid() % 100,
+        help='ROS_DOMAIN_ID, default derived from the process id',
+    )
+    parser.add_argument(
+        '--output', type=Path, default=Path('demo'), help='folder for the picture, default demo'
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         sys.exit(run(options.domain_id, Path(temporary), options.output))

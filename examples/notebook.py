@@ -34,12 +34,21 @@ found.plot('gyroscope')
 truth = imu.load(SESSION / 'truth.yaml')
 names = [name for name in truth.param_names if name in found.calibration.param_names]
 known = dict(zip(truth.param_names, truth.values, strict=True))
-error = {name: (value - known[name]) / sd for name, value, sd in
-         zip(found.calibration.param_names, found.calibration.values, found.calibration.sd, strict=True) if name in names and sd > 0}
-print(f'{len(error)} parameters, largest error {max(map(abs, error.values())):.1f} sd, rms {np.sqrt(np.mean(np.square(list(error.values())))):.2f} sd')
+error = {
+    name: (value - known[name]) / sd
+    for name, value, sd in zip(
+        found.calibration.param_names, found.calibration.values, found.calibration.sd, strict=True
+    )
+    if name in names and sd > 0
+}
+print(
+    f'{len(error)} parameters, largest error {max(map(abs, error.values())):.1f} sd, rms {np.sqrt(np.mean(np.square(list(error.values())))):.2f} sd'
+)
 
 # %%
-force, rate = found.calibration.compensate(np.tile([0.0, 0.0, 9.81], (4, 1)), np.zeros((4, 3)), time=0.01 * np.arange(4))
+force, rate = found.calibration.compensate(
+    np.tile([0.0, 0.0, 9.81], (4, 1)), np.zeros((4, 3)), time=0.01 * np.arange(4)
+)
 force[-1], rate[-1]
 
 # %% [markdown]

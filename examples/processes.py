@@ -17,12 +17,25 @@ END_TIMEOUT = 30.0
 def local_environment(domain_id: int) -> dict[str, str]:
     """Return an environment in which DDS is limited to this host and a separate domain."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get('PYTHONPATH', '')]))
-    return {**os.environ, 'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'PYTHONPATH': path,
-            'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+    return {
+        **os.environ,
+        'ROS_DOMAIN_ID': str(domain_id),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+        'PYTHONPATH': path,
+        'OMP_NUM_THREADS': '1',
+        'OPENBLAS_NUM_THREADS': '1',
+    }
 
 
-def node_command(name: str, parameters: Mapping | None = None, *, remappings: Mapping | None = None, namespace: str = '',
-                 node_name: str | None = None, parameter_file: Any = None) -> list[str]:
+def node_command(
+    name: str,
+    parameters: Mapping | None = None,
+    *,
+    remappings: Mapping | None = None,
+    namespace: str = '',
+    node_name: str | None = None,
+    parameter_file: Any = None,
+) -> list[str]:
     """
     Return the command that runs a node of this package.
 
@@ -63,14 +76,23 @@ class NodeProcesses:
     def __init__(self, domain_id: int):
         self.environment, self.running = local_environment(domain_id), []
 
-    def start(self, name: str, parameters: Mapping | None = None, output: Any = None, **options: Any) -> subprocess.Popen:
+    def start(
+        self, name: str, parameters: Mapping | None = None, output: Any = None, **options: Any
+    ) -> subprocess.Popen:
         """Start a node (see `node_command`) and return its Popen; `output` is a file for its output."""
-        process = subprocess.Popen(node_command(name, parameters, **options), env=self.environment, stdout=output, stderr=output,
-                                   stdin=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            node_command(name, parameters, **options),
+            env=self.environment,
+            stdout=output,
+            stderr=output,
+            stdin=subprocess.DEVNULL,
+        )
         self.running.append(process)
         return process
 
-    def end(self, process: subprocess.Popen, number: int = signal.SIGINT, timeout: float = END_TIMEOUT) -> int:
+    def end(
+        self, process: subprocess.Popen, number: int = signal.SIGINT, timeout: float = END_TIMEOUT
+    ) -> int:
         """Send a signal and return the exit code; kill a process that does not end in time."""
         if process.poll() is None:
             process.send_signal(number)

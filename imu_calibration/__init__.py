@@ -63,9 +63,16 @@ From the lowest layer; each package imports only packages above it in this list.
 ================  ======================================================================================================
 """
 
-TYPE_CHECKING = False   # the name that type checkers take for true; `typing` would take most of the time of this import
+TYPE_CHECKING = False  # the name that type checkers take for true; `typing` would take most of the time of this import
 if TYPE_CHECKING:
-    from imu_calibration.use_cases.notebook import calibrate, check, compensate, diagnose, load, simulate
+    from imu_calibration.use_cases.notebook import (
+        calibrate,
+        check,
+        compensate,
+        diagnose,
+        load,
+        simulate,
+    )
 
 __all__ = ['calibrate', 'check', 'compensate', 'diagnose', 'load', 'simulate']
 __version__ = '0.1.0'
@@ -76,6 +83,7 @@ def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module 'imu_calibration' has no attribute '{name}'")
     from imu_calibration.use_cases import notebook
+
     return getattr(notebook, name)
 
 

@@ -31,7 +31,9 @@ class Interruption:
         if importing or (numerical and self._left >= 0):
             signal.setitimer(signal.ITIMER_REAL, RETRY_SECONDS)
         else:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)   # a second one ends the process at once, without a traceback
+            signal.signal(
+                signal.SIGINT, signal.SIG_DFL
+            )  # a second one ends the process at once, without a traceback
             raise KeyboardInterrupt
 
 
@@ -39,10 +41,11 @@ def main() -> int:
     """Run the command line; return its exit code. Partial results are removed after SIGTERM as after Ctrl+C."""
     handler = Interruption()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
-        if signal.getsignal(number) != signal.SIG_IGN:   # a background job ignores SIGINT
+        if signal.getsignal(number) != signal.SIG_IGN:  # a background job ignores SIGINT
             signal.signal(number, handler)
     try:
         from imu_calibration.cli.main import main as run_verb
+
         return run_verb()
     except KeyboardInterrupt:
         print('imu_calibration: interrupted; no file was written', file=sys.stderr)

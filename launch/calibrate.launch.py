@@ -23,33 +23,84 @@ CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
 
 def generate_launch_description():
     """Describe calibration_node and the names it can be given."""
-    return LaunchDescription([
-        DeclareLaunchArgument('table', default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
-                              description='table description, YAML; the template is refused; none: no table, by hand'),
-        DeclareLaunchArgument('urdf', default_value='', description='robot description, path (.urdf, or .xacro with '
-                              'allow_xacro: true in params); or topic: '
-                              'robot_description; with table:=none, or a table with the site of the arm'),
-        DeclareLaunchArgument('imu_link', default_value='', description='link that carries the IMU; empty: the frame of its messages'),
-        DeclareLaunchArgument('params', default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
-                              description='parameters of the node, YAML'),
-        DeclareLaunchArgument('save_file', default_value='',
-                              description='file of ~/save; empty: calibration.yaml in the working directory, by ~/save only'),
-        DeclareLaunchArgument('resume', default_value='false', description='continue with the accumulator in the folder of save_file'),
-        DeclareLaunchArgument('namespace', default_value='', description='one per IMU when there are several'),
-        DeclareLaunchArgument('imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'),
-        DeclareLaunchArgument('joint_states', default_value='joint_states', description='topic of sensor_msgs/JointState'),
-        DeclareLaunchArgument('temperature', default_value='imu/temperature', description='topic of sensor_msgs/Temperature'),
-        DeclareLaunchArgument('use_sim_time', default_value='false', description='use the time of /clock'),
-        Node(
-            package='imu_calibration', executable='calibration_node', namespace=LaunchConfiguration('namespace'), output='screen',
-            parameters=[LaunchConfiguration('params'), {
-                'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
-                'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
-                'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
-                'save_file': ParameterValue(LaunchConfiguration('save_file'), value_type=str),
-                'resume': ParameterValue(LaunchConfiguration('resume'), value_type=bool),
-                'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)}],
-            remappings=[('imu/data_raw', LaunchConfiguration('imu')), ('joint_states', LaunchConfiguration('joint_states')),
-                        ('imu/temperature', LaunchConfiguration('temperature'))],
-        ),
-    ])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                'table',
+                default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
+                description='table description, YAML; the template is refused; none: no table, by hand',
+            ),
+            DeclareLaunchArgument(
+                'urdf',
+                default_value='',
+                description='robot description, path (.urdf, or .xacro with '
+                'allow_xacro: true in params); or topic: '
+                'robot_description; with table:=none, or a table with the site of the arm',
+            ),
+            DeclareLaunchArgument(
+                'imu_link',
+                default_value='',
+                description='link that carries the IMU; empty: the frame of its messages',
+            ),
+            DeclareLaunchArgument(
+                'params',
+                default_value=PathJoinSubstitution([CONFIG, 'calibration_node.yaml']),
+                description='parameters of the node, YAML',
+            ),
+            DeclareLaunchArgument(
+                'save_file',
+                default_value='',
+                description='file of ~/save; empty: calibration.yaml in the working directory, by ~/save only',
+            ),
+            DeclareLaunchArgument(
+                'resume',
+                default_value='false',
+                description='continue with the accumulator in the folder of save_file',
+            ),
+            DeclareLaunchArgument(
+                'namespace', default_value='', description='one per IMU when there are several'
+            ),
+            DeclareLaunchArgument(
+                'imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'
+            ),
+            DeclareLaunchArgument(
+                'joint_states',
+                default_value='joint_states',
+                description='topic of sensor_msgs/JointState',
+            ),
+            DeclareLaunchArgument(
+                'temperature',
+                default_value='imu/temperature',
+                description='topic of sensor_msgs/Temperature',
+            ),
+            DeclareLaunchArgument(
+                'use_sim_time', default_value='false', description='use the time of /clock'
+            ),
+            Node(
+                package='imu_calibration',
+                executable='calibration_node',
+                namespace=LaunchConfiguration('namespace'),
+                output='screen',
+                parameters=[
+                    LaunchConfiguration('params'),
+                    {
+                        'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
+                        'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
+                        'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
+                        'save_file': ParameterValue(
+                            LaunchConfiguration('save_file'), value_type=str
+                        ),
+                        'resume': ParameterValue(LaunchConfiguration('resume'), value_type=bool),
+                        'use_sim_time': ParameterValue(
+                            LaunchConfiguration('use_sim_time'), value_type=bool
+                        ),
+                    },
+                ],
+                remappings=[
+                    ('imu/data_raw', LaunchConfiguration('imu')),
+                    ('joint_states', LaunchConfiguration('joint_states')),
+                    ('imu/temperature', LaunchConfiguration('temperature')),
+                ],
+            ),
+        ]
+    )

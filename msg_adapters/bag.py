@@ -50,36 +50,60 @@ def description_in(path: str, imu_topic: str | None = None) -> str:
         When it holds none.
 
     """
-    texts = list(_messages(path, imu_topic, DESCRIPTION_TOPIC, STRING_TYPE, lambda message: str(message.data)))
+    texts = list(
+        _messages(
+            path, imu_topic, DESCRIPTION_TOPIC, STRING_TYPE, lambda message: str(message.data)
+        )
+    )
     if not texts:
-        raise InputError(f'{path} must hold the robot description on {DESCRIPTION_TOPIC} ({STRING_TYPE}), it holds none; record that '
-                         'topic, or give the file', key='urdf', code='description_missing')
+        raise InputError(
+            f'{path} must hold the robot description on {DESCRIPTION_TOPIC} ({STRING_TYPE}), it holds none; record that '
+            'topic, or give the file',
+            key='urdf',
+            code='description_missing',
+        )
     return texts[-1]
 
 
 def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str, str, np.ndarray]]:
     """Return (parent, child, quaternion x y z w of the child in the parent) of every static transform of a recording."""
-    return [row for rows in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows) for row in rows]
+    return [
+        row
+        for rows in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows)
+        for row in rows
+    ]
 
 
 def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
     """Return (parent, child, quaternion) of each transform of a TFMessage, as an object of rclpy or rosbags."""
-    return [(clean_name(t.header.frame_id).lstrip('/'), clean_name(t.child_frame_id).lstrip('/'),
-             np.array([float(getattr(t.transform.rotation, a)) for a in 'xyzw'])) for t in message.transforms]
+    return [
+        (
+            clean_name(t.header.frame_id).lstrip('/'),
+            clean_name(t.child_frame_id).lstrip('/'),
+            np.array([float(getattr(t.transform.rotation, a)) for a in 'xyzw']),
+        )
+        for t in message.transforms
+    ]
 
 
-def _messages(path, imu_topic, topic, message_type, read: Callable[[Any], Sample]) -> Iterator[Sample]:
+def _messages(
+    path, imu_topic, topic, message_type, read: Callable[[Any], Sample]
+) -> Iterator[Sample]:
     """Yield the result of `read` for each decodable message of a topic; no results when the recording lacks it."""
     with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
         if recording.source.types.get(topic) == message_type:
             deserialize = recording.deserializer(message_type)
             for raw in recording.source.stretches([topic]):
                 for k in range(len(raw.packed)):
-                    with suppress(Exception):   # rosbags raises many kinds on broken bytes
+                    with suppress(Exception):  # rosbags raises many kinds on broken bytes
                         yield read(deserialize(raw.packed.message(k)))
 
 
-TOPIC_KEYS = {IMU_TYPE: 'imu_topic', JOINT_STATE_TYPE: 'joint_topic', TEMPERATURE_TYPE: 'temperature_topic'}
+TOPIC_KEYS = {
+    IMU_TYPE: 'imu_topic',
+    JOINT_STATE_TYPE: 'joint_topic',
+    TEMPERATURE_TYPE: 'temperature_topic',
+}
 """Key in errors for the choice of a topic."""
 
 BLOCK_SAMPLES = 65536
@@ -98,9 +122,16 @@ class Topic:
     """Number of messages by the recording's metadata."""
 
 
-def open_recording(path: str | PathLike[str], imu_topic: str | None = None, joint_topic: str | None = None, *,
-                   temperature_topic: str | None = None, want_joints: bool | str = True,
-                   want_temperature: bool | str = True, frame_id: str | None = None) -> 'Recording':
+def open_recording(
+    path: str | PathLike[str],
+    imu_topic: str | None = None,
+    joint_topic: str | None = None,
+    *,
+    temperature_topic: str | None = None,
+    want_joints: bool | str = True,
+    want_temperature: bool | str = True,
+    frame_id: str | None = None,
+) -> 'Recording':
     """
     Open a bag and choose its topics: by the given name, the default name, or the only one of the type, in this order.
 
@@ -134,23 +165,58 @@ def open_recording(path: str | PathLike[str], imu_topic: str | None = None, join
         imu = _choose(path, topics, IMU_TYPE, imu_topic, required=True)
         joints = temperature = None
         if want_joints:
-            joints = _choose(path, topics, JOINT_STATE_TYPE, joint_topic, want_joints is True, want_joints == 'optional')
+            joints = _choose(
+                path,
+                topics,
+                JOINT_STATE_TYPE,
+                joint_topic,
+                want_joints is True,
+                want_joints == 'optional',
+            )
         if want_temperature:
-            temperature = _choose(path, topics, TEMPERATURE_TYPE, temperature_topic, False, want_temperature == 'optional')
+            temperature = _choose(
+                path,
+                topics,
+                TEMPERATURE_TYPE,
+                temperature_topic,
+                False,
+                want_temperature == 'optional',
+            )
     except BaseException:
         source.close()
         raise
-    return Recording(path, source, topics, imu_topic=imu, joint_topic=joints, temperature_topic=temperature, frame_id=frame_id)
+    return Recording(
+        path,
+        source,
+        topics,
+        imu_topic=imu,
+        joint_topic=joints,
+        temperature_topic=temperature,
+        frame_id=frame_id,
+    )
 
 
 class Recording:
     """An open bag; use it as a context manager or call `close`."""
 
-    def __init__(self, path: Path, source: 'Rosbag2 | Ros1File', topics: tuple[Topic, ...], *, imu_topic: str, joint_topic: str | None,
-                 temperature_topic: str | None, frame_id: str | None = None):
+    def __init__(
+        self,
+        path: Path,
+        source: 'Rosbag2 | Ros1File',
+        topics: tuple[Topic, ...],
+        *,
+        imu_topic: str,
+        joint_topic: str | None,
+        temperature_topic: str | None,
+        frame_id: str | None = None,
+    ):
         self.path = path
         self.topics = topics
-        self.imu_topic, self.joint_topic, self.temperature_topic = imu_topic, joint_topic, temperature_topic
+        self.imu_topic, self.joint_topic, self.temperature_topic = (
+            imu_topic,
+            joint_topic,
+            temperature_topic,
+        )
         self.source, self.frame_id = source, frame_id
 
     @property
@@ -168,7 +234,9 @@ class Recording:
         """Unreadable data, reason -> count; complete when `blocks` has run to its end."""
         return dict(self.source.lost)
 
-    def blocks(self, joint_names: Iterable[str] | None = None, block_samples: int = BLOCK_SAMPLES) -> Generator[SampleBlock, None, None]:
+    def blocks(
+        self, joint_names: Iterable[str] | None = None, block_samples: int = BLOCK_SAMPLES
+    ) -> Generator[SampleBlock, None, None]:
         """
         Read the samples in file order.
 
@@ -212,28 +280,41 @@ class Recording:
         source, decoders = self.source, {}
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
-            standard = not source.ros1 and is_standard(message_type, *source.definitions.get(message_type, ('', '')))
+            standard = not source.ros1 and is_standard(
+                message_type, *source.definitions.get(message_type, ('', ''))
+            )
             deserialize = None if standard else self.deserializer(message_type)
             if message_type == JOINT_STATE_TYPE:
                 decoders[topic] = JointDecoder(joint_names, deserialize)
             else:
-                decoders[topic] = Decoder(message_type, deserialize, FrameChoice(topic, frame_id) if message_type == IMU_TYPE else None)
+                decoders[topic] = Decoder(
+                    message_type,
+                    deserialize,
+                    FrameChoice(topic, frame_id) if message_type == IMU_TYPE else None,
+                )
         return decoders
 
     def frames(self) -> list[str]:
         """Return the frames of the first stretch of the Imu topic, in order of name; [] without messages."""
-        decoder = self._decoders(None, '')[self.imu_topic]   # with a chosen frame, several frames are no error
+        decoder = self._decoders(None, '')[
+            self.imu_topic
+        ]  # with a chosen frame, several frames are no error
         if (raw := next(iter(self.source.stretches([self.imu_topic])), None)) is not None:
             decoder.decode(*raw.of(0))
-        return sorted(frame for frame, count in decoder.choice.counts.items() if count >= OTHER_FRAME)
+        return sorted(
+            frame for frame, count in decoder.choice.counts.items() if count >= OTHER_FRAME
+        )
 
     def deserializer(self, message_type: str) -> Callable:
         """Return a function from message bytes to a message object (raises InputError for a definition that cannot be used)."""
         try:
             return deserializer(message_type, self.source.definitions, self.source.ros1)
-        except Exception as error:   # rosbags' parser raises many kinds
-            raise InputError(f'the definition of {message_type} in {self.path} must be one that rosbags understands, got: '
-                             f'{shortened(str(error), 200)}; record again with standard messages', code='definition_damaged') from error
+        except Exception as error:  # rosbags' parser raises many kinds
+            raise InputError(
+                f'the definition of {message_type} in {self.path} must be one that rosbags understands, got: '
+                f'{shortened(str(error), 200)}; record again with standard messages',
+                code='definition_damaged',
+            ) from error
 
     def close(self) -> None:
         """Close the files."""
@@ -250,26 +331,38 @@ def _block(parts, decoders):
     """Join the parts of a block and add the counts of messages dropped by the decoders since the last one."""
     dropped, notes = taken_counts(decoders.values())
     joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
-    return SampleBlock(joined.get(ImuSamples), joined.get(JointSamples), joined.get(TemperatureSamples), dropped, notes)
+    return SampleBlock(
+        joined.get(ImuSamples),
+        joined.get(JointSamples),
+        joined.get(TemperatureSamples),
+        dropped,
+        notes,
+    )
 
 
 def _open_source(path):
     if not path.exists():
-        raise InputError(f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file, got {path}, which does not '
-                         'exist; check the path')
+        raise InputError(
+            f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file, got {path}, which does not '
+            'exist; check the path'
+        )
     if not (path.is_dir() or path.is_file()):
-        raise InputError(f'a recording must be a folder or a regular file, got {path}, which is a pipe or a device; give a file')
+        raise InputError(
+            f'a recording must be a folder or a regular file, got {path}, which is a pipe or a device; give a file'
+        )
     try:
         if path.suffix.lower() in SUFFIXES:
             return CsvBag(path)
         return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
     except InputError:
         raise
-    except Exception as error:   # rosbags, sqlite3 and the system raise many kinds
+    except Exception as error:  # rosbags, sqlite3 and the system raise many kinds
         came = shortened(str(error), 300)
-        raise InputError(f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file) or a text log '
-                         f'({", ".join(SUFFIXES)}), got: {came}; check the path, record again, or write the data as CSV and use the verb '
-                         'convert') from error
+        raise InputError(
+            f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file) or a text log '
+            f'({", ".join(SUFFIXES)}), got: {came}; check the path, record again, or write the data as CSV and use the verb '
+            'convert'
+        ) from error
 
 
 def list_topics(path: str | PathLike[str]) -> tuple[Topic, ...]:
@@ -282,7 +375,9 @@ def list_topics(path: str | PathLike[str]) -> tuple[Topic, ...]:
 
 
 def _listed(source):
-    return tuple(Topic(name, source.types[name], source.counts[name]) for name in sorted(source.types))
+    return tuple(
+        Topic(name, source.types[name], source.counts[name]) for name in sorted(source.types)
+    )
 
 
 def _choose(path, topics, message_type, asked, required, lenient=False):
@@ -292,26 +387,39 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
     if asked is not None:
         names = [name for name in (asked, '/' + asked.lstrip('/')) if name in fitting]
         if not names:
-            raise InputError(f'the topic that is read must be a {message_type} topic of {path}, got {asked}'
-                             f'{did_you_mean(asked, fitting)}; {_listing(topics, fitting)}', key=key, code='topic_unknown')
+            raise InputError(
+                f'the topic that is read must be a {message_type} topic of {path}, got {asked}'
+                f'{did_you_mean(asked, fitting)}; {_listing(topics, fitting)}',
+                key=key,
+                code='topic_unknown',
+            )
         return names[0]
     if DEFAULT_TOPICS[message_type] in fitting:
         return DEFAULT_TOPICS[message_type]
     if len(fitting) == 1:
         return fitting[0]
     if fitting and not lenient:
-        raise InputError(f'{path} must have one {message_type} topic or one named {DEFAULT_TOPICS[message_type]}, '
-                         f'got {", ".join(fitting)}; choose one', key=key, code='topic_ambiguous')
+        raise InputError(
+            f'{path} must have one {message_type} topic or one named {DEFAULT_TOPICS[message_type]}, '
+            f'got {", ".join(fitting)}; choose one',
+            key=key,
+            code='topic_ambiguous',
+        )
     if required:
-        raise InputError(f'{path} must have a {message_type} topic, got none: {_listing(topics, fitting)}; record it'
-                         f'{", or calibrate by hand, without a table" * (message_type == JOINT_STATE_TYPE)}', code='no_topic_of_type')
+        raise InputError(
+            f'{path} must have a {message_type} topic, got none: {_listing(topics, fitting)}; record it'
+            f'{", or calibrate by hand, without a table" * (message_type == JOINT_STATE_TYPE)}',
+            code='no_topic_of_type',
+        )
     return None
 
 
 def _listing(topics, fitting):
     if fitting:
         return f'choose one of {", ".join(fitting)}'
-    return 'it holds ' + (', '.join(f'{topic.name} ({topic.type})' for topic in topics) or 'no topics')
+    return 'it holds ' + (
+        ', '.join(f'{topic.name} ({topic.type})' for topic in topics) or 'no topics'
+    )
 
 
 STRETCH_MESSAGES = 8192
@@ -325,6 +433,7 @@ class Ros1File:
 
     def __init__(self, path: Path):
         from rosbags.rosbag1 import Reader
+
         self.reader = Reader(Path(path))
         self.reader.open()
         self.reader.chunks = {place: _bounded(chunk) for place, chunk in self.reader.chunks.items()}
@@ -343,7 +452,11 @@ class Ros1File:
     @property
     def duration_ns(self) -> int:
         """Time between the first and the last message by the clock of the recorder."""
-        return max(self.reader.end_time - self.reader.start_time - 1, 0) if self.reader.message_count else 0
+        return (
+            max(self.reader.end_time - self.reader.start_time - 1, 0)
+            if self.reader.message_count
+            else 0
+        )
 
     def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
         """Yield RawMessages of the topics in file order; lost messages of the file are counted in `lost`."""
@@ -351,13 +464,15 @@ class Ros1File:
         pending, n_read = [], 0
         expected = sum(c.msgcount for c in connections)
         try:
-            for connection, received_ns, data in self.reader.messages(connections) if connections else ():
+            for connection, received_ns, data in (
+                self.reader.messages(connections) if connections else ()
+            ):
                 pending.append((topics.index(self.topics[connection.id]), received_ns, bytes(data)))
                 n_read += 1
                 if len(pending) == STRETCH_MESSAGES:
                     yield _raw(pending)
                     pending = []
-        except Exception as error:   # rosbags raises various errors on damaged files
+        except Exception as error:  # rosbags raises various errors on damaged files
             self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
         if pending:
             yield _raw(pending)
@@ -371,11 +486,18 @@ class Ros1File:
 def _bounded(chunk: Any) -> Any:
     """Return a chunk of rosbags' reader that decompresses within limits."""
     from lz4 import frame
+
     compression = {bz2.decompress: 'bz2', frame.decompress: 'lz4'}.get(chunk.decompressor)
-    return chunk if compression is None else chunk._replace(decompressor=lambda data: decompress(compression, data, LARGEST_CHUNK))
+    return (
+        chunk
+        if compression is None
+        else chunk._replace(decompressor=lambda data: decompress(compression, data, LARGEST_CHUNK))
+    )
 
 
 def _raw(pending):
     """Return the RawMessages of a list of (index of the topic, receive time, message)."""
     numbers, times, messages = zip(*pending, strict=True)
-    return RawMessages(np.array(numbers), partial(np.array, times, dtype=np.int64), Packed.join(messages))
+    return RawMessages(
+        np.array(numbers), partial(np.array, times, dtype=np.int64), Packed.join(messages)
+    )

@@ -38,8 +38,10 @@ class BagWriter:
 
     def __init__(self, path: str | PathLike[str], storage: str = 'sqlite3', **options: str):
         if storage not in identifiers():
-            raise InputError(f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r}; choose one of these',
-                             code='storage_unknown')
+            raise InputError(
+                f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r}; choose one of these',
+                code='storage_unknown',
+            )
         self.path = Path(path)
         self.topics, self.counts = {}, Counter()
         self.first_ns: int | None = None
@@ -53,7 +55,9 @@ class BagWriter:
         """Declare a topic (`definition` is a TypeDefinition, `qos` a list of rosbag2 QoS mappings); return its id."""
         topic_id = len(self.topics) + 1
         self.topics[topic_id] = (name, definition, list(qos))
-        self.storage.add_topic(topic_id, name, definition, qos=dump_yaml(list(qos)).strip() if qos else '')
+        self.storage.add_topic(
+            topic_id, name, definition, qos=dump_yaml(list(qos)).strip() if qos else ''
+        )
         return topic_id
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
@@ -71,7 +75,9 @@ class BagWriter:
         """Finish the files and put the folder in its place."""
         information = self._metadata()
         self.storage.close(information, dump_yaml(information).strip())
-        (self.partial / 'metadata.yaml').write_text(dump_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8')
+        (self.partial / 'metadata.yaml').write_text(
+            dump_yaml({'rosbag2_bagfile_information': information}), encoding='utf-8'
+        )
         if self.path.exists():
             self.abort()
             raise InputError(f'{self.path} must not exist yet; remove it or choose another name')
@@ -83,15 +89,36 @@ class BagWriter:
         shutil.rmtree(self.partial, ignore_errors=True)
 
     def _metadata(self):
-        times = {'starting_time': {'nanoseconds_since_epoch': self.first_ns or 0},
-                 'duration': {'nanoseconds': (self.last_ns or 0) - (self.first_ns or 0)},
-                 'message_count': self.counts.total()}
-        topics = [{'topic_metadata': {'name': name, 'type': definition.type, 'serialization_format': 'cdr', 'offered_qos_profiles': qos,
-                                      'type_description_hash': definition.digest},
-                   'message_count': self.counts[topic_id]} for topic_id, (name, definition, qos) in self.topics.items()]
-        return {'version': METADATA_VERSION, 'storage_identifier': self.kind.identifier, **times, 'topics_with_message_count': topics,
-                'compression_format': '', 'compression_mode': '', 'relative_file_paths': [self.file_name],
-                'files': [{'path': self.file_name, **times}], 'custom_data': None, 'ros_distro': ROS_DISTRO}
+        times = {
+            'starting_time': {'nanoseconds_since_epoch': self.first_ns or 0},
+            'duration': {'nanoseconds': (self.last_ns or 0) - (self.first_ns or 0)},
+            'message_count': self.counts.total(),
+        }
+        topics = [
+            {
+                'topic_metadata': {
+                    'name': name,
+                    'type': definition.type,
+                    'serialization_format': 'cdr',
+                    'offered_qos_profiles': qos,
+                    'type_description_hash': definition.digest,
+                },
+                'message_count': self.counts[topic_id],
+            }
+            for topic_id, (name, definition, qos) in self.topics.items()
+        ]
+        return {
+            'version': METADATA_VERSION,
+            'storage_identifier': self.kind.identifier,
+            **times,
+            'topics_with_message_count': topics,
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [self.file_name],
+            'files': [{'path': self.file_name, **times}],
+            'custom_data': None,
+            'ros_distro': ROS_DISTRO,
+        }
 
     def __enter__(self):
         return self
@@ -104,24 +131,31 @@ class BagWriter:
             error = failure
         self.abort()
         if isinstance(error, (OSError, sqlite3.Error)):
-            raise InputError(f'{self.path} must be writable to its end, got: {error}; free space or choose another output') from error
+            raise InputError(
+                f'{self.path} must be writable to its end, got: {error}; free space or choose another output'
+            ) from error
 
 
 def make_partial_folder(path: Path) -> Path:
     """Make the temporary folder next to `path` (raises InputError when `path` exists or cannot be written)."""
     path = Path(path)
     if path.exists():
-        raise InputError(f'{path} must not exist yet; remove it or choose another name', code='exists_already')
+        raise InputError(
+            f'{path} must not exist yet; remove it or choose another name', code='exists_already'
+        )
     partial = path.with_name(f'.{path.name}.{os.getpid()}.{token_hex(8)}.partial')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial.mkdir()
     except OSError as error:
-        raise InputError(f'{path.parent} must be a folder that can be written: {error.strerror}; choose another output') from error
+        raise InputError(
+            f'{path.parent} must be a folder that can be written: {error.strerror}; choose another output'
+        ) from error
     return partial
 
 
 def dump_yaml(value: Any) -> str:
     """Return YAML text in the order of the mapping."""
     import yaml
+
     return yaml.safe_dump(value, sort_keys=False, width=1000)

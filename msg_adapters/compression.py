@@ -54,6 +54,7 @@ def decompress(compression: str, packed: bytes | memoryview, limit: int) -> byte
 def _decompressor(compression: str) -> Callable[[], Any]:
     if compression == 'lz4':
         from lz4 import frame
+
         return frame.LZ4FrameDecompressor
     return {'zstd': zstd().ZstdDecompressor, 'bz2': bz2.BZ2Decompressor}[compression]
 
@@ -66,7 +67,9 @@ def decompression_errors() -> tuple[type[Exception], ...]:
 def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:
     """Return the content of a chunk, at most the `size` bytes that its header declares, or its readable part (raises ValueError)."""
     if size > LARGEST_CHUNK:
-        raise ValueError(f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted')
+        raise ValueError(
+            f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted'
+        )
     try:
         return decompress(compression, packed, size)
     except KeyError:
@@ -102,18 +105,26 @@ def decompress_file(source: Path, target: Path) -> str | None:
 
     """
     module, source = zstd(), Path(source)
-    limit = min(largest_content(source.stat().st_size), shutil.disk_usage(target.parent).free * 9 // 10)
+    limit = min(
+        largest_content(source.stat().st_size), shutil.disk_usage(target.parent).free * 9 // 10
+    )
     with source.open('rb') as packed, Path(target).open('wb') as plain:
         decompressor, n_frames, data, started = module.ZstdDecompressor(), 0, b'', True
         try:
             while data or not decompressor.needs_input or (data := packed.read(PACKED_PIECE_BYTES)):
                 plain.write(decompressor.decompress(data, PACKED_PIECE_BYTES))
                 data, started = b'', True
-                if decompressor.eof:   # a file may hold several frames
-                    data, decompressor, n_frames = decompressor.unused_data, module.ZstdDecompressor(), n_frames + 1
+                if decompressor.eof:  # a file may hold several frames
+                    data, decompressor, n_frames = (
+                        decompressor.unused_data,
+                        module.ZstdDecompressor(),
+                        n_frames + 1,
+                    )
                     started = bool(data)
                 if plain.tell() > limit or n_frames > MOST_FRAMES:
-                    raise ValueError(f'it expands beyond the {limit} bytes or {MOST_FRAMES} frames that are accepted')
+                    raise ValueError(
+                        f'it expands beyond the {limit} bytes or {MOST_FRAMES} frames that are accepted'
+                    )
         except module.ZstdError as error:
             return str(error)
     return 'the stream is cut off' if started else None
@@ -125,5 +136,6 @@ def compressor(name: str) -> Callable | type:
         return zstd().compress
     if name == 'lz4':
         from lz4.frame import compress
+
         return compress
     return bytes

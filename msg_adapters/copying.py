@@ -17,10 +17,19 @@ from msg_adapters.imu import IMU_TYPE, decode_imu, find_imu_layout, patch_imu_gr
 from msg_adapters.layout import NS_PER_S, Packed, group_by_layout
 
 
-def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike[str], imu_topic: str, *, corrected_topic: str,
-                        correct: Callable, propagate: Callable | None = None, frame_id: str | None = None,
-                        mat_ts: np.ndarray | None = None, late_ns: int = 0,
-                        source_frame_id: str | None = None) -> dict[str, int]:
+def copy_with_corrected(
+    source: str | PathLike[str],
+    destination: str | PathLike[str],
+    imu_topic: str,
+    *,
+    corrected_topic: str,
+    correct: Callable,
+    propagate: Callable | None = None,
+    frame_id: str | None = None,
+    mat_ts: np.ndarray | None = None,
+    late_ns: int = 0,
+    source_frame_id: str | None = None,
+) -> dict[str, int]:
     """
     Write a bag with all topics of another one and each corrected Imu message after the measured one.
 
@@ -64,7 +73,9 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
         choice = FrameChoice(recording.imu_topic, source_frame_id)
         patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns, choice)
         with BagWriter(destination, bag.storage) as writer:
-            ids = np.array([writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics])
+            ids = np.array(
+                [writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics]
+            )
             corrected_id = writer.add_topic(corrected_topic, standard_definition(IMU_TYPE))
             for raw in bag.stretches(topics):
                 measured = np.flatnonzero(raw.topic == topics.index(recording.imu_topic))
@@ -76,34 +87,55 @@ def copy_with_corrected(source: str | PathLike[str], destination: str | PathLike
 def _check(recording, corrected_topic):
     bag, name = recording.source, recording.imu_topic
     if bag.ros1:
-        raise InputError(f"{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with the command "
-                         "'rosbags-convert' (pip install rosbags)", code='ros1_bag')
+        raise InputError(
+            f'{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with the command '
+            "'rosbags-convert' (pip install rosbags)",
+            code='ros1_bag',
+        )
     if not is_standard(IMU_TYPE, *bag.definitions.get(IMU_TYPE, ('', ''))):
-        raise InputError(f'{recording.path} must be a rosbag2 recording with the standard Imu definition; convert it first')
+        raise InputError(
+            f'{recording.path} must be a rosbag2 recording with the standard Imu definition; convert it first'
+        )
     foreign = [topic.name for topic in recording.topics if ' ' in topic.type]
     if foreign:
-        raise InputError(f'every topic of {recording.path} must be CDR to be copied, got {", ".join(foreign)}; record without them')
+        raise InputError(
+            f'every topic of {recording.path} must be CDR to be copied, got {", ".join(foreign)}; record without them'
+        )
     if corrected_topic in recording.message_counts:
-        raise InputError(f'the corrected topic must be new, {recording.path} has {corrected_topic} already in addition to {name}; '
-                         'choose another name', code='topic_taken')
+        raise InputError(
+            f'the corrected topic must be new, {recording.path} has {corrected_topic} already in addition to {name}; '
+            'choose another name',
+            code='topic_taken',
+        )
 
 
 def _write(writer, topic_ids, raw, measured, corrected_id, patch):
     """Write one stretch, every corrected message after the measured one."""
     received_ns = raw.received_ns()
-    done, corrected = patch(raw.packed.select(measured), received_ns[measured]) if len(measured) else (measured, [])
+    done, corrected = (
+        patch(raw.packed.select(measured), received_ns[measured])
+        if len(measured)
+        else (measured, [])
+    )
     measured = measured[done]
     order = np.argsort(np.concatenate([np.arange(len(raw.packed)), measured]), kind='stable')
     topic_ids = np.concatenate([topic_ids, np.full(len(measured), corrected_id)])
     received_ns = np.concatenate([received_ns, received_ns[measured]])
-    writer.write(topic_ids[order], received_ns[order], Packed.chain([raw.packed, *corrected]).select(order))
+    writer.write(
+        topic_ids[order], received_ns[order], Packed.chain([raw.packed, *corrected]).select(order)
+    )
 
 
 class _Patch:
     """Makes corrected messages from measured ones."""
 
     def __init__(self, correct, propagate, frame_id, mat_ts, late_ns, choice):
-        self.correct, self.propagate, self.late_ns, self.choice = correct, propagate, late_ns, choice
+        self.correct, self.propagate, self.late_ns, self.choice = (
+            correct,
+            propagate,
+            late_ns,
+            choice,
+        )
         self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
 
@@ -119,15 +151,32 @@ class _Patch:
         order = np.argsort(found)
         done = found[order]
         samples = in_order([(index, decode_imu(layout, group)) for layout, index, group in groups])
-        corrected = self.correct(replace(samples, stamp_ns=np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns)))
+        corrected = self.correct(
+            replace(
+                samples,
+                stamp_ns=np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns),
+            )
+        )
         tables = []
         for layout, index, group in groups:
             place = np.searchsorted(done, index)
-            fields = self._fields(layout, group, (corrected.force[place], corrected.rate[place]), corrected.marks[place])
+            fields = self._fields(
+                layout,
+                group,
+                (corrected.force[place], corrected.rate[place]),
+                corrected.marks[place],
+            )
             table = patch_imu_group(layout, group, fields, frame_id=self.frame_id)
             if self.late_ns:
-                for place, values, kind in zip((4, 8), np.divmod(layout.stamp_ns(group) - self.late_ns, NS_PER_S), 'iu', strict=True):
-                    table[:, place:place + 4] = values.astype(f'{layout.order}{kind}4').view(np.uint8).reshape(-1, 4)
+                for place, values, kind in zip(
+                    (4, 8),
+                    np.divmod(layout.stamp_ns(group) - self.late_ns, NS_PER_S),
+                    'iu',
+                    strict=True,
+                ):
+                    table[:, place : place + 4] = (
+                        values.astype(f'{layout.order}{kind}4').view(np.uint8).reshape(-1, 4)
+                    )
             tables.append(Packed.of_rows(table))
         return done, [Packed.chain(tables).select(order)]
 
@@ -137,18 +186,30 @@ class _Patch:
         absent = [covariance[:, :1] == -1.0 for covariance in measured]
         fields = {}
         for quantity, values, missing in zip(('force', 'rate'), vectors, absent, strict=True):
-            fields[f'{quantity}_s'] = np.where(missing, layout.column(packed, f'{quantity}_s'), values)
+            fields[f'{quantity}_s'] = np.where(
+                missing, layout.column(packed, f'{quantity}_s'), values
+            )
         if self.propagate is not None:
             covariances = _propagated(self.propagate, np.concatenate(measured, axis=1))
-            for k, (quantity, before, missing) in enumerate(zip(('force', 'rate'), measured, absent, strict=True)):
-                mark = marks[:, k:k + 1]
-                after = np.where(mark > 0, mark * np.eye(3).ravel(), covariances[:, 9 * k:9 * k + 9])
+            for k, (quantity, before, missing) in enumerate(
+                zip(('force', 'rate'), measured, absent, strict=True)
+            ):
+                mark = marks[:, k : k + 1]
+                after = np.where(
+                    mark > 0, mark * np.eye(3).ravel(), covariances[:, 9 * k : 9 * k + 9]
+                )
                 fields[f'{quantity}_cov'] = np.where(missing, before, after)
         if self.mat_st is not None:
             orientation_cov = layout.column(packed, 'orientation_cov')
-            fields['orientation'] = self._turned(layout.column(packed, 'orientation'), orientation_cov[:, 0])
-            turned = (self.mat_st.T @ orientation_cov.reshape(-1, 3, 3) @ self.mat_st).reshape(-1, 9)
-            fields['orientation_cov'] = np.where(orientation_cov[:, :1] == -1.0, orientation_cov, turned)
+            fields['orientation'] = self._turned(
+                layout.column(packed, 'orientation'), orientation_cov[:, 0]
+            )
+            turned = (self.mat_st.T @ orientation_cov.reshape(-1, 3, 3) @ self.mat_st).reshape(
+                -1, 9
+            )
+            fields['orientation_cov'] = np.where(
+                orientation_cov[:, :1] == -1.0, orientation_cov, turned
+            )
         return fields
 
     def _turned(self, quaternion, first_cov):
@@ -156,13 +217,25 @@ class _Patch:
         given = (first_cov != -1.0) & np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
         turned = quaternion.copy()
         if given.any():
-            turned[given] = (Rotation.from_quat(quaternion[given]) * Rotation.from_matrix(self.mat_st)).as_quat()
+            turned[given] = (
+                Rotation.from_quat(quaternion[given]) * Rotation.from_matrix(self.mat_st)
+            ).as_quat()
         return turned
 
 
 def _propagated(propagate, pairs):
     """Return the corrected covariances of measured ones, both (n, 18): nine numbers of force, nine of rate."""
-    distinct, which = (pairs[:1], np.zeros(len(pairs), int)) if (pairs == pairs[0]).all() else np.unique(pairs, axis=0, return_inverse=True)
-    known = [[None if not c.any() else c.reshape(3, 3) for c in np.split(np.where(pair == -1.0, 0.0, pair), 2)] for pair in distinct]
+    distinct, which = (
+        (pairs[:1], np.zeros(len(pairs), int))
+        if (pairs == pairs[0]).all()
+        else np.unique(pairs, axis=0, return_inverse=True)
+    )
+    known = [
+        [
+            None if not c.any() else c.reshape(3, 3)
+            for c in np.split(np.where(pair == -1.0, 0.0, pair), 2)
+        ]
+        for pair in distinct
+    ]
     table = np.array([np.concatenate([c.ravel() for c in propagate(*pair)]) for pair in known])
     return table[which.ravel()]

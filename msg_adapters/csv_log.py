@@ -37,22 +37,60 @@ COLUMN_UNITS = {
 }
 """Quantity -> unit -> size of the unit in SI (degrees Celsius for temperatures)."""
 SPELLINGS = {
-    'time': {'sec': 's', 'secs': 's', 'second': 's', 'seconds': 's', 'msec': 'ms', 'millis': 'ms', 'µs': 'us', 'μs': 'us', 'usec': 'us',
-             'micros': 'us', 'nsec': 'ns', 'nanos': 'ns'},
-    'force': {'m/s2': 'm/s^2', 'm/s²': 'm/s^2', 'm/s/s': 'm/s^2', 'm/sec^2': 'm/s^2', 'ms^-2': 'm/s^2', 'mps2': 'm/s^2', 'ms2': 'm/s^2'},
-    'rate': {'rads': 'rad/s', 'rps': 'rad/s', 'rad/sec': 'rad/s', 'rads^-1': 'rad/s', 'dps': 'deg/s', '°/s': 'deg/s', 'deg/sec': 'deg/s',
-             'degs': 'deg/s', 'mdps': 'mdeg/s'},
+    'time': {
+        'sec': 's',
+        'secs': 's',
+        'second': 's',
+        'seconds': 's',
+        'msec': 'ms',
+        'millis': 'ms',
+        'µs': 'us',
+        'μs': 'us',
+        'usec': 'us',
+        'micros': 'us',
+        'nsec': 'ns',
+        'nanos': 'ns',
+    },
+    'force': {
+        'm/s2': 'm/s^2',
+        'm/s²': 'm/s^2',
+        'm/s/s': 'm/s^2',
+        'm/sec^2': 'm/s^2',
+        'ms^-2': 'm/s^2',
+        'mps2': 'm/s^2',
+        'ms2': 'm/s^2',
+    },
+    'rate': {
+        'rads': 'rad/s',
+        'rps': 'rad/s',
+        'rad/sec': 'rad/s',
+        'rads^-1': 'rad/s',
+        'dps': 'deg/s',
+        '°/s': 'deg/s',
+        'deg/sec': 'deg/s',
+        'degs': 'deg/s',
+        'mdps': 'mdeg/s',
+    },
     'temperature': {'c': 'C', '°c': 'C', 'degc': 'C', 'celsius': 'C'},
     'joint': {'rads': 'rad', '°': 'deg', 'degrees': 'deg', 'radians': 'rad'},
 }
 """Quantity -> spelling in headers -> unit."""
 COLUMN_PATTERNS = (
-    ('time', r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|'
-     r'(.* )?stamp|.*elapsed|time since start.*'),
-    ('force', r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
-     r'(.* )?linear acceleration)'),
-    ('rate', r'(g|w|gyr|gyro|gyroscope|omega|rate|w rs s|(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
-     r'(.* )?angular velocity)'),
+    (
+        'time',
+        r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|'
+        r'(.* )?stamp|.*elapsed|time since start.*',
+    ),
+    (
+        'force',
+        r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
+        r'(.* )?linear acceleration)',
+    ),
+    (
+        'rate',
+        r'(g|w|gyr|gyro|gyroscope|omega|rate|w rs s|(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
+        r'(.* )?angular velocity)',
+    ),
     ('temperature', r'temp|temperature|(imu|sensor|chip|die) temp(erature)?'),
 )
 """Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force and rate."""
@@ -103,7 +141,9 @@ class CsvLog:
     """Other columns."""
 
 
-@np.errstate(over='ignore', invalid='ignore')   # readings that are not finite are counted where samples are used
+@np.errstate(
+    over='ignore', invalid='ignore'
+)  # readings that are not finite are counted where samples are used
 def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
     """
     Read a text log with a header line.
@@ -132,14 +172,25 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
     by_quantity = {each.quantity: each for each in found}
     for quantity in ('time', 'force', 'rate'):
         if quantity not in by_quantity:
-            raise InputError(f'{path} must have a column of {quantity}{"" if quantity == "time" else " per axis"}, got the columns '
-                             f'{shortened(", ".join(table.names), 300)}; {REMEDY}', key='columns')
+            raise InputError(
+                f'{path} must have a column of {quantity}{"" if quantity == "time" else " per axis"}, got the columns '
+                f'{shortened(", ".join(table.names), 300)}; {REMEDY}',
+                key='columns',
+            )
     table.load([name for each in found for name in each.names])
-    time = _with_unit(by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path)
+    time = _with_unit(
+        by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path
+    )
     stamp_ns = table.stamps(time)
-    force = _with_unit(by_quantity['force'], lambda: _force_unit(table.values(by_quantity['force'].names)), path)
+    force = _with_unit(
+        by_quantity['force'], lambda: _force_unit(table.values(by_quantity['force'].names)), path
+    )
     force_s = table.values(force.names) * COLUMN_UNITS['force'][force.unit]
-    rate = _with_unit(by_quantity['rate'], lambda: _rate_unit(stamp_ns, force_s, table.values(by_quantity['rate'].names)), path)
+    rate = _with_unit(
+        by_quantity['rate'],
+        lambda: _rate_unit(stamp_ns, force_s, table.values(by_quantity['rate'].names)),
+        path,
+    )
     used, temperature, joints = [time, force, rate], None, []
     for each in found:
         if each.quantity == 'temperature':
@@ -147,12 +198,22 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
             temperature = TemperatureSamples(stamp_ns, table.values(each.names)[:, 0])
         elif each.quantity == 'joint':
             joints.append(_with_unit(each, lambda: None, path))
-    imu = ImuSamples(stamp_ns, force_s, table.values(rate.names) * COLUMN_UNITS['rate'][rate.unit], 'imu_link')
+    imu = ImuSamples(
+        stamp_ns, force_s, table.values(rate.names) * COLUMN_UNITS['rate'][rate.unit], 'imu_link'
+    )
     used += joints
     taken = {name.removeprefix('-') for each in used for name in each.names}
-    angles = {each.joint: table.values(each.names)[:, 0] * COLUMN_UNITS['joint'][each.unit] for each in joints}
-    return CsvLog(tuple(used), imu, JointSamples.of_angles(stamp_ns, angles) if angles else None, temperature,
-                  tuple(name for name in table.names if name not in taken))
+    angles = {
+        each.joint: table.values(each.names)[:, 0] * COLUMN_UNITS['joint'][each.unit]
+        for each in joints
+    }
+    return CsvLog(
+        tuple(used),
+        imu,
+        JointSamples.of_angles(stamp_ns, angles) if angles else None,
+        temperature,
+        tuple(name for name in table.names if name not in taken),
+    )
 
 
 def _with_unit(columns, guess, path):
@@ -161,8 +222,11 @@ def _with_unit(columns, guess, path):
         return columns
     unit = guess()
     if unit is None:
-        raise InputError(f'the unit of {columns.quantity} in {path} must be stated by the header or follow from the values, got columns '
-                         f'{", ".join(columns.names)} without one; {REMEDY}', key='columns')
+        raise InputError(
+            f'the unit of {columns.quantity} in {path} must be stated by the header or follow from the values, got columns '
+            f'{", ".join(columns.names)} without one; {REMEDY}',
+            key='columns',
+        )
     return replace(columns, unit=unit, origin='values')
 
 
@@ -176,11 +240,20 @@ def _parse(text):
     units = COLUMN_UNITS.get(quantity, {})
     unit = SPELLINGS.get(quantity, {}).get(unit.lower(), unit) if unit else None
     names = tuple(name.strip() for name in names.split(',') if name.strip())
-    if not units or (quantity == 'joint') != bool(joint) or len(names) != (3 if quantity in ('force', 'rate') else 1):
-        raise InputError(f'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and rate, got {text!r}; '
-                         f'{REMEDY}', key='columns')
+    if (
+        not units
+        or (quantity == 'joint') != bool(joint)
+        or len(names) != (3 if quantity in ('force', 'rate') else 1)
+    ):
+        raise InputError(
+            f'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and rate, got {text!r}; '
+            f'{REMEDY}',
+            key='columns',
+        )
     if unit is not None and unit not in units:
-        raise InputError(f'the unit of {quantity} must be one of {", ".join(units)}, got {unit!r}; correct {text!r}')
+        raise InputError(
+            f'the unit of {quantity} must be one of {", ".join(units)}, got {unit!r}; correct {text!r}'
+        )
     return Columns(quantity, names, unit, joint, 'given')
 
 
@@ -197,28 +270,57 @@ class _Table:
             head = file.read(HEAD_BYTES)
         lines = head.splitlines()
         if not lines or '\0' in head:
-            raise InputError(f'{path} must be a text log, got {"an empty file" if not lines else "binary data"}; check the path')
+            raise InputError(
+                f'{path} must be a text log, got {"an empty file" if not lines else "binary data"}; check the path'
+            )
         self.delimiter = _delimiter(lines)
-        rows = [self._cells(line) for line in lines[:None if len(head) < HEAD_BYTES else -1]]
-        first = next((k for k, row in enumerate(rows) if len(row) > 1 and sum(map(_numeric, row)) >= min(4, len(row))), None)
+        rows = [self._cells(line) for line in lines[: None if len(head) < HEAD_BYTES else -1]]
+        first = next(
+            (
+                k
+                for k, row in enumerate(rows)
+                if len(row) > 1 and sum(map(_numeric, row)) >= min(4, len(row))
+            ),
+            None,
+        )
         if first is None:
-            raise InputError(f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces, got none; check the file')
-        self.first, self.decimal_comma = first, any(re.fullmatch(r'\s*-?\d+,\d+\s*', cell) for cell in rows[first])
+            raise InputError(
+                f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces, got none; check the file'
+            )
+        self.first, self.decimal_comma = (
+            first,
+            any(re.fullmatch(r'\s*-?\d+,\d+\s*', cell) for cell in rows[first]),
+        )
         width = len(rows[first])
         header = [row for row in rows[:first] if len(row) == width][-2:]
-        self.names = [re.sub(r'\s+', ' ', ''.join(c if c.isprintable() else ' ' for c in name)).strip()
-                      for name in (header[0] if header else [str(k + 1) for k in range(width)])]
-        if len(header) == 2:   # a second row with units
+        self.names = [
+            re.sub(r'\s+', ' ', ''.join(c if c.isprintable() else ' ' for c in name)).strip()
+            for name in (header[0] if header else [str(k + 1) for k in range(width)])
+        ]
+        if len(header) == 2:  # a second row with units
             units = [unit.strip(' ()[]') for unit in header[1]]
-            self.names = [f'{name} ({unit})' if unit else name for name, unit in zip(self.names, units, strict=True)]
+            self.names = [
+                f'{name} ({unit})' if unit else name
+                for name, unit in zip(self.names, units, strict=True)
+            ]
         counts = Counter(self.names)
-        self.names = [name if counts[name] == 1 else f'{name} [{k + 1}]' for k, name in enumerate(self.names)]
-        self.dates = {k for k, cell in enumerate(rows[first]) if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell)}
+        self.names = [
+            name if counts[name] == 1 else f'{name} [{k + 1}]' for k, name in enumerate(self.names)
+        ]
+        self.dates = {
+            k
+            for k, cell in enumerate(rows[first])
+            if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell)
+        }
         self._values = {}
 
     def _cells(self, line):
         line = line.lstrip('# ')
-        return line.split() if self.delimiter is None else next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])
+        return (
+            line.split()
+            if self.delimiter is None
+            else next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])
+        )
 
     def column(self, name):
         """Return the index of a column by name or number."""
@@ -227,7 +329,9 @@ class _Table:
             return self.names.index(name)
         if name.isdigit() and 1 <= int(name) <= len(self.names):
             return int(name) - 1
-        raise InputError(f'a column must be in {self.path}, got {name!r}; it has {shortened(", ".join(self.names), 300)}')
+        raise InputError(
+            f'a column must be in {self.path}, got {name!r}; it has {shortened(", ".join(self.names), 300)}'
+        )
 
     def load(self, names):
         """Read the columns; cells without a number become NaN."""
@@ -235,27 +339,43 @@ class _Table:
         numbers = [k for k in wanted if k not in self.dates]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
         with _opened(self.path) as file:
-            lines = file.read().splitlines()[self.first:]
+            lines = file.read().splitlines()[self.first :]
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]
         with warnings.catch_warnings():
-            warnings.simplefilter('ignore', UserWarning)   # rows without all columns, which are left out, and files without rows
+            warnings.simplefilter(
+                'ignore', UserWarning
+            )  # rows without all columns, which are left out, and files without rows
             try:
                 data = np.loadtxt(lines, usecols=numbers, ndmin=2, quotechar='"', **options)
-            except ValueError:   # empty cells, text such as "nan" in other languages, truncated rows
-                data = np.genfromtxt(lines, usecols=numbers, invalid_raise=False, **options).reshape(-1, len(numbers))
+            except ValueError:  # empty cells, text such as "nan" in other languages, truncated rows
+                data = np.genfromtxt(
+                    lines, usecols=numbers, invalid_raise=False, **options
+                ).reshape(-1, len(numbers))
         self._values = dict(zip(numbers, data.T, strict=True))
         for k in set(wanted) & self.dates:
             cells = [self._cells(line) for line in lines if line.strip()]
-            dates = [re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', row[k].strip()).replace(' ', 'T') if k < len(row) else 'NaT' for row in cells]
+            dates = [
+                re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', row[k].strip()).replace(' ', 'T')
+                if k < len(row)
+                else 'NaT'
+                for row in cells
+            ]
             self._values[k] = np.array(dates, 'datetime64[ns]')
         if min(map(len, self._values.values())) < 2:
-            raise InputError(f'{self.path} must have at least two rows of numbers, got fewer; check the file')
+            raise InputError(
+                f'{self.path} must have at least two rows of numbers, got fewer; check the file'
+            )
 
     def values(self, names):
         """Return columns, shape (n, len(names))."""
-        return np.column_stack([(1.0 if name in self.names or not name.startswith('-') else -1.0) * self._values[self.column(name)]
-                                for name in names])
+        return np.column_stack(
+            [
+                (1.0 if name in self.names or not name.startswith('-') else -1.0)
+                * self._values[self.column(name)]
+                for name in names
+            ]
+        )
 
     def raw(self, name):
         """Return one column as read, float or datetime64."""
@@ -269,17 +389,22 @@ class _Table:
         unit = COLUMN_UNITS['time'][time.unit]
         bad = np.count_nonzero(~(np.abs(values * unit) < MAX_TIME_SECONDS))
         if bad:
-            raise InputError(f'the time of every row of {self.path} must be a number below {MAX_TIME_SECONDS:g} s, got {bad} without one; '
-                             'remove these rows', code='csv_time')
+            raise InputError(
+                f'the time of every row of {self.path} must be a number below {MAX_TIME_SECONDS:g} s, got {bad} without one; '
+                'remove these rows',
+                code='csv_time',
+            )
         return stamps_of(values, unit)
 
 
 def _delimiter(lines):
     """Return the delimiter that gives the same number of columns, at least four, in most lines; None for white space."""
+
     def agreement(delimiter):
         counts = Counter(len(line.split(delimiter)) for line in lines[:50] if line.strip())
         width, number = counts.most_common(1)[0]
         return number if width >= 4 else 0
+
     return max((';', '\t', ',', None), key=agreement)
 
 
@@ -297,7 +422,9 @@ def _guess(table):
         for quantity, pattern in COLUMN_PATTERNS:
             if quantity in axes:
                 if axis and re.fullmatch(pattern, axis.group(1)):
-                    axes[quantity].setdefault(re.sub(r'[^a-z]', '', axis.group(1)), {})[axis.group(2)] = (name, _unit(quantity, unit_text))
+                    axes[quantity].setdefault(re.sub(r'[^a-z]', '', axis.group(1)), {})[
+                        axis.group(2)
+                    ] = (name, _unit(quantity, unit_text))
             elif re.fullmatch(pattern, words) and quantity not in {each.quantity for each in found}:
                 found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
         if joint:
@@ -305,11 +432,20 @@ def _guess(table):
     for quantity, groups in axes.items():
         complete = [group for group in groups.values() if set(group) == set('xyz')]
         if len(complete) > 1:
-            raise InputError(f'{table.path} must have one column of {quantity} per axis, got {len(complete)} sets: '
-                             f'{"; ".join(", ".join(group[axis][0] for axis in "xyz") for group in complete)}; {REMEDY}', key='columns')
+            raise InputError(
+                f'{table.path} must have one column of {quantity} per axis, got {len(complete)} sets: '
+                f'{"; ".join(", ".join(group[axis][0] for axis in "xyz") for group in complete)}; {REMEDY}',
+                key='columns',
+            )
         if complete:
             units = {group[axis][1] for group in complete for axis in 'xyz'}
-            found.append(Columns(quantity, tuple(complete[0][axis][0] for axis in 'xyz'), units.pop() if len(units) == 1 else None))
+            found.append(
+                Columns(
+                    quantity,
+                    tuple(complete[0][axis][0] for axis in 'xyz'),
+                    units.pop() if len(units) == 1 else None,
+                )
+            )
     return found
 
 
@@ -317,11 +453,15 @@ def _words(name):
     """Return (name in lower case with spaces, without unit; text of the unit)."""
     bracket = re.search(r'[(\[](.*?)[)\]]\s*(?:\[\d+\])?$', name)
     unit = bracket.group(1) if bracket else ''
-    text = name[:bracket.start()] if bracket else name
+    text = name[: bracket.start()] if bracket else name
     if not unit:
-        suffix = re.search(r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|ms|us|ns|deg|rad|c|s)$', text, re.IGNORECASE)
+        suffix = re.search(
+            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|ms|us|ns|deg|rad|c|s)$',
+            text,
+            re.IGNORECASE,
+        )
         if suffix:
-            unit, text = suffix.group(1), text[:suffix.start()]
+            unit, text = suffix.group(1), text[: suffix.start()]
     text = re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', text)
     unit = unit.lower().replace('m_s2', 'm/s2').replace('m_s_2', 'm/s2').replace('_s', '/s')
     return re.sub(r'[\s_./-]+', ' ', text).strip().lower(), unit
@@ -346,8 +486,14 @@ def _time_unit(values):
 def _force_unit(force):
     """Return the unit in which the median length is that of gravity."""
     length = float(np.nanmedian(np.linalg.norm(force, axis=1)))
-    return next((unit for unit, size in COLUMN_UNITS['force'].items()
-                 if 1 / GRAVITY_BAND < length * size / STANDARD_GRAVITY < GRAVITY_BAND), None)
+    return next(
+        (
+            unit
+            for unit, size in COLUMN_UNITS['force'].items()
+            if 1 / GRAVITY_BAND < length * size / STANDARD_GRAVITY < GRAVITY_BAND
+        ),
+        None,
+    )
 
 
 def _rate_unit(stamp_ns, force_s, rate):
@@ -358,7 +504,14 @@ def _rate_unit(stamp_ns, force_s, rate):
     turning = relate_turns(series.chunks())
     if turning is None:
         return None
-    return next((unit for unit, size in COLUMN_UNITS['rate'].items() if 1 / RATE_BAND < turning.factor / size < RATE_BAND), None)
+    return next(
+        (
+            unit
+            for unit, size in COLUMN_UNITS['rate'].items()
+            if 1 / RATE_BAND < turning.factor / size < RATE_BAND
+        ),
+        None,
+    )
 
 
 class CsvBag(Rosbag2):

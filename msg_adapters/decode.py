@@ -9,7 +9,14 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from msg_adapters.definitions import standard_bytes
-from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE, decode_imu, decode_temperature, find_imu_layout, find_temperature_layout
+from msg_adapters.imu import (
+    IMU_TYPE,
+    TEMPERATURE_TYPE,
+    decode_imu,
+    decode_temperature,
+    find_imu_layout,
+    find_temperature_layout,
+)
 from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout
 from msg_adapters.layout import MessageLayout, Packed, UnusableMessage, group_by_layout
 
@@ -37,7 +44,12 @@ class Decoder:
     """
 
     def __init__(self, message_type: str, deserialize: Callable | None = None, choice: Any = None):
-        self.message_type, self.name, self.deserialize, self.choice = message_type, message_type.rpartition('/')[2], deserialize, choice
+        self.message_type, self.name, self.deserialize, self.choice = (
+            message_type,
+            message_type.rpartition('/')[2],
+            deserialize,
+            choice,
+        )
         self.dropped, self.notes = Counter(), Counter()
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
@@ -57,7 +69,13 @@ class Decoder:
         if n_broken:
             self.dropped[f'{self.name} message that cannot be decoded'] += n_broken
         parts = [(index, self._samples(layout, group)) for layout, index, group in groups]
-        return in_order([(index, self._stamped(samples, index, arrived_ns)) for index, samples in parts if samples is not None])
+        return in_order(
+            [
+                (index, self._stamped(samples, index, arrived_ns))
+                for index, samples in parts
+                if samples is not None
+            ]
+        )
 
     def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
         """Return the samples of messages of one layout, None for messages that are not wanted (raises UnusableMessage)."""
@@ -84,7 +102,7 @@ class Decoder:
         """Return a message as standard CDR; no bytes for one that cannot be read."""
         try:
             return standard_bytes(self.deserialize(data), self.message_type)
-        except Exception:   # rosbags' generated readers raise many kinds on broken bytes, and fields of other definitions differ
+        except Exception:  # rosbags' generated readers raise many kinds on broken bytes, and fields of other definitions differ
             return b''
 
 
@@ -107,16 +125,25 @@ class FrameChoice:
     def wants(self, frame_id: str, n_messages: int = 1) -> bool:
         """Return whether messages of a frame are used; raises InputError if the choice is ambiguous."""
         self.counts[frame_id] += n_messages
-        if self.frame_id is None and sum(count >= OTHER_FRAME for count in self.counts.values()) > 1:
-            raise InputError(f'{self.topic} must have messages of one frame_id, got {self._listed()}; choose one', key='frame_id',
-                             code='frame_ambiguous')
+        if (
+            self.frame_id is None
+            and sum(count >= OTHER_FRAME for count in self.counts.values()) > 1
+        ):
+            raise InputError(
+                f'{self.topic} must have messages of one frame_id, got {self._listed()}; choose one',
+                key='frame_id',
+                code='frame_ambiguous',
+            )
         return self.frame_id is None or frame_id == self.frame_id
 
     def check(self) -> None:
         """Raise InputError if no message has the frame_id that was chosen."""
         if self.frame_id is not None and self.counts and self.frame_id not in self.counts:
-            raise InputError(f"the frame_id must be one of {self.topic}, got '{self.frame_id}'; choose one of {self._listed()}",
-                             key='frame_id', code='frame_unknown')
+            raise InputError(
+                f"the frame_id must be one of {self.topic}, got '{self.frame_id}'; choose one of {self._listed()}",
+                key='frame_id',
+                code='frame_unknown',
+            )
 
     def _listed(self):
         return ', '.join(f"'{name}'" for name, _ in self.counts.most_common(KEPT_NAMES))
@@ -135,7 +162,9 @@ class JointDecoder(Decoder):
 
     """
 
-    def __init__(self, joint_names: Sequence[str] | None = None, deserialize: Callable | None = None):
+    def __init__(
+        self, joint_names: Sequence[str] | None = None, deserialize: Callable | None = None
+    ):
         super().__init__(JOINT_STATE_TYPE, deserialize)
         self.asked = joint_names is not None
         self.names = () if joint_names is None else tuple(joint_names)
@@ -163,13 +192,21 @@ class JointDecoder(Decoder):
         """Raise InputError when no message so far contains the joints of the table."""
         if self.asked and self.seen and not self.n_fitting:
             if any(set(self.names) <= set(names) for names in self.seen):
-                raise InputError('JointState must have one position for each named joint, the messages so far do not; correct the '
-                                 'driver, or choose a different topic', key='joint_topic')
+                raise InputError(
+                    'JointState must have one position for each named joint, the messages so far do not; correct the '
+                    'driver, or choose a different topic',
+                    key='joint_topic',
+                )
             came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
-            missing = min(([name for name in self.names if name not in names] for names in self.seen), key=len)
-            raise InputError(f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}, which lacks '
-                             f'{", ".join(missing)}; correct the names in the table description, or choose another topic',
-                             key='joint_topic', code='joint_names')
+            missing = min(
+                ([name for name in self.names if name not in names] for names in self.seen), key=len
+            )
+            raise InputError(
+                f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}, which lacks '
+                f'{", ".join(missing)}; correct the names in the table description, or choose another topic',
+                key='joint_topic',
+                code='joint_names',
+            )
 
 
 def taken_counts(decoders: Iterable[Decoder]) -> tuple[dict[str, int] | None, ...]:
@@ -186,11 +223,16 @@ def in_order(parts: Sequence[Any]) -> Any:
     """Join (index, samples) pairs in the order of the indices; None when there are none."""
     if len(parts) < 2:
         return parts[0][1] if parts else None
-    parts = sorted(parts, key=lambda part: part[0][0])   # so that the frame is that of the first message
+    parts = sorted(
+        parts, key=lambda part: part[0][0]
+    )  # so that the frame is that of the first message
     joined = type(parts[0][1]).concatenate(samples for _, samples in parts)
     return joined.select(np.argsort(np.concatenate([index for index, _ in parts]), kind='stable'))
 
 
 FIND_LAYOUT: dict[str, Callable[[bytes], MessageLayout]] = {
-    IMU_TYPE: find_imu_layout, JOINT_STATE_TYPE: find_joint_layout, TEMPERATURE_TYPE: find_temperature_layout}
+    IMU_TYPE: find_imu_layout,
+    JOINT_STATE_TYPE: find_joint_layout,
+    TEMPERATURE_TYPE: find_temperature_layout,
+}
 """Message type -> function from bytes to MessageLayout (raises MessageError)."""

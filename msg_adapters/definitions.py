@@ -12,7 +12,11 @@ from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, st
 SEPARATOR = '=' * 80
 MAX_DEFINITION_CHARACTERS, MAX_ELEMENTS = 100_000, 10_000
 """Characters of a definition and elements of a message at most, an array counted by its elements."""
-DEFAULT_TOPICS = {IMU_TYPE: '/imu/data_raw', JOINT_STATE_TYPE: '/joint_states', TEMPERATURE_TYPE: '/imu/temperature'}
+DEFAULT_TOPICS = {
+    IMU_TYPE: '/imu/data_raw',
+    JOINT_STATE_TYPE: '/joint_states',
+    TEMPERATURE_TYPE: '/imu/temperature',
+}
 
 STANDARD_TYPES = (IMU_TYPE, JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, TEMPERATURE_TYPE)
 
@@ -34,7 +38,12 @@ class TypeDefinition(NamedTuple):
 def standard_definition(message_type: str) -> TypeDefinition:
     """Return the TypeDefinition of a type that this package supports, as in ROS 2 Jazzy."""
     store = standard_store()
-    return TypeDefinition(message_type, 'ros2msg', store.generate_msgdef(message_type, ros_version=2)[0], store.hash_rihs01(message_type))
+    return TypeDefinition(
+        message_type,
+        'ros2msg',
+        store.generate_msgdef(message_type, ros_version=2)[0],
+        store.hash_rihs01(message_type),
+    )
 
 
 def is_standard(message_type: str, encoding: str, text: str) -> bool:
@@ -44,18 +53,23 @@ def is_standard(message_type: str, encoding: str, text: str) -> bool:
     if encoding != 'ros2msg' or len(text) > MAX_DEFINITION_CHARACTERS:
         return False
     try:
-        return _fields(text, message_type) == _fields(standard_definition(message_type).text, message_type)
-    except Exception:   # rosbags' parser raises many kinds
+        return _fields(text, message_type) == _fields(
+            standard_definition(message_type).text, message_type
+        )
+    except Exception:  # rosbags' parser raises many kinds
         return False
 
 
 def _fields(text, message_type):
     """Return the types of a ros2msg definition with their fields, without constants and default values."""
     from rosbags.typesys import get_types_from_msg
+
     return {name: fields for name, (_, fields) in get_types_from_msg(text, message_type).items()}
 
 
-def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros1: bool = False) -> Callable:
+def deserializer(
+    message_type: str, definitions: dict[str, tuple[str, str]], ros1: bool = False
+) -> Callable:
     """
     Return a function from message bytes to a message object, by rosbags.
 
@@ -70,14 +84,21 @@ def deserializer(message_type: str, definitions: dict[str, tuple[str, str]], ros
 
     """
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
     types = dict(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY).fielddefs)
     encoding, text = definitions.get(message_type, ('', ''))
     if len(text) > MAX_DEFINITION_CHARACTERS:
-        raise ValueError(f'a definition of {len(text)} characters, at most {MAX_DEFINITION_CHARACTERS} are accepted')
+        raise ValueError(
+            f'a definition of {len(text)} characters, at most {MAX_DEFINITION_CHARACTERS} are accepted'
+        )
     if text and encoding == 'ros2msg':
         types.update(get_types_from_msg(text, message_type))
     elif text:
-        parts = [part.split('\n', 1)[1] for part in text.split(SEPARATOR + '\n')[1:]] if text.startswith(SEPARATOR) else [text]
+        parts = (
+            [part.split('\n', 1)[1] for part in text.split(SEPARATOR + '\n')[1:]]
+            if text.startswith(SEPARATOR)
+            else [text]
+        )
         for part in parts:
             types.update(get_types_from_idl(part))
     _require_size(types, message_type)

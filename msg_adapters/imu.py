@@ -3,19 +3,39 @@
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
-from msg_adapters.layout import FRAME_OFFSET, MessageError, MessageLayout, Packed, aligned, frame_head, open_header, overlapping
+from msg_adapters.layout import (
+    FRAME_OFFSET,
+    MessageError,
+    MessageLayout,
+    Packed,
+    aligned,
+    frame_head,
+    open_header,
+    overlapping,
+)
 
 IMU_TYPE = 'sensor_msgs/msg/Imu'
 
 N_DOUBLES = 37
-FIELDS = {'orientation': slice(0, 4), 'orientation_cov': slice(4, 13), 'rate_s': slice(13, 16), 'rate_cov': slice(16, 25),
-          'force_s': slice(25, 28), 'force_cov': slice(28, 37)}
+FIELDS = {
+    'orientation': slice(0, 4),
+    'orientation_cov': slice(4, 13),
+    'rate_s': slice(13, 16),
+    'rate_cov': slice(16, 25),
+    'force_s': slice(25, 28),
+    'force_cov': slice(28, 37),
+}
 """Positions in the 37 doubles after the header: x, y, z, w and row-major 3 x 3 covariances."""
 
 
 def find_imu_layout(data: bytes) -> MessageLayout:
     """Return the MessageLayout of a serialized Imu message (raises MessageError)."""
-    return _layout(data, 'Imu', N_DOUBLES, {name: (place.start, place.stop - place.start) for name, place in FIELDS.items()})
+    return _layout(
+        data,
+        'Imu',
+        N_DOUBLES,
+        {name: (place.start, place.stop - place.start) for name, place in FIELDS.items()},
+    )
 
 
 def _layout(data, kind, n_doubles, fields):
@@ -23,9 +43,18 @@ def _layout(data, kind, n_doubles, fields):
     header = open_header(data)
     body = aligned(header.end, 8)
     if len(data) < body + 8 * n_doubles:
-        raise MessageError(f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles} bytes, got {len(data)}')
+        raise MessageError(
+            f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles} bytes, got {len(data)}'
+        )
     offsets = {name: (body + 8 * first, count) for name, (first, count) in fields.items()}
-    return MessageLayout(header.order, len(data), bytes(data), ((0, 2), (FRAME_OFFSET, header.end)), offsets, (header.frame_id,))
+    return MessageLayout(
+        header.order,
+        len(data),
+        bytes(data),
+        ((0, 2), (FRAME_OFFSET, header.end)),
+        offsets,
+        (header.frame_id,),
+    )
 
 
 def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
@@ -40,7 +69,13 @@ def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
     return ImuSamples(layout.stamp_ns(packed), frame_id=layout.names[0], **readings)
 
 
-def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.ndarray], *, frame_id: str | None = None) -> np.ndarray:
+def patch_imu_group(
+    layout: MessageLayout,
+    packed: Packed,
+    fields: dict[str, np.ndarray],
+    *,
+    frame_id: str | None = None,
+) -> np.ndarray:
     """
     Return copies of messages of one layout with some fields replaced.
 
@@ -59,15 +94,23 @@ def patch_imu_group(layout: MessageLayout, packed: Packed, fields: dict[str, np.
         uint8, shape (n, n_bytes): one message per row.
 
     """
-    table = overlapping(packed.buffer, f'V{layout.size}')[packed.start].view(np.uint8).reshape(-1, layout.size)
+    table = (
+        overlapping(packed.buffer, f'V{layout.size}')[packed.start]
+        .view(np.uint8)
+        .reshape(-1, layout.size)
+    )
     for name, values in fields.items():
         offset, count = layout.offsets[name]
-        table[:, offset:offset + 8 * count] = np.ascontiguousarray(values, dtype=layout.order + 'f8').view(np.uint8)
+        table[:, offset : offset + 8 * count] = np.ascontiguousarray(
+            values, dtype=layout.order + 'f8'
+        ).view(np.uint8)
     if frame_id is None or frame_id == layout.names[0]:
         return table
     head = np.frombuffer(frame_head(frame_id, layout.order), np.uint8)
     rows = np.broadcast_to(head, (len(table), len(head)))
-    return np.concatenate([table[:, :FRAME_OFFSET], rows, table[:, layout.offsets['orientation'][0]:]], axis=1)
+    return np.concatenate(
+        [table[:, :FRAME_OFFSET], rows, table[:, layout.offsets['orientation'][0] :]], axis=1
+    )
 
 
 TEMPERATURE_TYPE = 'sensor_msgs/msg/Temperature'

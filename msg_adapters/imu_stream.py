@@ -31,7 +31,13 @@ class ImuStream:
 
     def __init__(self, frame_id: str | None = None, late_ns: int = 0):
         self._frame_out, self._late_ns = frame_id, late_ns
-        self._size, self._order, self._head, self._head_end, self._head_out = -1, b'', b'', HEAD_AT, b''
+        self._size, self._order, self._head, self._head_end, self._head_out = (
+            -1,
+            b'',
+            b'',
+            HEAD_AT,
+            b'',
+        )
         self._body = self._rate_at = self._force_at = 0
         self._rate_cov = self._force_cov = b''
         self._use('<')
@@ -55,17 +61,26 @@ class ImuStream:
         layout = find_imu_layout(data)
         self._use(layout.order)
         self._order, self._body = data[:2], layout.offsets['orientation'][0]
-        self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]   # the padding after it is arbitrary
-        self._head = data[HEAD_AT:self._head_end]
+        self._head_end = (
+            HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]
+        )  # the padding after it is arbitrary
+        self._head = data[HEAD_AT : self._head_end]
         self._rate_at, self._force_at = layout.offsets['rate_s'][0], layout.offsets['force_s'][0]
-        self._head_out = frame_head(layout.names[0] if self._frame_out is None else self._frame_out, layout.order)
+        self._head_out = frame_head(
+            layout.names[0] if self._frame_out is None else self._frame_out, layout.order
+        )
         self._size = len(data)
         return layout.names[0]
 
     def take(self, data: bytes) -> tuple[int, tuple[float, ...]] | None:
         """Return (stamp in ns, readings: rate x, y, z, force x, y, z), or None where head or covariances differ from the last."""
-        if (len(data) != self._size or data[HEAD_AT:self._head_end] != self._head or data[:2] != self._order
-                or data[self._rate_at + 24:self._rate_at + 96] != self._rate_cov or data[self._force_at + 24:] != self._force_cov):
+        if (
+            len(data) != self._size
+            or data[HEAD_AT : self._head_end] != self._head
+            or data[:2] != self._order
+            or data[self._rate_at + 24 : self._rate_at + 96] != self._rate_cov
+            or data[self._force_at + 24 :] != self._force_cov
+        ):
             return None
         return self.read(data)
 
@@ -76,7 +91,11 @@ class ImuStream:
 
     def heads(self, data: bytes) -> bool:
         """Return whether a message has the head of the last opened one, so that all positions are equal."""
-        return len(data) == self._size and data[HEAD_AT:self._head_end] == self._head and data[:2] == self._order
+        return (
+            len(data) == self._size
+            and data[HEAD_AT : self._head_end] == self._head
+            and data[:2] == self._order
+        )
 
     def forget(self) -> None:
         """Have the next message opened in any case."""
@@ -84,12 +103,18 @@ class ImuStream:
 
     def covariances(self, data: bytes) -> tuple[np.ndarray, ...]:
         """Return the covariances of (force, rate), each (3, 3)."""
-        self._rate_cov, self._force_cov = data[self._rate_at + 24:self._rate_at + 96], data[self._force_at + 24:]
-        return tuple(np.array(self._nine.unpack_from(raw)).reshape(3, 3) for raw in (self._force_cov, self._rate_cov))
+        self._rate_cov, self._force_cov = (
+            data[self._rate_at + 24 : self._rate_at + 96],
+            data[self._force_at + 24 :],
+        )
+        return tuple(
+            np.array(self._nine.unpack_from(raw)).reshape(3, 3)
+            for raw in (self._force_cov, self._rate_cov)
+        )
 
     def orientation(self, data: bytes) -> tuple[tuple[float, ...], bytes]:
         """Return (quaternion x, y, z, w; its covariance as bytes)."""
-        return self._four.unpack_from(data, self._body), data[self._body + 32:self._rate_at]
+        return self._four.unpack_from(data, self._body), data[self._body + 32 : self._rate_at]
 
     def unpacked(self, covariance: bytes) -> np.ndarray:
         """Return the matrix in the bytes of a covariance, shape (3, 3)."""
@@ -99,8 +124,16 @@ class ImuStream:
         """Return a covariance, (3, 3), as bytes."""
         return self._nine.pack(*covariance.ravel().tolist())
 
-    def rewritten(self, data: bytes, stamp_ns: int, readings: Sequence[float], *, rate_cov: bytes, force_cov: bytes,
-                  orientation: tuple[Sequence[float], bytes] | None = None) -> bytes:
+    def rewritten(
+        self,
+        data: bytes,
+        stamp_ns: int,
+        readings: Sequence[float],
+        *,
+        rate_cov: bytes,
+        force_cov: bytes,
+        orientation: tuple[Sequence[float], bytes] | None = None,
+    ) -> bytes:
         """
         Return a message with new readings, otherwise unchanged.
 
@@ -118,10 +151,10 @@ class ImuStream:
         """
         tail = self._tail.pack(*readings[:3], rate_cov, *readings[3:], force_cov)
         if orientation is None and not self._late_ns:
-            return data[:self._rate_at] + tail
+            return data[: self._rate_at] + tail
         start = data[:STAMP_AT] + self._stamp.pack(*divmod(stamp_ns - self._late_ns, NS))
         if orientation is None:
-            return start + data[HEAD_AT:self._rate_at] + tail
+            return start + data[HEAD_AT : self._rate_at] + tail
         return start + self._head_out + self._four.pack(*orientation[0]) + orientation[1] + tail
 
 
@@ -152,4 +185,6 @@ class ImuHeads:
         quaternion, packed = self._stream.orientation(self._last)
         matrices = (*self._stream.covariances(self._last), self._stream.unpacked(packed))
         covariances = dict(zip(MESSAGE_QUANTITIES, matrices, strict=True))
-        return MessageEvidence(dict(self._frame_ids), covariances, np.array(quaternion), np.array(self._age))
+        return MessageEvidence(
+            dict(self._frame_ids), covariances, np.array(quaternion), np.array(self._age)
+        )

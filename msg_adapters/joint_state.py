@@ -46,14 +46,20 @@ def find_joint_layout(data: bytes) -> MessageLayout:
         n_names = walk.count()
         names = tuple(walk.string() for _ in range(min(n_names, MAX_MESSAGE_JOINTS)))
         if n_names > MAX_MESSAGE_JOINTS or walk.position > MAX_NAME_BYTES:
-            raise MessageError(f'a JointState must have at most {MAX_MESSAGE_JOINTS} joints and {MAX_NAME_BYTES} bytes of names')
+            raise MessageError(
+                f'a JointState must have at most {MAX_MESSAGE_JOINTS} joints and {MAX_NAME_BYTES} bytes of names'
+            )
         offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
     except struct.error:
-        raise MessageError(f'a JointState of {len(data)} bytes ends before its last field') from None
+        raise MessageError(
+            f'a JointState of {len(data)} bytes ends before its last field'
+        ) from None
     return MessageLayout(header.order, len(data), bytes(data), tuple(walk.fixed), offsets, names)
 
 
-def decode_joints(layout: MessageLayout, packed: Packed, joint_names: Sequence[str]) -> JointSamples:
+def decode_joints(
+    layout: MessageLayout, packed: Packed, joint_names: Sequence[str]
+) -> JointSamples:
     """
     Decode messages of one layout, columns in the order of `joint_names`.
 
@@ -97,7 +103,7 @@ class _Walk:
         length = self.count()
         start = self._skip(length)
         self.fixed.append((start, self.position))
-        return clean_name(self.data[start:start + max(length - 1, 0)])
+        return clean_name(self.data[start : start + max(length - 1, 0)])
 
     def doubles(self):
         """Step over a sequence of doubles; return (offset, count)."""
@@ -121,17 +127,25 @@ _FIELDS = {'position': 'positions', 'rate': 'velocities', 'acceleration': 'accel
 def standard_store() -> Any:
     """Return rosbags' standard types; the first call takes a third of a second."""
     from rosbags.typesys import Stores, get_typestore
+
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def encode_trajectory(points: TrajectoryPoints) -> bytes:
     """Return TrajectoryPoints as plain little-endian CDR, without a frame, to begin at their arrival."""
     types, none = standard_store().types, np.zeros(0)
-    columns = {name: np.ascontiguousarray(values) for name, values in points.columns().items()}   # each row is serialized as its bytes
+    columns = {
+        name: np.ascontiguousarray(values) for name, values in points.columns().items()
+    }  # each row is serialized as its bytes
     duration = types['builtin_interfaces/msg/Duration']
-    listed = [types['trajectory_msgs/msg/JointTrajectoryPoint'](*(columns[name][k] if name in columns else none for name in _FIELDS), none,
-                                                                duration(*divmod(round(time * NS_PER_S), NS_PER_S)))
-              for k, time in enumerate(points.time)]
+    listed = [
+        types['trajectory_msgs/msg/JointTrajectoryPoint'](
+            *(columns[name][k] if name in columns else none for name in _FIELDS),
+            none,
+            duration(*divmod(round(time * NS_PER_S), NS_PER_S)),
+        )
+        for k, time in enumerate(points.time)
+    ]
     header = types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](0, 0), '')
     message = types[JOINT_TRAJECTORY_TYPE](header, list(points.joint_names), listed)
     return bytes(standard_store().serialize_cdr(message, JOINT_TRAJECTORY_TYPE))
@@ -150,11 +164,22 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
 
     """
     names, points = tuple(message.joint_names), message.points
-    time = np.array([point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in points], float)
-    given = {name: [list(getattr(point, field)) for point in points] for name, field in _FIELDS.items()}
-    complete = {name: np.array(values, float).reshape(len(points), len(names)) for name, values in given.items()
-                if all(len(row) == len(names) for row in values) and (values or name == 'position')}
+    time = np.array(
+        [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in points],
+        float,
+    )
+    given = {
+        name: [list(getattr(point, field)) for point in points] for name, field in _FIELDS.items()
+    }
+    complete = {
+        name: np.array(values, float).reshape(len(points), len(names))
+        for name, values in given.items()
+        if all(len(row) == len(names) for row in values) and (values or name == 'position')
+    }
     if 'position' not in complete:
-        raise InputError(f'each point of a trajectory must have {len(names)} positions, one for each joint, some have not; '
-                         'give them all', code='position_count')
+        raise InputError(
+            f'each point of a trajectory must have {len(names)} positions, one for each joint, some have not; '
+            'give them all',
+            code='position_count',
+        )
     return TrajectoryPoints(names, time, **complete)

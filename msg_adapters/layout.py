@@ -30,7 +30,7 @@ class Packed:
     def message(self, index: int) -> bytes:
         """Return the bytes of one message."""
         start = int(self.start[index])
-        return self.buffer[start:start + int(self.size[index])].tobytes()
+        return self.buffer[start : start + int(self.size[index])].tobytes()
 
     def views(self) -> list[memoryview]:
         """Return the messages without copying them."""
@@ -41,7 +41,12 @@ class Packed:
         return self._parts(bytearray(self.buffer))
 
     def _parts(self, data):
-        return (data[start:end] for start, end in zip(self.start.tolist(), (self.start + self.size).tolist(), strict=True))
+        return (
+            data[start:end]
+            for start, end in zip(
+                self.start.tolist(), (self.start + self.size).tolist(), strict=True
+            )
+        )
 
     def copy_to(self, target: np.ndarray, place: np.ndarray) -> None:
         """Copy each message into the bytes `target`, from its `place` on: one gather for each size."""
@@ -49,7 +54,9 @@ class Packed:
         for some in np.split(order, np.flatnonzero(np.diff(self.size[order])) + 1):
             if len(some) and self.size[some[0]]:
                 kind = f'V{self.size[some[0]]}'
-                overlapping(target, kind)[place[some]] = overlapping(self.buffer, kind)[self.start[some]]
+                overlapping(target, kind)[place[some]] = overlapping(self.buffer, kind)[
+                    self.start[some]
+                ]
 
     def select(self, index: np.ndarray) -> 'Packed':
         """Return some of the messages."""
@@ -74,7 +81,12 @@ class Packed:
             return parts[0]
         sizes = [len(part.buffer) for part in parts]
         start = [part.start + sum(sizes[:k]) for k, part in enumerate(parts)]
-        return cls(*(np.concatenate(each) for each in ([part.buffer for part in parts], start, [part.size for part in parts])))
+        return cls(
+            *(
+                np.concatenate(each)
+                for each in ([part.buffer for part in parts], start, [part.size for part in parts])
+            )
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +109,11 @@ class MessageLayout:
     def matches(self, packed: Packed) -> np.ndarray:
         """Return which messages have this layout, bool, shape (n,)."""
         same = packed.size == self.size
-        start = packed.start if same.all() else np.where(same, packed.start, packed.start[np.argmax(same)])
+        start = (
+            packed.start
+            if same.all()
+            else np.where(same, packed.start, packed.start[np.argmax(same)])
+        )
         words = overlapping(packed.buffer, '<u8')
         for offset, mask, expected in _checks(self.fixed, self.sample):
             same &= (words[start + offset] & mask) == expected
@@ -120,7 +136,9 @@ class MessageLayout:
         return rows.view(self.order + 'f8').reshape(-1, count).astype(float, copy=False)
 
 
-def group_by_layout(packed: Packed, find_layout: Callable) -> tuple[list[tuple[MessageLayout, np.ndarray, Packed]], int]:
+def group_by_layout(
+    packed: Packed, find_layout: Callable
+) -> tuple[list[tuple[MessageLayout, np.ndarray, Packed]], int]:
     """
     Split messages into groups of one layout each; after `MAX_LAYOUTS` groups each message is one.
 
@@ -168,9 +186,15 @@ def _checks(fixed, sample):
         left[first:last] = True
     while left.any():
         offset = min(int(np.argmax(left)), len(sample) - 8)
-        mask = int.from_bytes(np.where(left[offset:offset + 8], 0xff, 0).astype(np.uint8).tobytes(), 'little')
-        left[offset:offset + 8] = False
-        yield offset, np.uint64(mask), np.uint64(int.from_bytes(sample[offset:offset + 8], 'little') & mask)
+        mask = int.from_bytes(
+            np.where(left[offset : offset + 8], 0xFF, 0).astype(np.uint8).tobytes(), 'little'
+        )
+        left[offset : offset + 8] = False
+        yield (
+            offset,
+            np.uint64(mask),
+            np.uint64(int.from_bytes(sample[offset : offset + 8], 'little') & mask),
+        )
 
 
 NS_PER_S = 1_000_000_000
@@ -226,16 +250,27 @@ def open_header(data: bytes) -> Header:
     """Return the Header of a serialized message (raises MessageError); plain CDR (XCDR1) is the only representation in ROS 2."""
     order = _BYTE_ORDERS.get(bytes(data[:2]))
     if order is None:
-        raise MessageError(f'encapsulation must be plain CDR (0x0000 or 0x0001), got 0x{bytes(data[:2]).hex()}')
+        raise MessageError(
+            f'encapsulation must be plain CDR (0x0000 or 0x0001), got 0x{bytes(data[:2]).hex()}'
+        )
     if len(data) < FRAME_OFFSET + 4:
-        raise MessageError(f'a stamped message has at least {FRAME_OFFSET + 4} bytes, got {len(data)}')
+        raise MessageError(
+            f'a stamped message has at least {FRAME_OFFSET + 4} bytes, got {len(data)}'
+        )
     sec, nanosec, length = _STARTS[order].unpack_from(data, ENCAPSULATION_SIZE)
     if length > LONGEST_FRAME:
         raise MessageError(f'a frame_id must have at most {LONGEST_FRAME} bytes, got {length}')
     end = FRAME_OFFSET + 4 + length
     if end > len(data):
-        raise MessageError(f'a frame_id of {length} bytes ends at byte {end}, the message has {len(data)}')
-    return Header(order, sec * NS_PER_S + nanosec, bytes(data[FRAME_OFFSET + 4:end - 1 if length else end]), end)
+        raise MessageError(
+            f'a frame_id of {length} bytes ends at byte {end}, the message has {len(data)}'
+        )
+    return Header(
+        order,
+        sec * NS_PER_S + nanosec,
+        bytes(data[FRAME_OFFSET + 4 : end - 1 if length else end]),
+        end,
+    )
 
 
 def frame_head(frame_id: str, order: str = '<') -> bytes:

@@ -31,11 +31,21 @@ class LiveGatherer:
 
     """
 
-    def __init__(self, joint_names: Sequence[str] | None = None, max_messages: int = 1_000_000, frame_id: str | None = None):
+    def __init__(
+        self,
+        joint_names: Sequence[str] | None = None,
+        max_messages: int = 1_000_000,
+        frame_id: str | None = None,
+    ):
         imu = Decoder(IMU_TYPE, choice=None if frame_id is None else OneFrame(clean_name(frame_id)))
-        self._topics = {'imu': _Topic(imu, max_messages), 'joints': _Topic(JointDecoder(joint_names), max_messages),
-                        'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages)}
-        self.add_imu, self.add_joints, self.add_temperature = (topic.add for topic in self._topics.values())
+        self._topics = {
+            'imu': _Topic(imu, max_messages),
+            'joints': _Topic(JointDecoder(joint_names), max_messages),
+            'temperature': _Topic(Decoder(TEMPERATURE_TYPE), max_messages),
+        }
+        self.add_imu, self.add_joints, self.add_temperature = (
+            topic.add for topic in self._topics.values()
+        )
         """Add a serialized message, and when it was sent, ns."""
 
     def __len__(self) -> int:
@@ -90,6 +100,11 @@ class _Topic:
             messages, self.waiting = self.waiting, deque()
             n_lost, self.n_lost = self.n_lost, 0
         if n_lost:
-            self.decoder.dropped[f'{self.decoder.name} message that was dropped because the queue was full'] += n_lost
+            self.decoder.dropped[
+                f'{self.decoder.name} message that was dropped because the queue was full'
+            ] += n_lost
         sent_ns = np.array([sent for _, sent in messages], np.int64)
-        return self.decoder.decode(Packed.join([message for message, _ in messages]), (lambda: sent_ns) if np.all(sent_ns) else None)
+        return self.decoder.decode(
+            Packed.join([message for message, _ in messages]),
+            (lambda: sent_ns) if np.all(sent_ns) else None,
+        )

@@ -61,7 +61,7 @@ class McapDamage(Exception):
 
 def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
     """Return (id, Schema) from the content of a Schema record."""
-    number, = struct.unpack_from('<H', content)
+    (number,) = struct.unpack_from('<H', content)
     name, encoding, text = _strings(content, 2, 3)
     return number, Schema(clean_name(name), clean_name(encoding), text.decode(errors='replace'))
 
@@ -83,7 +83,13 @@ def parse_message_index(content: bytes) -> tuple[int, np.ndarray]:
 def parse_statistics(content: bytes) -> tuple[int, int, dict[int, int]]:
     """Return (first time, last time, channel id -> messages) from a Statistics record."""
     first, last = struct.unpack_from('<QQ', content, 26)
-    return first, last, dict(struct.iter_unpack('<HQ', content[46:46 + struct.unpack_from('<I', content, 42)[0]]))
+    return (
+        first,
+        last,
+        dict(
+            struct.iter_unpack('<HQ', content[46 : 46 + struct.unpack_from('<I', content, 42)[0]])
+        ),
+    )
 
 
 def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
@@ -105,11 +111,11 @@ def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
     """
     try:
         size, crc, length = struct.unpack_from('<QII', content, 16)
-        compression = bytes(content[32:32 + length]).decode()
-        packed_size, = struct.unpack_from('<Q', content, 32 + length)
+        compression = bytes(content[32 : 32 + length]).decode()
+        (packed_size,) = struct.unpack_from('<Q', content, 32 + length)
     except (struct.error, UnicodeDecodeError):
         raise McapDamage('a chunk without its header') from None
-    packed = content[40 + length:40 + length + packed_size]
+    packed = content[40 + length : 40 + length + packed_size]
     try:
         records = packed if compression == '' else decompress_chunk(compression, packed, size)
     except ValueError as error:
@@ -120,7 +126,9 @@ def unpack_chunk(content: memoryview) -> tuple[bytes | memoryview, bool]:
     return records, whole
 
 
-def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]) -> tuple[np.ndarray, Packed] | None:
+def indexed_messages(
+    buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarray]]
+) -> tuple[np.ndarray, Packed] | None:
     """
     Find the messages of a chunk by its message indexes.
 
@@ -140,8 +148,14 @@ def indexed_messages(buffer: np.ndarray, indexes: Sequence[tuple[float, np.ndarr
     if not len(offset) or offset[0] < 0 or offset[-1] + MESSAGE_PREFIX > len(buffer):
         return None
     length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64)
-    gapless = offset[0] == 0 and np.array_equal(offset + PREFIX.size + length, np.append(offset[1:], len(buffer)))
-    if not gapless or (buffer[offset] != MESSAGE).any() or (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any():
+    gapless = offset[0] == 0 and np.array_equal(
+        offset + PREFIX.size + length, np.append(offset[1:], len(buffer))
+    )
+    if (
+        not gapless
+        or (buffer[offset] != MESSAGE).any()
+        or (overlapping(buffer, '<u2')[offset + PREFIX.size] != channel).any()
+    ):
         return None
     return channel, Packed(buffer, offset + MESSAGE_PREFIX, length - 22)
 
@@ -165,23 +179,38 @@ def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int,
     while position + PREFIX.size <= end:
         opcode, length = PREFIX.unpack_from(view, position)
         behind = position + PREFIX.size + length
-        if not is_record(opcode) or opcode in (CHUNK, DATA_END, FOOTER) or behind > end or (opcode == MESSAGE and length < 22):
+        if (
+            not is_record(opcode)
+            or opcode in (CHUNK, DATA_END, FOOTER)
+            or behind > end
+            or (opcode == MESSAGE and length < 22)
+        ):
             break
         if opcode != MESSAGE:
             if len(others) == MOST_OTHERS:
                 break
-            others.append((opcode, bytes(view[position + PREFIX.size:behind])))
+            others.append((opcode, bytes(view[position + PREFIX.size : behind])))
         else:
             run = run + 1 if length == previous else 0
             previous = length
-            offsets.append(np.array([position]) if run < RUN else _run(buffer, position, PREFIX.size + length, 4 * run))
+            offsets.append(
+                np.array([position])
+                if run < RUN
+                else _run(buffer, position, PREFIX.size + length, 4 * run)
+            )
             run += len(offsets[-1]) - 1
             behind = int(offsets[-1][-1]) + PREFIX.size + length
         position = behind
     offset = np.concatenate(offsets) if offsets else np.zeros(0, np.int64)
     length = overlapping(buffer, '<u8')[offset + 1].astype(np.int64) if len(offset) else offset
-    channel = overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64) if len(offset) else offset
-    return (channel, Packed(buffer[:position], offset + MESSAGE_PREFIX, length - 22)), others, position
+    channel = (
+        overlapping(buffer, '<u2')[offset + PREFIX.size].astype(np.int64) if len(offset) else offset
+    )
+    return (
+        (channel, Packed(buffer[:position], offset + MESSAGE_PREFIX, length - 22)),
+        others,
+        position,
+    )
 
 
 def log_times(messages: Packed, index: np.ndarray) -> np.ndarray:
@@ -197,15 +226,17 @@ def is_record(opcode: int) -> bool:
 def _run(buffer, position, stride, reach):
     """Return offsets of up to `reach` records from `position` on that follow each other with the same opcode and length."""
     offset = position + stride * np.arange(min((len(buffer) - position) // stride, reach))
-    same = (buffer[offset] == MESSAGE) & (overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size)
-    return offset[:len(offset) if same.all() else int(np.argmin(same))]
+    same = (buffer[offset] == MESSAGE) & (
+        overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size
+    )
+    return offset[: len(offset) if same.all() else int(np.argmin(same))]
 
 
 def _strings(content, position, count):
     texts = []
     for _ in range(count):
-        length, = struct.unpack_from('<I', content, position)
-        texts.append(bytes(content[position + 4:position + 4 + length]))
+        (length,) = struct.unpack_from('<I', content, position)
+        texts.append(bytes(content[position + 4 : position + 4 + length]))
         position += 4 + length
     return texts
 
@@ -252,8 +283,14 @@ class McapFile(StorageFile):
         """Topic -> message type; serializations other than CDR are named after the type."""
         types = {}
         for channel in self.channels.values():
-            name = self.schemas[channel.schema_id].name if channel.schema_id in self.schemas else 'unknown'
-            types[channel.topic] = name if channel.encoding == 'cdr' else f'{name} ({channel.encoding})'
+            name = (
+                self.schemas[channel.schema_id].name
+                if channel.schema_id in self.schemas
+                else 'unknown'
+            )
+            types[channel.topic] = (
+                name if channel.encoding == 'cdr' else f'{name} ({channel.encoding})'
+            )
         return types
 
     @property
@@ -290,7 +327,11 @@ class McapFile(StorageFile):
         wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
         with closing(read_ahead(self._joined_pieces(wanted))) as pieces:
             for channel, packed in pieces:
-                yield Stretch(channel, lambda index, packed=packed: (index, packed.select(index)), partial(log_times, packed))
+                yield Stretch(
+                    channel,
+                    lambda index, packed=packed: (index, packed.select(index)),
+                    partial(log_times, packed),
+                )
 
     def _joined_pieces(self, wanted):
         """Join pieces to stretches."""
@@ -352,11 +393,18 @@ class McapFile(StorageFile):
             if opcode in (DATA_END, FOOTER):
                 return
             if not is_record(opcode) or behind > self.size:
-                if opcode == CHUNK:   # up to the next one, so that no byte is read twice
-                    yield CHUNK, position + PREFIX.size, (self._following(position) or self.size) - position - PREFIX.size, None
+                if opcode == CHUNK:  # up to the next one, so that no byte is read twice
+                    yield (
+                        CHUNK,
+                        position + PREFIX.size,
+                        (self._following(position) or self.size) - position - PREFIX.size,
+                        None,
+                    )
                 position = self._resume(position)
             elif opcode == MESSAGE:
-                buffer = np.frombuffer(self._read(position, max(ahead, behind - position)), np.uint8)
+                buffer = np.frombuffer(
+                    self._read(position, max(ahead, behind - position)), np.uint8
+                )
                 messages, others, end = walk(buffer)
                 ahead = min(2 * ahead, STRETCH_BYTES) if 2 * end > len(buffer) else FIRST_BYTES
                 if end:
@@ -388,15 +436,19 @@ class McapFile(StorageFile):
             try:
                 indexes.append(parse_message_index(self._read(position + PREFIX.size, length)))
             except (struct.error, ValueError):
-                return []   # the chunk is then walked through
+                return []  # the chunk is then walked through
             position += PREFIX.size + length
 
     def _read_summary(self):
         """Read channels, counts and positions of chunks from the summary, when the file has one."""
         footer = self._read(max(self.size - FOOTER_SIZE - len(MAGIC), 0), FOOTER_SIZE + len(MAGIC))
-        if len(footer) < FOOTER_SIZE + len(MAGIC) or footer[FOOTER_SIZE:] != MAGIC or footer[0] != FOOTER:
+        if (
+            len(footer) < FOOTER_SIZE + len(MAGIC)
+            or footer[FOOTER_SIZE:] != MAGIC
+            or footer[0] != FOOTER
+        ):
             return
-        start, = struct.unpack_from('<Q', footer, PREFIX.size)
+        (start,) = struct.unpack_from('<Q', footer, PREFIX.size)
         if not len(MAGIC) <= start < self.size:
             return
         _, records, _ = walk(np.frombuffer(self._read(start, self.size - start), np.uint8))
@@ -423,7 +475,7 @@ class McapFile(StorageFile):
                 counts.update(walked[0][0].tolist())
             elif opcode in (SCHEMA, CHANNEL):
                 self._register([(opcode, self._read(position, length))])
-        self.lost.clear()   # it will be counted again when the messages are read
+        self.lost.clear()  # it will be counted again when the messages are read
         return 0, 0, counts
 
     def _register(self, records):

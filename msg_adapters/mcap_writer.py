@@ -13,8 +13,16 @@ from msg_adapters.layout import Packed, overlapping
 from msg_adapters.mcap_file import MAGIC
 
 CHUNK_SIZE = 1 << 20
-MESSAGE_HEADER = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                           ('log_ns', '<u8'), ('publish_ns', '<u8')])
+MESSAGE_HEADER = np.dtype(
+    [
+        ('opcode', 'u1'),
+        ('length', '<u8'),
+        ('channel', '<u2'),
+        ('sequence', '<u4'),
+        ('log_ns', '<u8'),
+        ('publish_ns', '<u8'),
+    ]
+)
 """Prefix of the data of a Message record, 31 bytes."""
 
 
@@ -44,19 +52,39 @@ class McapWriter:
     def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
         """Declare a topic; `definition` is a TypeDefinition."""
         if definition.type not in self.schemas:
-            schema = record(0x03, struct.pack('<H', len(self.schemas) + 1), text(definition.type), text(definition.encoding),
-                            text(definition.text))
+            schema = record(
+                0x03,
+                struct.pack('<H', len(self.schemas) + 1),
+                text(definition.type),
+                text(definition.encoding),
+                text(definition.text),
+            )
             self.schemas[definition.type] = (len(self.schemas) + 1, schema)
             self.new_records += schema
-        metadata = text('offered_qos_profiles') + text(qos) + text('topic_type_hash') + text(definition.digest)
-        channel = record(0x04, struct.pack('<HH', topic_id, self.schemas[definition.type][0]), text(name), text('cdr'), text(metadata))
+        metadata = (
+            text('offered_qos_profiles')
+            + text(qos)
+            + text('topic_type_hash')
+            + text(definition.digest)
+        )
+        channel = record(
+            0x04,
+            struct.pack('<HH', topic_id, self.schemas[definition.type][0]),
+            text(name),
+            text('cdr'),
+            text(metadata),
+        )
         self.channels[topic_id] = channel
         self.new_records += channel
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
         headers, head = np.zeros(len(messages), dtype=MESSAGE_HEADER), MESSAGE_HEADER.itemsize
-        headers['opcode'], headers['length'], headers['channel'] = 0x05, messages.size + 22, topic_ids
+        headers['opcode'], headers['length'], headers['channel'] = (
+            0x05,
+            messages.size + 22,
+            topic_ids,
+        )
         headers['log_ns'] = headers['publish_ns'] = received_ns
         end = np.cumsum(messages.size + head)
         place = end - messages.size - head
@@ -65,7 +93,11 @@ class McapWriter:
         messages.copy_to(content, place + head)
         cuts = np.flatnonzero(np.diff(end // CHUNK_SIZE)) + 1
         for first, last in zip([0, *cuts], [*cuts, len(messages)], strict=True):
-            self._write_chunk(headers[first:last], place[first:last] - place[first], content[place[first]:end[last - 1]])
+            self._write_chunk(
+                headers[first:last],
+                place[first:last] - place[first],
+                content[place[first] : end[last - 1]],
+            )
 
     def _write_chunk(self, headers, offset, messages):
         content = self.new_records + messages.tobytes()
@@ -75,11 +107,24 @@ class McapWriter:
         times = struct.pack('<QQ', int(headers['log_ns'].min()), int(headers['log_ns'].max()))
         sizes = text(self.compression) + struct.pack('<Q', len(packed))
         start = self.file.tell()
-        self.file.write(record(0x06, times, struct.pack('<QI', len(content), zlib.crc32(content)), sizes, packed))
+        self.file.write(
+            record(
+                0x06, times, struct.pack('<QI', len(content), zlib.crc32(content)), sizes, packed
+            )
+        )
         length = self.file.tell() - start
         places = self._write_message_indexes(headers, offset)
-        self.chunk_indexes.append(record(0x08, times, struct.pack('<QQ', start, length), text(places),
-                                         struct.pack('<Q', self.file.tell() - start - length), sizes, struct.pack('<Q', len(content))))
+        self.chunk_indexes.append(
+            record(
+                0x08,
+                times,
+                struct.pack('<QQ', start, length),
+                text(places),
+                struct.pack('<Q', self.file.tell() - start - length),
+                sizes,
+                struct.pack('<Q', len(content)),
+            )
+        )
 
     def _write_message_indexes(self, headers, offset):
         places = b''
@@ -97,18 +142,39 @@ class McapWriter:
         metadata_start = self.file.tell()
         content = record(0x0C, text('rosbag2'), text(text('serialized_metadata') + text(metadata)))
         self.file.write(content + record(0x0F, struct.pack('<I', 0)))
-        counts = b''.join(struct.pack('<HQ', channel, entry['message_count'])
-                          for channel, entry in zip(self.channels, information['topics_with_message_count'], strict=True))
+        counts = b''.join(
+            struct.pack('<HQ', channel, entry['message_count'])
+            for channel, entry in zip(
+                self.channels, information['topics_with_message_count'], strict=True
+            )
+        )
         first_ns = information['starting_time']['nanoseconds_since_epoch']
-        statistics = struct.pack('<QHIIIIQQ', information['message_count'], len(self.schemas), len(self.channels), 0, 1,
-                                 len(self.chunk_indexes), first_ns, first_ns + information['duration']['nanoseconds'])
-        groups = {0x03: [schema for _, schema in self.schemas.values()], 0x04: list(self.channels.values()), 0x08: self.chunk_indexes,
-                  0x0D: [record(0x0D, struct.pack('<QQ', metadata_start, len(content)), text('rosbag2'))],
-                  0x0B: [record(0x0B, statistics, text(counts))]}
+        statistics = struct.pack(
+            '<QHIIIIQQ',
+            information['message_count'],
+            len(self.schemas),
+            len(self.channels),
+            0,
+            1,
+            len(self.chunk_indexes),
+            first_ns,
+            first_ns + information['duration']['nanoseconds'],
+        )
+        groups = {
+            0x03: [schema for _, schema in self.schemas.values()],
+            0x04: list(self.channels.values()),
+            0x08: self.chunk_indexes,
+            0x0D: [record(0x0D, struct.pack('<QQ', metadata_start, len(content)), text('rosbag2'))],
+            0x0B: [record(0x0B, statistics, text(counts))],
+        }
         summary_start = self.file.tell()
         offsets = self._write_groups(groups)
         offset_start = self.file.tell()
-        self.file.write(b''.join(offsets) + record(0x02, struct.pack('<QQI', summary_start, offset_start, 0)) + MAGIC)
+        self.file.write(
+            b''.join(offsets)
+            + record(0x02, struct.pack('<QQI', summary_start, offset_start, 0))
+            + MAGIC
+        )
         self.file.close()
 
     def _write_groups(self, groups):
@@ -117,7 +183,9 @@ class McapWriter:
             start = self.file.tell()
             self.file.write(b''.join(records))
             if records:
-                offsets.append(record(0x0E, struct.pack('<BQQ', opcode, start, self.file.tell() - start)))
+                offsets.append(
+                    record(0x0E, struct.pack('<BQQ', opcode, start, self.file.tell() - start))
+                )
         return offsets
 
     def abort(self) -> None:

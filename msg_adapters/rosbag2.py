@@ -13,7 +13,12 @@ from imu_calibration.core import documents
 from imu_calibration.core.documents import open_regular, parsed
 from imu_calibration.core.errors import InputError, shortened
 from msg_adapters.compression import decompress_file, decompress_message
-from msg_adapters.definitions import STANDARD_TYPES, TypeDefinition, is_standard, standard_definition
+from msg_adapters.definitions import (
+    STANDARD_TYPES,
+    TypeDefinition,
+    is_standard,
+    standard_definition,
+)
 from msg_adapters.layout import clean_name
 from msg_adapters.storage import RawMessages
 from msg_adapters.storages import STORAGES, suffixes
@@ -37,7 +42,15 @@ def _name(key, value):
     if key not in QOS_POLICIES or not isinstance(value, int):
         return value
     from rosbags import interfaces
-    return next((policy.name.lower() for policy in getattr(interfaces, f'Qos{key.title()}') if policy.value == value), 'unknown')
+
+    return next(
+        (
+            policy.name.lower()
+            for policy in getattr(interfaces, f'Qos{key.title()}')
+            if policy.value == value
+        ),
+        'unknown',
+    )
 
 
 COMPRESSED = ('.zstd', '.zst')
@@ -68,11 +81,18 @@ class Rosbag2:
         self._lost, self.files = {}, []
         by_message = str(self.metadata.get('compression_mode', '')).lower() == 'message'
         try:
-            errors = [self._open(path, decompress_message if by_message else None) for path in self._storage_paths()]
+            errors = [
+                self._open(path, decompress_message if by_message else None)
+                for path in self._storage_paths()
+            ]
             if not self.files:
-                raise ValueError('; '.join(filter(None, errors)) or f'there is no {" or ".join(suffixes())} file')
+                raise ValueError(
+                    '; '.join(filter(None, errors)) or f'there is no {" or ".join(suffixes())} file'
+                )
             self.types = {name: kind for file in self.files for name, kind in file.types.items()}
-            self.definitions = {name: text for file in self.files for name, text in file.definitions.items()}
+            self.definitions = {
+                name: text for file in self.files for name, text in file.definitions.items()
+            }
             self.counts = self._counts()
         except BaseException:
             self.close()
@@ -97,7 +117,9 @@ class Rosbag2:
     @property
     def storage(self) -> str:
         """Name in rosbag2 of the storage of the first file."""
-        return next(storage.identifier for storage in STORAGES if isinstance(self.files[0], storage.reader))
+        return next(
+            storage.identifier for storage in STORAGES if isinstance(self.files[0], storage.reader)
+        )
 
     def definition(self, topic: str) -> TypeDefinition:
         """Return the TypeDefinition of a topic; the standard one where the bag has none."""
@@ -121,14 +143,20 @@ class Rosbag2:
                 for raw in file.stretches(topics):
                     n_read += len(raw.topic)
                     yield raw
-            except Exception as error:   # readers raise various errors on hostile or damaged files
-                file.lost[f'rest of {file.path.name} after damage ({shortened(f"{type(error).__name__}: {error}", 100)})'] = 1
+            except Exception as error:  # readers raise various errors on hostile or damaged files
+                file.lost[
+                    f'rest of {file.path.name} after damage ({shortened(f"{type(error).__name__}: {error}", 100)})'
+                ] = 1
         announced = sum(self._announced().get(topic, 0) for topic in topics)
         if self.lost and announced > n_read:
-            self._lost['messages that the metadata announce and the files do not hold'] = announced - n_read
+            self._lost['messages that the metadata announce and the files do not hold'] = (
+                announced - n_read
+            )
 
     def _entry(self, topic):
-        entries = [entry['topic_metadata'] for entry in self.metadata.get('topics_with_message_count', ())]
+        entries = [
+            entry['topic_metadata'] for entry in self.metadata.get('topics_with_message_count', ())
+        ]
         return next((entry for entry in entries if entry['name'] == topic), {})
 
     def close(self) -> None:
@@ -142,22 +170,35 @@ class Rosbag2:
         if not self.path.is_dir():
             return [self.path]
         if self.metadata.get('relative_file_paths'):
-            return [self.path / name for name in dict.fromkeys(PurePath(name).name for name in self.metadata['relative_file_paths'])]
-        return sorted((path for path in self.path.iterdir() if _storage_suffix(path) in suffixes()), key=_natural)
+            return [
+                self.path / name
+                for name in dict.fromkeys(
+                    PurePath(name).name for name in self.metadata['relative_file_paths']
+                )
+            ]
+        return sorted(
+            (path for path in self.path.iterdir() if _storage_suffix(path) in suffixes()),
+            key=_natural,
+        )
 
     def _open(self, path, unpack):
         """Open one storage file; return the error when that fails."""
         try:
-            reader = next((storage.reader for storage in STORAGES if storage.suffix == _storage_suffix(path)), None)
+            reader = next(
+                (storage.reader for storage in STORAGES if storage.suffix == _storage_suffix(path)),
+                None,
+            )
             if reader is None:
-                raise ValueError(f'a storage file must end in {", ".join(suffixes())}, with {" or ".join(COMPRESSED)} behind it when '
-                                 'compressed')
+                raise ValueError(
+                    f'a storage file must end in {", ".join(suffixes())}, with {" or ".join(COMPRESSED)} behind it when '
+                    'compressed'
+                )
             if path.exists() and not path.is_file():
                 raise ValueError('it is not a regular file')
             plain = self._decompressed(path) if path.suffix in COMPRESSED else path
             self.files.append(reader(plain, unpack))
             self._lost.update(self.files[-1].lost)
-        except Exception as error:   # sqlite3, struct, OS and decompression errors: a damaged file must not prevent reading of intact ones
+        except Exception as error:  # sqlite3, struct, OS and decompression errors: a damaged file must not prevent reading of intact ones
             self._lost[f'file {path.name} that cannot be read ({error})'] = 1
             return f'{path.name}: {error}'
         return None
@@ -171,8 +212,10 @@ class Rosbag2:
         return target
 
     def _announced(self):
-        return {entry['topic_metadata']['name']: int(entry['message_count'])
-                for entry in self.metadata.get('topics_with_message_count', ())}
+        return {
+            entry['topic_metadata']['name']: int(entry['message_count'])
+            for entry in self.metadata.get('topics_with_message_count', ())
+        }
 
     def _counts(self):
         counts = self._announced() or sum((Counter(file.count()) for file in self.files), Counter())
@@ -184,11 +227,15 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     try:
         with open_regular(folder / 'metadata.yaml') as file:
             text = file.read(documents.MAX_DOCUMENT_CHARACTERS + 1).decode()
-        information = documents.parsed(text, 'metadata', aliases=True)['rosbag2_bagfile_information']
+        information = documents.parsed(text, 'metadata', aliases=True)[
+            'rosbag2_bagfile_information'
+        ]
         for entry in information['topics_with_message_count']:
             topic, entry['message_count'] = entry['topic_metadata'], int(entry['message_count'])
             topic['name'], topic['type'] = clean_name(topic['name']), clean_name(topic['type'])
-        information['relative_file_paths'] = [str(name) for name in information['relative_file_paths']]
+        information['relative_file_paths'] = [
+            str(name) for name in information['relative_file_paths']
+        ]
         if 'duration' in information:
             int(information['duration']['nanoseconds'])
     except (OSError, InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError):

@@ -61,42 +61,64 @@ class SqliteFile(StorageFile):
     def _read_topics(self):
         self._require_tables()
         self.topic_ids, self.types, self.definitions = defaultdict(list), {}, {}
-        for topic_id, name, message_type, encoding in self.connection.execute('SELECT id, name, type, serialization_format FROM topics')\
-                .fetchmany(MOST_TOPICS):
-            if not (isinstance(topic_id, int) and isinstance(name, str) and isinstance(message_type, str)):
+        for topic_id, name, message_type, encoding in self.connection.execute(
+            'SELECT id, name, type, serialization_format FROM topics'
+        ).fetchmany(MOST_TOPICS):
+            if not (
+                isinstance(topic_id, int)
+                and isinstance(name, str)
+                and isinstance(message_type, str)
+            ):
                 self._lose('topics without a name or type', 1)
                 continue
             topic = clean_name(name)
             self.topic_ids[topic].append(topic_id)
-            self.types[topic] = clean_name(message_type if encoding == 'cdr' else f'{message_type} ({encoding})')
-        with suppress(sqlite3.Error):   # before schema version 4 there are no definitions
-            rows = self.connection.execute('SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')\
-                .fetchmany(MOST_TOPICS)
-            self.definitions = {clean_name(str(name)): (str(encoding), str(text)) for name, encoding, text in rows}
+            self.types[topic] = clean_name(
+                message_type if encoding == 'cdr' else f'{message_type} ({encoding})'
+            )
+        with suppress(sqlite3.Error):  # before schema version 4 there are no definitions
+            rows = self.connection.execute(
+                'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
+            ).fetchmany(MOST_TOPICS)
+            self.definitions = {
+                clean_name(str(name)): (str(encoding), str(text)) for name, encoding, text in rows
+            }
 
     def _require_tables(self):
         """Refuse views, virtual tables and generated columns: they are programs that can give rows without end."""
-        for kind, name, text in self.connection.execute('SELECT type, name, sql FROM sqlite_master').fetchmany(MOST_TABLES):
+        for kind, name, text in self.connection.execute(
+            'SELECT type, name, sql FROM sqlite_master'
+        ).fetchmany(MOST_TABLES):
             if str(name).lower() not in TABLES or kind == 'index':
                 continue
             columns = self.connection.execute(f'PRAGMA table_xinfo({str(name).lower()})').fetchall()
-            if kind != 'table' or 'VIRTUAL' in str(text).upper().split()[:2] or any(column[6] for column in columns):
-                raise ValueError(f"'{name}' must be a plain table, got a {kind} with {len(columns)} columns")
+            if (
+                kind != 'table'
+                or 'VIRTUAL' in str(text).upper().split()[:2]
+                or any(column[6] for column in columns)
+            ):
+                raise ValueError(
+                    f"'{name}' must be a plain table, got a {kind} with {len(columns)} columns"
+                )
 
     def count(self) -> dict[str, int]:
         """Return topic -> messages by counting them."""
         by_id = defaultdict(int)
         for stretch in self._stretches(list(self.topic_ids)):
-            for topic_id, count in zip(*np.unique(stretch.topic_ids, return_counts=True), strict=True):
+            for topic_id, count in zip(
+                *np.unique(stretch.topic_ids, return_counts=True), strict=True
+            ):
                 by_id[int(topic_id)] += int(count)
         return {name: sum(by_id[k] for k in ids) for name, ids in self.topic_ids.items()}
 
     def time_range(self) -> tuple[int, int] | None:
         """Return (first, last) receive time in ns, or None when there are no messages or they cannot be read."""
         with suppress(sqlite3.Error):
-            first, = self.connection.execute('SELECT min(timestamp) FROM messages').fetchone()
-            last, = self.connection.execute('SELECT max(timestamp) FROM messages').fetchone()
-            return (first, last) if isinstance(first, int) and isinstance(last, int) else None   # a damaged index has other values
+            (first,) = self.connection.execute('SELECT min(timestamp) FROM messages').fetchone()
+            (last,) = self.connection.execute('SELECT max(timestamp) FROM messages').fetchone()
+            return (
+                (first, last) if isinstance(first, int) and isinstance(last, int) else None
+            )  # a damaged index has other values
         return None
 
     def close(self) -> None:
@@ -123,8 +145,15 @@ class SqliteFile(StorageFile):
     def _root(self):
         """Return the root page of the table of messages, or None when only SQL can read it (write-ahead log, other columns)."""
         columns = [row[1] for row in self.connection.execute('PRAGMA table_info(messages)')]
-        found = self.connection.execute("SELECT rootpage, sql FROM sqlite_master WHERE type = 'table' AND name = 'messages'").fetchone()
-        if self.logged or columns != MESSAGE_COLUMNS or not found or 'INTEGER PRIMARY KEY' not in found[1].upper():
+        found = self.connection.execute(
+            "SELECT rootpage, sql FROM sqlite_master WHERE type = 'table' AND name = 'messages'"
+        ).fetchone()
+        if (
+            self.logged
+            or columns != MESSAGE_COLUMNS
+            or not found
+            or 'INTEGER PRIMARY KEY' not in found[1].upper()
+        ):
             return None
         return found[0]
 
@@ -139,17 +168,25 @@ class SqliteFile(StorageFile):
         start[outside], size[outside] = len(rows.buffer) + tail.start, tail.size
         kept = np.ones(len(index), dtype=bool)
         kept[outside] = [data is not None for data in found]
-        return index[kept], Packed(np.concatenate([rows.buffer, tail.buffer]), start[kept], size[kept])
+        return index[kept], Packed(
+            np.concatenate([rows.buffer, tail.buffer]), start[kept], size[kept]
+        )
 
     def _by_id(self, row_id):
         try:
-            return memoryview(self.connection.execute('SELECT data FROM messages WHERE id = ?', (row_id,)).fetchone()[0]).tobytes()
+            return memoryview(
+                self.connection.execute(
+                    'SELECT data FROM messages WHERE id = ?', (row_id,)
+                ).fetchone()[0]
+            ).tobytes()
         except (sqlite3.Error, TypeError):
             self._lose('unreadable rows', 1)
             return None
 
     def _rows_by_sql(self):
-        cursor = iter(self.connection.execute('SELECT topic_id, timestamp, data FROM messages ORDER BY id'))
+        cursor = iter(
+            self.connection.execute('SELECT topic_id, timestamp, data FROM messages ORDER BY id')
+        )
         while True:
             rows: list[Any] = []
             try:
@@ -162,8 +199,12 @@ class SqliteFile(StorageFile):
             if usable:
                 ids, received, messages = zip(*usable, strict=True)
                 packed, received = Packed.join(messages), np.array(received, dtype=np.int64)
-                yield Stretch(np.array(ids), lambda index, packed=packed: (index, packed.select(index)), received.__getitem__)
-            if len(rows) < STRETCH_ROWS:   # the end, or damage
+                yield Stretch(
+                    np.array(ids),
+                    lambda index, packed=packed: (index, packed.select(index)),
+                    received.__getitem__,
+                )
+            if len(rows) < STRETCH_ROWS:  # the end, or damage
                 return
 
 
@@ -202,8 +243,13 @@ class SqliteWriter:
     def __init__(self, path: Path, ros_distro: str):
         self.connection = sqlite3.connect(path, isolation_level=None)
         # The file is made under another name and deleted on failure: a journal would have no benefit.
-        for pragma in (f'page_size = {PAGE_SIZE}', 'journal_mode = OFF', 'synchronous = OFF', 'locking_mode = EXCLUSIVE',
-                       'cache_size = -16000'):
+        for pragma in (
+            f'page_size = {PAGE_SIZE}',
+            'journal_mode = OFF',
+            'synchronous = OFF',
+            'locking_mode = EXCLUSIVE',
+            'cache_size = -16000',
+        ):
             self.connection.execute('PRAGMA ' + pragma)
         self.connection.execute('BEGIN')
         for statement in SCHEMA_STATEMENTS:
@@ -212,26 +258,40 @@ class SqliteWriter:
 
     def add_topic(self, topic_id: int, name: str, definition: TypeDefinition, *, qos: str) -> None:
         """Declare a topic; `definition` is a TypeDefinition."""
-        self.connection.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
-                                (topic_id, name, definition.type, 'cdr', qos, definition.digest))
-        known = self.connection.execute('SELECT 1 FROM message_definitions WHERE topic_type = ?', (definition.type,)).fetchone()
+        self.connection.execute(
+            'INSERT INTO topics VALUES (?, ?, ?, ?, ?, ?)',
+            (topic_id, name, definition.type, 'cdr', qos, definition.digest),
+        )
+        known = self.connection.execute(
+            'SELECT 1 FROM message_definitions WHERE topic_type = ?', (definition.type,)
+        ).fetchone()
         if not known and definition.text:
             self.connection.execute(
                 'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) '
-                'VALUES (?, ?, ?, ?)', (definition.type, definition.encoding, definition.text, definition.digest))
+                'VALUES (?, ?, ?, ?)',
+                (definition.type, definition.encoding, definition.text, definition.digest),
+            )
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
         """Append messages: arrays of topic ids and receive times, and the messages."""
-        values = chain.from_iterable(zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True))
+        values = chain.from_iterable(
+            zip(topic_ids.tolist(), received_ns.tolist(), messages.copies(), strict=True)
+        )
         whole = len(messages) // INSERTED_ROWS * INSERTED_ROWS
         for count, rows in ((whole, INSERTED_ROWS), (len(messages) - whole, 1)):
-            self.connection.executemany('INSERT INTO messages (topic_id, timestamp, data) VALUES ' + ', '.join(['(?, ?, ?)'] * rows),
-                                        zip(*[islice(values, 3 * count)] * (3 * rows), strict=True))
+            self.connection.executemany(
+                'INSERT INTO messages (topic_id, timestamp, data) VALUES '
+                + ', '.join(['(?, ?, ?)'] * rows),
+                zip(*[islice(values, 3 * count)] * (3 * rows), strict=True),
+            )
 
     def close(self, information: dict[str, Any], metadata: str) -> None:
         """Add the index by time and the metadata as text, and close."""
         self.connection.execute('CREATE INDEX timestamp_idx ON messages (timestamp ASC)')
-        self.connection.execute('INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)', (information['version'], metadata))
+        self.connection.execute(
+            'INSERT INTO metadata (metadata_version, metadata) VALUES (?, ?)',
+            (information['version'], metadata),
+        )
         self.connection.execute('COMMIT')
         self.connection.close()
 

@@ -75,7 +75,9 @@ class PageReader:
             pass
         self.scanning = self.damaged_pages > 0
         if self.scanning:
-            self.damaged_pages = max(int.from_bytes(header[28:32], 'big') - self.n_pages, self.damaged_pages)
+            self.damaged_pages = max(
+                int.from_bytes(header[28:32], 'big') - self.n_pages, self.damaged_pages
+            )
 
     def close(self) -> None:
         """Close the file."""
@@ -85,14 +87,16 @@ class PageReader:
         """Yield (buffer, starts of the pages in it) over the leaves."""
         if self.scanning:
             for first in range(1, self.n_pages + 1, self.stretch_pages):
-                yield self._read(np.arange(first, min(first + self.stretch_pages, self.n_pages + 1)))
+                yield self._read(
+                    np.arange(first, min(first + self.stretch_pages, self.n_pages + 1))
+                )
             return
         waiting = np.zeros(0, dtype=np.int64)
-        for leaves in self._leaves():   # of one inner page: many where the pages are large
+        for leaves in self._leaves():  # of one inner page: many where the pages are large
             waiting = np.concatenate([waiting, leaves])
             while len(waiting) >= self.stretch_pages:
-                yield self._read(waiting[:self.stretch_pages])
-                waiting = waiting[self.stretch_pages:]
+                yield self._read(waiting[: self.stretch_pages])
+                waiting = waiting[self.stretch_pages :]
         if len(waiting):
             yield self._read(waiting)
 
@@ -111,16 +115,24 @@ class PageReader:
         cell = np.minimum(page + word[page + 8 + 2 * number], page_end)
         rows, sensible = _parse_cells(buffer, cell, page_end, self.usable - 35)
         if self.scanning:
-            sensible &= self._ascending(rows.row_id, sensible)   # other tables, and old copies of pages
+            sensible &= self._ascending(
+                rows.row_id, sensible
+            )  # other tables, and old copies of pages
         else:
             self.damaged_rows += int((~sensible).sum())
-        return rows if sensible.all() else MessageRows(buffer, *(column[sensible] for column in rows[1:]))
+        return (
+            rows
+            if sensible.all()
+            else MessageRows(buffer, *(column[sensible] for column in rows[1:]))
+        )
 
     def _ascending(self, row_id, sensible):
         """Return where the row ids exceed the largest earlier one."""
         lowest = np.iinfo(np.int64).min
         ids = np.where(sensible, row_id, lowest)
-        before = np.maximum.accumulate(np.concatenate([[lowest if self.last_id is None else self.last_id], ids]))
+        before = np.maximum.accumulate(
+            np.concatenate([[lowest if self.last_id is None else self.last_id], ids])
+        )
         self.last_id = int(before[-1])
         return ids > before[:-1]
 
@@ -153,11 +165,13 @@ class PageReader:
         return os.pread(self.file.fileno(), 1, (int(page) - 1) * self.page_size)[0]
 
     def _children(self, page):
-        data = np.frombuffer(os.pread(self.file.fileno(), self.page_size, (int(page) - 1) * self.page_size), np.uint8)
+        data = np.frombuffer(
+            os.pread(self.file.fileno(), self.page_size, (int(page) - 1) * self.page_size), np.uint8
+        )
         n_cells = int(data[3]) << 8 | int(data[4])
         if data[0] != INTERIOR or 12 + 2 * n_cells > self.usable:
             return None
-        pointers = data[12:12 + 2 * n_cells].view('>u2').astype(np.int64)
+        pointers = data[12 : 12 + 2 * n_cells].view('>u2').astype(np.int64)
         if n_cells and pointers.max() + 4 > self.page_size:
             return None
         word = np.ndarray((len(data) - 3,), '>u4', data, strides=(1,))
@@ -171,12 +185,19 @@ class PageReader:
             ordered = np.sort(pages)
             cuts = np.flatnonzero(np.diff(ordered) > 8) + 1
             runs = [(run[0], run[-1] + 1) for run in np.split(ordered, cuts)]
-        buffer = np.empty(sum(int(last - first) for first, last in runs) * self.page_size + PADDING_BYTES, dtype=np.uint8)
+        buffer = np.empty(
+            sum(int(last - first) for first, last in runs) * self.page_size + PADDING_BYTES,
+            dtype=np.uint8,
+        )
         buffer[-PADDING_BYTES:] = 0
         filled, firsts, bases = 0, [], []
         for first, last in runs:
             size = int(last - first) * self.page_size
-            _read_into(self.file.fileno(), buffer[filled:filled + size], (int(first) - 1) * self.page_size)
+            _read_into(
+                self.file.fileno(),
+                buffer[filled : filled + size],
+                (int(first) - 1) * self.page_size,
+            )
             firsts.append(first)
             bases.append(filled)
             filled += size
@@ -201,7 +222,7 @@ def _parse_cells(buffer, cell, page_end, largest):
     header_size, field = _varint(buffer, position)
     value = position + header_size
     types = []
-    for _ in range(4):   # id, topic_id, timestamp, data
+    for _ in range(4):  # id, topic_id, timestamp, data
         serial, field = _varint(buffer, field)
         types.append(serial)
     sizes = [_INTEGER_SIZE[np.clip(serial, 0, 11)] for serial in types[:3]]
@@ -210,9 +231,17 @@ def _parse_cells(buffer, cell, page_end, largest):
     start = received_at + sizes[2]
     size = (types[3] - 12) >> 1
     inside = payload_size <= largest
-    sensible = (types[3] >= 12) & (types[1] < 12) & (types[2] < 12) & (field == value) & (value <= page_end)
+    sensible = (
+        (types[3] >= 12)
+        & (types[1] < 12)
+        & (types[2] < 12)
+        & (field == value)
+        & (value <= page_end)
+    )
     sensible &= (start - position + size == payload_size) & (~inside | (start + size <= page_end))
-    return MessageRows(buffer, row_id, topic_id, start, size, inside, received_at, types[2]), sensible
+    return MessageRows(
+        buffer, row_id, topic_id, start, size, inside, received_at, types[2]
+    ), sensible
 
 
 def _varint(buffer, position):
@@ -227,7 +256,9 @@ def _varint(buffer, position):
         if not len(going):
             break
         byte = buffer[position[going]].astype(np.int64)
-        value[going] = (value[going] << 8 | byte) if count == 9 else (value[going] << 7 | byte & 0x7F)
+        value[going] = (
+            (value[going] << 8 | byte) if count == 9 else (value[going] << 7 | byte & 0x7F)
+        )
         position[going] += 1
         going = going[(byte & 0x80) != 0]
     return value, position
@@ -243,5 +274,7 @@ def _integer(buffer, position, serial):
             at = np.clip(position[mine, np.newaxis] + np.arange(size), 0, len(buffer) - 1)
             padded = np.zeros((len(mine), 8), dtype=np.uint8)
             padded[:, :size] = buffer[at]
-            value[mine] = padded.view('>i8')[:, 0] >> 8 * (8 - size)   # the shift brings the sign along
+            value[mine] = padded.view('>i8')[:, 0] >> 8 * (
+                8 - size
+            )  # the shift brings the sign along
     return value

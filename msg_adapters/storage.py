@@ -93,7 +93,7 @@ class StorageFile:
             return self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
         try:
             return self.unpack(data)
-        except Exception as error:   # decompressors raise various errors on damaged data
+        except Exception as error:  # decompressors raise various errors on damaged data
             return self._lose(f'messages that cannot be decompressed ({error})', 1)
 
     def _lose(self, what, count):
@@ -126,4 +126,6 @@ def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, N
         finally:
             for future in waiting:
                 future.cancel()
-            thread.submit(pieces.close)   # not here: an interruption may have left the thread within the generator
+            thread.submit(
+                pieces.close
+            )  # not here: an interruption may have left the thread within the generator

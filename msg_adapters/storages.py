@@ -21,7 +21,10 @@ class Storage(NamedTuple):
     """Makes (path, ROS distribution, options by name)."""
 
 
-STORAGES = [Storage('sqlite3', '.db3', SqliteFile, SqliteWriter), Storage('mcap', '.mcap', McapFile, McapWriter)]
+STORAGES = [
+    Storage('sqlite3', '.db3', SqliteFile, SqliteWriter),
+    Storage('mcap', '.mcap', McapFile, McapWriter),
+]
 
 
 def identifiers() -> list[str]:

@@ -22,7 +22,12 @@ ABSENT_COVARIANCE = (-1.0,) + (0.0,) * 8
 """Covariances: all zeros means unknown, -1 first means that the message does not hold the quantity."""
 
 
-def encode_imu(imu: ImuSamples, *, force_cov: ArrayLike = UNKNOWN_COVARIANCE, rate_cov: ArrayLike = UNKNOWN_COVARIANCE) -> np.ndarray:
+def encode_imu(
+    imu: ImuSamples,
+    *,
+    force_cov: ArrayLike = UNKNOWN_COVARIANCE,
+    rate_cov: ArrayLike = UNKNOWN_COVARIANCE,
+) -> np.ndarray:
     """
     Serialize ImuSamples; the orientation is declared absent.
 
@@ -33,8 +38,14 @@ def encode_imu(imu: ImuSamples, *, force_cov: ArrayLike = UNKNOWN_COVARIANCE, ra
 
     """
     doubles = np.zeros((len(imu), N_DOUBLES), dtype='<f8')
-    columns = {'orientation': NO_ORIENTATION, 'orientation_cov': ABSENT_COVARIANCE, 'rate_s': imu.rate_s, 'force_s': imu.force_s,
-               'rate_cov': np.ravel(rate_cov), 'force_cov': np.ravel(force_cov)}
+    columns = {
+        'orientation': NO_ORIENTATION,
+        'orientation_cov': ABSENT_COVARIANCE,
+        'rate_s': imu.rate_s,
+        'force_s': imu.force_s,
+        'rate_cov': np.ravel(rate_cov),
+        'force_cov': np.ravel(force_cov),
+    }
     for name, value in columns.items():
         doubles[:, FIELDS[name]] = value
     return _table(imu.stamp_ns, frame_head(imu.frame_id), [doubles])
@@ -47,7 +58,11 @@ def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarra
     for name in joints.names:
         head = _padded(head + _string(name), 4)
     velocity = [count + bytes(4), joints.velocity] if with_velocity and joints.names else [bytes(4)]
-    return _table(joints.stamp_ns, _padded(head + count, 8 if joints.names else 4), [joints.position, *velocity, bytes(4)])
+    return _table(
+        joints.stamp_ns,
+        _padded(head + count, 8 if joints.names else 4),
+        [joints.position, *velocity, bytes(4)],
+    )
 
 
 def encode_temperature(temperature: TemperatureSamples) -> np.ndarray:
@@ -74,7 +89,11 @@ def _table(stamp_ns, head, pieces):
     stamps[:, 0], stamps[:, 1] = np.divmod(np.asarray(stamp_ns, dtype=np.int64), NS_PER_S)
     columns = [_constant(b'\0\x01\0\0', n), stamps.view(np.uint8), _constant(head, n)]
     for piece in pieces:
-        columns.append(_constant(piece, n) if isinstance(piece, bytes) else np.ascontiguousarray(piece, dtype='<f8').view(np.uint8))
+        columns.append(
+            _constant(piece, n)
+            if isinstance(piece, bytes)
+            else np.ascontiguousarray(piece, dtype='<f8').view(np.uint8)
+        )
     return np.concatenate(columns, axis=1)
 
 
@@ -86,10 +105,20 @@ WRITE_BATCH = 65536
 """Messages handed to the storage at once; bounds the memory of a long recording."""
 
 
-def write_session(path: str | PathLike[str], imu: ImuSamples, joints: JointSamples | None = None, *,
-                  temperature: TemperatureSamples | None = None, storage: str = 'sqlite3', imu_topic: str = DEFAULT_TOPICS[IMU_TYPE],
-                  joint_topic: str = DEFAULT_TOPICS[JOINT_STATE_TYPE], temperature_topic: str = DEFAULT_TOPICS[TEMPERATURE_TYPE],
-                  force_cov: ArrayLike = UNKNOWN_COVARIANCE, rate_cov: ArrayLike = UNKNOWN_COVARIANCE, **options: Any) -> None:
+def write_session(
+    path: str | PathLike[str],
+    imu: ImuSamples,
+    joints: JointSamples | None = None,
+    *,
+    temperature: TemperatureSamples | None = None,
+    storage: str = 'sqlite3',
+    imu_topic: str = DEFAULT_TOPICS[IMU_TYPE],
+    joint_topic: str = DEFAULT_TOPICS[JOINT_STATE_TYPE],
+    temperature_topic: str = DEFAULT_TOPICS[TEMPERATURE_TYPE],
+    force_cov: ArrayLike = UNKNOWN_COVARIANCE,
+    rate_cov: ArrayLike = UNKNOWN_COVARIANCE,
+    **options: Any,
+) -> None:
     """
     Write a session into a new bag; receive times are the header stamps, made monotone per topic.
 
@@ -116,21 +145,44 @@ def write_session(path: str | PathLike[str], imu: ImuSamples, joints: JointSampl
         When `path` exists already or cannot be written.
 
     """
-    streams: list[tuple[str, str, Any, Callable]] = [(imu_topic, IMU_TYPE, imu,
-                                                      lambda part: encode_imu(part, force_cov=force_cov, rate_cov=rate_cov))]
+    streams: list[tuple[str, str, Any, Callable]] = [
+        (
+            imu_topic,
+            IMU_TYPE,
+            imu,
+            lambda part: encode_imu(part, force_cov=force_cov, rate_cov=rate_cov),
+        )
+    ]
     if joints is not None:
         keep_velocity = not np.isnan(joints.velocity).all()
-        streams.append((joint_topic, JOINT_STATE_TYPE, joints, lambda part: encode_joints(part, with_velocity=keep_velocity)))
+        streams.append(
+            (
+                joint_topic,
+                JOINT_STATE_TYPE,
+                joints,
+                lambda part: encode_joints(part, with_velocity=keep_velocity),
+            )
+        )
     if temperature is not None:
         streams.append((temperature_topic, TEMPERATURE_TYPE, temperature, encode_temperature))
     with BagWriter(path, storage, **options) as bag:
-        ids = [bag.add_topic(name, standard_definition(message_type)) for name, message_type, _, _ in streams]
+        ids = [
+            bag.add_topic(name, standard_definition(message_type))
+            for name, message_type, _, _ in streams
+        ]
         received = [np.maximum.accumulate(samples.stamp_ns) for _, _, samples, _ in streams]
         for parts in _merged(received):
-            _write_batch(bag, ids, received, [(samples, encode) for _, _, samples, encode in streams], parts)
+            _write_batch(
+                bag, ids, received, [(samples, encode) for _, _, samples, encode in streams], parts
+            )
 
 
-def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, TrajectoryPoints]], *, storage: str = 'sqlite3') -> None:
+def write_trajectories(
+    path: str | PathLike[str],
+    parts: Sequence[tuple[int, TrajectoryPoints]],
+    *,
+    storage: str = 'sqlite3',
+) -> None:
     """
     Write joint trajectories into a new bag, each at the time (ns) at which it shall begin: played back, it drives the joints.
 
@@ -143,7 +195,9 @@ def write_trajectories(path: str | PathLike[str], parts: Sequence[tuple[int, Tra
     with BagWriter(path, storage) as bag:
         number = bag.add_topic('joint_trajectory', standard_definition(JOINT_TRAJECTORY_TYPE))
         messages = Packed.join([encode_trajectory(points) for _, points in parts])
-        bag.write(np.full(len(parts), number), np.array([stamp for stamp, _ in parts], np.int64), messages)
+        bag.write(
+            np.full(len(parts), number), np.array([stamp for stamp, _ in parts], np.int64), messages
+        )
 
 
 def _merged(received):
@@ -152,14 +206,25 @@ def _merged(received):
     limits = [*everything[WRITE_BATCH::WRITE_BATCH], None]
     starts = [0] * len(received)
     for limit in limits:
-        ends = [len(times) if limit is None else int(np.searchsorted(times, limit)) for times in received]
+        ends = [
+            len(times) if limit is None else int(np.searchsorted(times, limit))
+            for times in received
+        ]
         yield [slice(start, end) for start, end in zip(starts, ends, strict=True)]
         starts = ends
 
 
 def _write_batch(bag, ids, received, streams, parts):
     times = np.concatenate([times[part] for times, part in zip(received, parts, strict=True)])
-    topic_ids = np.concatenate([np.full(part.stop - part.start, topic) for topic, part in zip(ids, parts, strict=True)])
-    tables = [encode(samples.select(part)) for (samples, encode), part in zip(streams, parts, strict=True)]
+    topic_ids = np.concatenate(
+        [np.full(part.stop - part.start, topic) for topic, part in zip(ids, parts, strict=True)]
+    )
+    tables = [
+        encode(samples.select(part)) for (samples, encode), part in zip(streams, parts, strict=True)
+    ]
     order = np.argsort(times, kind='stable')
-    bag.write(topic_ids[order], times[order], Packed.chain([Packed.of_rows(table) for table in tables]).select(order))
+    bag.write(
+        topic_ids[order],
+        times[order],
+        Packed.chain([Packed.of_rows(table) for table in tables]).select(order),
+    )

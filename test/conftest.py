@@ -4,13 +4,17 @@ import os
 from collections import Counter
 from pathlib import Path
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')   # before numpy comes: threads that wait for each other take minutes on a busy machine
+os.environ.setdefault(
+    'OPENBLAS_NUM_THREADS', '1'
+)  # before numpy comes: threads that wait for each other take minutes on a busy machine
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The same examples every time, and no failure because the machine is busy.
-settings.register_profile('suite', derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    'suite', derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile('suite')
 
 pytest_plugins = ['lanes']
@@ -19,13 +23,23 @@ pytest_plugins = ['lanes']
 @pytest.fixture(scope='session')
 def recordings():
     """Folder of the real recordings; tests that need it are skipped when it is absent."""
-    folder = Path(os.environ.get('IMU_CALIBRATION_DATA', Path(__file__).parents[2] / 'shared' / 'data'))
+    folder = Path(
+        os.environ.get('IMU_CALIBRATION_DATA', Path(__file__).parents[2] / 'shared' / 'data')
+    )
     if not folder.is_dir():
         pytest.skip(f'real recordings not found at {folder}; set IMU_CALIBRATION_DATA')
     return folder
 
 
-FEW = ('accel_quadratic', 'accel_cubic', 'accel_bias_drift', 'gyro_g_sensitivity', 'gyro_bandwidth', 'gyro_bias_drift', 'time_offset')
+FEW = (
+    'accel_quadratic',
+    'accel_cubic',
+    'accel_bias_drift',
+    'gyro_g_sensitivity',
+    'gyro_bandwidth',
+    'gyro_bias_drift',
+    'time_offset',
+)
 
 
 @pytest.fixture(scope='module')
@@ -33,12 +47,14 @@ def few_candidates(request):
     """Restrict the candidates of each search on a table to effects of users and `FEW` of the module or of this file: it takes a third of the time."""
     from imu_calibration.effects.catalogue import CATALOGUE
     from imu_calibration.selection import investigation
+
     every, few_names = investigation.testable_effects, getattr(request.module, 'FEW', FEW)
     left_out = {name for _, name in CATALOGUE.effects()} - set(few_names)
 
     def few(*arguments):
         effects, not_testable = every(*arguments)
         return [effect for effect in effects if effect.name not in left_out], not_testable
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(investigation, 'testable_effects', few)
         yield
@@ -52,14 +68,21 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     """Let the files with the most long tests begin first: one that begins last keeps the other processes waiting for it."""
-    long = Counter(item.path for item in items if any(map(item.get_closest_marker, ('slow', 'long', 'live'))))
+    long = Counter(
+        item.path for item in items if any(map(item.get_closest_marker, ('slow', 'long', 'live')))
+    )
     items.sort(key=lambda item: -long[item.path])
 
 
 def pytest_terminal_summary(terminalreporter):
     """List the figures that passing tests printed beside what was wanted or known."""
-    lines = [line for report in terminalreporter.stats.get('passed', ()) if report.when == 'call'
-             for line in report.capstdout.splitlines() if ' wanted ' in line or '(known ' in line]
+    lines = [
+        line
+        for report in terminalreporter.stats.get('passed', ())
+        if report.when == 'call'
+        for line in report.capstdout.splitlines()
+        if ' wanted ' in line or '(known ' in line
+    ]
     if lines:
         terminalreporter.section('measured figures')
         for line in lines:

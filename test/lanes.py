@@ -20,18 +20,26 @@ _start = pytest.StashKey()
 
 def _kept_out(function, action):
     """Return a function that fails a core test before it acts; a failure is no Exception, so that code under test cannot catch it."""
+
     @functools.wraps(function)
     def guarded(*arguments, **options):
         if _core_test and not _library_calls():
-            pytest.fail(f'A core test must not {action}; {_core_test} did: mark it with pytest.mark.live, or test without it.')
+            pytest.fail(
+                f'A core test must not {action}; {_core_test} did: mark it with pytest.mark.live, or test without it.'
+            )
         return function(*arguments, **options)
+
     return guarded
 
 
 def _library_calls():
     """Return whether an installed library acts by itself, as matplotlib, which runs fc-list when it has no list of fonts yet."""
     frame = sys._getframe(2)
-    while frame and frame.f_code.co_filename.startswith((STANDARD_LIBRARY, '<frozen')) and '-packages' not in frame.f_code.co_filename:
+    while (
+        frame
+        and frame.f_code.co_filename.startswith((STANDARD_LIBRARY, '<frozen'))
+        and '-packages' not in frame.f_code.co_filename
+    ):
         frame = frame.f_back
     return frame is not None and '-packages' in frame.f_code.co_filename
 
@@ -78,14 +86,26 @@ def pytest_runtest_makereport(item, call):
 
 def pytest_runtest_logreport(report):
     """Collect the processor times."""
-    _seconds.update({report.nodeid: seconds for name, seconds in report.user_properties if name == 'processor_seconds'})
+    _seconds.update(
+        {
+            report.nodeid: seconds
+            for name, seconds in report.user_properties
+            if name == 'processor_seconds'
+        }
+    )
 
 
 def pytest_terminal_summary(terminalreporter):
     """List the tests that took most processor time."""
-    slowest = [item for item in sorted(_seconds.items(), key=lambda item: -item[1])[:SLOWEST] if item[1] > 1]
+    slowest = [
+        item
+        for item in sorted(_seconds.items(), key=lambda item: -item[1])[:SLOWEST]
+        if item[1] > 1
+    ]
     if not slowest:
         return
-    terminalreporter.section(f'slowest {len(slowest)} of {len(_seconds)} tests, {sum(_seconds.values()):.0f} s of processor time in total')
+    terminalreporter.section(
+        f'slowest {len(slowest)} of {len(_seconds)} tests, {sum(_seconds.values()):.0f} s of processor time in total'
+    )
     for name, seconds in slowest:
         terminalreporter.write_line(f'{seconds:6.1f} s {name}')

@@ -23,4 +23,6 @@ def refused(kind, code, *values):
     with pytest.raises(kind) as caught:
         yield caught
     assert caught.value.code == code, f'{caught.value.code!r}: {caught.value}'
-    assert [value for value in values if str(value) not in str(caught.value)] == [], str(caught.value)
+    assert [value for value in values if str(value) not in str(caught.value)] == [], str(
+        caught.value
+    )

@@ -30,7 +30,11 @@ class Failures:
 
     def may_repeat(self):
         """Return whether every failure is that of a live test."""
-        return not self.others and bool(self.reports) and all('live' in report.keywords for report in self.reports.values())
+        return (
+            not self.others
+            and bool(self.reports)
+            and all('live' in report.keywords for report in self.reports.values())
+        )
 
 
 def run(lanes, options):
@@ -41,11 +45,17 @@ def run(lanes, options):
     if code != pytest.ExitCode.TESTS_FAILED or not failures.may_repeat():
         return code
     plugins = ['-p', 'xdist', '-n', '0'] if 'xdist' in options else ['-n', '0']
-    again = subprocess.run([sys.executable, '-m', 'pytest', *plugins, *failures.reports], capture_output=True, text=True)
+    again = subprocess.run(
+        [sys.executable, '-m', 'pytest', *plugins, *failures.reports],
+        capture_output=True,
+        text=True,
+    )
     if again.returncode == 0:
         for name, report in failures.reports.items():
-            print(f'unstable: {name} failed once and passed when repeated; first failure:\n{report.longreprtext}\n')
-    print(again.stdout, again.stderr, sep='', end='', flush=True)   # ends with pytest's closing line
+            print(
+                f'unstable: {name} failed once and passed when repeated; first failure:\n{report.longreprtext}\n'
+            )
+    print(again.stdout, again.stderr, sep='', end='', flush=True)  # ends with pytest's closing line
     return again.returncode
 
 
@@ -55,7 +65,7 @@ def main():
     parser.add_argument('lanes', nargs='+', choices=LANES)
     arguments = sys.argv[1:]
     end = arguments.index('--') if '--' in arguments else len(arguments)
-    sys.exit(run(parser.parse_args(arguments[:end]).lanes, arguments[end + 1:]))
+    sys.exit(run(parser.parse_args(arguments[:end]).lanes, arguments[end + 1 :]))
 
 
 if __name__ == '__main__':

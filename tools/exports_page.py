@@ -29,14 +29,26 @@ def rendered() -> str:
 
 def _row(target: Target) -> str:
     sensors = {capability.sensor for capability in target.estimates}
-    estimated = 'biases' + (f' ({", ".join(sensors)})' if len(sensors) == 1 else '') if sensors else '-'
-    cells = (f'`{target.name}`', target.title, holds_in_words(target), estimated, target.noise_is or '-', 'yes' if target.read else 'no')
+    estimated = (
+        'biases' + (f' ({", ".join(sensors)})' if len(sensors) == 1 else '') if sensors else '-'
+    )
+    cells = (
+        f'`{target.name}`',
+        target.title,
+        holds_in_words(target),
+        estimated,
+        target.noise_is or '-',
+        'yes' if target.read else 'no',
+    )
     return f'| {" | ".join(cells)} |\n'
 
 
 def _section(target: Target) -> str:
     hint = f'{target.hint[0].upper()}{target.hint[1:]}.\n' if target.hint else ''
-    return f'## {target.name}\n\n```\n{target.formula}\n```\n\nSource: {target.source}. {hint}'.rstrip() + '\n'
+    return (
+        f'## {target.name}\n\n```\n{target.formula}\n```\n\nSource: {target.source}. {hint}'.rstrip()
+        + '\n'
+    )
 
 
 def main(folder: Path = Path(__file__).resolve().parents[1] / 'docs') -> None:

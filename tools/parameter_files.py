@@ -20,13 +20,18 @@ def main(folder: Path = Path(__file__).resolve().parents[1] / 'config') -> None:
 
 def rendered(node: str) -> str:
     """Return the text of the parameter file of `node`."""
-    lines = [f'# Parameters of {node} with their defaults: meaning [unit], range, and symptoms of a wrong value.', '/**:',
-             '  ros__parameters:']
+    lines = [
+        f'# Parameters of {node} with their defaults: meaning [unit], range, and symptoms of a wrong value.',
+        '/**:',
+        '  ros__parameters:',
+    ]
     for group in settings_of(node):
         for item in describe(group):
             words = meaning(item) + (f'. When wrong: {item.symptom}' if item.symptom else '')
             lines += textwrap.wrap(words, 120, initial_indent='    # ', subsequent_indent='    # ')
-            lines.append(f'    {"# " if item.session else ""}{item.name}: {value_text(item.default)}')
+            lines.append(
+                f'    {"# " if item.session else ""}{item.name}: {value_text(item.default)}'
+            )
     return '\n'.join(lines) + '\n'
 
 

@@ -17,23 +17,34 @@ import tokenize
 
 MOST = {'docstring': 6.0, 'comment': 6.0, 'message': 8.0, 'page': 10.0}
 """Largest number of markers per 1,000 words of each kind of text; lower it when the rate has fallen, never raise it."""
-MOST_WORDS = {'README.md': 900, 'docs/turntable.md': 900, 'docs/planning.md': 900, 'docs/decisions/*.md': 250}
+MOST_WORDS = {
+    'README.md': 900,
+    'docs/turntable.md': 900,
+    'docs/planning.md': 900,
+    'docs/decisions/*.md': 250,
+}
 """Largest number of words of a page."""
-MARKERS = set("""
+MARKERS = set(
+    """
 what whatever whoever whose nobody nothing everything everybody somebody hardly anew strange alone else others those
 say says said tell tells told ask asks asked speak speaks spoken answer answers answered know knows let lets
 beside behind apart far whole stay stays stayed come comes came go goes went gone stand stands stood leave leaves
 take takes took taken look looks looked word words people chance chances story say-so
-""".split())
+""".split()
+)
 SENTENCE = re.compile(r'(?<=[.!?;:])\s+')
-CODE = re.compile(r'```.*?```|``[^`]*``|`[^`]*`|https?://\S+|<style.*?</style>|\{[{%].*?[}%]\}|<[^>]+>', re.S)
+CODE = re.compile(
+    r'```.*?```|``[^`]*``|`[^`]*`|https?://\S+|<style.*?</style>|\{[{%].*?[}%]\}|<[^>]+>', re.S
+)
 
 
 def texts(path):
     """Yield (kind, line, text) of one Python or Markdown file or HTML template."""
     source = path.read_text(encoding='utf8')
     if path.suffix != '.py':
-        for number, line in enumerate(CODE.sub(lambda m: '\n' * m.group().count('\n'), source).splitlines(), 1):
+        for number, line in enumerate(
+            CODE.sub(lambda m: '\n' * m.group().count('\n'), source).splitlines(), 1
+        ):
             if line.strip() and not line.lstrip().startswith('|'):
                 yield 'message' if path.suffix == '.html' else 'page', number, line
         return
@@ -41,7 +52,11 @@ def texts(path):
     bare = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
     inside = {id(v) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for v in n.values}
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inside:
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in inside
+        ):
             if id(node) in bare:
                 yield 'docstring', node.lineno, CODE.sub(' ', node.value)
             elif len(node.value.split()) > 3:
@@ -60,8 +75,12 @@ def files(root):
     if root.is_file():
         return [root]
     skip = {'test', 'build', 'install', 'validation', 'tools', 'site', 'demo'}
-    found = [path for pattern in ('*.py', '*.html') for path in root.rglob(pattern)
-             if not any(part in skip or part.startswith('.') for part in path.relative_to(root).parts)]
+    found = [
+        path
+        for pattern in ('*.py', '*.html')
+        for path in root.rglob(pattern)
+        if not any(part in skip or part.startswith('.') for part in path.relative_to(root).parts)
+    ]
     found += [p for p in [root / 'README.md', root / 'CONTRIBUTING.md'] if p.exists()]
     return sorted(found) + sorted((root / 'docs').rglob('*.md'))
 
@@ -70,12 +89,18 @@ def main():
     """Print the rate by folder and by kind of text."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('root', nargs='?', default='.', type=pathlib.Path)
-    parser.add_argument('--worst', type=int, default=0, help='print the N sentences with most markers')
+    parser.add_argument(
+        '--worst', type=int, default=0, help='print the N sentences with most markers'
+    )
     parser.add_argument('--folders', action='store_true', help='print the rate of each folder')
     arguments = parser.parse_args()
     count, sentences = {}, []
     for path in files(arguments.root):
-        place = '/'.join(path.relative_to(arguments.root).parts[:2]) if arguments.root.is_dir() else path.name
+        place = (
+            '/'.join(path.relative_to(arguments.root).parts[:2])
+            if arguments.root.is_dir()
+            else path.name
+        )
         for kind, line, text in texts(path):
             for sentence in SENTENCE.split(text):
                 words = re.findall(r"[A-Za-z][A-Za-z'-]*", sentence)
@@ -86,32 +111,46 @@ def main():
                     known[1] += len(hits)
                     known[2] += len(words) > 30
                 if len(hits) > 1:
-                    sentences.append((len(hits) / (len(words) + 8), f'{path}:{line}', ' '.join(sentence.split())))
+                    sentences.append(
+                        (len(hits) / (len(words) + 8), f'{path}:{line}', ' '.join(sentence.split()))
+                    )
 
     def row(name, numbers):
         words, hits, long = numbers
         return f'{name:34s} {words:7d} words {1000 * hits / max(words, 1):6.1f} markers per 1,000  {long:4d} sentences above 30 words'
 
-    for (group, name), numbers in sorted(count.items(), key=lambda item: (item[0][0] != 'place', -item[1][1])):
+    for (group, name), numbers in sorted(
+        count.items(), key=lambda item: (item[0][0] != 'place', -item[1][1])
+    ):
         if arguments.folders and group == 'place':
             print(row(name, numbers))
-    for share, place, sentence in sorted(sentences, reverse=True)[:arguments.worst]:
+    for share, place, sentence in sorted(sentences, reverse=True)[: arguments.worst]:
         print(f'  {place}: {sentence[:200]}')
     total = [sum(n[k] for (g, _), n in count.items() if g == 'all') for k in range(3)]
     for kind in ('docstring', 'comment', 'message', 'page'):
         if ('all', kind) in count:
             print(row(kind, count['all', kind]))
     print(row('total', total))
-    rates = {kind: 1000 * numbers[1] / max(numbers[0], 1) for (group, kind), numbers in count.items() if group == 'all'}
+    rates = {
+        kind: 1000 * numbers[1] / max(numbers[0], 1)
+        for (group, kind), numbers in count.items()
+        if group == 'all'
+    }
     if not arguments.root.is_dir():
         return
-    faults = [f'marker words per 1,000 words in {kind}s must be at most {MOST[kind]:g}, got {rate:.2f}; rewrite the sentences that '
-              '`tools/plain.py --worst 20` prints' for kind, rate in rates.items() if rate > MOST[kind]]
+    faults = [
+        f'marker words per 1,000 words in {kind}s must be at most {MOST[kind]:g}, got {rate:.2f}; rewrite the sentences that '
+        '`tools/plain.py --worst 20` prints'
+        for kind, rate in rates.items()
+        if rate > MOST[kind]
+    ]
     for pattern, most in MOST_WORDS.items():
         for path in sorted(arguments.root.glob(pattern)):
             words = len(path.read_text().split())
             if words > most:
-                faults.append(f'{path.relative_to(arguments.root)} must have at most {most} words, got {words}; shorten it')
+                faults.append(
+                    f'{path.relative_to(arguments.root)} must have at most {most} words, got {words}; shorten it'
+                )
     if faults:
         sys.exit('\n'.join(faults))
 

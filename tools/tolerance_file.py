@@ -20,8 +20,14 @@ def rendered(catalogue: Catalogue = CATALOGUE) -> str:
     lines = [HEAD]
     for section in SECTIONS:
         effects = [effect for effect in catalogue.effects().values() if effect.sensor == section]
-        lines += [f'{section}:', *(f'{f"  {e.name}: {_number(e.tolerance)}":{COMMENT_AT - 1}} # {e.unit_of(0)}: {e.tolerance_reason}'
-                                   for e in effects), '']
+        lines += [
+            f'{section}:',
+            *(
+                f'{f"  {e.name}: {_number(e.tolerance)}":{COMMENT_AT - 1}} # {e.unit_of(0)}: {e.tolerance_reason}'
+                for e in effects
+            ),
+            '',
+        ]
     return '\n'.join(lines[:-1]) + '\n'
 
 
@@ -29,7 +35,9 @@ def _number(value):
     """Return a number so that YAML reads a number."""
     mantissa, exponent = f'{value:.5e}'.split('e')
     mantissa = mantissa.rstrip('0')
-    return f'{mantissa}0e{int(exponent)}' if mantissa.endswith('.') else f'{mantissa}e{int(exponent)}'
+    return (
+        f'{mantissa}0e{int(exponent)}' if mantissa.endswith('.') else f'{mantissa}e{int(exponent)}'
+    )
 
 
 def main(folder: Path = Path(__file__).resolve().parents[1] / 'config') -> None:

@@ -15,7 +15,15 @@ import pathlib
 import sys
 import tokenize
 
-LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER, tokenize.ENCODING}
+LAYOUT = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENDMARKER,
+    tokenize.ENCODING,
+}
 
 
 def documented(tree):
@@ -27,7 +35,11 @@ def documented(tree):
             continue
         texts = body if isinstance(node, (ast.Module, ast.ClassDef)) else body[:1]
         for each in texts:
-            if isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant) and isinstance(each.value.value, str):
+            if (
+                isinstance(each, ast.Expr)
+                and isinstance(each.value, ast.Constant)
+                and isinstance(each.value.value, str)
+            ):
                 lines.update(range(each.lineno, each.end_lineno + 1))
     return lines
 
@@ -37,14 +49,22 @@ def weigh(path):
     text = path.read_text()
     tree = ast.parse(text)
     skip = documented(tree)
-    tokens = sum(token.type not in LAYOUT and token.start[0] not in skip for token in tokenize.generate_tokens(io.StringIO(text).readline))
-    statements = sum(isinstance(node, ast.stmt) and node.lineno not in skip for node in ast.walk(tree))
+    tokens = sum(
+        token.type not in LAYOUT and token.start[0] not in skip
+        for token in tokenize.generate_tokens(io.StringIO(text).readline)
+    )
+    statements = sum(
+        isinstance(node, ast.stmt) and node.lineno not in skip for node in ast.walk(tree)
+    )
     return tokens, statements
 
 
 def imports(root, files):
     """Return module -> modules of the product that it imports."""
-    names = {'.'.join(p.relative_to(root).with_suffix('').parts).removesuffix('.__init__'): p for p in files}
+    names = {
+        '.'.join(p.relative_to(root).with_suffix('').parts).removesuffix('.__init__'): p
+        for p in files
+    }
     graph = {}
     for name, path in names.items():
         found = set()
@@ -52,8 +72,14 @@ def imports(root, files):
             if isinstance(node, ast.Import):
                 found.update(alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                found.update({node.module, *(f'{node.module}.{alias.name}' for alias in node.names)})
-        graph[name] = {each for each in found if each in names and each != name and names[each].name != '__init__.py'}
+                found.update(
+                    {node.module, *(f'{node.module}.{alias.name}' for alias in node.names)}
+                )
+        graph[name] = {
+            each
+            for each in found
+            if each in names and each != name and names[each].name != '__init__.py'
+        }
     return graph
 
 
@@ -96,7 +122,9 @@ def main():
     parser.add_argument('--packages', action='store_true', help='print each package')
     options = parser.parse_args()
     root = options.root.resolve()
-    files = sorted(p for package in ('imu_calibration', 'msg_adapters') for p in (root / package).rglob('*.py'))
+    files = sorted(
+        p for package in ('imu_calibration', 'msg_adapters') for p in (root / package).rglob('*.py')
+    )
     packages = collections.defaultdict(lambda: [0, 0, 0])
     for path in files:
         *folders, _ = path.relative_to(root).parts
@@ -107,12 +135,18 @@ def main():
         package[2] += statements
     loops = cycles(imports(root, files))
     if options.packages:
-        for name, (count, tokens, statements) in sorted(packages.items(), key=lambda each: -each[1][1]):
+        for name, (count, tokens, statements) in sorted(
+            packages.items(), key=lambda each: -each[1][1]
+        ):
             print(f'  {name:34s} {count:4d} files {tokens:7d} tokens {statements:6d} statements')
     count, tokens, statements = map(sum, zip(*packages.values()))
     print(f'tokens {tokens}, statements {statements}, files {count}, cycles {len(loops)}')
     if loops:
-        sys.exit('\n'.join('modules must not import each other, these do: ' + ', '.join(loop) for loop in loops))
+        sys.exit(
+            '\n'.join(
+                'modules must not import each other, these do: ' + ', '.join(loop) for loop in loops
+            )
+        )
 
 
 if __name__ == '__main__':

@@ -2,5 +2,8 @@
 
 import os
 
-for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):   # before numpy: threads that wait for each other use processor time
+for _name in (
+    'OMP_NUM_THREADS',
+    'OPENBLAS_NUM_THREADS',
+):  # before numpy: threads that wait for each other use processor time
     os.environ.setdefault(_name, '1')

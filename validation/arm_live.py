@@ -58,7 +58,9 @@ class Case:
     def pose_of_a(self):
         """(xyz, rpy) of A in B's frame, the node's target_xyz and target_rpy."""
         mat_ba = self.arm.mat_ab.T
-        return tuple((-mat_ba @ self.arm.arm).tolist()), tuple(Rotation.from_matrix(mat_ba).as_euler('xyz').tolist())
+        return tuple((-mat_ba @ self.arm.arm).tolist()), tuple(
+            Rotation.from_matrix(mat_ba).as_euler('xyz').tolist()
+        )
 
 
 def prepare(folder, name, arm_from, pair=PAIR, seconds=STRETCH_S):
@@ -79,14 +81,18 @@ def prepare(folder, name, arm_from, pair=PAIR, seconds=STRETCH_S):
     force_b = found[1][1].compensate(b.force_s, b.rate_s)[0]
     force_b = np.stack([np.interp(time_a, time_b, force_b[:, k]) for k in range(3)], axis=1)
     bad_b = clipped(b.force_s) | clipped(b.rate_s)
-    bad = _after(clipped(a.force_s) | clipped(a.rate_s))[-len(part):] | (np.interp(time_a, time_b, _after(bad_b).astype(float)) > 0)
+    bad = _after(clipped(a.force_s) | clipped(a.rate_s))[-len(part) :] | (
+        np.interp(time_a, time_b, _after(bad_b).astype(float)) > 0
+    )
     fast = np.linalg.norm(part.rate_s, axis=1) > MOVING
     return Case(part, force_b, fast & ~bad, calibration_to_text(found[0][0]), arm)
 
 
 def _after(bad):
     """Return the flags stretched by GUARD samples to later ones and by one to earlier ones."""
-    return np.convolve(np.concatenate([bad[1:], [False]]), np.ones(GUARD + 2), 'full')[:len(bad)] > 0
+    return (
+        np.convolve(np.concatenate([bad[1:], [False]]), np.ones(GUARD + 2), 'full')[: len(bad)] > 0
+    )
 
 
 def play(case, speed=SPEED, domain_id=DOMAIN):
@@ -99,8 +105,11 @@ def play(case, speed=SPEED, domain_id=DOMAIN):
         {'turned': {stamp_ns: force}, 'moved': {stamp_ns: force}}.
 
     """
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = local_environment(domain_id)['ROS_AUTOMATIC_DISCOVERY_RANGE']
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = local_environment(domain_id)[
+        'ROS_AUTOMATIC_DISCOVERY_RANGE'
+    ]
     import rclpy
+
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain_id)
     try:
@@ -111,7 +120,9 @@ def play(case, speed=SPEED, domain_id=DOMAIN):
             xyz, rpy = case.pose_of_a
             common = {'calibration_file': path, 'target_frame': 'imu_b', 'target_rpy': list(rpy)}
             processes.start('compensator_node', common, namespace='/turned')
-            processes.start('compensator_node', common | {'target_xyz': list(xyz)}, namespace='/moved')
+            processes.start(
+                'compensator_node', common | {'target_xyz': list(xyz)}, namespace='/moved'
+            )
             return _exchange(rclpy, context, case, speed)
     finally:
         context.try_shutdown()
@@ -123,6 +134,7 @@ def _exchange(rclpy, context, case, speed):
     from sensor_msgs.msg import Imu
 
     from imu_calibration.nodes.inputs import input_qos, output_qos
+
     node = rclpy.create_node('validation', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
@@ -130,9 +142,21 @@ def _exchange(rclpy, context, case, speed):
     publishers = {}
     for name, store in received.items():
         publishers[name] = node.create_publisher(Imu, f'/{name}/imu/data_raw', output_qos())
-        node.create_subscription(Imu, f'/{name}/imu/data_corrected', store.append, input_qos(reliable=True), raw=True)
-    _spin_until(executor, lambda: all(p.get_subscription_count() for p in publishers.values()), 60.0, 'both nodes')
-    _spin_until(executor, lambda: all(node.count_publishers(f'/{name}/imu/data_corrected') for name in received), 60.0, 'their outputs')
+        node.create_subscription(
+            Imu, f'/{name}/imu/data_corrected', store.append, input_qos(reliable=True), raw=True
+        )
+    _spin_until(
+        executor,
+        lambda: all(p.get_subscription_count() for p in publishers.values()),
+        60.0,
+        'both nodes',
+    )
+    _spin_until(
+        executor,
+        lambda: all(node.count_publishers(f'/{name}/imu/data_corrected') for name in received),
+        60.0,
+        'their outputs',
+    )
     _spin_until(executor, lambda: False, 1.0)
     messages = [row.tobytes() for row in encode_imu(case.imu_a)]
     due = time.monotonic() + 1e-9 * (case.imu_a.stamp_ns - case.imu_a.stamp_ns[0]) / speed
@@ -141,11 +165,16 @@ def _exchange(rclpy, context, case, speed):
             executor.spin_once(timeout_sec=left)
         for publisher in publishers.values():
             publisher.publish(data)
-    _spin_until(executor, lambda: all(len(store) >= len(messages) for store in received.values()), 30.0)
+    _spin_until(
+        executor, lambda: all(len(store) >= len(messages) for store in received.values()), 30.0
+    )
     executor.shutdown(timeout_sec=1.0)
     node.destroy_node()
     parsed = {name: map(parse_imu, store) for name, store in received.items()}
-    return {name: {message.stamp_ns: message.doubles[FIELDS['force_s']] for message in messages} for name, messages in parsed.items()}
+    return {
+        name: {message.stamp_ns: message.doubles[FIELDS['force_s']] for message in messages}
+        for name, messages in parsed.items()
+    }
 
 
 def _spin_until(executor, condition, seconds, what=None):
@@ -164,7 +193,10 @@ def residuals(case, came):
     both = np.array([all(stamp in messages for messages in came.values()) for stamp in stamps])
     keep = case.usable & both
     chosen = [stamp for stamp, kept in zip(stamps, keep) if kept]
-    found = {name: case.force_b[keep] - np.array([messages[stamp] for stamp in chosen]) for name, messages in came.items()}
+    found = {
+        name: case.force_b[keep] - np.array([messages[stamp] for stamp in chosen])
+        for name, messages in came.items()
+    }
     return found, {name: len(messages) for name, messages in came.items()}
 
 
@@ -180,18 +212,29 @@ def looking_ahead(case):
     'central': the angular acceleration from the samples before and after. 'filter': from nine samples, with the weights that
     fit B's readings in this stretch best; its residual is not determined by the samples of the rate.
     """
-    calibration, (xyz, rpy), imu = calibration_from_text(case.calibration), case.pose_of_a, case.imu_a
+    calibration, (xyz, rpy), imu = (
+        calibration_from_text(case.calibration),
+        case.pose_of_a,
+        case.imu_a,
+    )
     slope = np.gradient(imu.rate_s, 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), axis=0)
     slope = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
     transfer = Transfer.from_pose('imu_b', xyz, rpy)
     central = compensate(calibration, imu.force_s, imu.rate_s, alpha_s=slope, transfer=transfer)
-    still = compensate(calibration, imu.force_s, imu.rate_s, alpha_s=np.zeros_like(slope), transfer=transfer)
+    still = compensate(
+        calibration, imu.force_s, imu.rate_s, alpha_s=np.zeros_like(slope), transfer=transfer
+    )
     lags = range(-4, 5)
-    columns = np.stack([np.cross(np.roll(still.rate, lag, axis=0), -transfer.arm_t) for lag in lags], axis=2)
+    columns = np.stack(
+        [np.cross(np.roll(still.rate, lag, axis=0), -transfer.arm_t) for lag in lags], axis=2
+    )
     keep = case.usable & (np.arange(len(imu)) >= 4) & (np.arange(len(imu)) < len(imu) - 4)
     wanted, columns = (case.force_b - still.force)[keep], columns[keep]
     weights = np.linalg.lstsq(columns.reshape(-1, len(lags)), wanted.ravel(), rcond=None)[0]
-    return {'central': (case.force_b - central.force)[case.usable], 'filter': wanted - columns @ weights}
+    return {
+        'central': (case.force_b - central.force)[case.usable],
+        'filter': wanted - columns @ weights,
+    }
 
 
 def run(folder, plots):
@@ -206,19 +249,62 @@ def run(folder, plots):
         found, count = residuals(case, play(case))
         before, after, ahead = rms(found['turned']), rms(found['moved']), looking_ahead(case)
         lost = 2 * len(case.imu_a) - sum(count.values())
-        section.claim(f'{name}: one IMU predicts another\'s accelerometer live, rms without and with the arm', 'falls',
-                      f'{before:.2f} → {after:.2f} m/s² ({100 * (1 - after / before):.0f} % less)', after < before)
-        section.claim(f'{name}: messages lost between player, nodes and listener', '0', f'{lost} of {2 * len(case.imu_a)}', lost == 0)
-        per_axis = [f'{rms(found[which][:, k]):.2f}' for which in ('turned', 'moved') for k in range(3)]
+        section.claim(
+            f"{name}: one IMU predicts another's accelerometer live, rms without and with the arm",
+            'falls',
+            f'{before:.2f} → {after:.2f} m/s² ({100 * (1 - after / before):.0f} % less)',
+            after < before,
+        )
+        section.claim(
+            f'{name}: messages lost between player, nodes and listener',
+            '0',
+            f'{lost} of {2 * len(case.imu_a)}',
+            lost == 0,
+        )
+        per_axis = [
+            f'{rms(found[which][:, k]):.2f}' for which in ('turned', 'moved') for k in range(3)
+        ]
         lengths = [f'{typical(found[which]):.1f}' for which in ('turned', 'moved')]
-        rows.append((name, str(len(found['moved'])), *per_axis, *lengths, f'{after:.2f}', *(f'{rms(ahead[which]):.2f}' for which in ahead)))
+        rows.append(
+            (
+                name,
+                str(len(found['moved'])),
+                *per_axis,
+                *lengths,
+                f'{after:.2f}',
+                *(f'{rms(ahead[which]):.2f}' for which in ahead),
+            )
+        )
         bins.append((name, *by_rate(case, found)))
     axes = [f'{when} {k}' for when in ('before', 'after') for k in 'xyz']
-    section.table(('recording', 'samples', *axes, 'before, median length', 'after, median length', 'after, all', 'central difference',
-                   'best filter'), rows)
+    section.table(
+        (
+            'recording',
+            'samples',
+            *axes,
+            'before, median length',
+            'after, median length',
+            'after, all',
+            'central difference',
+            'best filter',
+        ),
+        rows,
+    )
     section.say('Before → after by the rate of turning, rms of components, m/s²:')
-    section.table(('recording', *(f'{low} to {high} rad/s' for low, high in zip(RATES, RATES[1:]))), bins)
-    section.say(text('arm_live', a=PAIR[0], b=PAIR[1], seconds=STRETCH_S, speed=SPEED, moving=MOVING, guard=GUARD))
+    section.table(
+        ('recording', *(f'{low} to {high} rad/s' for low, high in zip(RATES, RATES[1:]))), bins
+    )
+    section.say(
+        text(
+            'arm_live',
+            a=PAIR[0],
+            b=PAIR[1],
+            seconds=STRETCH_S,
+            speed=SPEED,
+            moving=MOVING,
+            guard=GUARD,
+        )
+    )
     _draw(section, plots, case, found)
     return section
 
@@ -230,19 +316,30 @@ def typical(values):
 
 def by_rate(case, found):
     """Return 'before → after (samples)' for each stretch of RATES."""
-    rate = np.linalg.norm(case.imu_a.rate_s[case.usable][:len(found['moved'])], axis=1)
+    rate = np.linalg.norm(case.imu_a.rate_s[case.usable][: len(found['moved'])], axis=1)
     parts = [(rate >= low) & (rate < high) for low, high in zip(RATES, RATES[1:])]
-    return [f'{rms(found["turned"][part]):.1f} → {rms(found["moved"][part]):.1f} ({part.sum()})' for part in parts]
+    return [
+        f'{rms(found["turned"][part]):.1f} → {rms(found["moved"][part]):.1f} ({part.sum()})'
+        for part in parts
+    ]
 
 
 def _draw(section, plots, case, found):
     stamps = case.imu_a.stamp_ns[case.usable]
-    time_s = 1e-9 * (stamps[:len(found['moved'])] - case.imu_a.stamp_ns[0])
+    time_s = 1e-9 * (stamps[: len(found['moved'])] - case.imu_a.stamp_ns[0])
     figure, axes = new_figure(3, 1, (9, 6))
     for axis, panel in enumerate(axes):
-        for name, colour, label in (('turned', 'tab:orange', 'without the arm'), ('moved', 'tab:blue', 'with the arm')):
+        for name, colour, label in (
+            ('turned', 'tab:orange', 'without the arm'),
+            ('moved', 'tab:blue', 'with the arm'),
+        ):
             panel.plot(time_s, found[name][:, axis], '.', markersize=2, color=colour, label=label)
         panel.set_ylabel(f'{"xyz"[axis]}, m/s²')
     axes[0].legend()
     axes[-1].set_xlabel(f'time in the stretch of {NAMES[-1]}, s')
-    section.plot(plots, 'arm_live.png', figure, "B's accelerometer minus the node's prediction from A, moving and unclipped samples.")
+    section.plot(
+        plots,
+        'arm_live.png',
+        figure,
+        "B's accelerometer minus the node's prediction from A, moving and unclipped samples.",
+    )

@@ -14,7 +14,10 @@ NAMES = ('array_2', 'array_5')
 
 def arms_of(folder, name, pairs):
     """Return {(a, b): RelativeArm} of one recording."""
-    imus = {k: load(folder, name, f'/imu_{k}/data_raw') for k in sorted({k for pair in pairs for k in pair})}
+    imus = {
+        k: load(folder, name, f'/imu_{k}/data_raw')
+        for k in sorted({k for pair in pairs for k in pair})
+    }
     return {(a, b): estimate_arm(imus[a], imus[b]) for a, b in pairs}
 
 
@@ -26,30 +29,77 @@ def design_mm(folder, name, pair):
 
 def run(folder, plots):
     """Return the section."""
-    section, pairs = Section('Arms between IMUs on one board (array_2, array_5)'), list(combinations(BOARD, 2))
+    section, pairs = (
+        Section('Arms between IMUs on one board (array_2, array_5)'),
+        list(combinations(BOARD, 2)),
+    )
     arms = {name: arms_of(folder, name, pairs) for name in NAMES}
-    errors = {name: np.array([1e3 * arms[name][pair].arm - design_mm(folder, name, pair) for pair in pairs]) for name in NAMES}
+    errors = {
+        name: np.array(
+            [1e3 * arms[name][pair].arm - design_mm(folder, name, pair) for pair in pairs]
+        )
+        for name in NAMES
+    }
     apart = errors[NAMES[1]] - errors[NAMES[0]]
     worst = max(np.max(np.linalg.norm(e, axis=1)) for e in errors.values())
-    section.claim('arm of every pair against the design, length of the difference', 'within 1 mm', f'at most {worst:.2f} mm', worst < 1.0)
-    expected = np.array([1e3 * np.hypot(*(arms[name][pair].arm_sd for name in NAMES)) for pair in pairs])
+    section.claim(
+        'arm of every pair against the design, length of the difference',
+        'within 1 mm',
+        f'at most {worst:.2f} mm',
+        worst < 1.0,
+    )
+    expected = np.array(
+        [1e3 * np.hypot(*(arms[name][pair].arm_sd for name in NAMES)) for pair in pairs]
+    )
     in_sd = np.abs(apart / expected)
-    section.claim('arm of a pair from the two recordings, difference per axis', 'within three of its sds (0.3 mm until 0.30 mm was seen)',
-                  f'at most {in_sd.max():.1f} sd, rms {_rms(in_sd):.2f} sd; at most {np.abs(apart).max():.2f} mm, sds {expected.min():.2f} to {expected.max():.2f} mm',
-                  in_sd.max() < 3.0)
-    ratios = np.array([np.linalg.norm(arms[n][p].arm) / np.linalg.norm(design_mm(folder, n, p)) * 1e3 for n in NAMES for p in pairs])
-    section.claim('baselines against the design', 'a plain derivative makes them 2 to 6 % too long',
-                  f'{100 * (ratios.min() - 1):+.1f} to {100 * (ratios.max() - 1):+.1f} %')
+    section.claim(
+        'arm of a pair from the two recordings, difference per axis',
+        'within three of its sds (0.3 mm until 0.30 mm was seen)',
+        f'at most {in_sd.max():.1f} sd, rms {_rms(in_sd):.2f} sd; at most {np.abs(apart).max():.2f} mm, sds {expected.min():.2f} to {expected.max():.2f} mm',
+        in_sd.max() < 3.0,
+    )
+    ratios = np.array(
+        [
+            np.linalg.norm(arms[n][p].arm) / np.linalg.norm(design_mm(folder, n, p)) * 1e3
+            for n in NAMES
+            for p in pairs
+        ]
+    )
+    section.claim(
+        'baselines against the design',
+        'a plain derivative makes them 2 to 6 % too long',
+        f'{100 * (ratios.min() - 1):+.1f} to {100 * (ratios.max() - 1):+.1f} %',
+    )
     rows = []
     for k, pair in enumerate(pairs):
         sd = [1e3 * arms[name][pair].arm_sd for name in NAMES]
         clipped = [f'{100 * arms[name][pair].diagnostics["clipped_share"]:.0f}' for name in NAMES]
-        rows.append((f'{pair[0]} → {pair[1]}', *(listed(errors[name][k], 2) for name in NAMES), listed(apart[k], 2),
-                     f'{max(s.max() for s in sd):.2f}', ' / '.join(clipped)))
-    section.table(('pair', 'array_2 − design, mm', 'array_5 − design, mm', 'array_5 − array_2, mm', 'largest sd, mm',
-                   'clipped, % of moving time'), rows)
+        rows.append(
+            (
+                f'{pair[0]} → {pair[1]}',
+                *(listed(errors[name][k], 2) for name in NAMES),
+                listed(apart[k], 2),
+                f'{max(s.max() for s in sd):.2f}',
+                ' / '.join(clipped),
+            )
+        )
+    section.table(
+        (
+            'pair',
+            'array_2 − design, mm',
+            'array_5 − design, mm',
+            'array_5 − array_2, mm',
+            'largest sd, mm',
+            'clipped, % of moving time',
+        ),
+        rows,
+    )
     shares = [arms[name][pair].diagnostics['clipped_share'] for name in NAMES for pair in pairs]
-    section.say(text('boards', expected=_rms(np.linalg.norm(expected, axis=1)), clipped=100 * np.mean(shares)))
+    section.say(
+        text(
+            'boards', expected=_rms(np.linalg.norm(expected, axis=1)), clipped=100 * np.mean(shares)
+        )
+    )
     _draw(section, plots, pairs, errors)
     return section
 
@@ -68,4 +118,9 @@ def _draw(section, plots, pairs, errors):
         panel.set_xticks(range(len(pairs)), [f'{a}→{b}' for a, b in pairs])
     axes[0].set_ylabel('arm minus design, mm')
     axes[0].legend()
-    section.plot(plots, 'boards.png', figure, 'Arms between the IMUs of the board minus the design; the axes end where the limit is.')
+    section.plot(
+        plots,
+        'boards.png',
+        figure,
+        'Arms between the IMUs of the board minus the design; the axes end where the limit is.',
+    )

@@ -29,13 +29,23 @@ TEMPLATES = {
     'magnitude': ('gyroscope', 'abs(f_z)', 'rad/s/(m/s^2)', 1e-4),
     'sign': ('gyroscope', 'sign(f_y) * w_x', 'rad/s/(rad/s)', 2e-3),
     'sum of squares': ('gyroscope', 'f_x ** 2 + f_y ** 2', 'rad/s/(m/s^2)^2', 1e-5),
-    'temperature': ('gyroscope', '(temperature_c - temperature_ref_c) * f_x * w_z', 'rad/s/K/(m/s^2)/(rad/s)', 1e-4),
+    'temperature': (
+        'gyroscope',
+        '(temperature_c - temperature_ref_c) * f_x * w_z',
+        'rad/s/K/(m/s^2)/(rad/s)',
+        1e-4,
+    ),
     'time': ('accelerometer', 'time * f_y * w_x', 'm/s^2/s/(m/s^2)/(rad/s)', 5e-5),
     'order of a joint': ('accelerometer', 'cos(5 * angle_1)', 'm/s^2', 2e-2),
     'orders of two joints': ('gyroscope', 'cos(2 * angle_1) * sin(3 * angle_2)', 'rad/s', 2e-3),
     'order and joint rate': ('gyroscope', 'joint_rate_2 * sin(4 * angle_2)', 'rad/s/(rad/s)', 2e-3),
     'joint rate': ('accelerometer', 'joint_rate_1 * abs(joint_rate_1)', 'm/s^2/(rad/s)^2', 3e-2),
-    'table vector and order': ('gyroscope', ['cos(2 * angle_1) * c_xx', 'cos(2 * angle_1) * c_yx', 'cos(2 * angle_1) * c_zx'], 'rad/s', 1e-3),
+    'table vector and order': (
+        'gyroscope',
+        ['cos(2 * angle_1) * c_xx', 'cos(2 * angle_1) * c_yx', 'cos(2 * angle_1) * c_zx'],
+        'rad/s',
+        1e-3,
+    ),
 }
 """Template of the grammar -> (sensor, column, unit, size of each axis, SI)."""
 PHASE, SAME_PHASE = re.compile(r' ([+-]) ([\d.e-]+)(?=\))'), 0.01
@@ -47,25 +57,57 @@ SIZE = 1.0
 def measured_sessions(names):
     """Yield (name, function of a seed that simulates the session) of each cause."""
     for effect in catalogue_of(None).effects().values():
-        if effect.plausible and effect.name not in ('bias', 'matrix') and (not names or effect.name in names):
-            yield effect.name, lambda seed, name=effect.name: simulate('random', effects=[name], size=SIZE, grade='tactical', seed=seed)
+        if (
+            effect.plausible
+            and effect.name not in ('bias', 'matrix')
+            and (not names or effect.name in names)
+        ):
+            yield (
+                effect.name,
+                lambda seed, name=effect.name: simulate(
+                    'random', effects=[name], size=SIZE, grade='tactical', seed=seed
+                ),
+            )
     for template, (sensor, column, unit, size) in TEMPLATES.items():
         if names and template not in names:
             continue
-        definition = {'sensor': sensor, 'column': column, 'unit': unit, 'tolerance': size / 100, 'largest': size, 'text': template}
-        yield template, lambda seed, definition=definition, template=template: simulate(
-            'random', effects=['hidden_formula'], size=1.0, grade='tactical', seed=seed, catalogue={'hidden_formula': definition},
-            temperature='temperature' in template)
+        definition = {
+            'sensor': sensor,
+            'column': column,
+            'unit': unit,
+            'tolerance': size / 100,
+            'largest': size,
+            'text': template,
+        }
+        yield (
+            template,
+            lambda seed, definition=definition, template=template: simulate(
+                'random',
+                effects=['hidden_formula'],
+                size=1.0,
+                grade='tactical',
+                seed=seed,
+                catalogue={'hidden_formula': definition},
+                temperature='temperature' in template,
+            ),
+        )
 
 
 def sizes_of(found):
     """Return {name: {parameter: (value, sd)}} of the findings and formulas, implausible findings excepted."""
-    sizes = {finding.effect: {name: (value, sd) for name, (value, sd, _) in finding.parameters.items()}
-             for finding in found.findings if not finding.implausible}
+    sizes = {
+        finding.effect: {name: (value, sd) for name, (value, sd, _) in finding.parameters.items()}
+        for finding in found.findings
+        if not finding.implausible
+    }
     for rest in found.result.diagnosis.unexplained.values():
         if rest.proposal:
-            sizes |= {column: dict(zip(AXES, zip(values, sds)))
-                      for column, values, sds in zip(rest.proposal.columns, rest.proposal.values, rest.proposal.sds)}
+            sizes |= {
+                column: dict(zip(AXES, zip(values, sds)))
+                for column, values, sds in zip(
+                    rest.proposal.columns, rest.proposal.values, rest.proposal.sds
+                )
+            }
     return sizes
 
 
@@ -80,23 +122,51 @@ def values_of(calibration):
 
 def same_formula(column, known):
     """Return whether two columns differ in their estimated phases only, by less than `SAME_PHASE`."""
-    one, other = (np.array([float(sign + phase) for sign, phase in PHASE.findall(text)]) for text in (column, known))
+    one, other = (
+        np.array([float(sign + phase) for sign, phase in PHASE.findall(text)])
+        for text in (column, known)
+    )
     turns = one.shape == other.shape and np.angle(np.exp(1j * (one - other)))
-    return PHASE.sub('', column) == PHASE.sub('', known) and turns is not False and bool(np.all(np.abs(turns) < SAME_PHASE))
+    return (
+        PHASE.sub('', column) == PHASE.sub('', known)
+        and turns is not False
+        and bool(np.all(np.abs(turns) < SAME_PHASE))
+    )
 
 
 def compared(expected, calibration, measured, seed):
     """Simulate a calibration on the motion of a session, diagnose the simulation and compare with {name: {parameter: value}}."""
-    second = diagnose(replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table)
-    known = {column: next((name for name in expected if same_formula(column, name)), column) for column in sizes_of(second)}
+    second = diagnose(
+        replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table
+    )
+    known = {
+        column: next((name for name in expected if same_formula(column, name)), column)
+        for column in sizes_of(second)
+    }
     found = {known[name]: sizes for name, sizes in sizes_of(second).items()}
-    classes = {finding.effect: {finding.effect, *finding.indistinguishable_from} for finding in second.findings}
-    classes |= {known[column]: {known[column], *rest.proposal.alike} for rest in second.result.diagnosis.unexplained.values() if rest.proposal
-                for column in rest.proposal.columns}
+    classes = {
+        finding.effect: {finding.effect, *finding.indistinguishable_from}
+        for finding in second.findings
+    }
+    classes |= {
+        known[column]: {known[column], *rest.proposal.alike}
+        for rest in second.result.diagnosis.unexplained.values()
+        if rest.proposal
+        for column in rest.proposal.columns
+    }
     again = [name for name in expected if any(name in members for members in classes.values())]
-    z = [(value - expected[name][part]) / sd for name in expected.keys() & found.keys() for part, (value, sd) in found[name].items()
-         if part in expected[name]]
-    return {'found': sorted(expected), 'again': sorted(again), 'new': sorted(name for name in found if not classes[name] & expected.keys()), 'z': z}
+    z = [
+        (value - expected[name][part]) / sd
+        for name in expected.keys() & found.keys()
+        for part, (value, sd) in found[name].items()
+        if part in expected[name]
+    ]
+    return {
+        'found': sorted(expected),
+        'again': sorted(again),
+        'new': sorted(name for name in found if not classes[name] & expected.keys()),
+        'z': z,
+    }
 
 
 def exchanged(calibration, finding, mate, measured):
@@ -106,8 +176,19 @@ def exchanged(calibration, finding, mate, measured):
     All parameters are estimated with it: a drift in place of a thermal bias needs another bias.
     """
     model, sensor = calibration.model, catalogue_of(None).owner_of(mate)
-    less = replace(model, point={}, **{finding.sensor: tuple(name for name in getattr(model, finding.sensor) if name != finding.effect)})
-    names = {f'{part}_model': '+'.join(getattr(less.with_effect(sensor, mate), part)) or 'none' for part in ('accelerometer', 'gyroscope', 'reference')}
+    less = replace(
+        model,
+        point={},
+        **{
+            finding.sensor: tuple(
+                name for name in getattr(model, finding.sensor) if name != finding.effect
+            )
+        },
+    )
+    names = {
+        f'{part}_model': '+'.join(getattr(less.with_effect(sensor, mate), part)) or 'none'
+        for part in ('accelerometer', 'gyroscope', 'reference')
+    }
     other = calibrate(measured.samples, measured.table, model_as_asked=True, **names).calibration
     return other if 'held' not in np.array(other.status)[other.model.slices[sensor, mate]] else None
 
@@ -120,22 +201,46 @@ def run(names, seed):
         try:
             measured = make(seed)
             first = diagnose(measured.samples, measured.table)
-            sizes = {effect: {part: value for part, (value, _) in own.items()} for effect, own in sizes_of(first).items()}
-            found.append({'cause': name, 'kind': 'formula' if name in TEMPLATES else 'effect'}
-                         | compared(sizes, first.proposed or first.calibration, measured, seed + 1000))
+            sizes = {
+                effect: {part: value for part, (value, _) in own.items()}
+                for effect, own in sizes_of(first).items()
+            }
+            found.append(
+                {'cause': name, 'kind': 'formula' if name in TEMPLATES else 'effect'}
+                | compared(sizes, first.proposed or first.calibration, measured, seed + 1000)
+            )
             for finding in first.findings:
                 for mate in finding.indistinguishable_from:
                     other = exchanged(first.calibration, finding, mate, measured)
                     if other is not None:
-                        expected = {name: own for name, own in values_of(other).items() if name == mate or name in sizes}
-                        found.append({'cause': f'{mate} for {finding.effect}', 'kind': 'pair'}
-                                     | compared(expected, other, measured, seed + 2000))
+                        expected = {
+                            name: own
+                            for name, own in values_of(other).items()
+                            if name == mate or name in sizes
+                        }
+                        found.append(
+                            {'cause': f'{mate} for {finding.effect}', 'kind': 'pair'}
+                            | compared(expected, other, measured, seed + 2000)
+                        )
         except ImuCalibrationError as error:
-            found.append({'cause': name, 'kind': 'refused', 'found': [], 'again': [], 'new': [], 'z': [], 'why': str(error)})
+            found.append(
+                {
+                    'cause': name,
+                    'kind': 'refused',
+                    'found': [],
+                    'again': [],
+                    'new': [],
+                    'z': [],
+                    'why': str(error),
+                }
+            )
         for row in found:
-            print(f"{row['cause']}: found {', '.join(row['found']) or '-'}; again {', '.join(row['again']) or '-'}; new "
-                  f"{', '.join(row['new']) or '-'}; z {' '.join(f'{z:.1f}' for z in row['z'])} {row.get('why', '')} "
-                  f'({time.process_time() - start:.0f} s)', flush=True)
+            print(
+                f'{row["cause"]}: found {", ".join(row["found"]) or "-"}; again {", ".join(row["again"]) or "-"}; new '
+                f'{", ".join(row["new"]) or "-"}; z {" ".join(f"{z:.1f}" for z in row["z"])} {row.get("why", "")} '
+                f'({time.process_time() - start:.0f} s)',
+                flush=True,
+            )
         rows += found
     return rows
 
@@ -147,10 +252,29 @@ def table_of_rows(rows):
         own = [row for row in rows if row['kind'] == kind]
         named = [row for row in own if row['found']]
         z = np.array([value for row in own for value in row['z']])
-        lines.append((kind, str(len(own)), str(len(named)), str(sum(row['again'] == row['found'] for row in named)),
-                      str(sum(bool(row['new']) for row in own)), '–' if not z.size else f'{np.sqrt(np.mean(z ** 2)):.2f}',
-                      '–' if not z.size else f'{np.mean(np.abs(z) < 2):.2f} of {z.size}'))
-    return markdown_table(('cause', 'sessions', 'with a finding', 'same finding', 'other names', 'rms z', 'share with |z| < 2'), lines)
+        lines.append(
+            (
+                kind,
+                str(len(own)),
+                str(len(named)),
+                str(sum(row['again'] == row['found'] for row in named)),
+                str(sum(bool(row['new']) for row in own)),
+                '–' if not z.size else f'{np.sqrt(np.mean(z**2)):.2f}',
+                '–' if not z.size else f'{np.mean(np.abs(z) < 2):.2f} of {z.size}',
+            )
+        )
+    return markdown_table(
+        (
+            'cause',
+            'sessions',
+            'with a finding',
+            'same finding',
+            'other names',
+            'rms z',
+            'share with |z| < 2',
+        ),
+        lines,
+    )
 
 
 def main():

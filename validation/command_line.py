@@ -9,8 +9,14 @@ import yaml
 
 from validation.recordings import BOARD, ROOT, SHAFT, reference
 
-ALL = (*((name, '/imu/data_raw') for name in SHAFT), *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD),
-       ('xsens_counts', None), ('mpu9150_0', None), ('mpu9150_3', None), ('ferraris', None))
+ALL = (
+    *((name, '/imu/data_raw') for name in SHAFT),
+    *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD),
+    ('xsens_counts', None),
+    ('mpu9150_0', None),
+    ('mpu9150_3', None),
+    ('ferraris', None),
+)
 """Every recording, with the topic where there are several."""
 TIMEOUT = 1200
 
@@ -36,4 +42,8 @@ def run_verb(verb, bag, options):
     command = [sys.executable, '-m', 'imu_calibration', verb, str(bag), *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=TIMEOUT)
     errors = [line for line in done.stderr.splitlines() if line.strip()]
-    return done.returncode, [line.rstrip() for line in done.stdout.splitlines()], errors[-1] if errors else ''
+    return (
+        done.returncode,
+        [line.rstrip() for line in done.stdout.splitlines()],
+        errors[-1] if errors else '',
+    )

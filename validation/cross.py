@@ -14,7 +14,13 @@ from imu_calibration.use_cases.calibrate import calibrate, check
 from validation.section import Section, text
 from validation.shaft import read
 
-RECORDINGS = ('shaft_pitch_slow', 'shaft_yaw_medium', 'shaft_yaw_slow_later', 'shaft_roll_fast', 'shaft_roll_fast_later')
+RECORDINGS = (
+    'shaft_pitch_slow',
+    'shaft_yaw_medium',
+    'shaft_yaw_slow_later',
+    'shaft_roll_fast',
+    'shaft_roll_fast_later',
+)
 ONE_UNIT = (('shaft_roll_fast', 'shaft_roll_fast_later'),)
 """Two parts of one trial: one unit, one mounting, one motion."""
 WORSE = 1.05
@@ -25,7 +31,10 @@ WORSE = 1.05
 def recording(folder, name):
     """Return (Table, SampleBlock) of a recording."""
     table, blocks = read(folder, name)
-    parts = {field: [getattr(block, field) for block in blocks if getattr(block, field) is not None] for field in ('imu', 'joints')}
+    parts = {
+        field: [getattr(block, field) for block in blocks if getattr(block, field) is not None]
+        for field in ('imu', 'joints')
+    }
     return table, SampleBlock(*(type(part[0]).concatenate(part) for part in parts.values()))
 
 
@@ -33,8 +42,13 @@ def halves(block):
     """Return the two halves of a recording."""
     start, end = block.imu.stamp_ns[[0, -1]]
     middle = start + (end - start) // 2
-    return [SampleBlock(block.imu.select(side(block.imu.stamp_ns, middle)), block.joints.select(side(block.joints.stamp_ns, middle)))
-            for side in (np.less, np.greater_equal)]
+    return [
+        SampleBlock(
+            block.imu.select(side(block.imu.stamp_ns, middle)),
+            block.joints.select(side(block.joints.stamp_ns, middle)),
+        )
+        for side in (np.less, np.greater_equal)
+    ]
 
 
 @cache
@@ -50,7 +64,9 @@ def transfer(folder, made, used, parts=(None, None)):
         found = _calibrated(folder, made, parts[0])
     except ImuCalibrationError as error:
         return error, None
-    return found, check(block if parts[1] is None else halves(block)[parts[1]], found.calibration, table)
+    return found, check(
+        block if parts[1] is None else halves(block)[parts[1]], found.calibration, table
+    )
 
 
 def outcome(found, checked):
@@ -59,9 +75,16 @@ def outcome(found, checked):
         return f'refused: {found}', True
     words, claimed = [], []
     for sensor, entry in checked.proof.items():
-        ratio, worst = entry['after'] / entry['before'], max(part['after'] / part['before'] for part in entry['regimes'].values())
-        words.append(f'{sensor} {found.verdict.decisions[sensor]}: {ratio:.2f}, at most {worst:.2f} in any motion')
-        claimed.append(found.verdict.decisions[sensor] is not HELPS or ratio < 1.0 and worst <= WORSE)
+        ratio, worst = (
+            entry['after'] / entry['before'],
+            max(part['after'] / part['before'] for part in entry['regimes'].values()),
+        )
+        words.append(
+            f'{sensor} {found.verdict.decisions[sensor]}: {ratio:.2f}, at most {worst:.2f} in any motion'
+        )
+        claimed.append(
+            found.verdict.decisions[sensor] is not HELPS or ratio < 1.0 and worst <= WORSE
+        )
     return '; '.join(words), bool(words) and all(claimed)
 
 
@@ -78,7 +101,9 @@ def spread(first, second):
         if other and 'held' not in (status, other[2]) and not name.startswith('reference'):
             group = name.rpartition('.')[0]
             of_lags = group.rpartition('.')[2] in FAMILY
-            groups.setdefault(f'{group.partition(".")[0]}.lags' if of_lags else group, []).append((value - other[0]) / np.hypot(sd, other[1]))
+            groups.setdefault(f'{group.partition(".")[0]}.lags' if of_lags else group, []).append(
+                (value - other[0]) / np.hypot(sd, other[1])
+            )
     lags = [total_lags(each.param_names, each.values, each.covariance) for each in (first, second)]
     for sensor in set(lags[0]) & set(lags[1]):
         (value, sd), (other, others) = (each[sensor] for each in lags)
@@ -105,14 +130,31 @@ def halves_together(folder):
 def must_be_refused(folder):
     """Yield (fault, outcome as text, whether it was detected)."""
     table, block = recording(folder, 'shaft_yaw_medium')
-    yield 'the IMU on the bench beside the shaft (wrong topic)', *_attempt(folder / 'shaft_yaw_medium', table, imu_topic='/imu_fixed/data_raw')
-    yield 'stamps of the IMU one second late', *_attempt(replace(block, imu=replace(block.imu, stamp_ns=block.imu.stamp_ns + 10**9)), table)
-    yield 'stamps of the IMU 2.14 s late, a period of its sweeps', *_attempt(replace(block, imu=replace(block.imu, stamp_ns=block.imu.stamp_ns + 2_140_000_000)), table)
+    yield (
+        'the IMU on the bench beside the shaft (wrong topic)',
+        *_attempt(folder / 'shaft_yaw_medium', table, imu_topic='/imu_fixed/data_raw'),
+    )
+    yield (
+        'stamps of the IMU one second late',
+        *_attempt(
+            replace(block, imu=replace(block.imu, stamp_ns=block.imu.stamp_ns + 10**9)), table
+        ),
+    )
+    yield (
+        'stamps of the IMU 2.14 s late, a period of its sweeps',
+        *_attempt(
+            replace(block, imu=replace(block.imu, stamp_ns=block.imu.stamp_ns + 2_140_000_000)),
+            table,
+        ),
+    )
     turned = replace(block.joints, position=-block.joints.position, velocity=-block.joints.velocity)
     yield 'the encoder counts the other way round', *_attempt(replace(block, joints=turned), table)
     rate = block.imu.rate_s.copy()
-    rate[len(rate) // 3:2 * len(rate) // 3] = rate[len(rate) // 3]
-    yield 'the gyroscope is frozen for a third of the time', *_attempt(replace(block, imu=replace(block.imu, rate_s=rate)), table)
+    rate[len(rate) // 3 : 2 * len(rate) // 3] = rate[len(rate) // 3]
+    yield (
+        'the gyroscope is frozen for a third of the time',
+        *_attempt(replace(block, imu=replace(block.imu, rate_s=rate)), table),
+    )
 
 
 def _attempt(source, table: Table, **choices):
@@ -120,8 +162,14 @@ def _attempt(source, table: Table, **choices):
         found = calibrate(source, table, **choices)
     except ImuCalibrationError as error:
         return f'refused: {error}', True
-    warned = [item['text'] for item in found.calibration.statistics['preflight'] if 'frozen' in item['text'] or 'stay' in item['text']]
-    return found.verdict.text + ''.join(f'; {text}' for text in warned[:1]), bool(warned) or HELPS not in found.verdict.decisions.values()
+    warned = [
+        item['text']
+        for item in found.calibration.statistics['preflight']
+        if 'frozen' in item['text'] or 'stay' in item['text']
+    ]
+    return found.verdict.text + ''.join(f'; {text}' for text in warned[:1]), bool(
+        warned
+    ) or HELPS not in found.verdict.decisions.values()
 
 
 def run(folder, plots):
@@ -129,20 +177,38 @@ def run(folder, plots):
     section = Section('Recordings of hardware predict one another')
     for first, second in ONE_UNIT:
         for made, used in ((first, second), (second, first)):
-            section.claim(f'calibrated on {made}, compensated on {used}: error after / before', 'below 1, in no motion above 1.05, or refused with a sentence',
-                          *outcome(*transfer(folder, made, used)), True)
+            section.claim(
+                f'calibrated on {made}, compensated on {used}: error after / before',
+                'below 1, in no motion above 1.05, or refused with a sentence',
+                *outcome(*transfer(folder, made, used)),
+                True,
+            )
         pair = [transfer(folder, name, name)[0] for name in (first, second)]
         if not any(isinstance(found, Exception) for found in pair):
             groups = rms(spread(*(found.calibration for found in pair)))
-            section.claim(f'{first} and {second}: differences over combined sds, rms by group', 'at most 1.5 in every group',
-                          ', '.join(f'{group} {value:.1f}' for group, value in groups.items()), max(groups.values()) <= 1.5, True)
+            section.claim(
+                f'{first} and {second}: differences over combined sds, rms by group',
+                'at most 1.5 in every group',
+                ', '.join(f'{group} {value:.1f}' for group, value in groups.items()),
+                max(groups.values()) <= 1.5,
+                True,
+            )
     for name in RECORDINGS:
         for made, used in ((0, 1), (1, 0)):
-            section.claim(f'{name}: half {made + 1} calibrates, half {used + 1} is compensated: error after / before', 'below 1, in no motion above 1.05, or refused',
-                          *outcome(*transfer(folder, name, name, (made, used))), made == 0)
+            section.claim(
+                f'{name}: half {made + 1} calibrates, half {used + 1} is compensated: error after / before',
+                'below 1, in no motion above 1.05, or refused',
+                *outcome(*transfer(folder, name, name, (made, used))),
+                made == 0,
+            )
     groups = halves_together(folder)
-    section.claim('halves of the five recordings, 240 s each: differences over combined sds, rms by group', 'at most 1.5 in every group',
-                  ', '.join(f'{group} {value:.2f}' for group, value in groups.items()), max(groups.values()) <= 1.5, True)
+    section.claim(
+        'halves of the five recordings, 240 s each: differences over combined sds, rms by group',
+        'at most 1.5 in every group',
+        ', '.join(f'{group} {value:.2f}' for group, value in groups.items()),
+        max(groups.values()) <= 1.5,
+        True,
+    )
     for what, found, noticed in must_be_refused(folder):
         section.claim(f'shaft_yaw_medium, {what}', 'refused, or said', found, noticed, True)
     section.say(text('cross'))

@@ -36,7 +36,9 @@ def found_text(finding):
     factor, unit = for_people(largest['unit'])
     mates = finding.get('indistinguishable_from') or []
     size = f'{significant(largest["value"] * factor)} ± {significant(largest["sd"] * factor, 2)} {unit}'
-    return f'{finding["effect"]}: {name.split(".", 1)[1]} {size}' + (f' (or {", ".join(mates)})' if mates else '')
+    return f'{finding["effect"]}: {name.split(".", 1)[1]} {size}' + (
+        f' (or {", ".join(mates)})' if mates else ''
+    )
 
 
 def _clearness(item):
@@ -73,18 +75,43 @@ def run(folder, plots):
     made = {key: document for key, document in documents.items() if not isinstance(document, str)}
     findings = [finding for document in made.values() for finding in document['findings']]
     total = len(documents)
-    section.claim('every recording is diagnosed', f'{total} of {total}', f'{len(made)} of {total}', len(made) == total)
+    section.claim(
+        'every recording is diagnosed',
+        f'{total} of {total}',
+        f'{len(made)} of {total}',
+        len(made) == total,
+    )
     good = sum(lowers(finding) for finding in findings)
-    section.claim('every finding lowers the error on data held out, with its whole interval (what does not is withdrawn beforehand: this counts, it is no test)',
-                  f'all {len(findings)} findings', f'{good} of {len(findings)}', good == len(findings))
-    stories = [f'{label(*key)} {finding["effect"]}' for key, document in made.items() for finding in document['findings']
-               if not lowers(finding)]
+    section.claim(
+        'every finding lowers the error on data held out, with its whole interval (what does not is withdrawn beforehand: this counts, it is no test)',
+        f'all {len(findings)} findings',
+        f'{good} of {len(findings)}',
+        good == len(findings),
+    )
+    stories = [
+        f'{label(*key)} {finding["effect"]}'
+        for key, document in made.items()
+        for finding in document['findings']
+        if not lowers(finding)
+    ]
     if stories:
-        section.say('Reported as found although the interval of the gain reaches zero or below: ' + ', '.join(stories) + '.')
+        section.say(
+            'Reported as found although the interval of the gain reaches zero or below: '
+            + ', '.join(stories)
+            + '.'
+        )
     _xsens(section, documents['xsens_counts', None])
     for name in SHAFT:
         _shaft(section, name, documents[name, '/imu/data_raw'])
-    section.table(('recording', 'found', 'gain on data held out [95 %]', *(f'unexplained, {sensor}' for sensor in SENSORS)), rows)
+    section.table(
+        (
+            'recording',
+            'found',
+            'gain on data held out [95 %]',
+            *(f'unexplained, {sensor}' for sensor in SENSORS),
+        ),
+        rows,
+    )
     section.say(text('diagnosing'))
     return section
 
@@ -95,19 +122,38 @@ def _rows(name, document):
     rest = [unexplained_text(document, sensor) for sensor in SENSORS]
     if not document['findings']:
         return [(name, 'nothing', '', *rest)]
-    return [(name if k == 0 else '', found_text(finding), gain_text(finding), *(rest if k == 0 else ('', '')))
-            for k, finding in enumerate(document['findings'])]
+    return [
+        (
+            name if k == 0 else '',
+            found_text(finding),
+            gain_text(finding),
+            *(rest if k == 0 else ('', '')),
+        )
+        for k, finding in enumerate(document['findings'])
+    ]
 
 
 def _xsens(section, document):
-    claim, wanted = 'xsens_counts, accelerometer: nothing named, unexplained with its size', 'unexplained, significant'
+    claim, wanted = (
+        'xsens_counts, accelerometer: nothing named, unexplained with its size',
+        'unexplained, significant',
+    )
     if isinstance(document, str):
         section.claim(claim, wanted, document, False)
         return
-    named = [finding['effect'] for finding in document['findings'] if finding['sensor'] == 'accelerometer']
+    named = [
+        finding['effect']
+        for finding in document['findings']
+        if finding['sensor'] == 'accelerometer'
+    ]
     rest = document['unexplained'].get('accelerometer') or {}
-    section.claim(claim, wanted, f'{", ".join(named) or "nothing named"}; {unexplained_text(document, "accelerometer")}',
-                  not named and rest.get('significant'), headline=True)
+    section.claim(
+        claim,
+        wanted,
+        f'{", ".join(named) or "nothing named"}; {unexplained_text(document, "accelerometer")}',
+        not named and rest.get('significant'),
+        headline=True,
+    )
 
 
 LAGS = ('time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter')
@@ -115,11 +161,21 @@ LAGS = ('time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter')
 
 
 def _shaft(section, name, document):
-    claim, wanted = f'{name}: the lag is found by itself', 'a lag of the gyroscope, of whichever kind, together 12 to 14 in whole ms (12.0 to 14.0 until 11.97 was seen; time_offset or gyro_bandwidth while there were no others)'
+    claim, wanted = (
+        f'{name}: the lag is found by itself',
+        'a lag of the gyroscope, of whichever kind, together 12 to 14 in whole ms (12.0 to 14.0 until 11.97 was seen; time_offset or gyro_bandwidth while there were no others)',
+    )
     if isinstance(document, str):
         section.claim(claim, wanted, document, False)
         return
     lags = [finding for finding in document['findings'] if finding['effect'] in LAGS]
-    shown = '; '.join(f'{found_text(finding)}, gain {gain_text(finding)}' for finding in lags) or 'not found'
-    lag = sum(parameter['value'] for finding in lags for parameter in finding['parameters'].values())
-    section.claim(claim, wanted, f'{1e3 * lag:.1f} ms: {shown}', 12 <= round(1e3 * lag) <= 14, headline=True)
+    shown = (
+        '; '.join(f'{found_text(finding)}, gain {gain_text(finding)}' for finding in lags)
+        or 'not found'
+    )
+    lag = sum(
+        parameter['value'] for finding in lags for parameter in finding['parameters'].values()
+    )
+    section.claim(
+        claim, wanted, f'{1e3 * lag:.1f} ms: {shown}', 12 <= round(1e3 * lag) <= 14, headline=True
+    )

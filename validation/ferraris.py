@@ -27,7 +27,12 @@ def calibrate_sections(imu, sections, angle):
     """Return our calibration from the six faces, the way between them, and the full turns."""
     faces = [slice(*sections[name]) for name in FACES]
     order = np.argsort([face.start for face in faces])
-    return calibrate_by_hand(imu, HandOptions(GRAVITY), [faces[k] for k in order], known_turns=known_turns(imu, sections, angle)), order
+    return calibrate_by_hand(
+        imu,
+        HandOptions(GRAVITY),
+        [faces[k] for k in order],
+        known_turns=known_turns(imu, sections, angle),
+    ), order
 
 
 def angles_between(matrix):
@@ -43,10 +48,21 @@ def comparable(found, info):
     rows = []
     for k, axis in enumerate('xyz'):
         sd = found.sd_of(f'accelerometer.bias.{axis}')
-        rows.append(_row(f'accelerometer bias {axis}', 'mm/s²', 1e3, bias_f[k], theirs_f.bias[k], sd))
+        rows.append(
+            _row(f'accelerometer bias {axis}', 'mm/s²', 1e3, bias_f[k], theirs_f.bias[k], sd)
+        )
     rows += _matrix_rows('accelerometer', matrix_f, theirs_f.matrix, found)
     for k, axis in enumerate('xyz'):
-        rows.append(_row(f'gyroscope bias {axis}', 'deg/s', 180 / np.pi, bias_w[k], info.b_g[k], found.sd_of(f'gyroscope.bias.{axis}')))
+        rows.append(
+            _row(
+                f'gyroscope bias {axis}',
+                'deg/s',
+                180 / np.pi,
+                bias_w[k],
+                info.b_g[k],
+                found.sd_of(f'gyroscope.bias.{axis}'),
+            )
+        )
     return rows + _matrix_rows('gyroscope', matrix_w, theirs_w, found)
 
 
@@ -58,10 +74,21 @@ def _matrix_rows(sensor, ours, theirs, found):
     rows = []
     for k, axis in enumerate('xyz'):
         lengths = [100 * (np.linalg.norm(matrix[k]) - 1) for matrix in (ours, theirs)]
-        rows.append((f'{sensor} scale factor {axis}, from 1', '%', *lengths, 100 * found.sd_of(f'{sensor}.matrix.{axis}{axis}')))
-    for pair, (_, _, name) in zip(np.array([angles_between(ours), angles_between(theirs)]).T, PAIRS):
+        rows.append(
+            (
+                f'{sensor} scale factor {axis}, from 1',
+                '%',
+                *lengths,
+                100 * found.sd_of(f'{sensor}.matrix.{axis}{axis}'),
+            )
+        )
+    for pair, (_, _, name) in zip(
+        np.array([angles_between(ours), angles_between(theirs)]).T, PAIRS
+    ):
         i, j = name
-        sd = np.degrees(np.hypot(found.sd_of(f'{sensor}.matrix.{i}{j}'), found.sd_of(f'{sensor}.matrix.{j}{i}')))
+        sd = np.degrees(
+            np.hypot(found.sd_of(f'{sensor}.matrix.{i}{j}'), found.sd_of(f'{sensor}.matrix.{j}{i}'))
+        )
         rows.append((f'{sensor} angle between {i} and {j}, from 90 deg', 'deg', *pair, sd))
     return rows
 
@@ -97,22 +124,51 @@ def run(folder, plots):
     signs = {np.sign(turn.angle) for turn in known_turns(imu, sections, angle)}
     info = ferraris(imu, sections, RATE_HZ, GRAVITY, angle * signs.pop())
     rows = comparable(found, info)
-    section.table(('parameter', 'unit', 'ours', 'our sd', 'imucal', 'difference', 'in our sd'),
-                  [(name, unit, f'{a:+.3f}', f'{sd:.3f}', f'{b:+.3f}', f'{b - a:+.3f}', f'{(b - a) / sd:+.1f}')
-                   for name, unit, a, b, sd in rows])
+    section.table(
+        ('parameter', 'unit', 'ours', 'our sd', 'imucal', 'difference', 'in our sd'),
+        [
+            (
+                name,
+                unit,
+                f'{a:+.3f}',
+                f'{sd:.3f}',
+                f'{b:+.3f}',
+                f'{b - a:+.3f}',
+                f'{(b - a) / sd:+.1f}',
+            )
+            for name, unit, a, b, sd in rows
+        ],
+    )
     up = faces_as_they_lay(found, order)
     bias, matrix = imucal_from_ours(found, up)
     theirs = accelerometer_of(info)
     left = np.max(np.abs(bias - theirs.bias)), np.max(np.abs(matrix - theirs.matrix))
     apart = np.array([abs(b - a) / sd for _, _, a, b, sd in rows])
-    section.claim('ferraris: all 18 parameters agree with imucal', 'within three of our sd', f'largest difference {apart.max():.1f} sd',
-                  apart.max() < 3, headline=True)
-    section.claim('differences of the accelerometer explained: imucal\'s formulas on our sensor and the faces as they lay give its result',
-                  'bias within 1 mm/s², matrix within 0.0001', f'{1e3 * left[0]:.3f} mm/s², {left[1]:.6f}',
-                  left[0] < 1e-3 and left[1] < 1e-4)
+    section.claim(
+        'ferraris: all 18 parameters agree with imucal',
+        'within three of our sd',
+        f'largest difference {apart.max():.1f} sd',
+        apart.max() < 3,
+        headline=True,
+    )
+    section.claim(
+        "differences of the accelerometer explained: imucal's formulas on our sensor and the faces as they lay give its result",
+        'bias within 1 mm/s², matrix within 0.0001',
+        f'{1e3 * left[0]:.3f} mm/s², {left[1]:.6f}',
+        left[0] < 1e-3 and left[1] < 1e-4,
+    )
     sensitivity = any('g_sensitivity' in name for name in found.param_names)
     weak = [name for name, status in zip(found.param_names, found.statuses) if status in LACKING]
-    section.say(text('ferraris', gravity=GRAVITY, turn_deg=known['turn_deg'], tilts=', '.join(f'{t:.1f}' for t in tilts(up)),
-                     sensitivity='estimates it' if sensitivity else 'leaves it out, since six attitudes do not show it',
-                     weak=', '.join(weak) or 'nothing'))
+    section.say(
+        text(
+            'ferraris',
+            gravity=GRAVITY,
+            turn_deg=known['turn_deg'],
+            tilts=', '.join(f'{t:.1f}' for t in tilts(up)),
+            sensitivity='estimates it'
+            if sensitivity
+            else 'leaves it out, since six attitudes do not show it',
+            weak=', '.join(weak) or 'nothing',
+        )
+    )
     return section

@@ -16,9 +16,19 @@ RATE, FINE = 100, 8
 DEG, GRAVITY = np.pi / 180, 9.8093
 LATITUDE, AZIMUTH, EARTH = 48.8, 20.0, 7.292115e-5
 JOINTS = ('outer', 'middle', 'inner')
-TABLE = {'joints': [{'name': name, 'axis': axis} for name, axis in zip(JOINTS, ([0, 0, 1], [0, 1, 0], [1, 0, 0]))], 'up': [0, 0, 1],
-         'gravity': GRAVITY, 'gravity_sd': 1e-5, 'latitude': LATITUDE, 'height': 150.0, 'azimuth_deg': AZIMUTH,
-         'mount': {'rpy_deg': [0, 0, 0], 'xyz': None}}
+TABLE = {
+    'joints': [
+        {'name': name, 'axis': axis}
+        for name, axis in zip(JOINTS, ([0, 0, 1], [0, 1, 0], [1, 0, 0]))
+    ],
+    'up': [0, 0, 1],
+    'gravity': GRAVITY,
+    'gravity_sd': 1e-5,
+    'latitude': LATITUDE,
+    'height': 150.0,
+    'azimuth_deg': AZIMUTH,
+    'mount': {'rpy_deg': [0, 0, 0], 'xyz': None},
+}
 """Description of the table for the calibration."""
 START_NS = 1_750_000_000_000_000_000
 FORCE, TURN = 0.03, 0.12 * DEG
@@ -83,10 +93,17 @@ def _blend(start, end, duration, step):
 def _motion(rng, step):
     """Return joint angles, rad, shape (n, 3): 26 poses of 4 s, two spins of each joint, swings of two joints at a time."""
     here, parts = np.zeros(3), []
-    poses = rng.permutation([[o, m, i] for o in (0, 90) for m in (-90, -45, 0, 45, 90) for i in (0, 90, 180)])[:26]
+    poses = rng.permutation(
+        [[o, m, i] for o in (0, 90) for m in (-90, -45, 0, 45, 90) for i in (0, 90, 180)]
+    )[:26]
     plan = [('pose', pose + rng.uniform(-8, 8, 3)) for pose in poses]
-    plan += [('spin', (joint, sign * rng.uniform(50, 110))) for joint in range(3) for sign in (-1, 1)]
-    plan += [('swing', (rng.permutation(3)[:2], rng.uniform(0.25, 0.9, 2), rng.uniform(10, 35, 2))) for _ in range(5)]
+    plan += [
+        ('spin', (joint, sign * rng.uniform(50, 110))) for joint in range(3) for sign in (-1, 1)
+    ]
+    plan += [
+        ('swing', (rng.permutation(3)[:2], rng.uniform(0.25, 0.9, 2), rng.uniform(10, 35, 2)))
+        for _ in range(5)
+    ]
     for number in rng.permutation(len(plan)):
         kind, what = plan[number]
         if kind == 'pose':
@@ -131,8 +148,13 @@ def _kinematics(angle, step):
     mat_ns = outer @ middle @ inner
     mat_sn = mat_ns.transpose(0, 2, 1)
     latitude, azimuth = LATITUDE * DEG, AZIMUTH * DEG
-    earth = EARTH * np.array([np.cos(latitude) * np.cos(azimuth), np.cos(latitude) * np.sin(azimuth), np.sin(latitude)])
-    axes = np.stack([np.tile([0.0, 0.0, 1.0], (len(angle), 1)), outer[:, :, 1], (outer @ middle)[:, :, 0]], axis=1)
+    earth = EARTH * np.array(
+        [np.cos(latitude) * np.cos(azimuth), np.cos(latitude) * np.sin(azimuth), np.sin(latitude)]
+    )
+    axes = np.stack(
+        [np.tile([0.0, 0.0, 1.0], (len(angle), 1)), outer[:, :, 1], (outer @ middle)[:, :, 0]],
+        axis=1,
+    )
     rate_n = earth + (axes * turn[:, :, None]).sum(axis=1)
     return turn, mat_sn, mat_sn @ [0.0, 0.0, GRAVITY], (mat_sn @ rate_n[:, :, None])[:, :, 0]
 
@@ -144,27 +166,57 @@ def make_world(kind: str, unit: int, motion: int) -> World:
     angle = _motion(rng, step)
     time = step * np.arange(len(angle))
     turn, mat_sn, force, rate = _kinematics(angle, step)
-    warm = 24.0 + own.uniform(6, 9) * -np.expm1(-time / (0.4 * time[-1])) + 0.5 * np.sin(2 * np.pi * time / (0.7 * time[-1]))
+    warm = (
+        24.0
+        + own.uniform(6, 9) * -np.expm1(-time / (0.4 * time[-1]))
+        + 0.5 * np.sin(2 * np.pi * time / (0.7 * time[-1]))
+    )
     biases = own.normal(0.0, 0.05, 3), own.normal(0.0, 0.3 * DEG, 3)
     mats = [np.eye(3) + own.normal(0.0, 4e-3, (3, 3)) for _ in range(2)]
     axis = int(own.integers(3))
     zeros = np.zeros_like(force)
-    scene = Scene(time, angle, turn, mat_sn, force.copy(), rate.copy(), warm, np.random.default_rng([unit, 3]), axis,
-                  zeros.copy(), zeros.copy(), angle.copy(), lambda t: t, None)
+    scene = Scene(
+        time,
+        angle,
+        turn,
+        mat_sn,
+        force.copy(),
+        rate.copy(),
+        warm,
+        np.random.default_rng([unit, 3]),
+        axis,
+        zeros.copy(),
+        zeros.copy(),
+        angle.copy(),
+        lambda t: t,
+        None,
+    )
     if kind != 'nothing':
         KINDS[kind](scene)
-    outputs = [bias + value @ mat.T + more for bias, value, mat, more in
-               zip(biases, (scene.force, scene.rate), mats, (scene.added_force, scene.added_rate))]
-    outputs = [scene.truth[key](out) if key in scene.truth else out for key, out in zip(('filter_force', 'filter_rate'), outputs)]
+    outputs = [
+        bias + value @ mat.T + more
+        for bias, value, mat, more in zip(
+            biases, (scene.force, scene.rate), mats, (scene.added_force, scene.added_rate)
+        )
+    ]
+    outputs = [
+        scene.truth[key](out) if key in scene.truth else out
+        for key, out in zip(('filter_force', 'filter_rate'), outputs)
+    ]
     outputs = [out[::FINE] for out in outputs]
     count = len(outputs[0])
-    densities, wanders = (1.0e-3 * np.sqrt(RATE), 0.012 * DEG * np.sqrt(RATE) / 3), (4e-4, 1.5e-3 * DEG)
+    densities, wanders = (
+        (1.0e-3 * np.sqrt(RATE), 0.012 * DEG * np.sqrt(RATE) / 3),
+        (4e-4, 1.5e-3 * DEG),
+    )
     for out, density, wander in zip(outputs, densities, wanders):
         out += rng.normal(0.0, density, out.shape)
         decay = np.exp(-1.0 / RATE / 120.0)
         steps = rng.normal(0.0, wander * np.sqrt(1 - decay**2), out.shape)
         out += lfilter([1.0], [1.0, -decay], steps, axis=0)
-    kept, places = (np.arange(count), np.arange(count) / RATE) if scene.thin is None else scene.thin(count)
+    kept, places = (
+        (np.arange(count), np.arange(count) / RATE) if scene.thin is None else scene.thin(count)
+    )
     stamps = scene.clock(places)
     joint_time = np.arange(0.0, time[-1], 1.0 / RATE) + 0.0037
     at_joint = np.minimum((joint_time / step).round().astype(int), len(time) - 1)
@@ -173,14 +225,25 @@ def make_world(kind: str, unit: int, motion: int) -> World:
     truth = {key: scene.truth[key] for key in ('sensor', 'place', 'names') if key in scene.truth}
     inside = scene.truth.get('inside')
     axes = scene.truth.get('axes', {axis} if kind != 'nothing' else ())
-    return World(START_NS + (stamps * 1e9).round().astype(np.int64), outputs[0][kept], outputs[1][kept],
-                 START_NS + (time[at_joint] * 1e9).round().astype(np.int64), seen,
-                 START_NS + (warm_time * 1e9).round().astype(np.int64), np.interp(warm_time, time, warm) + rng.normal(0.0, 0.01, len(warm_time)),
-                 force[::FINE][kept], rate[::FINE][kept], time[::FINE][kept], axes=frozenset('xyz'[k] for k in axes),
-                 inside=None if inside is None else inside[::FINE][kept], **truth)
+    return World(
+        START_NS + (stamps * 1e9).round().astype(np.int64),
+        outputs[0][kept],
+        outputs[1][kept],
+        START_NS + (time[at_joint] * 1e9).round().astype(np.int64),
+        seen,
+        START_NS + (warm_time * 1e9).round().astype(np.int64),
+        np.interp(warm_time, time, warm) + rng.normal(0.0, 0.01, len(warm_time)),
+        force[::FINE][kept],
+        rate[::FINE][kept],
+        time[::FINE][kept],
+        axes=frozenset('xyz'[k] for k in axes),
+        inside=None if inside is None else inside[::FINE][kept],
+        **truth,
+    )
 
 
 # --- causes at a place ---------------------------------------------------------------------------------------------------------------------
+
 
 def _mark(scene, sensor, inside, *place, names=(), axes=None):
     scene.truth |= {'sensor': sensor, 'inside': inside, 'place': place, 'names': frozenset(names)}
@@ -189,13 +252,24 @@ def _mark(scene, sensor, inside, *place, names=(), axes=None):
 
 
 def _arc(scene, joint, width):
-    middle = scene.rng.choice([0.0, 90.0, -45.0, 45.0] if joint == 1 else [0.0, 90.0, 180.0] if joint == 2 else [0.0, 90.0]) * DEG
+    middle = (
+        scene.rng.choice(
+            [0.0, 90.0, -45.0, 45.0]
+            if joint == 1
+            else [0.0, 90.0, 180.0]
+            if joint == 2
+            else [0.0, 90.0]
+        )
+        * DEG
+    )
     away = np.abs((scene.angle[:, joint] - middle + np.pi) % (2 * np.pi) - np.pi)
     return away < 0.5 * width * DEG
 
 
 def _offset(scene, sensor, inside, *place, names=(), share=1.0):
-    target, size = (scene.added_force, FORCE) if sensor == 'accelerometer' else (scene.added_rate, TURN)
+    target, size = (
+        (scene.added_force, FORCE) if sensor == 'accelerometer' else (scene.added_rate, TURN)
+    )
     target[:, scene.axis] += share * size * scene.rng.choice([-1, 1]) * inside
     _mark(scene, sensor, inside, *place, names=names)
 
@@ -203,19 +277,30 @@ def _offset(scene, sensor, inside, *place, names=(), share=1.0):
 def _arc_offset(sensor, joint):
     def act(scene):
         _offset(scene, sensor, _arc(scene, joint, 50.0), f'angle of {JOINTS[joint]}')
+
     return act
 
 
 def _rattle_in_an_arc(scene):
     inside = _arc(scene, 1, 50.0)
-    scene.added_force[:, scene.axis] += 3 * FORCE * inside * np.repeat(scene.rng.normal(size=len(inside) // FINE + 1), FINE)[:len(inside)]
+    scene.added_force[:, scene.axis] += (
+        3
+        * FORCE
+        * inside
+        * np.repeat(scene.rng.normal(size=len(inside) // FINE + 1), FINE)[: len(inside)]
+    )
     _mark(scene, 'accelerometer', inside, 'angle of middle')
 
 
 def _gear_whine(scene):
     joint = int(scene.rng.integers(3))
     inside = np.abs(scene.turn[:, joint]) > 40 * DEG
-    scene.added_rate[:, scene.axis] += 4 * TURN * inside * np.sin(2 * np.pi * 21.0 * scene.time + np.cumsum(scene.rng.normal(0, 0.02, len(inside))))
+    scene.added_rate[:, scene.axis] += (
+        4
+        * TURN
+        * inside
+        * np.sin(2 * np.pi * 21.0 * scene.time + np.cumsum(scene.rng.normal(0, 0.02, len(inside))))
+    )
     _mark(scene, 'gyroscope', inside, f'rate of {JOINTS[joint]}', 'speed', 'rate about')
 
 
@@ -229,16 +314,29 @@ def _knock(scene):
 
 def _supply_dip(scene):
     start = scene.rng.uniform(0.25, 0.5) * scene.time[-1]
-    _offset(scene, 'gyroscope', (scene.time > start) & (scene.time < start + 0.25 * scene.time[-1]), 'time')
+    _offset(
+        scene,
+        'gyroscope',
+        (scene.time > start) & (scene.time < start + 0.25 * scene.time[-1]),
+        'time',
+    )
 
 
 def _warm_stick(scene):
-    _offset(scene, 'accelerometer', scene.warm > np.quantile(scene.warm, scene.rng.uniform(0.35, 0.6)), 'temperature', 'time')
+    _offset(
+        scene,
+        'accelerometer',
+        scene.warm > np.quantile(scene.warm, scene.rng.uniform(0.35, 0.6)),
+        'temperature',
+        'time',
+    )
 
 
 def _one_direction(scene):
     joint = int(scene.rng.integers(3))
-    _offset(scene, 'gyroscope', scene.turn[:, joint] > 5 * DEG, f'rate of {JOINTS[joint]}', share=2.0)
+    _offset(
+        scene, 'gyroscope', scene.turn[:, joint] > 5 * DEG, f'rate of {JOINTS[joint]}', share=2.0
+    )
 
 
 def _play(values, width):
@@ -253,11 +351,25 @@ def _play(values, width):
 def _approach(scene):
     joint = int(scene.rng.integers(3))
     lag = scene.angle[:, joint] - _play(scene.angle[:, joint], 1.0 * DEG)
-    _offset(scene, 'accelerometer', lag > 0, f'approach of {JOINTS[joint]}', f'last motion of {JOINTS[joint]}', f'before rest of {JOINTS[joint]}', JOINTS[joint])
+    _offset(
+        scene,
+        'accelerometer',
+        lag > 0,
+        f'approach of {JOINTS[joint]}',
+        f'last motion of {JOINTS[joint]}',
+        f'before rest of {JOINTS[joint]}',
+        JOINTS[joint],
+    )
 
 
 def _one_sided(scene):
-    _offset(scene, 'accelerometer', scene.force[:, scene.axis] > 6.0, f'specific force along {"xyz"[scene.axis]}', 'angle of')
+    _offset(
+        scene,
+        'accelerometer',
+        scene.force[:, scene.axis] > 6.0,
+        f'specific force along {"xyz"[scene.axis]}',
+        'angle of',
+    )
 
 
 def _bad_code(scene):
@@ -272,7 +384,12 @@ def _fast_offset(scene):
 def _loose_for_a_while(scene):
     start = scene.rng.uniform(0.3, 0.6) * scene.time[-1]
     inside = (scene.time > start) & (scene.time < start + 0.2 * scene.time[-1])
-    scene.added_force[:, scene.axis] += 3 * FORCE * inside * np.repeat(scene.rng.normal(size=len(inside) // FINE + 1), FINE)[:len(inside)]
+    scene.added_force[:, scene.axis] += (
+        3
+        * FORCE
+        * inside
+        * np.repeat(scene.rng.normal(size=len(inside) // FINE + 1), FINE)[: len(inside)]
+    )
     _mark(scene, 'accelerometer', inside, 'time')
 
 
@@ -283,6 +400,7 @@ def _axes_exchanged(scene):
         one, two = (scene.axis + 1) % 3, (scene.axis + 2) % 3
         out[inside, one], out[inside, two] = out[inside, two].copy(), out[inside, one].copy()
         return out
+
     scene.truth['filter_rate'] = exchange
     _mark(scene, 'gyroscope', inside, 'time', axes={(scene.axis + 1) % 3, (scene.axis + 2) % 3})
 
@@ -309,12 +427,25 @@ def _clock_stepped(scene):
 
 
 PLACED = {
-    'gyro_offset_in_outer_arc': _arc_offset('gyroscope', 0), 'gyro_offset_in_middle_arc': _arc_offset('gyroscope', 1),
-    'gyro_offset_in_inner_arc': _arc_offset('gyroscope', 2), 'accel_offset_in_outer_arc': _arc_offset('accelerometer', 0),
-    'accel_offset_in_middle_arc': _arc_offset('accelerometer', 1), 'accel_offset_in_inner_arc': _arc_offset('accelerometer', 2),
-    'rattle_in_an_arc': _rattle_in_an_arc, 'gear_whine': _gear_whine, 'knock': _knock, 'supply_dip': _supply_dip,
-    'warm_stick': _warm_stick, 'one_direction': _one_direction, 'approach': _approach, 'one_sided': _one_sided, 'bad_code': _bad_code,
-    'fast_offset': _fast_offset, 'loose_for_a_while': _loose_for_a_while, 'axes_exchanged': _axes_exchanged, 'mount_knocked': _mount_knocked,
+    'gyro_offset_in_outer_arc': _arc_offset('gyroscope', 0),
+    'gyro_offset_in_middle_arc': _arc_offset('gyroscope', 1),
+    'gyro_offset_in_inner_arc': _arc_offset('gyroscope', 2),
+    'accel_offset_in_outer_arc': _arc_offset('accelerometer', 0),
+    'accel_offset_in_middle_arc': _arc_offset('accelerometer', 1),
+    'accel_offset_in_inner_arc': _arc_offset('accelerometer', 2),
+    'rattle_in_an_arc': _rattle_in_an_arc,
+    'gear_whine': _gear_whine,
+    'knock': _knock,
+    'supply_dip': _supply_dip,
+    'warm_stick': _warm_stick,
+    'one_direction': _one_direction,
+    'approach': _approach,
+    'one_sided': _one_sided,
+    'bad_code': _bad_code,
+    'fast_offset': _fast_offset,
+    'loose_for_a_while': _loose_for_a_while,
+    'axes_exchanged': _axes_exchanged,
+    'mount_knocked': _mount_knocked,
     'belt_slipped': _belt_slipped,
 }
 """Kinds that act at a place."""
@@ -322,8 +453,11 @@ PLACED = {
 
 # --- causes without a place ------------------------------------------------------------------------------------------------------------------
 
+
 def _add(scene, sensor, signal, *, names=(), axes=None, size=1.0):
-    target, rms = (scene.added_force, FORCE) if sensor == 'accelerometer' else (scene.added_rate, TURN)
+    target, rms = (
+        (scene.added_force, FORCE) if sensor == 'accelerometer' else (scene.added_rate, TURN)
+    )
     target[:, scene.axis] += size * rms * signal / np.sqrt((signal**2).mean())
     _mark(scene, sensor, None, names=names, axes=axes)
 
@@ -331,6 +465,7 @@ def _add(scene, sensor, signal, *, names=(), axes=None, size=1.0):
 def _signal(sensor, make, **options):
     def act(scene):
         _add(scene, sensor, make(scene), **options)
+
     return act
 
 
@@ -350,14 +485,17 @@ def _resonant_gyro(scene):
     def pass_through(out):
         out[:, scene.axis] = _resonator(out[:, scene.axis], 6.0, 0.3, 1.0 / RATE / FINE)
         return out
+
     scene.truth['filter_rate'] = pass_through
-    _mark(scene, 'gyroscope', None, names=['gyro_filter', 'gyro_delay', 'gyro_bandwidth', 'gyro_lag'])
+    _mark(
+        scene, 'gyroscope', None, names=['gyro_filter', 'gyro_delay', 'gyro_bandwidth', 'gyro_lag']
+    )
 
 
 def _noise_with_motion(scene):
     count = len(scene.time) // FINE + 1
-    bursts = np.repeat(scene.rng.standard_t(3, count // 200 + 1), 200 * FINE)[:len(scene.time)]
-    grains = np.repeat(scene.rng.normal(size=count), FINE)[:len(scene.time)]
+    bursts = np.repeat(scene.rng.standard_t(3, count // 200 + 1), 200 * FINE)[: len(scene.time)]
+    grains = np.repeat(scene.rng.normal(size=count), FINE)[: len(scene.time)]
     speed = np.linalg.norm(scene.rate, axis=1)
     scene.added_rate[:, scene.axis] += 8 * TURN * np.abs(bursts) * grains * speed / speed.max()
     _mark(scene, 'gyroscope', None)
@@ -378,6 +516,7 @@ def _lost(scene):
     def thin(count):
         kept = np.flatnonzero(np.arange(count) % 50 != 17)
         return kept, np.linspace(0.0, (count - 1) / RATE, len(kept))
+
     scene.thin = thin
     _mark(scene, 'both', None, names=['clock_rate', 'time_offset'], axes=())
 
@@ -394,22 +533,49 @@ def _order(scene):
 
 
 UNPLACED = {
-    'hysteretic_gyro': _signal('gyroscope', _hysteretic_gyro), 'resonant_gyro': _resonant_gyro, 'noise_with_motion': _noise_with_motion,
-    'clock_fast': _clock_fast, 'floored': _floored, 'lost': _lost,
-    'drift_gyro': _signal('gyroscope', lambda s: s.time - s.time.mean(), names=['gyro_bias_trend', 'gyro_bias_drift']),
-    'drift_accel': _signal('accelerometer', lambda s: s.time - s.time.mean(), names=['accel_bias_trend', 'accel_bias_drift']),
-    'field_turns_gyro': _signal('gyroscope', lambda s: np.sin(3 * s.angle[:, 0]) * np.sin(2 * s.angle[:, 1] + 1)),
-    'field_turns_accel': _signal('accelerometer', lambda s: np.sin(2 * s.angle[:, 2]) * np.sin(3 * s.angle[:, 1] + 1)),
-    'coriolis': _signal('accelerometer', lambda s: s.rate[:, s.axis] * s.force[:, (s.axis + 1) % 3], size=2.0),
-    'scale_by_force': _signal('gyroscope', lambda s: s.rate[:, s.axis] * s.force[:, (s.axis + 2) % 3], size=2.0),
-    'warm_rate_product': _signal('gyroscope', lambda s: (s.warm - 27) * s.rate[:, (s.axis + 1) % 3], size=2.0),
-    'warm_force_product': _signal('accelerometer', lambda s: (s.warm - 27) * s.force[:, (s.axis + 1) % 3]),
-    'force_cubed_in_gyro': _signal('gyroscope', lambda s: s.force[:, s.axis]**3),
+    'hysteretic_gyro': _signal('gyroscope', _hysteretic_gyro),
+    'resonant_gyro': _resonant_gyro,
+    'noise_with_motion': _noise_with_motion,
+    'clock_fast': _clock_fast,
+    'floored': _floored,
+    'lost': _lost,
+    'drift_gyro': _signal(
+        'gyroscope', lambda s: s.time - s.time.mean(), names=['gyro_bias_trend', 'gyro_bias_drift']
+    ),
+    'drift_accel': _signal(
+        'accelerometer',
+        lambda s: s.time - s.time.mean(),
+        names=['accel_bias_trend', 'accel_bias_drift'],
+    ),
+    'field_turns_gyro': _signal(
+        'gyroscope', lambda s: np.sin(3 * s.angle[:, 0]) * np.sin(2 * s.angle[:, 1] + 1)
+    ),
+    'field_turns_accel': _signal(
+        'accelerometer', lambda s: np.sin(2 * s.angle[:, 2]) * np.sin(3 * s.angle[:, 1] + 1)
+    ),
+    'coriolis': _signal(
+        'accelerometer', lambda s: s.rate[:, s.axis] * s.force[:, (s.axis + 1) % 3], size=2.0
+    ),
+    'scale_by_force': _signal(
+        'gyroscope', lambda s: s.rate[:, s.axis] * s.force[:, (s.axis + 2) % 3], size=2.0
+    ),
+    'warm_rate_product': _signal(
+        'gyroscope', lambda s: (s.warm - 27) * s.rate[:, (s.axis + 1) % 3], size=2.0
+    ),
+    'warm_force_product': _signal(
+        'accelerometer', lambda s: (s.warm - 27) * s.force[:, (s.axis + 1) % 3]
+    ),
+    'force_cubed_in_gyro': _signal('gyroscope', lambda s: s.force[:, s.axis] ** 3),
     'tone': _signal('accelerometer', lambda s: np.sin(2 * np.pi * 31.0 * s.time), size=3.0),
     'order': _signal('gyroscope', _order, size=3.0),
-    'soft_mount': _signal('accelerometer', _soft_mount), 'friction': _signal('gyroscope', lambda s: np.tanh(s.turn[:, 1] / (0.3 * DEG))),
-    'bent_scale': _signal('gyroscope', lambda s: np.tanh(s.rate[:, s.axis] / (40 * DEG)) - 0.7 * s.rate[:, s.axis] / (40 * DEG),
-                          names=['gyro_cubic', 'gyro_quadratic', 'gyro_scale_asymmetry'], size=2.0),
+    'soft_mount': _signal('accelerometer', _soft_mount),
+    'friction': _signal('gyroscope', lambda s: np.tanh(s.turn[:, 1] / (0.3 * DEG))),
+    'bent_scale': _signal(
+        'gyroscope',
+        lambda s: np.tanh(s.rate[:, s.axis] / (40 * DEG)) - 0.7 * s.rate[:, s.axis] / (40 * DEG),
+        names=['gyro_cubic', 'gyro_quadratic', 'gyro_scale_asymmetry'],
+        size=2.0,
+    ),
 }
 """Kinds without a place."""
 KINDS = PLACED | UNPLACED | {'clock_stepped': _clock_stepped}

@@ -61,19 +61,50 @@ def write(folder, *, data, recordings, sessions, plan):
     for name in recordings:
         bag = data / name
         table = bag / 'table.yaml'
-        sources.append((name, bag, table if table.is_file() else None, reference(data, name).get('nominal')))
+        sources.append(
+            (name, bag, table if table.is_file() else None, reference(data, name).get('nominal'))
+        )
     for k in range(sessions):
         bag, hidden = folder / f'session_{k}' / 'bag', EFFECTS[k % len(EFFECTS)]
         effect = ('--effect', hidden) if hidden else ()
-        writer.run(f'session_{k}/simulated', 'simulate', '--profile', 'quick', '--seed', 100 + k, *effect, '--output', bag)
+        writer.run(
+            f'session_{k}/simulated',
+            'simulate',
+            '--profile',
+            'quick',
+            '--seed',
+            100 + k,
+            *effect,
+            '--output',
+            bag,
+        )
         sources.append((f'session_{k}', bag, bag / 'table.yaml', None))
     for name, bag, table, nominal in sources:
         documents_of(writer, name, bag, table=table, nominal=nominal)
         if plan and table is not None:
-            writer.run(f'{name}/plan', 'plan', '--table', table, '--output', folder / name / 'plan', '--no-report', '--no-bound')
-        print(f'{name}: {sum(key.startswith(name + "/") for key in writer.codes)} verbs', flush=True)
+            writer.run(
+                f'{name}/plan',
+                'plan',
+                '--table',
+                table,
+                '--output',
+                folder / name / 'plan',
+                '--no-report',
+                '--no-bound',
+            )
+        print(
+            f'{name}: {sum(key.startswith(name + "/") for key in writer.codes)} verbs', flush=True
+        )
     if plan:
-        writer.run('by_hand/plan', 'plan', '--by-hand', '--output', folder / 'by_hand/plan', '--no-report', '--no-bound')
+        writer.run(
+            'by_hand/plan',
+            'plan',
+            '--by-hand',
+            '--output',
+            folder / 'by_hand/plan',
+            '--no-report',
+            '--no-bound',
+        )
     (folder / 'exit_codes.yaml').write_text(yaml.safe_dump(writer.codes))
 
 
@@ -88,16 +119,37 @@ def documents_of(writer, name, bag, *, table, nominal):
         scaled = ('--nominal', place / 'nominal.yaml')
     calibration = place / 'calibrate/calibration.yaml'
     writer.run(f'{name}/noise', 'noise', bag, *scaled, '--output', place / 'noise', '--no-report')
-    writer.run(f'{name}/diagnose', 'diagnose', bag, *options, *scaled, '--output', place / 'diagnose')
-    if writer.run(f'{name}/calibrate', 'calibrate', bag, *options, *scaled, '--output', place / 'calibrate', '--no-report'):
+    writer.run(
+        f'{name}/diagnose', 'diagnose', bag, *options, *scaled, '--output', place / 'diagnose'
+    )
+    if writer.run(
+        f'{name}/calibrate',
+        'calibrate',
+        bag,
+        *options,
+        *scaled,
+        '--output',
+        place / 'calibrate',
+        '--no-report',
+    ):
         writer.run(f'{name}/check', 'check', bag, *options, '--calibration', calibration)
         for target in targets():
-            writer.run(f'{name}/export_{target}', 'export', calibration, '--to', target, '--anyway', '--output', place / f'export/{target}.txt')
+            writer.run(
+                f'{name}/export_{target}',
+                'export',
+                calibration,
+                '--to',
+                target,
+                '--anyway',
+                '--output',
+                place / f'export/{target}.txt',
+            )
 
 
 def targets():
     """Return the names of the programs that `export` writes, except the binary file of MATLAB."""
     from imu_calibration.document.exports.export import all_targets
+
     return [name for name in all_targets() if name != 'mat']
 
 
@@ -106,7 +158,9 @@ def numbers_of(path):
     text = path.read_text()
     if path.suffix in ('.yaml', '.json'):
         with contextlib.suppress(ValueError, yaml.YAMLError):
-            return dict(_leaves(json.loads(text) if path.suffix == '.json' else yaml.safe_load(text), ''))
+            return dict(
+                _leaves(json.loads(text) if path.suffix == '.json' else yaml.safe_load(text), '')
+            )
     return {f'number {k}': float(found) for k, found in enumerate(NUMBER.findall(text))}
 
 
@@ -124,12 +178,21 @@ def _leaves(value, place):
 
 def compare(before, after):
     """Return the lines that describe each difference of two folders."""
+
     def names(folder):
-        return {p.relative_to(folder) for p in folder.rglob('*') if p.suffix in ('.yaml', '.json', '.txt') and 'bag' not in p.parts}
+        return {
+            p.relative_to(folder)
+            for p in folder.rglob('*')
+            if p.suffix in ('.yaml', '.json', '.txt') and 'bag' not in p.parts
+        }
+
     lines = [f'{name}: only in one folder' for name in sorted(names(before) ^ names(after))]
     for name in sorted(names(before) & names(after)):
         if (before / name).read_bytes() != (after / name).read_bytes():
-            lines += [f'{name}: {line}' for line in differences(numbers_of(before / name), numbers_of(after / name))]
+            lines += [
+                f'{name}: {line}'
+                for line in differences(numbers_of(before / name), numbers_of(after / name))
+            ]
     return lines
 
 
@@ -149,7 +212,12 @@ if __name__ == '__main__':
     verbs = parser.add_subparsers(dest='verb', required=True)
     writing = verbs.add_parser('write')
     writing.add_argument('folder', type=Path)
-    writing.add_argument('--data', type=Path, default=data_folder(), help=f'folder of the recordings, default {VARIABLE}')
+    writing.add_argument(
+        '--data',
+        type=Path,
+        default=data_folder(),
+        help=f'folder of the recordings, default {VARIABLE}',
+    )
     writing.add_argument('--recordings', nargs='*', default=[])
     writing.add_argument('--sessions', type=int, default=0)
     writing.add_argument('--without-plan', action='store_true')
@@ -158,7 +226,13 @@ if __name__ == '__main__':
     comparing.add_argument('after', type=Path)
     given = parser.parse_args()
     if given.verb == 'write':
-        write(given.folder.resolve(), data=given.data, recordings=given.recordings, sessions=given.sessions, plan=not given.without_plan)
+        write(
+            given.folder.resolve(),
+            data=given.data,
+            recordings=given.recordings,
+            sessions=given.sessions,
+            plan=not given.without_plan,
+        )
         sys.exit(0)
     found = compare(given.before, given.after)
     print('\n'.join(found) or 'no difference')

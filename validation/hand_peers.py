@@ -20,21 +20,40 @@ def imu_tk(imu, ranges, gravity, without=None):
     that overlap the slice `without` are not used.
     """
     first, time, best = ranges[0], 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), None
-    variance, threshold = _variance(imu.force_s), np.linalg.norm(imu.force_s[first].var(axis=0, ddof=1))
+    variance, threshold = (
+        _variance(imu.force_s),
+        np.linalg.norm(imu.force_s[first].var(axis=0, ddof=1)),
+    )
     for multiplier in MULTIPLIERS:
-        rests = [piece for piece in _runs(variance < multiplier * threshold) if piece.stop - piece.start >= PER_REST]
+        rests = [
+            piece
+            for piece in _runs(variance < multiplier * threshold)
+            if piece.stop - piece.start >= PER_REST
+        ]
         if len(rests) < LEAST_RESTS:
             continue
-        pieces = [slice((rest.start + rest.stop - PER_REST) // 2, (rest.start + rest.stop + PER_REST) // 2) for rest in rests]
+        pieces = [
+            slice(
+                (rest.start + rest.stop - PER_REST) // 2, (rest.start + rest.stop + PER_REST) // 2
+            )
+            for rest in rests
+        ]
         force = _means(imu, pieces)
         sensor = fit_norm(force, gravity)
-        cost = np.sum(sensor.norm_errors(force, gravity)**2)
+        cost = np.sum(sensor.norm_errors(force, gravity) ** 2)
         best = (cost, sensor, pieces, force) if best is None or cost < best[0] else best
     if best is None:
         return None
     _, sensor, pieces, force = best
-    turns = [(np.diff(time[a.stop:b.start]), imu.rate_s[a.stop:b.start]) for a, b in zip(pieces, pieces[1:])]
-    return sensor, _gyroscope(*_other_turns(turns, sensor.directions(force), pieces, without), imu.rate_s[first].mean(axis=0), loss='linear')
+    turns = [
+        (np.diff(time[a.stop : b.start]), imu.rate_s[a.stop : b.start])
+        for a, b in zip(pieces, pieces[1:])
+    ]
+    return sensor, _gyroscope(
+        *_other_turns(turns, sensor.directions(force), pieces, without),
+        imu.rate_s[first].mean(axis=0),
+        loss='linear',
+    )
 
 
 def imu_calib(imu, ranges, gravity, without=None):
@@ -43,8 +62,15 @@ def imu_calib(imu, ranges, gravity, without=None):
     step = 1e-9 * (imu.stamp_ns[-1] - imu.stamp_ns[0]) / (len(imu) - 1)
     samples = imu.force_s[np.concatenate([np.arange(rest.start, rest.stop) for rest in rests])]
     sensor = fit_norm(samples, gravity, loss='soft_l1')
-    turns = [(np.full(b.start - a.stop + 9, step), imu.rate_s[a.stop - 5:b.start + 5]) for a, b in zip(rests, rests[1:])]
-    return sensor, _gyroscope(*_other_turns(turns, sensor.directions(_means(imu, rests)), rests, without), imu.rate_s[first].mean(axis=0), loss='soft_l1')
+    turns = [
+        (np.full(b.start - a.stop + 9, step), imu.rate_s[a.stop - 5 : b.start + 5])
+        for a, b in zip(rests, rests[1:])
+    ]
+    return sensor, _gyroscope(
+        *_other_turns(turns, sensor.directions(_means(imu, rests)), rests, without),
+        imu.rate_s[first].mean(axis=0),
+        loss='soft_l1',
+    )
 
 
 def norm_fit(imu, ranges, gravity):
@@ -63,10 +89,17 @@ def six_faces(imu, ranges, gravity):
 
 def _variance(values):
     """Return the norm of the variances of the axes in the window about each sample, infinite at the ends, shape (n,)."""
-    sums = np.pad(np.cumsum(np.stack([values - values.mean(axis=0), (values - values.mean(axis=0))**2]), axis=1), ((0, 0), (1, 0), (0, 0)))
+    sums = np.pad(
+        np.cumsum(
+            np.stack([values - values.mean(axis=0), (values - values.mean(axis=0)) ** 2]), axis=1
+        ),
+        ((0, 0), (1, 0), (0, 0)),
+    )
     width, result = 2 * HALF_WINDOW + 1, np.full(len(values), np.inf)
     total, square = sums[:, width:] - sums[:, :-width]
-    result[HALF_WINDOW:-HALF_WINDOW] = np.linalg.norm((square - total**2 / width) / (width - 1), axis=1)
+    result[HALF_WINDOW:-HALF_WINDOW] = np.linalg.norm(
+        (square - total**2 / width) / (width - 1), axis=1
+    )
     return result
 
 
@@ -88,26 +121,41 @@ def _means(imu, rests):
 
 def _other_turns(turns, up, rests, without):
     """Return (turns, gravity before them, gravity after them) of the turns between rests that do not overlap the slice `without`."""
-    used = np.array([k for k, (a, b) in enumerate(zip(rests, rests[1:]))
-                     if without is None or b.start <= without.start or a.stop >= without.stop], int)
+    used = np.array(
+        [
+            k
+            for k, (a, b) in enumerate(zip(rests, rests[1:]))
+            if without is None or b.start <= without.start or a.stop >= without.stop
+        ],
+        int,
+    )
     return [turns[k] for k in used], up[used], up[used + 1]
 
 
 def _gyroscope(turns, first, last, bias, loss):
     """Return the gyroscope, bias and matrix, that turns gravity from rest to rest, directions `first` and `last` of each turn."""
+
     def misses(values):
         inverse = np.linalg.inv(values[3:].reshape(3, 3))
-        return np.concatenate([turned((rate - values[:3]) @ inverse.T, step).T @ before - after
-                               for (step, rate), before, after in zip(turns, first, last)])
+        return np.concatenate(
+            [
+                turned((rate - values[:3]) @ inverse.T, step).T @ before - after
+                for (step, rate), before, after in zip(turns, first, last)
+            ]
+        )
 
-    found = least_squares(misses, np.concatenate([bias, np.eye(3).ravel()]), x_scale='jac', loss=loss).x
+    found = least_squares(
+        misses, np.concatenate([bias, np.eye(3).ravel()]), x_scale='jac', loss=loss
+    ).x
     return Forward(found[:3], found[3:].reshape(3, 3))
 
 
 def turned(rate, step):
     """Return the rotation matrix, end to start, of rates with `step` s (one or n - 1) between them (trapezoids, commutator of neighbours)."""
     step = np.broadcast_to(step, len(rate) - 1)[:, None]
-    mats = Rotation.from_rotvec(0.5 * step * (rate[1:] + rate[:-1]) + step**2 / 12 * np.cross(rate[:-1], rate[1:])).as_matrix()
+    mats = Rotation.from_rotvec(
+        0.5 * step * (rate[1:] + rate[:-1]) + step**2 / 12 * np.cross(rate[:-1], rate[1:])
+    ).as_matrix()
     while len(mats) > 1:
         mats = np.concatenate([mats, np.eye(3)[None]]) if len(mats) % 2 else mats
         mats = mats[0::2] @ mats[1::2]

@@ -9,7 +9,14 @@ from imu_calibration.references.gravity.hand_parameters import HandOptions
 from validation.ferraris import GRAVITY, RATE_HZ, calibrate_sections, known_turns
 from validation.ferraris import NAME as FERRARIS
 from validation.recordings import BY_HAND, gravity_of, label, load, reference
-from validation.second_opinions import FACES, Forward, accelerometer_of, ferraris, fit_norm, installed
+from validation.second_opinions import (
+    FACES,
+    Forward,
+    accelerometer_of,
+    ferraris,
+    fit_norm,
+    installed,
+)
 from validation.section import Section, text
 
 FEW, SPLITS, DRAWS, SEED = 12, 20, 10_000, 20
@@ -31,7 +38,11 @@ def without(imu, ranges, left_out):
     for k in left_out:
         keep[ranges[k]] = False
     place = np.concatenate([[0], np.cumsum(keep)])
-    return imu.select(keep), [slice(int(place[r.start]), int(place[r.stop])) for k, r in enumerate(ranges) if k not in set(left_out)]
+    return imu.select(keep), [
+        slice(int(place[r.start]), int(place[r.stop]))
+        for k, r in enumerate(ranges)
+        if k not in set(left_out)
+    ]
 
 
 def ours(imu, ranges, left_out, gravity):
@@ -45,8 +56,11 @@ def errors_of_splits(imu, ranges, gravity, splits):
     force, result = mean_forces(imu, ranges), {'ours': [], 'norm fit': [], 'uncalibrated': []}
     for left_out in splits:
         rest = np.setdiff1d(np.arange(len(ranges)), left_out)
-        sensors = {'ours': ours(imu, ranges, left_out, gravity), 'norm fit': fit_norm(force[rest], gravity),
-                   'uncalibrated': Forward(np.zeros(3), np.eye(3))}
+        sensors = {
+            'ours': ours(imu, ranges, left_out, gravity),
+            'norm fit': fit_norm(force[rest], gravity),
+            'uncalibrated': Forward(np.zeros(3), np.eye(3)),
+        }
         for name, sensor in sensors.items():
             result[name].append(sensor.norm_errors(force[left_out], gravity))
     return result
@@ -79,7 +93,11 @@ def leave_one_out(imu, ranges, gravity, rng):
     """Return ({method: rms}, interval of norm fit minus ours, errors) with every pose left out once."""
     found = errors_of_splits(imu, ranges, gravity, [np.array([k]) for k in range(len(ranges))])
     errors = {name: np.concatenate(parts) for name, parts in found.items()}
-    return {name: rms(values) for name, values in errors.items()}, bootstrap_difference(errors['ours'], errors['norm fit'], rng), errors
+    return (
+        {name: rms(values) for name, values in errors.items()},
+        bootstrap_difference(errors['ours'], errors['norm fit'], rng),
+        errors,
+    )
 
 
 def few_poses(imu, ranges, gravity, rng):
@@ -87,7 +105,9 @@ def few_poses(imu, ranges, gravity, rng):
     splits = [np.sort(rng.permutation(len(ranges))[FEW:]) for _ in range(SPLITS)]
     found = errors_of_splits(imu, ranges, gravity, splits)
     ratio = resampled_ratio(found['ours'], found['norm fit'], (len(ranges) - FEW) / FEW)
-    return {name: float(np.median([rms(e) for e in errors])) for name, errors in found.items()}, ratio
+    return {
+        name: float(np.median([rms(e) for e in errors])) for name, errors in found.items()
+    }, ratio
 
 
 def faces_and_the_rest(folder):
@@ -104,12 +124,18 @@ def faces_and_the_rest(folder):
     rests = [r for r in find_still(imu) if not used[r].any()]
     force = mean_forces(imu, rests)
     found, _ = calibrate_sections(imu, sections, angle)
-    methods = {'ours': Forward(*found.accelerometer),
-               'norm fit': fit_norm(mean_forces(imu, [slice(*sections[name]) for name in FACES]), GRAVITY, cross_axis=False),
-               'uncalibrated': Forward(np.zeros(3), np.eye(3))}
+    methods = {
+        'ours': Forward(*found.accelerometer),
+        'norm fit': fit_norm(
+            mean_forces(imu, [slice(*sections[name]) for name in FACES]), GRAVITY, cross_axis=False
+        ),
+        'uncalibrated': Forward(np.zeros(3), np.eye(3)),
+    }
     if installed('imucal'):
         sign = np.sign(known_turns(imu, sections, angle)[0].angle)
-        methods['imucal'] = accelerometer_of(ferraris(imu, sections, RATE_HZ, GRAVITY, sign * angle))
+        methods['imucal'] = accelerometer_of(
+            ferraris(imu, sections, RATE_HZ, GRAVITY, sign * angle)
+        )
     return {name: method.norm_errors(force, GRAVITY) for name, method in methods.items()}
 
 
@@ -117,7 +143,9 @@ def off_faces(imu, ranges):
     """Return the angles between the six faces and the poses nearest to them, deg, shape (6,)."""
     force = mean_forces(imu, ranges)
     directions = force / np.linalg.norm(force, axis=1, keepdims=True)
-    return np.degrees(np.arccos(np.clip(np.concatenate([directions.max(axis=0), -directions.min(axis=0)]), -1, 1)))
+    return np.degrees(
+        np.arccos(np.clip(np.concatenate([directions.max(axis=0), -directions.min(axis=0)]), -1, 1))
+    )
 
 
 def _verdict(interval, better='ours', other='norm fit'):
@@ -129,7 +157,11 @@ def run(folder, plots):
     section = Section('Who predicts better: poses that took no part')
     rows, few, faces, everything = [], [], [], {}
     for name, topic in BY_HAND:
-        rng, gravity, imu = np.random.default_rng(SEED), gravity_of(folder, name), load(folder, name, topic)
+        rng, gravity, imu = (
+            np.random.default_rng(SEED),
+            gravity_of(folder, name),
+            load(folder, name, topic),
+        )
         ranges = find_still(imu)
         values, interval, everything[label(name, topic)] = leave_one_out(imu, ranges, gravity, rng)
         rows.append(_row(label(name, topic), len(ranges), values, interval))
@@ -137,24 +169,43 @@ def run(folder, plots):
         shown = f'{ratio:.2f} [{interval[0]:.2f}, {interval[1]:.2f}]'
         few.append((*_start(label(name, topic), FEW, values), shown, _verdict(np.log(interval))))
         faces.append((label(name, topic), f'{off_faces(imu, ranges).max():.0f} deg'))
-    head = ('recording', 'poses', 'uncalibrated', 'norm fit', 'ours', 'norm fit − ours [95 %]', 'better')
+    head = (
+        'recording',
+        'poses',
+        'uncalibrated',
+        'norm fit',
+        'ours',
+        'norm fit − ours [95 %]',
+        'better',
+    )
     section.say(text('held_out_errors'))
     section.table(head, rows)
     section.say(text('held_out_few', splits=SPLITS, few=FEW))
     section.table((*head[:5], 'norm fit / ours [95 %]', 'better'), few)
     _six_faces(section, folder)
-    section.say(text('held_out_imucal', faces=', '.join(f'{angle} ({name})' for name, angle in faces)))
+    section.say(
+        text('held_out_imucal', faces=', '.join(f'{angle} ({name})' for name, angle in faces))
+    )
     _count(section, rows, few)
     _draw(section, plots, everything)
     return section
 
 
 def _start(name, count, values):
-    return name, str(count), f'{1e3 * values["uncalibrated"]:.0f}', *(f'{1e3 * values[key]:.2f}' for key in ('norm fit', 'ours'))
+    return (
+        name,
+        str(count),
+        f'{1e3 * values["uncalibrated"]:.0f}',
+        *(f'{1e3 * values[key]:.2f}' for key in ('norm fit', 'ours')),
+    )
 
 
 def _row(name, count, values, interval):
-    return *_start(name, count, values), f'[{1e3 * interval[0]:+.2f}, {1e3 * interval[1]:+.2f}]', _verdict(interval)
+    return (
+        *_start(name, count, values),
+        f'[{1e3 * interval[0]:+.2f}, {1e3 * interval[1]:+.2f}]',
+        _verdict(interval),
+    )
 
 
 def _six_faces(section, folder):
@@ -162,8 +213,18 @@ def _six_faces(section, folder):
     rows = []
     for name in ('uncalibrated', 'norm fit', 'imucal', 'ours'):
         if name in errors:
-            interval = 1e3 * bootstrap_difference(errors['ours'], errors[name], rng) if name != 'ours' else None
-            rows.append((name, f'{1e3 * rms(errors[name]):.2f}', '' if interval is None else f'[{interval[0]:+.2f}, {interval[1]:+.2f}]'))
+            interval = (
+                1e3 * bootstrap_difference(errors['ours'], errors[name], rng)
+                if name != 'ours'
+                else None
+            )
+            rows.append(
+                (
+                    name,
+                    f'{1e3 * rms(errors[name]):.2f}',
+                    '' if interval is None else f'[{interval[0]:+.2f}, {interval[1]:+.2f}]',
+                )
+            )
     section.say(text('held_out_faces', rests=len(errors['ours'])))
     section.table(('method', 'rms of the rests, mm/s²', 'minus ours [95 %]'), rows)
 
@@ -171,20 +232,45 @@ def _six_faces(section, folder):
 def _count(section, rows, few):
     for what, table in (('every pose left out once', rows), (f'{FEW} poses for the fit', few)):
         better = [row[-1] for row in table]
-        section.claim(f'poses that took no part, norm fit beside ours, {what}', 'whoever predicts better',
-                      f'ours better in {better.count("ours")}, norm fit in {better.count("norm fit")}, no difference seen in '
-                      f'{better.count("no difference seen")} of {len(better)}', headline=table is rows)
+        section.claim(
+            f'poses that took no part, norm fit beside ours, {what}',
+            'whoever predicts better',
+            f'ours better in {better.count("ours")}, norm fit in {better.count("norm fit")}, no difference seen in '
+            f'{better.count("no difference seen")} of {len(better)}',
+            headline=table is rows,
+        )
 
 
 def _draw(section, plots, everything):
     from validation.figures import new_figure
+
     figure, axes = new_figure(1, 1, (8, 4))
     for k, (name, errors) in enumerate(everything.items()):
-        for shift, method, colour in ((-0.13, 'norm fit', 'tab:orange'), (0.13, 'ours', 'tab:blue')):
+        for shift, method, colour in (
+            (-0.13, 'norm fit', 'tab:orange'),
+            (0.13, 'ours', 'tab:blue'),
+        ):
             values = 1e3 * np.abs(errors[method])
-            axes.plot(np.full(len(values), k + shift), values, '.', color=colour, alpha=0.5, label=method if k == 0 else None)
-            axes.plot([k + shift - 0.1, k + shift + 0.1], [1e3 * rms(errors[method])] * 2, color=colour, linewidth=2)
+            axes.plot(
+                np.full(len(values), k + shift),
+                values,
+                '.',
+                color=colour,
+                alpha=0.5,
+                label=method if k == 0 else None,
+            )
+            axes.plot(
+                [k + shift - 0.1, k + shift + 0.1],
+                [1e3 * rms(errors[method])] * 2,
+                color=colour,
+                linewidth=2,
+            )
     axes.set(yscale='log', ylabel='error of a pose left out, mm/s²', ylim=(0.01, None))
     axes.set_xticks(range(len(everything)), everything, rotation=30, ha='right')
     axes.legend()
-    section.plot(plots, 'held_out.png', figure, 'Every pose left out once: errors of the poses (dots) and their rms (bars).')
+    section.plot(
+        plots,
+        'held_out.png',
+        figure,
+        'Every pose left out once: errors of the poses (dots) and their rms (bars).',
+    )

@@ -30,32 +30,68 @@ FIRST_SEED = 277000
 
 def main(arguments=None):
     """Run the tasks on some processes, keep a record, print and draw."""
+
     def names(text):
         return tuple(text.split(','))
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seeds', type=int, default=1, help='times that every effect is hidden at each grade in white and in realistic noise; other parts grow alike')
+    parser.add_argument(
+        '--seeds',
+        type=int,
+        default=1,
+        help='times that every effect is hidden at each grade in white and in realistic noise; other parts grow alike',
+    )
     parser.add_argument('--first-seed', type=int, default=FIRST_SEED)
     parser.add_argument('--effects', help='names joined by commas; default all')
     parser.add_argument('--parts', default=PARTS, type=names)
     parser.add_argument('--grades', default=GRADES, type=names)
-    parser.add_argument('--noise', type=names, help='white, realistic and names of worlds.wanders, joined by commas; default white, and realistic kinds dealt to the effects')
+    parser.add_argument(
+        '--noise',
+        type=names,
+        help='white, realistic and names of worlds.wanders, joined by commas; default white, and realistic kinds dealt to the effects',
+    )
     parser.add_argument('--pairs', type=int, help='so many pairs, drawn by chance; default all')
     parser.add_argument('--processes', type=int, default=2)
     parser.add_argument('--minutes', type=float, help='start nothing new after this time')
-    parser.add_argument('--record', type=Path, default=Path('out/hide_and_seek.jsonl'), help='one line per session')
-    parser.add_argument('--docs', type=Path, help='where pictures and figures go; default docs/ for a run in full, else beside the record')
-    parser.add_argument('--from-record', nargs='+', type=Path, help='only print and draw what these records hold')
-    parser.add_argument('--keep', action='store_true', help='take the rows into the record of the repository')
+    parser.add_argument(
+        '--record', type=Path, default=Path('out/hide_and_seek.jsonl'), help='one line per session'
+    )
+    parser.add_argument(
+        '--docs',
+        type=Path,
+        help='where pictures and figures go; default docs/ for a run in full, else beside the record',
+    )
+    parser.add_argument(
+        '--from-record', nargs='+', type=Path, help='only print and draw what these records hold'
+    )
+    parser.add_argument(
+        '--keep', action='store_true', help='take the rows into the record of the repository'
+    )
     options = parser.parse_args(arguments)
-    part_of_it = options.from_record or options.effects or options.minutes or options.noise or options.pairs or set(options.parts) != set(PARTS) or len(options.grades) < len(GRADES)
+    part_of_it = (
+        options.from_record
+        or options.effects
+        or options.minutes
+        or options.noise
+        or options.pairs
+        or set(options.parts) != set(PARTS)
+        or len(options.grades) < len(GRADES)
+    )
     docs = options.docs or (options.record.parent if part_of_it else ROOT / 'docs')
-    rows = [row for path in options.from_record for row in record_kept.read(path)] if options.from_record else _work(tasks_of(options), options)
+    rows = (
+        [row for path in options.from_record for row in record_kept.read(path)]
+        if options.from_record
+        else _work(tasks_of(options), options)
+    )
     report(rows, docs)
     write_figures(rows, docs)
     kept = record_kept.read()
     changed = record_kept.differences(rows, kept)
-    print(f'\nbeside the record in the repository ({len(kept)} sessions), of {len(rows)} sessions another thing is told of {len(changed)}', *changed, sep='\n  ')
+    print(
+        f'\nbeside the record in the repository ({len(kept)} sessions), of {len(rows)} sessions another thing is told of {len(changed)}',
+        *changed,
+        sep='\n  ',
+    )
     if options.keep:
         record_kept.keep(rows)
     return 0
@@ -83,7 +119,12 @@ def _work(tasks, options):
                     if isinstance(future.exception(), BrokenExecutor) and not running:
                         pool = ProcessPoolExecutor(options.processes)
                 record_file.flush()
-                print(f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions, {(time.time() - start) / 60:.1f} min', end='', file=sys.stderr, flush=True)
+                print(
+                    f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions, {(time.time() - start) / 60:.1f} min',
+                    end='',
+                    file=sys.stderr,
+                    flush=True,
+                )
         except KeyboardInterrupt:
             print('\nstopped: what is done is counted', end='', file=sys.stderr)
         finally:
@@ -95,7 +136,11 @@ def _work(tasks, options):
 def _result(future, task):
     """Return the rows of a task; a process that died with it, for lack of memory, is a row."""
     problem = future.exception()
-    return future.result() if problem is None else [failed(f'{task[0].__name__}{task[1][:2]}', problem)]
+    return (
+        future.result()
+        if problem is None
+        else [failed(f'{task[0].__name__}{task[1][:2]}', problem)]
+    )
 
 
 if __name__ == '__main__':

@@ -29,7 +29,7 @@ def report(rows, docs):
     _beyond(parts['beyond'])
     _seconds(rows)
     for row in parts['failed']:
-        print(f"FAILED {row['what']}: {row['why']}")
+        print(f'FAILED {row["what"]}: {row["why"]}')
     docs.mkdir(parents=True, exist_ok=True)
     if parts['effects']:
         draw_confusion(parts['effects'], docs / 'hide_and_seek_confusion.png')
@@ -58,15 +58,21 @@ def _effects(rows, what):
     if not rows:
         return
     for grade, noise, some in by_grade(rows):
-        print(f'\nfirst finding right or in its class, {what}, {grade} grade, {noise} noise: {_share(map(first_is_right, some))}; strictly first '
-              f'{_share(map(strictly_first, some))}; nothing else named {_share(len(row["found"]) == 1 for row in some)}')
+        print(
+            f'\nfirst finding right or in its class, {what}, {grade} grade, {noise} noise: {_share(map(first_is_right, some))}; strictly first '
+            f'{_share(map(strictly_first, some))}; nothing else named {_share(len(row["found"]) == 1 for row in some)}'
+        )
     for kind in sorted(set(map(kind_of, rows))):
         print(f'  {kind}: {_share(first_is_right(row) for row in rows if kind_of(row) == kind)}')
     for row in rows:
         if not first_is_right(row):
-            print(f"  {row['hidden'][0]} seed {row['seed']} {row['noise']}: {row['found']} {row['classes']}, rest significant: {row['unexplained']}")
+            print(
+                f'  {row["hidden"][0]} seed {row["seed"]} {row["noise"]}: {row["found"]} {row["classes"]}, rest significant: {row["unexplained"]}'
+            )
     names = sorted({row['hidden'][0] for row in rows})
-    weak = [(name, [first_is_right(row) for row in rows if row['hidden'][0] == name]) for name in names]
+    weak = [
+        (name, [first_is_right(row) for row in rows if row['hidden'][0] == name]) for name in names
+    ]
     for name, right in weak:
         if np.mean(right) < 1:
             print(f'  {name}: {_share(right)}')
@@ -81,15 +87,24 @@ def print_confusion(rows):
         found = Counter(row['found'][0] if row['found'] else 'nothing' for row in some)
         mates = Counter(mate for row in some if row['found'] for mate in row['classes'][0])
         line = ', '.join(f'{effect} {count}' for effect, count in found.most_common())
-        print(f'  {name:24s} {line}' + (f"   [{', '.join(f'{mate} {count}' for mate, count in mates.most_common())}]" if mates else ''))
+        print(
+            f'  {name:24s} {line}'
+            + (
+                f'   [{", ".join(f"{mate} {count}" for mate, count in mates.most_common())}]'
+                if mates
+                else ''
+            )
+        )
 
 
 def _parameters(rows):
     errors = [error for row in rows for values in row['errors_in_sd'].values() for error in values]
     if errors:
         errors = np.abs(errors)
-        rms = np.sqrt(np.mean(np.minimum(errors, 10)**2))
-        print(f'\nparameters within 3 sd: {100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms error in sd {rms:.2f}')
+        rms = np.sqrt(np.mean(np.minimum(errors, 10) ** 2))
+        print(
+            f'\nparameters within 3 sd: {100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms error in sd {rms:.2f}'
+        )
     levels = [row['level_error'] for row in rows if 'level_error' in row]
     if levels:
         print(f'saturation level within 1 %: {_share(level < 0.01 for level in levels)}')
@@ -100,27 +115,35 @@ def _separating(rows):
         print(f'\nsessions made to separate: strictly first {_share(map(strictly_first, rows))}')
         for row in rows:
             if not strictly_first(row):
-                print(f"  {row['hidden'][0]} seed {row['seed']}: {row['found']} {row['classes']}")
+                print(f'  {row["hidden"][0]} seed {row["seed"]}: {row["found"]} {row["classes"]}')
 
 
 def _nothing(rows, what):
     for grade, noise, some in by_grade(rows):
-        print(f'\n{what}, {grade} grade, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)}; '
-              f'significant rest in {_share(row["unexplained"] for row in some)}; a formula in {_share(bool(row["formulas"]) for row in some)}')
+        print(
+            f'\n{what}, {grade} grade, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)}; '
+            f'significant rest in {_share(row["unexplained"] for row in some)}; a formula in {_share(bool(row["formulas"]) for row in some)}'
+        )
         for row in some:
             if row['found'] or row['unexplained'] or row['formulas']:
-                print(f"  seed {row['seed']} {row['noise']}: {row['found']}, rest significant: {row['unexplained']}, {row['formulas']}")
+                print(
+                    f'  seed {row["seed"]} {row["noise"]}: {row["found"]}, rest significant: {row["unexplained"]}, {row["formulas"]}'
+                )
 
 
 def _outside(rows):
     if not rows:
         return
-    print(f'\ncauses outside the catalogue: unexplained significant in {_share(row["unexplained"] for row in rows)}, nothing named in '
-          f'{_share(not row["found"] for row in rows)}')
+    print(
+        f'\ncauses outside the catalogue: unexplained significant in {_share(row["unexplained"] for row in rows)}, nothing named in '
+        f'{_share(not row["found"] for row in rows)}'
+    )
     for name in sorted({row['hidden'][0] for row in rows}):
         some = [row for row in rows if row['hidden'][0] == name]
-        print(f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named '
-              f'{_share(not row["found"] for row in some)} {[row["found"] for row in some if row["found"]]}')
+        print(
+            f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named '
+            f'{_share(not row["found"] for row in some)} {[row["found"] for row in some if row["found"]]}'
+        )
 
 
 def _traps(rows):
@@ -128,7 +151,7 @@ def _traps(rows):
         print(f'\ntraps: a finding in {_share(bool(row["found"]) for row in rows)}')
         for row in rows:
             if row['found']:
-                print(f"  {row['trap']} seed {row['seed']}: {row['found']}")
+                print(f'  {row["trap"]} seed {row["seed"]}: {row["found"]}')
 
 
 def class_sizes(rows):
@@ -139,12 +162,16 @@ def class_sizes(rows):
 def _classes(rows):
     sizes = class_sizes(rows)
     if len(sizes):
-        print(f'\nright first findings told with mates: {_share(sizes > 1)}, of these with two: {_share(sizes[sizes > 1] > 2)}')
+        print(
+            f'\nright first findings told with mates: {_share(sizes > 1)}, of these with two: {_share(sizes[sizes > 1] > 2)}'
+        )
 
 
 def _beyond(rows):
     if rows:
-        print(f'\ncauses outside the catalogue, {len({row["kind"] for row in rows}) - 1} kinds, {len(rows)} worlds')
+        print(
+            f'\ncauses outside the catalogue, {len({row["kind"] for row in rows}) - 1} kinds, {len(rows)} worlds'
+        )
         for what, required, measured in beyond_catalogue.figures(rows):
             print(f'  {what}: {measured} (required: {required})')
         print(*beyond_catalogue.missed(rows), sep='\n')
@@ -153,27 +180,39 @@ def _beyond(rows):
 def _oracle(rows):
     ratios = [row['oracle_ratio'] for row in rows if row.get('oracle_ratio') is not None]
     if ratios:
-        print(f'\nheld-out rms over that of an oracle: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f} '
-              f'({len(ratios)} sessions)')
+        print(
+            f'\nheld-out rms over that of an oracle: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f} '
+            f'({len(ratios)} sessions)'
+        )
 
 
 def _seconds(rows):
     seconds = [row['seconds'] for row in rows if 'seconds' in row]
     if seconds:
-        print(f'\nprocessor time per diagnosis: median {np.median(seconds):.1f} s, largest {np.max(seconds):.1f} s')
+        print(
+            f'\nprocessor time per diagnosis: median {np.median(seconds):.1f} s, largest {np.max(seconds):.1f} s'
+        )
 
 
 def draw_confusion(rows, path):
     """Draw hidden effects against first findings."""
     from matplotlib.figure import Figure
+
     names = sorted({row['hidden'][0] for row in rows})
-    found = names + sorted({row['found'][0] for row in rows if row['found']} - set(names)) + ['nothing']
+    found = (
+        names + sorted({row['found'][0] for row in rows if row['found']} - set(names)) + ['nothing']
+    )
     table = np.zeros((len(names), len(found)))
     for row in rows:
-        table[names.index(row['hidden'][0]), found.index(row['found'][0] if row['found'] else 'nothing')] += 1
+        table[
+            names.index(row['hidden'][0]),
+            found.index(row['found'][0] if row['found'] else 'nothing'),
+        ] += 1
     figure = Figure(figsize=(11, 9.5), layout='constrained')
     axes = figure.add_subplot()
-    axes.imshow(table / np.maximum(table.sum(axis=1, keepdims=True), 1), cmap='Blues', vmin=0, vmax=1)
+    axes.imshow(
+        table / np.maximum(table.sum(axis=1, keepdims=True), 1), cmap='Blues', vmin=0, vmax=1
+    )
     for (i, j), count in np.ndenumerate(table):
         if count:
             colour = 'white' if count > 0.6 * table[i].sum() else 'black'
@@ -183,22 +222,34 @@ def draw_confusion(rows, path):
     axes.set_xlabel('first finding')
     axes.set_ylabel('hidden')
     right = np.mean([first_is_right(row) for row in rows])
-    axes.set_title(f'Hide and seek at five times the smallest detectable size: {100 * right:.1f} % of {len(rows)} sessions right '
-                   'or in the declared class', fontsize=10)
+    axes.set_title(
+        f'Hide and seek at five times the smallest detectable size: {100 * right:.1f} % of {len(rows)} sessions right '
+        'or in the declared class',
+        fontsize=10,
+    )
     figure.savefig(path, dpi=110)
 
 
 def _power(rows, path):
     from matplotlib.figure import Figure
+
     figure = Figure(figsize=(7, 4.5), layout='constrained')
     axes = figure.add_subplot()
     print('\ndetection power against size (in smallest detectable sizes)')
     for effect in sorted({row['hidden'][0] for row in rows}):
         some = [row for row in rows if row['hidden'][0] == effect]
         factors = sorted({row['factor'] for row in some})
-        power = [np.mean([first_is_right(row) for row in some if row['factor'] == factor]) for factor in factors]
-        axes.plot(factors, power, 'o-', label=f'{effect} ({len(some) // len(factors)} sessions a point)')
-        print(f'  {effect:24s} ' + ', '.join(f'{factor:g}: {value:.2f}' for factor, value in zip(factors, power)))
+        power = [
+            np.mean([first_is_right(row) for row in some if row['factor'] == factor])
+            for factor in factors
+        ]
+        axes.plot(
+            factors, power, 'o-', label=f'{effect} ({len(some) // len(factors)} sessions a point)'
+        )
+        print(
+            f'  {effect:24s} '
+            + ', '.join(f'{factor:g}: {value:.2f}' for factor, value in zip(factors, power))
+        )
     axes.axhline(0.5, color='grey', lw=0.8)
     axes.set_xlabel('size / smallest detectable size')
     axes.set_ylabel('share of sessions in which it is found')

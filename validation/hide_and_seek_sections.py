@@ -24,7 +24,9 @@ def by_grade(rows):
     order = ('consumer', 'industrial', 'tactical', 'navigation')
     for white in (True, False):
         for grade in order:
-            some = [row for row in rows if grade_of(row) == grade and (kind_of(row) == 'white') == white]
+            some = [
+                row for row in rows if grade_of(row) == grade and (kind_of(row) == 'white') == white
+            ]
             if some:
                 yield grade, 'white' if white else 'realistic', some
 
@@ -37,14 +39,20 @@ def both_found(row):
 def wrong_names(row):
     """Return the findings that are no hidden effect, and whose class holds none that has no finding of its own."""
     owned = set(_owners(row).values())
-    return [name for k, name in enumerate(row['found']) if k not in owned and name not in row['hidden']]
+    return [
+        name for k, name in enumerate(row['found']) if k not in owned and name not in row['hidden']
+    ]
 
 
 def _owners(row):
     """Return hidden effect -> number of its finding, as many as can be had with one each: by name first, then by class."""
     owners = {name: row['found'].index(name) for name in row['hidden'] if name in row['found']}
     for name in row['hidden']:
-        free = [k for k, mates in enumerate(row['classes']) if name in mates and k not in owners.values()]
+        free = [
+            k
+            for k, mates in enumerate(row['classes'])
+            if name in mates and k not in owners.values()
+        ]
         if name not in owners and free:
             owners[name] = free[0]
     return owners
@@ -59,29 +67,50 @@ def print_pairs(rows):
     """Print how many pairs were found, which not, and which no search can find in these sessions."""
     if not rows:
         return
-    asked, excepted = [row for row in rows if separable(row)], [row for row in rows if not separable(row)]
-    print(f'\nall pairs at five times the smallest detectable size: both named {share_of(map(both_found, asked))}; '
-          f'a wrong name {share_of(bool(wrong_names(row)) for row in asked)}')
+    asked, excepted = (
+        [row for row in rows if separable(row)],
+        [row for row in rows if not separable(row)],
+    )
+    print(
+        f'\nall pairs at five times the smallest detectable size: both named {share_of(map(both_found, asked))}; '
+        f'a wrong name {share_of(bool(wrong_names(row)) for row in asked)}'
+    )
     for row in asked:
         if not both_found(row) or wrong_names(row):
-            print(f"  {row['hidden']} seed {row['seed']}: {row['found']} {row['classes']}")
+            print(f'  {row["hidden"]} seed {row["seed"]}: {row["found"]} {row["classes"]}')
     if excepted:
-        print(f'excepted, for less than the smallest detectable size of a member is left beside the other: {len(excepted)}, of which both named '
-              f'{share_of(map(both_found, excepted))}; a wrong name {share_of(bool(wrong_names(row)) for row in excepted)}')
+        print(
+            f'excepted, for less than the smallest detectable size of a member is left beside the other: {len(excepted)}, of which both named '
+            f'{share_of(map(both_found, excepted))}; a wrong name {share_of(bool(wrong_names(row)) for row in excepted)}'
+        )
         for row in excepted:
-            print(f"  {' + '.join(row['hidden'])}: " + ', '.join(f'{name} {left:.2f}' for name, left in row['beside'].items() if np.isfinite(left)))
+            print(
+                f'  {" + ".join(row["hidden"])}: '
+                + ', '.join(
+                    f'{name} {left:.2f}'
+                    for name, left in row['beside'].items()
+                    if np.isfinite(left)
+                )
+            )
 
 
 def print_sizes(rows):
     """Print by size how often the first finding is right, and how often it carries the mark of an implausible size."""
     if not rows:
         return
-    print('\nsize (in smallest detectable sizes): first finding right or in its class, of these with the mark, a wrong name')
+    print(
+        '\nsize (in smallest detectable sizes): first finding right or in its class, of these with the mark, a wrong name'
+    )
     for factor in sorted({row['factor'] for row in rows}):
         some = [row for row in rows if row['factor'] == factor]
-        right = [bool(row['found']) and row['hidden'][0] in [row['found'][0], *row['classes'][0]] for row in some]
+        right = [
+            bool(row['found']) and row['hidden'][0] in [row['found'][0], *row['classes'][0]]
+            for row in some
+        ]
         marked = sum(good and row['implausible'][0] for good, row in zip(right, some))
-        print(f'  {factor:5g}: {share_of(right)}, {marked} marked, {share_of(bool(wrong_names(row)) for row in some)}')
+        print(
+            f'  {factor:5g}: {share_of(right)}, {marked} marked, {share_of(bool(wrong_names(row)) for row in some)}'
+        )
         for row, good in zip(some, right):
             if not good and factor > 1:
-                print(f"         {row['hidden'][0]} seed {row['seed']}: {row['found']}")
+                print(f'         {row["hidden"][0]} seed {row["seed"]}: {row["found"]}')

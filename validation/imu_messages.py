@@ -32,7 +32,11 @@ def parse_imu(data: bytes) -> ImuMessage:
 
     """
     header, body = open_header(data), find_imu_layout(data).offsets['orientation'][0]
-    return ImuMessage(header.stamp_ns, header.frame_id, struct.unpack_from(f'{header.order}{N_DOUBLES}d', data, body))
+    return ImuMessage(
+        header.stamp_ns,
+        header.frame_id,
+        struct.unpack_from(f'{header.order}{N_DOUBLES}d', data, body),
+    )
 
 
 def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float]) -> bytes:
@@ -54,11 +58,15 @@ def patch_imu(data: bytes, frame_id: str | None = None, **fields: Sequence[float
     if frame_id is not None and frame_id.encode() != header.frame:
         frame = frame_id.encode() + b'\0'
         new_body = aligned(FRAME_OFFSET + 4 + len(frame), 8)
-        data = (data[:FRAME_OFFSET] + struct.pack(order + 'I', len(frame)) + frame).ljust(new_body, b'\0') + data[body:]
+        data = (data[:FRAME_OFFSET] + struct.pack(order + 'I', len(frame)) + frame).ljust(
+            new_body, b'\0'
+        ) + data[body:]
         body = new_body
     patched = bytearray(data)
     for name, value in fields.items():
         value = np.asarray(value, dtype=float).ravel()
         place = FIELDS[name]
-        struct.pack_into(f'{order}{place.stop - place.start}d', patched, body + 8 * place.start, *value)
+        struct.pack_into(
+            f'{order}{place.stop - place.start}d', patched, body + 8 * place.start, *value
+        )
     return bytes(patched)

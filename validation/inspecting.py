@@ -10,7 +10,9 @@ from validation.section import Section, text
 
 def remarks(lines):
     """Return what was printed below the list of topics; checks that found all well are counted only."""
-    below = [line for line in (lines[lines.index('') + 1:] if '' in lines else lines) if line.strip()]
+    below = [
+        line for line in (lines[lines.index('') + 1 :] if '' in lines else lines) if line.strip()
+    ]
     good = [line for line in below if line.startswith('good')]
     names = ', '.join(re.split(r'\s{2,}', line)[1] for line in good)
     return [line for line in below if line not in good] + [f'good      {names}'] * bool(good)
@@ -23,24 +25,48 @@ def run(folder, plots):
     with TemporaryDirectory() as work:
         for name, topic in ALL:
             options = options_of(folder, name, topic, work)
-            if '--table' in options:   # what the motions determine stands in the section of the shaft
+            if (
+                '--table' in options
+            ):  # what the motions determine stands in the section of the shaft
                 at = options.index('--table')
-                del options[at:at + 2]
+                del options[at : at + 2]
             code, lines, error = run_verb('inspect', folder / name, options)
             codes.append(code)
             refused += code == 1
-            quoted += [f'{label(name, topic)}: exit code {code}', *(f'  {line}' for line in ([error] if code == 1 else remarks(lines)))]
+            quoted += [
+                f'{label(name, topic)}: exit code {code}',
+                *(f'  {line}' for line in ([error] if code == 1 else remarks(lines))),
+            ]
         bare = run_verb('inspect', folder / 'xsens_counts', [])
         several = run_verb('inspect', folder / 'array_2', [])
-        quoted += ['', f'xsens_counts without --nominal: exit code {bare[0]}', *(f'  {line}' for line in remarks(bare[1])),
-                   '', f'array_2 without --imu-topic: exit code {several[0]}', *(f'  {line}' for line in remarks(several[1]))]
-    section.claim('every recording is read', f'{len(ALL)} of {len(ALL)}', f'{len(ALL) - refused} of {len(ALL)}', refused == 0)
-    section.claim('counts are noticed when nobody says so', 'named', 'named' if any('count' in line for line in bare[1]) else 'not named',
-                  any('count' in line for line in bare[1]))
+        quoted += [
+            '',
+            f'xsens_counts without --nominal: exit code {bare[0]}',
+            *(f'  {line}' for line in remarks(bare[1])),
+            '',
+            f'array_2 without --imu-topic: exit code {several[0]}',
+            *(f'  {line}' for line in remarks(several[1])),
+        ]
+    section.claim(
+        'every recording is read',
+        f'{len(ALL)} of {len(ALL)}',
+        f'{len(ALL) - refused} of {len(ALL)}',
+        refused == 0,
+    )
+    section.claim(
+        'counts are noticed when nobody says so',
+        'named',
+        'named' if any('count' in line for line in bare[1]) else 'not named',
+        any('count' in line for line in bare[1]),
+    )
     topics = [line.split()[0] for line in several[1] if line.startswith('/imu') and ' ' in line]
     looked_at = [line for line in several[1] if line in topics]
-    section.claim('several topics, none chosen: every one is looked at', f'{len(topics)} of {len(topics)}, exit code 3: their gyroscopes clip',
-                  f'{len(looked_at)} of {len(topics)}, exit code {several[0]}', looked_at == topics and several[0] == 3)
+    section.claim(
+        'several topics, none chosen: every one is looked at',
+        f'{len(topics)} of {len(topics)}, exit code 3: their gyroscopes clip',
+        f'{len(looked_at)} of {len(topics)}, exit code {several[0]}',
+        looked_at == topics and several[0] == 3,
+    )
     section.say(text('inspecting'))
     section.quote(quoted)
     return section

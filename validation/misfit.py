@@ -13,27 +13,45 @@ ON_A_SHAFT = ('driver_lag', 'rate_dependent_lag', 'motor_ripple', 'flexible_moun
 def worlds():
     """Return (cause, name of the table, options of `make_pair`) of every world."""
     from worlds.misfit_worlds import CAUSES
-    return [*((cause, 'three axis', {}) for cause in (None, *CAUSES)),
-            *((cause, 'shaft', {'table': 'shaft', 'profile': 'sweeps'}) for cause in ON_A_SHAFT)]
+
+    return [
+        *((cause, 'three axis', {}) for cause in (None, *CAUSES)),
+        *((cause, 'shaft', {'table': 'shaft', 'profile': 'sweeps'}) for cause in ON_A_SHAFT),
+    ]
 
 
 def outcome(cause, options):
     """Return ([cells of the row: decisions, error after / before, the largest of a motion], [whether each sensor with `helps` improves as stated])."""
     from worlds.misfit_worlds import make_pair
+
     pair = make_pair(cause, SEED, **options)
     table = Table.from_mapping(pair.table)
     try:
         found = calibrate(pair.first.block, table)
     except ImuCalibrationError as error:
         return [f'refused: {error}', '', ''], []
-    proof, decisions = check(pair.second.block, found.calibration, table).proof, found.calibration.decisions
+    proof, decisions = (
+        check(pair.second.block, found.calibration, table).proof,
+        found.calibration.decisions,
+    )
     ratios = {sensor: entry['after'] / entry['before'] for sensor, entry in proof.items()}
-    worst = {sensor: max(part['after'] / part['before'] for part in entry['regimes'].values()) for sensor, entry in proof.items()}
+    worst = {
+        sensor: max(part['after'] / part['before'] for part in entry['regimes'].values())
+        for sensor, entry in proof.items()
+    }
     cells = [' / '.join(str(decisions[sensor]) for sensor in proof)]
     cells += [' / '.join(f'{value:.2f}' for value in values.values()) for values in (ratios, worst)]
-    worse = {sensor: {name for name, part in entry['regimes'].items() if part['after'] > HARM * part['before']} for sensor, entry in proof.items()}
-    return cells, [ratios[sensor] < 1.0 and worse[sensor] <= harmed(found.calibration.proof[sensor]).keys() for sensor in proof
-                   if decisions[sensor] is HELPS]
+    worse = {
+        sensor: {
+            name for name, part in entry['regimes'].items() if part['after'] > HARM * part['before']
+        }
+        for sensor, entry in proof.items()
+    }
+    return cells, [
+        ratios[sensor] < 1.0 and worse[sensor] <= harmed(found.calibration.proof[sensor]).keys()
+        for sensor in proof
+        if decisions[sensor] is HELPS
+    ]
 
 
 def run(folder, plots):
@@ -43,8 +61,22 @@ def run(folder, plots):
         cells, helps = outcome(cause, options)
         improved += helps
         rows.append(((cause or 'none').replace('_', ' '), table, *cells))
-    section.claim('worlds of misfit: sensors with the decision "helps" improve in a second session; regimes that are worse by 5 % are named',
-                  'all of them', f'{sum(improved)} of {len(improved)}', all(improved), True)
+    section.claim(
+        'worlds of misfit: sensors with the decision "helps" improve in a second session; regimes that are worse by 5 % are named',
+        'all of them',
+        f'{sum(improved)} of {len(improved)}',
+        all(improved),
+        True,
+    )
     section.say(text('misfit'))
-    section.table(('cause', 'table', 'decisions, accelerometer / gyroscope', 'error after / before', 'the largest of a motion'), rows)
+    section.table(
+        (
+            'cause',
+            'table',
+            'decisions, accelerometer / gyroscope',
+            'error after / before',
+            'the largest of a motion',
+        ),
+        rows,
+    )
     return section

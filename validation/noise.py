@@ -12,8 +12,13 @@ from imu_calibration.effects.base import AXES, SENSORS
 from validation.recordings import BOARD, label, load
 from validation.section import Section, text
 
-RESTING = (('shaft_pitch_slow', '/imu_fixed/data_raw'), ('xsens_counts', None), ('mpu9150_0', None), ('mpu9150_3', None),
-           *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD))
+RESTING = (
+    ('shaft_pitch_slow', '/imu_fixed/data_raw'),
+    ('xsens_counts', None),
+    ('mpu9150_0', None),
+    ('mpu9150_3', None),
+    *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD),
+)
 """Recordings with rest in both halves; the fixed unit stands on the bench of a running motor, the others are held or laid down by hand between turns."""
 INSIDE = 0.90
 """Share of the averaging times that must lie within their 95 % bands; neighbours on a curve go together, so that few independent ones count."""
@@ -39,11 +44,16 @@ def predicted_band(first, second, axis):
     found, moments = first.axes[axis], second.moments[axis]
     expected, freedom = predicted(moments, found)
     fit, own = found.fit, first.record.moments[axis]
-    fitted = own.design(fit.processes)[-len(fit.covariance):]
+    fitted = own.design(fit.processes)[-len(fit.covariance) :]
     seen = fit.coefficients > 0
     columns = Whitener(found.excess * fit.covariance)(fitted[:, seen])
     shares = second.moments[axis].scales
-    design = np.column_stack([shares.expectation(process) * moments.kept.of(process, shares.tau) for process in fit.processes])[:, seen]
+    design = np.column_stack(
+        [
+            shares.expectation(process) * moments.kept.of(process, shares.tau)
+            for process in fit.processes
+        ]
+    )[:, seen]
     root = np.linalg.solve(np.linalg.cholesky(columns.T @ columns), design.T)
     freedom = 2.0 / (2.0 / freedom + (root**2).sum(axis=0) / expected**2)
     return expected * np.array([chdtri(freedom, tail) for tail in (0.975, 0.025)]) / freedom
@@ -64,7 +74,9 @@ def compare(imu):
 
 def interval_of_share(counts, seed=0):
     """Return the 95 % interval of the share inside when the recordings are drawn anew, counts of (inside, all) of shape (n_recordings, 2)."""
-    drawn = counts[np.random.default_rng(seed).integers(len(counts), size=(DRAWS, len(counts)))].sum(axis=1)
+    drawn = counts[
+        np.random.default_rng(seed).integers(len(counts), size=(DRAWS, len(counts)))
+    ].sum(axis=1)
     return np.quantile(drawn[:, 0] / drawn[:, 1], (0.025, 0.975))
 
 
@@ -80,11 +92,33 @@ def run(folder, plots):
         explained = [points for points, excess in found if excess == 1]
         counts.append((sum(points.sum() for points in explained), sum(map(len, explained))))
         axes = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
-        strange = [f'{axis} ({np.sqrt(excess):.1f} times)' for axis, (_, excess) in zip(axes, found) if excess > 1]
-        rows.append((label(name, topic), ', '.join(f'{points.sum()} of {len(points)}' for points, _ in found), ', '.join(strange)))
+        strange = [
+            f'{axis} ({np.sqrt(excess):.1f} times)'
+            for axis, (_, excess) in zip(axes, found)
+            if excess > 1
+        ]
+        rows.append(
+            (
+                label(name, topic),
+                ', '.join(f'{points.sum()} of {len(points)}' for points, _ in found),
+                ', '.join(strange),
+            )
+        )
     (inside, every), (least, most) = np.sum(counts, axis=0), interval_of_share(np.array(counts))
-    section.claim('noise fitted to the first half: Allan variances of the second inside their 95 % bands', f'at least {INSIDE:.0%}',
-                  f'{inside} of {every} ({inside / every:.1%}; {least:.0%} to {most:.0%} with other such recordings)', inside >= INSIDE * every, headline=True)
+    section.claim(
+        'noise fitted to the first half: Allan variances of the second inside their 95 % bands',
+        f'at least {INSIDE:.0%}',
+        f'{inside} of {every} ({inside / every:.1%}; {least:.0%} to {most:.0%} with other such recordings)',
+        inside >= INSIDE * every,
+        headline=True,
+    )
     section.say(text('noise'))
-    section.table(('recording', 'inside, force x, y, z, rate x, y, z', 'no model explains the curve, departs by'), rows)
+    section.table(
+        (
+            'recording',
+            'inside, force x, y, z, rate x, y, z',
+            'no model explains the curve, departs by',
+        ),
+        rows,
+    )
     return section

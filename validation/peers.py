@@ -38,11 +38,20 @@ def kinds():
         def make(seed):
             imu, ranges, truth = hold_and_turn(seed, **options)
             return change(imu, seed), ranges, truth
+
         return make
-    return {'clean': made(), 'half of the turns clipped': made(lambda imu, seed: clipped(imu, 0.8 * np.median(np.abs(imu.rate_s).max(axis=0))), n_poses=18),
-            'eight poses': made(n_poses=8), 'poses creep by 0.15 deg/s': made(creep=np.radians(0.15)),
-            'stamps late by 3 ms rms': made(lambda imu, seed: with_stamp_jitter(imu, 3e-3, seed)),
-            '1 % spikes': made(lambda imu, seed: with_spikes(imu, 0.01, seed))}
+
+    return {
+        'clean': made(),
+        'half of the turns clipped': made(
+            lambda imu, seed: clipped(imu, 0.8 * np.median(np.abs(imu.rate_s).max(axis=0))),
+            n_poses=18,
+        ),
+        'eight poses': made(n_poses=8),
+        'poses creep by 0.15 deg/s': made(creep=np.radians(0.15)),
+        'stamps late by 3 ms rms': made(lambda imu, seed: with_stamp_jitter(imu, 3e-3, seed)),
+        '1 % spikes': made(lambda imu, seed: with_spikes(imu, 0.01, seed)),
+    }
 
 
 def plain(imu, ranges, average):
@@ -56,24 +65,44 @@ def plain(imu, ranges, average):
     up = accelerometer.directions(force)
     bias = np.mean([average(imu.rate_s[held], axis=0) for held in ranges], axis=0)
     step = 1e-9 * (imu.stamp_ns[-1] - imu.stamp_ns[0]) / (len(imu) - 1)
-    turns = [imu.rate_s[first.stop:second.start] - bias for first, second in zip(ranges, ranges[1:])]
+    turns = [
+        imu.rate_s[first.stop : second.start] - bias for first, second in zip(ranges, ranges[1:])
+    ]
 
     def misses(values):
         inverse = np.linalg.inv(values.reshape(3, 3))
-        return np.concatenate([turned(turn @ inverse.T, step).T @ before - after for turn, before, after in zip(turns, up, up[1:])])
+        return np.concatenate(
+            [
+                turned(turn @ inverse.T, step).T @ before - after
+                for turn, before, after in zip(turns, up, up[1:])
+            ]
+        )
 
-    return accelerometer, Forward(bias, least_squares(misses, np.eye(3).ravel(), x_scale='jac').x.reshape(3, 3))
+    return accelerometer, Forward(
+        bias, least_squares(misses, np.eye(3).ravel(), x_scale='jac').x.reshape(3, 3)
+    )
 
 
 def plain_on_a_table(block, table):
     """Return (accelerometer, gyroscope): bias and matrix by least squares over all samples beside what the joints say."""
-    gatherer, model = MotionGatherer(table), SensorModel(accelerometer=('bias', 'matrix'), gyroscope=('bias', 'matrix'), joint_names=tuple(table.joint_names))
+    gatherer, model = (
+        MotionGatherer(table),
+        SensorModel(
+            accelerometer=('bias', 'matrix'),
+            gyroscope=('bias', 'matrix'),
+            joint_names=tuple(table.joint_names),
+        ),
+    )
     windows = gatherer.push(block) + gatherer.finish()
     found = []
     for place, measured in enumerate(('force_s', 'rate_s')):
         readings = [getattr(window, measured) for window in windows]
-        reference = [np.broadcast_to(predict(model, model.start(), table, motion=window.motion)[place], reading.shape)
-                     for window, reading in zip(windows, readings)]
+        reference = [
+            np.broadcast_to(
+                predict(model, model.start(), table, motion=window.motion)[place], reading.shape
+            )
+            for window, reading in zip(windows, readings)
+        ]
         design = np.insert(np.concatenate(reference), 0, 1.0, axis=1)
         solution = np.linalg.lstsq(design, np.concatenate(readings), rcond=None)[0]
         found.append(Forward(solution[0], solution[1:].T))
@@ -84,22 +113,34 @@ def errors(found, truth):
     """Return rms errors of the compensated accelerometer (m/s^2, at 1 g) and gyroscope (rad/s, at 1 rad/s rms per axis), over the same directions for all."""
     rng, rms = np.random.default_rng(1), []
     force = rng.normal(size=(500, 3))
-    for sensor, true, motion in zip(found, truth, (GRAVITY * force / np.linalg.norm(force, axis=1, keepdims=True), rng.normal(size=(500, 3)))):
+    for sensor, true, motion in zip(
+        found,
+        truth,
+        (GRAVITY * force / np.linalg.norm(force, axis=1, keepdims=True), rng.normal(size=(500, 3))),
+    ):
         reading = motion @ true.matrix.T + true.bias
-        rms.append(np.sqrt(np.mean((sensor.compensated(reading) - motion)**2)))
+        rms.append(np.sqrt(np.mean((sensor.compensated(reading) - motion) ** 2)))
     return rms
 
 
 def ours(calibration):
     """Return (accelerometer, gyroscope) of a Calibration."""
     values = dict(zip(calibration.param_names, calibration.values))
-    return [Forward(np.array([values[f'{sensor}.bias.{axis}'] for axis in 'xyz']),
-                    np.array([[values[f'{sensor}.matrix.{row}{column}'] for column in 'xyz'] for row in 'xyz'])) for sensor in ('accelerometer', 'gyroscope')]
+    return [
+        Forward(
+            np.array([values[f'{sensor}.bias.{axis}'] for axis in 'xyz']),
+            np.array(
+                [[values[f'{sensor}.matrix.{row}{column}'] for column in 'xyz'] for row in 'xyz']
+            ),
+        )
+        for sensor in ('accelerometer', 'gyroscope')
+    ]
 
 
 def by_hand(make):
     """Return rms errors over the seeds of ours, the plain fit on means and on medians, shape (3, 2); inf where we refuse."""
     from worlds.hand_sessions import unpack
+
     rows = []
     for seed in SEEDS:
         imu, ranges, values = make(seed)
@@ -109,37 +150,73 @@ def by_hand(make):
             mine = errors(ours(calibrate(SampleBlock(imu), gravity=GRAVITY).calibration), truth)
         except ImuCalibrationError:
             mine = [np.inf, np.inf]
-        rows.append([mine, *(errors(plain(imu, ranges, average), truth) for average in (np.mean, np.median))])
+        rows.append(
+            [
+                mine,
+                *(errors(plain(imu, ranges, average), truth) for average in (np.mean, np.median)),
+            ]
+        )
     return np.sqrt(np.mean(np.square(rows), axis=0))
 
 
 def trial(make):
     """Return {method: median errors over the sessions of a trial}; None for a sensor that a method does not calibrate."""
     from worlds.hand_sessions import unpack
+
     found = {}
     for seed in TRIAL_SEEDS:
         imu, ranges, values = make(seed)
         bias_f, matrix_f, bias_w, matrix_w = unpack(values)
         truth = Forward(bias_f, matrix_f), Forward(bias_w, matrix_w)
-        methods = {'ours': ours(calibrate(SampleBlock(imu), gravity=GRAVITY).calibration),
-                   **{peer.__name__: peer(imu, ranges, GRAVITY) for peer in (imu_tk, imu_calib, norm_fit, six_faces)}}
+        methods = {
+            'ours': ours(calibrate(SampleBlock(imu), gravity=GRAVITY).calibration),
+            **{
+                peer.__name__: peer(imu, ranges, GRAVITY)
+                for peer in (imu_tk, imu_calib, norm_fit, six_faces)
+            },
+        }
         for name, sensors in methods.items():
-            found.setdefault(name, []).append([np.inf] * 2 if sensors is None else
-                                              errors((sensors[0], sensors[1] or Forward(np.full(3, np.inf), np.eye(3))), truth))
+            found.setdefault(name, []).append(
+                [np.inf] * 2
+                if sensors is None
+                else errors(
+                    (sensors[0], sensors[1] or Forward(np.full(3, np.inf), np.eye(3))), truth
+                )
+            )
     return {name: np.median(rows, axis=0) for name, rows in found.items()}
 
 
 def trials(section):
     """Add a claim for each trial of `worlds.hand_trials`, and the table of all methods."""
     from worlds.hand_trials import TRIALS
+
     rows = []
     for kind, make in TRIALS.items():
         found = trial(make)
-        mine, peers = found['ours'], np.nanmin([errors for name, errors in found.items() if name != 'ours'], axis=0)
-        section.claim(f'{kind}: median error of {len(TRIAL_SEEDS)} sessions, accelerometer and gyroscope, against the best peer', f'at most {WITHIN} of it',
-                      '; '.join(f'{1e3 * a:.2f} against {1e3 * b:.2f} {unit}' for a, b, unit in zip(mine, peers, ('mm/s²', 'mrad/s'))),
-                      np.all(mine <= WITHIN * peers))
-        rows.append((kind, *(' / '.join(f'{1e3 * value:.3g}' if np.isfinite(value) else '–' for value in errors) for errors in found.values())))
+        mine, peers = (
+            found['ours'],
+            np.nanmin([errors for name, errors in found.items() if name != 'ours'], axis=0),
+        )
+        section.claim(
+            f'{kind}: median error of {len(TRIAL_SEEDS)} sessions, accelerometer and gyroscope, against the best peer',
+            f'at most {WITHIN} of it',
+            '; '.join(
+                f'{1e3 * a:.2f} against {1e3 * b:.2f} {unit}'
+                for a, b, unit in zip(mine, peers, ('mm/s²', 'mrad/s'))
+            ),
+            np.all(mine <= WITHIN * peers),
+        )
+        rows.append(
+            (
+                kind,
+                *(
+                    ' / '.join(
+                        f'{1e3 * value:.3g}' if np.isfinite(value) else '–' for value in errors
+                    )
+                    for errors in found.values()
+                ),
+            )
+        )
     section.say(text('hand_trials', sessions=len(TRIAL_SEEDS)))
     section.table(('trial (mm/s² / mrad/s)', *(name.replace('_', ' ') for name in found)), rows)
 
@@ -147,12 +224,24 @@ def trials(section):
 def on_a_table():
     """Return rms errors of ours and of plain least squares over all samples, shape (2, 2), where both know all there is."""
     from worlds.physics import make_session
+
     rows = []
     for seed in ON_A_TABLE:
         session = make_session(seed, noise='white', duration=TABLE_SECONDS, temperature=None)
         table = Table.from_mapping(session.table)
-        truth = [Forward(session.truth[sensor].bias, session.truth[sensor].matrix) for sensor in ('accelerometer', 'gyroscope')]
-        rows.append([errors(found, truth) for found in (ours(calibrate(session.block, table).calibration), plain_on_a_table(session.block, table))])
+        truth = [
+            Forward(session.truth[sensor].bias, session.truth[sensor].matrix)
+            for sensor in ('accelerometer', 'gyroscope')
+        ]
+        rows.append(
+            [
+                errors(found, truth)
+                for found in (
+                    ours(calibrate(session.block, table).calibration),
+                    plain_on_a_table(session.block, table),
+                )
+            ]
+        )
     return np.sqrt(np.mean(np.square(rows), axis=0))
 
 
@@ -164,15 +253,42 @@ def run(folder, plots):
         ratios.append((kind, *(found[0] / found[1:].min(axis=0))))
         rows.append((kind, *(f'{1e3 * value:.2f}' for value in found.T.ravel())))
     first, of = sum(ratio <= 1.0 for _, *both in ratios for ratio in both), 2 * len(ratios)
-    section.claim(f'{len(SEEDS) * len(rows)} sessions by hand, {len(rows)} kinds, two sensors: closer to the truth than either peer', 'in most', f'{first} of {of}',
-                  first > of / 2, True)
-    section.claim('the same: our error over that of the better peer, accelerometer and gyroscope', f'at most {BEHIND} in every kind',
-                  '; '.join(f'{kind} {force:.2f}, {rate:.2f}' for kind, force, rate in ratios), max(max(both) for _, *both in ratios) <= BEHIND, True)
+    section.claim(
+        f'{len(SEEDS) * len(rows)} sessions by hand, {len(rows)} kinds, two sensors: closer to the truth than either peer',
+        'in most',
+        f'{first} of {of}',
+        first > of / 2,
+        True,
+    )
+    section.claim(
+        'the same: our error over that of the better peer, accelerometer and gyroscope',
+        f'at most {BEHIND} in every kind',
+        '; '.join(f'{kind} {force:.2f}, {rate:.2f}' for kind, force, rate in ratios),
+        max(max(both) for _, *both in ratios) <= BEHIND,
+        True,
+    )
     trials(section)
     mine, plainly = on_a_table()
-    section.claim('a table, bias and matrix are all there is: our error over that of plain least squares over all samples', f'at most {BEHIND}',
-                  f'{mine[0] / plainly[0]:.2f} ({1e3 * mine[0]:.3f} and {1e3 * plainly[0]:.3f} mm/s²), '
-                  f'gyroscope {mine[1] / plainly[1]:.2f}', max(mine / plainly) <= BEHIND, True)
-    section.say(text('peers', seeds=len(SEEDS), minutes=TABLE_SECONDS / 60, sessions=len(ON_A_TABLE)))
-    section.table(('kind of session', *(f'{sensor}, {who}' for sensor in ('mm/s²', 'mrad/s') for who in ('ours', 'on means', 'on medians'))), rows)
+    section.claim(
+        'a table, bias and matrix are all there is: our error over that of plain least squares over all samples',
+        f'at most {BEHIND}',
+        f'{mine[0] / plainly[0]:.2f} ({1e3 * mine[0]:.3f} and {1e3 * plainly[0]:.3f} mm/s²), '
+        f'gyroscope {mine[1] / plainly[1]:.2f}',
+        max(mine / plainly) <= BEHIND,
+        True,
+    )
+    section.say(
+        text('peers', seeds=len(SEEDS), minutes=TABLE_SECONDS / 60, sessions=len(ON_A_TABLE))
+    )
+    section.table(
+        (
+            'kind of session',
+            *(
+                f'{sensor}, {who}'
+                for sensor in ('mm/s²', 'mrad/s')
+                for who in ('ours', 'on means', 'on medians')
+            ),
+        ),
+        rows,
+    )
     return section

@@ -14,8 +14,12 @@ ROOT = Path(__file__).resolve().parents[1]
 VARIABLE = 'IMU_CALIBRATION_DATA'
 BOARD = (1, 3, 5, 7)
 """Numbers of the IMUs on the boards."""
-BY_HAND = (('xsens_counts', None), ('mpu9150_0', None), ('mpu9150_3', None),
-           *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD))
+BY_HAND = (
+    ('xsens_counts', None),
+    ('mpu9150_0', None),
+    ('mpu9150_3', None),
+    *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD),
+)
 """Recordings of many poses, with the topic where there are several."""
 SHAFT = ('shaft_pitch_slow', 'shaft_yaw_medium')
 """Recordings with one joint."""

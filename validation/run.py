@@ -12,21 +12,40 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
-    sys.path[:0] = [str(ROOT), str(ROOT / 'test')]   # simulated worlds are those of the tests
+    sys.path[:0] = [str(ROOT), str(ROOT / 'test')]  # simulated worlds are those of the tests
 
 from imu_calibration import __version__  # noqa: E402
 from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
 from validation.recordings import VARIABLE, data_folder  # noqa: E402
 from validation.section import Section, claims_table, text  # noqa: E402
 
-SECTIONS = ('cross', 'decisions', 'misfit', 'shaft', 'boards', 'arm_live', 'xsens', 'mpu9150', 'ferraris', 'simulated_table', 'peers', 'held_out', 'noise', 'inspecting', 'diagnosing')
+SECTIONS = (
+    'cross',
+    'decisions',
+    'misfit',
+    'shaft',
+    'boards',
+    'arm_live',
+    'xsens',
+    'mpu9150',
+    'ferraris',
+    'simulated_table',
+    'peers',
+    'held_out',
+    'noise',
+    'inspecting',
+    'diagnosing',
+)
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
 
 
 def versions():
     """Return [(name, version)] of the package, the system and the libraries."""
-    found = [('imu_calibration', __version__), ('Python', platform.python_version()),
-             ('system', f'{platform.system()} {platform.machine()}')]
+    found = [
+        ('imu_calibration', __version__),
+        ('Python', platform.python_version()),
+        ('system', f'{platform.system()} {platform.machine()}'),
+    ]
     for name in PACKAGES:
         try:
             found.append((name, version(name)))
@@ -44,19 +63,25 @@ def run_section(name, folder, plots):
     except ImuCalibrationError as error:
         section, whole = Section(name), False
         section.say(f'Refused: {error}')
-    except Exception as error:   # one section must not cost the others
+    except Exception as error:  # one section must not cost the others
         traceback.print_exc()
         section, whole = Section(name), False
         section.say(f'Could not be run: {type(error).__name__}: {error}')
     print(f'{time.monotonic() - start:.0f} s', flush=True)
     for row in section.rows:
-        print(f'    {row.claim}: {row.found} (wanted {row.target}){"" if row.holds in (None, True) else "  NO"}')
+        print(
+            f'    {row.claim}: {row.found} (wanted {row.target}){"" if row.holds in (None, True) else "  NO"}'
+        )
     return section, whole
 
 
 def document(sections):
     """Return the text of docs/validation.md."""
-    head = text('introduction', date=date.today().isoformat(), versions='\n'.join(f'| {name} | {found} |' for name, found in versions()))
+    head = text(
+        'introduction',
+        date=date.today().isoformat(),
+        versions='\n'.join(f'| {name} | {found} |' for name, found in versions()),
+    )
     rows = [row for section in sections for row in section.rows if row.holds is not None]
     missed = [row for row in rows if not row.holds]
     count = f'{len(rows) - len(missed)} of {len(rows)} claims hold.'
@@ -71,19 +96,40 @@ def claims(sections):
     rows = [row for section in sections for row in section.rows]
     judged = [row for row in rows if row.holds is not None]
     table = claims_table([row for row in rows if row.headline])
-    return text('claims', date=date.today().isoformat(), holding=sum(row.holds for row in judged), total=len(judged), table=table) + '\n'
+    return (
+        text(
+            'claims',
+            date=date.today().isoformat(),
+            holding=sum(row.holds for row in judged),
+            total=len(judged),
+            table=table,
+        )
+        + '\n'
+    )
 
 
 def main():
     """Run the sections and write the pages."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--only', action='append', choices=SECTIONS, help='run only this section and print it; may be repeated')
-    parser.add_argument('--output', type=Path, default=ROOT / 'docs', help='folder for validation.md, claims.md and validation/, default docs')
+    parser.add_argument(
+        '--only',
+        action='append',
+        choices=SECTIONS,
+        help='run only this section and print it; may be repeated',
+    )
+    parser.add_argument(
+        '--output',
+        type=Path,
+        default=ROOT / 'docs',
+        help='folder for validation.md, claims.md and validation/, default docs',
+    )
     options = parser.parse_args()
     folder = data_folder()
     if folder is None:
-        print(f'the recordings must be in ../shared/data or where {VARIABLE} says, there is no such folder; set {VARIABLE}',
-              file=sys.stderr)
+        print(
+            f'the recordings must be in ../shared/data or where {VARIABLE} says, there is no such folder; set {VARIABLE}',
+            file=sys.stderr,
+        )
         return 1
     plots = options.output / 'validation'
     plots.mkdir(parents=True, exist_ok=True)

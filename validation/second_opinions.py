@@ -52,14 +52,25 @@ def fit_norm(force, gravity, cross_axis=True, loss='linear'):
         return Forward(values[:3], matrix)
 
     start = np.concatenate([np.zeros(3), np.eye(3)[lower]])
-    return model(least_squares(lambda values: model(values).norm_errors(force, gravity), start, x_scale='jac', loss=loss).x)
+    return model(
+        least_squares(
+            lambda values: model(values).norm_errors(force, gravity),
+            start,
+            x_scale='jac',
+            loss=loss,
+        ).x
+    )
 
 
 def cut(imu, sections):
     """Return {'acc_x_p': (n, 3), ..., 'gyr_z_rot': (n, 3)}: the samples of each section, SI."""
     names = (*FACES, *TURNS)
     readings = (('acc', imu.force_s), ('gyr', imu.rate_s))
-    return {f'{sensor}_{name}': values[slice(*sections[name])] for name in names for sensor, values in readings}
+    return {
+        f'{sensor}_{name}': values[slice(*sections[name])]
+        for name in names
+        for sensor, values in readings
+    }
 
 
 def ferraris(imu, sections, rate_hz, gravity, angle):
@@ -69,8 +80,11 @@ def ferraris(imu, sections, rate_hz, gravity, angle):
     `angle` (rad) is the signed angle of all three turns. imucal's gyroscope works in deg/s by convention; given radians it stays in rad/s.
     """
     from imucal import FerrarisCalibration, FerrarisSignalRegions
+
     regions = FerrarisSignalRegions(**cut(imu, sections))
-    return FerrarisCalibration(grav=gravity, expected_angle=angle).compute(regions, rate_hz, from_acc_unit='m/s^2', from_gyr_unit='rad/s')
+    return FerrarisCalibration(grav=gravity, expected_angle=angle).compute(
+        regions, rate_hz, from_acc_unit='m/s^2', from_gyr_unit='rad/s'
+    )
 
 
 def accelerometer_of(info):

@@ -37,7 +37,9 @@ class Section:
 
     def claim(self, claim, target, found, holds=None, headline=False):
         """Add a claim; a headline is quoted by the README."""
-        self.rows.append(Row(claim, target, found, None if holds is None else bool(holds), headline))
+        self.rows.append(
+            Row(claim, target, found, None if holds is None else bool(holds), headline)
+        )
 
     def say(self, text):
         """Add a paragraph."""
@@ -81,7 +83,9 @@ def claims_table(rows):
 def markdown_table(head, rows):
     """Return a Markdown table; bars within cells are escaped."""
     lines = [head, ['---'] * len(head), *rows]
-    return '\n'.join('| ' + ' | '.join(str(cell).replace('|', '\\|') for cell in line) + ' |' for line in lines)
+    return '\n'.join(
+        '| ' + ' | '.join(str(cell).replace('|', '\\|') for cell in line) + ' |' for line in lines
+    )
 
 
 def listed(values, digits):

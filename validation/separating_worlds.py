@@ -33,7 +33,15 @@ from worlds.hiding import Recording, Sizes
 from worlds.physics import Session, make_session
 from worlds.physics_draw import generator, to_ns
 
-HIDDEN = ('accel_quadratic', 'gyro_bandwidth', 'accel_scale_asymmetry', 'gyro_quadratic', 'time_offset', 'gyro_scale_asymmetry', 'accel_bandwidth')
+HIDDEN = (
+    'accel_quadratic',
+    'gyro_bandwidth',
+    'accel_scale_asymmetry',
+    'gyro_quadratic',
+    'time_offset',
+    'gyro_scale_asymmetry',
+    'accel_bandwidth',
+)
 """Effects that depend on motion and are often confounded with others in a short recording."""
 FACTORS = (2.5, 4.0)
 """Sizes, as multiples of the smallest detectable size in the first recording; a larger one is less often in a class."""
@@ -76,7 +84,9 @@ class World:
 
     def session(self, number: int, motion: Profile, hidden: dict) -> Session:
         """Return one of the recordings: of the same unit, with other noise."""
-        return make_session(self.seed + 100_000 * number, hidden, self.noise, profile=motion, unit=self.seed)
+        return make_session(
+            self.seed + 100_000 * number, hidden, self.noise, profile=motion, unit=self.seed
+        )
 
 
 def _spin_one_way(builder, up, speed):
@@ -87,8 +97,16 @@ def _spin_one_way(builder, up, speed):
 def appended(first: SampleBlock, second: SampleBlock) -> SampleBlock:
     """Return two recordings as one, the second some time after the first."""
     shift = first.imu.stamp_ns[-1] + to_ns(PAUSE) - second.imu.stamp_ns[0]
-    later = [replace(part, stamp_ns=part.stamp_ns + shift) for part in (second.imu, second.joints, second.temperature)]
-    return SampleBlock(*(type(b).concatenate([a, b]) for a, b in zip((first.imu, first.joints, first.temperature), later, strict=True)))
+    later = [
+        replace(part, stamp_ns=part.stamp_ns + shift)
+        for part in (second.imu, second.joints, second.temperature)
+    ]
+    return SampleBlock(
+        *(
+            type(b).concatenate([a, b])
+            for a, b in zip((first.imu, first.joints, first.temperature), later, strict=True)
+        )
+    )
 
 
 def run(world: World) -> dict:
@@ -105,14 +123,24 @@ def run(world: World) -> dict:
     while len(done) < SEPARATIONS:
         left = LONGEST_SEPARATION - sum(made.seconds for made in done)
         try:
-            made = plan(table, calibration=found.calibration, diagnosis=found.document, longest=left, with_bound=False).plan
+            made = plan(
+                table,
+                calibration=found.calibration,
+                diagnosis=found.document,
+                longest=left,
+                with_bound=False,
+            ).plan
         except ImuCalibrationError as error:
             if not done:
                 return row | {'refused': str(error), 'right': False}
             break
         done.append(made)
         if made.motions:
-            motion = Profile('separating', tuple(segment for one in made.segments for segment in one), first.truth['profile'].joint_names)
+            motion = Profile(
+                'separating',
+                tuple(segment for one in made.segments for segment in one),
+                first.truth['profile'].joint_names,
+            )
             block = appended(block, world.session(len(done), motion, hidden).block)
             found = diagnose(block, table)
         row |= judged(names(found), world.effect, done)
@@ -128,28 +156,51 @@ def is_class(found: list) -> bool:
 
 def judged(found: list, hidden: str, done: Sequence[Plan]) -> dict:
     """Return the predictions of the plans, and whether the finding is the hidden effect alone, or a class that the first plan reported as one cause."""
-    missing = done[0].missing   # of all three minutes
-    alike = {hidden, *(name for pair in missing for name in pair.split(' and ') if hidden in pair.split(' and '))}
+    missing = done[0].missing  # of all three minutes
+    alike = {
+        hidden,
+        *(
+            name
+            for pair in missing
+            for name in pair.split(' and ')
+            if hidden in pair.split(' and ')
+        ),
+    }
     named = {name for effect, mates in found for name in (effect, *mates)}
-    return {'after': found, 'seconds': sum(made.seconds for made in done), 'motions': sum(len(made.motions) for made in done), 'rounds': len(done),
-            'missing': missing, 'right': found == [(hidden, ())], 'one_cause': len(found) == 1 and hidden in named and named <= alike}
+    return {
+        'after': found,
+        'seconds': sum(made.seconds for made in done),
+        'motions': sum(len(made.motions) for made in done),
+        'rounds': len(done),
+        'missing': missing,
+        'right': found == [(hidden, ())],
+        'one_cause': len(found) == 1 and hidden in named and named <= alike,
+    }
 
 
 def names(diagnosed: Diagnosed) -> list:
     """Return (effect, mates) of each finding."""
-    return [(finding.effect, tuple(finding.indistinguishable_from)) for finding in diagnosed.findings]
+    return [
+        (finding.effect, tuple(finding.indistinguishable_from)) for finding in diagnosed.findings
+    ]
 
 
 def worlds(first_seed: int, effects: Sequence[str] = HIDDEN) -> Iterator[World]:
     """Yield worlds without end: the effects by turns, in either size."""
     for number in count():
-        yield World(first_seed + number, effects[number % len(effects)], FACTORS[number // len(effects) % len(FACTORS)])
+        yield World(
+            first_seed + number,
+            effects[number % len(effects)],
+            FACTORS[number // len(effects) % len(FACTORS)],
+        )
 
 
 def main() -> None:
     """Simulate worlds until the requested number is ambiguous; print a row for each."""
     parser = ArgumentParser(description=__doc__.split('\n', maxsplit=1)[0])
-    parser.add_argument('--worlds', type=int, default=60, help='worlds in which the first recording leaves a class')
+    parser.add_argument(
+        '--worlds', type=int, default=60, help='worlds in which the first recording leaves a class'
+    )
     parser.add_argument('--first-seed', type=int, default=0)
     parser.add_argument('--effects', type=lambda text: text.split(','), default=HIDDEN)
     parser.add_argument('--most', type=int, default=400, help='worlds that are tried at most')
@@ -161,14 +212,19 @@ def main() -> None:
         if 'right' not in row:
             continue
         rows.append(row)
-        print(f"{row['seed']:6d} {row['hidden']:<24} x{row['factor']:<4g} {row['before']} -> {row.get('after', row.get('refused'))} "
-              f"{row.get('seconds', 0.0):.0f} s {'right' if row['right'] else 'one cause' if row.get('one_cause') else 'WRONG'} {row.get('missing') or ''}", flush=True)
+        print(
+            f'{row["seed"]:6d} {row["hidden"]:<24} x{row["factor"]:<4g} {row["before"]} -> {row.get("after", row.get("refused"))} '
+            f'{row.get("seconds", 0.0):.0f} s {"right" if row["right"] else "one cause" if row.get("one_cause") else "WRONG"} {row.get("missing") or ""}',
+            flush=True,
+        )
         if len(rows) == options.worlds:
             break
     seconds = [row['seconds'] for row in rows if 'seconds' in row]
-    print(f"{tried} worlds, {len(rows)} with a class; a single, right name in {sum(row['right'] for row in rows)}, one cause by the plan's own word in "
-          f"{sum(row.get('one_cause', False) and not row['right'] for row in rows)}; "
-          f'motion median {np.median(seconds):.0f} s, largest {max(seconds):.0f} s')
+    print(
+        f"{tried} worlds, {len(rows)} with a class; a single, right name in {sum(row['right'] for row in rows)}, one cause by the plan's own word in "
+        f'{sum(row.get("one_cause", False) and not row["right"] for row in rows)}; '
+        f'motion median {np.median(seconds):.0f} s, largest {max(seconds):.0f} s'
+    )
 
 
 if __name__ == '__main__':

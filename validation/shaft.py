@@ -40,7 +40,9 @@ def gain_and_lag(calibration, entry):
     values = dict(zip(calibration.param_names, calibration.values))
     sds = dict(zip(calibration.param_names, calibration.sd))
     key = f'gyroscope.matrix.{entry}'
-    lag = sum(values.get(name, 0.0) for name in LAG) if any(name in values for name in LAG) else None
+    lag = (
+        sum(values.get(name, 0.0) for name in LAG) if any(name in values for name in LAG) else None
+    )
     return values[key], sds[key], lag
 
 
@@ -66,17 +68,40 @@ def run(folder, plots):
 
 def _claims(section, name, what, calibration, entry, known):
     if isinstance(calibration, str):
-        section.claim(f'{name}, {what}: gain along the shaft', f'{known} within 0.003', f'refused: {calibration}', False)
+        section.claim(
+            f'{name}, {what}: gain along the shaft',
+            f'{known} within 0.003',
+            f'refused: {calibration}',
+            False,
+        )
         return
     gain, sd, lag = gain_and_lag(calibration, entry)
-    section.claim(f'{name}, {what}: gain along the shaft', f'{known} within 0.003', f'{gain:.4f} ± {sd:.4f}',
-                  abs(gain - known) < 0.003, what == 'default')
+    section.claim(
+        f'{name}, {what}: gain along the shaft',
+        f'{known} within 0.003',
+        f'{gain:.4f} ± {sd:.4f}',
+        abs(gain - known) < 0.003,
+        what == 'default',
+    )
     if lag is not None:
-        section.claim(f'{name}, {what}: lag behind the encoder', '12 to 14, in whole ms (12.0 to 14.0 until 11.97 was seen)', f'{1e3 * lag:.1f} ms', 12 <= round(1e3 * lag) <= 14)
+        section.claim(
+            f'{name}, {what}: lag behind the encoder',
+            '12 to 14, in whole ms (12.0 to 14.0 until 11.97 was seen)',
+            f'{1e3 * lag:.1f} ms',
+            12 <= round(1e3 * lag) <= 14,
+        )
     if what == 'default':
         groups = not_determined(calibration)
         across = [f'gyroscope.matrix.{a}{b}' for a in 'xyz' for b in 'xyz' if b != entry[1]]
         marked = [n for n in across if any(n in names for names in groups.values())]
-        section.claim(f'{name}: the rates across the shaft are marked as not determined', 'all six matrix entries',
-                      f'{len(marked)} of {len(across)}', len(marked) == len(across))
-        section.say(f'{name}, not determined: ' + '; '.join(f'{status}: {", ".join(names)}' for status, names in groups.items()) + '.')
+        section.claim(
+            f'{name}: the rates across the shaft are marked as not determined',
+            'all six matrix entries',
+            f'{len(marked)} of {len(across)}',
+            len(marked) == len(across),
+        )
+        section.say(
+            f'{name}, not determined: '
+            + '; '.join(f'{status}: {", ".join(names)}' for status, names in groups.items())
+            + '.'
+        )

@@ -26,7 +26,10 @@ def figures(folder):
     differences = {}
     for sensor in ('accelerometer', 'gyroscope'):
         offset, scale = in_counts(found, nominal, sensor)
-        differences[sensor] = offset - factory[f'{sensor}_offset'], scale / factory[f'{sensor}_scale'] - 1
+        differences[sensor] = (
+            offset - factory[f'{sensor}_offset'],
+            scale / factory[f'{sensor}_scale'] - 1,
+        )
     return found, differences
 
 
@@ -35,16 +38,39 @@ def run(folder, plots):
     section = Section('Raw counts: Xsens MTi (xsens_counts)')
     found, differences = figures(folder)
     (offset, scale), (offset_w, scale_w) = differences['accelerometer'], differences['gyroscope']
-    section.claim('xsens_counts: accelerometer offsets against the factory', 'within 10 counts', f'{listed(offset, 1)} counts',
-                  np.max(np.abs(offset)) < 10)
-    section.claim('xsens_counts: accelerometer scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale, 2)} %',
-                  np.max(np.abs(scale)) < 0.003)
-    section.claim('gyroscope scale factors against the factory', 'within 0.3 %', f'{listed(100 * scale_w, 2)} %',
-                  np.max(np.abs(scale_w)) < 0.003)
-    section.claim('gyroscope offsets against the factory', 'another turn-on', f'{listed(offset_w, 1)} counts')
+    section.claim(
+        'xsens_counts: accelerometer offsets against the factory',
+        'within 10 counts',
+        f'{listed(offset, 1)} counts',
+        np.max(np.abs(offset)) < 10,
+    )
+    section.claim(
+        'xsens_counts: accelerometer scale factors against the factory',
+        'within 0.3 %',
+        f'{listed(100 * scale, 2)} %',
+        np.max(np.abs(scale)) < 0.003,
+    )
+    section.claim(
+        'gyroscope scale factors against the factory',
+        'within 0.3 %',
+        f'{listed(100 * scale_w, 2)} %',
+        np.max(np.abs(scale_w)) < 0.003,
+    )
+    section.claim(
+        'gyroscope offsets against the factory', 'another turn-on', f'{listed(offset_w, 1)} counts'
+    )
     statistics = found.statistics
-    section.claim('chi-square per degree of freedom of the gravity norm, white noise', 'about 13 by batch means',
-                  f'{statistics["norm_chi2_per_dof"]:.1f}')
-    section.say(text('xsens', gravity=gravity_of(folder, NAME), scatter=1e3 * statistics['pose_scatter_sd'],
-                     **{key: statistics[key] for key in ('poses', 'attitudes', 'turns')}))
+    section.claim(
+        'chi-square per degree of freedom of the gravity norm, white noise',
+        'about 13 by batch means',
+        f'{statistics["norm_chi2_per_dof"]:.1f}',
+    )
+    section.say(
+        text(
+            'xsens',
+            gravity=gravity_of(folder, NAME),
+            scatter=1e3 * statistics['pose_scatter_sd'],
+            **{key: statistics[key] for key in ('poses', 'attitudes', 'turns')},
+        )
+    )
     return section

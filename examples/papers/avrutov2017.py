@@ -17,7 +17,11 @@ MODEL_COLUMNS = {
 }
 """Design columns of the axial model (eq. 2, 8), the pendulous or extended model (eq. 5, 11) and the full quadratic."""
 
-GIMBAL_ORDERS = tuple(''.join(order) for order in itertools.product('XYZ', repeat=3) if order[0] != order[1] != order[2])
+GIMBAL_ORDERS = tuple(
+    ''.join(order)
+    for order in itertools.product('XYZ', repeat=3)
+    if order[0] != order[1] != order[2]
+)
 """All 12 Euler and Tait-Bryan orders, the first rotation first."""
 
 
@@ -35,7 +39,7 @@ def nominal_gyroscopes(model: str = 'products', n11: float = 0.1) -> np.ndarray:
 
 def _stacked(bias, matrix, model):
     products = np.full((3, 3), 1e-3) - 2e-3 * np.eye(3)
-    return np.vstack([np.full(3, bias), matrix.T, products.T])[:len(MODEL_COLUMNS[model])]
+    return np.vstack([np.full(3, bias), matrix.T, products.T])[: len(MODEL_COLUMNS[model])]
 
 
 def turn(order: str, angles: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
@@ -53,7 +57,9 @@ def turn(order: str, angles: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
     return Rotation.from_euler(order, np.transpose(angles)).inv().as_matrix()
 
 
-def simultaneous_turn(angle: np.ndarray, axis: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> np.ndarray:
+def simultaneous_turn(
+    angle: np.ndarray, axis: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> np.ndarray:
     """Return body-from-base matrices of one turn by `angle` (rad, shape (n,)) about `axis`: "three axes simultaneously", literally."""
     return Rotation.from_rotvec(np.outer(angle, axis) / np.linalg.norm(axis)).inv().as_matrix()
 
@@ -63,7 +69,9 @@ def equal_angles(step_deg: float = 10.0, stop_deg: float = 400.0) -> np.ndarray:
     return np.deg2rad(np.arange(0.0, stop_deg + step_deg / 2, step_deg))
 
 
-def gravity_readings(mat_bn: np.ndarray, gravity_axis: str, tilt_rad: Sequence[float] | np.ndarray = (0.0, 0.0)) -> np.ndarray:
+def gravity_readings(
+    mat_bn: np.ndarray, gravity_axis: str, tilt_rad: Sequence[float] | np.ndarray = (0.0, 0.0)
+) -> np.ndarray:
     """
     Return the specific force in g in the body frame, shape (n, 3), for gravity along one axis of the table's base.
 
@@ -109,13 +117,33 @@ def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float) -> np.n
 def design_matrix(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
     """Return G (eq. 2, 5) or omega (eq. 8, 11), shape (n, n_params), columns as in `MODEL_COLUMNS`."""
     if model not in MODEL_COLUMNS:
-        raise InputError(f"model must be one of {', '.join(MODEL_COLUMNS)}, got '{model}'; choose one of them", code='model_unknown')
+        raise InputError(
+            f"model must be one of {', '.join(MODEL_COLUMNS)}, got '{model}'; choose one of them",
+            code='model_unknown',
+        )
     x, y, z = np.asarray(inputs, float).T
-    known = {'bias': np.ones_like(x), 'x': x, 'y': y, 'z': z, 'xy': x * y, 'yz': y * z, 'xz': x * z, 'xx': x * x, 'yy': y * y, 'zz': z * z}
+    known = {
+        'bias': np.ones_like(x),
+        'x': x,
+        'y': y,
+        'z': z,
+        'xy': x * y,
+        'yz': y * z,
+        'xz': x * z,
+        'xx': x * x,
+        'yy': y * y,
+        'zz': z * z,
+    }
     return np.column_stack([known[name] for name in MODEL_COLUMNS[model]])
 
 
-def calibrate(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear', *, weights: np.ndarray | None = None) -> LinearSolution:
+def calibrate(
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    model: str = 'linear',
+    *,
+    weights: np.ndarray | None = None,
+) -> LinearSolution:
     """
     Estimate bias, matrix and products of three sensors (eq. 3, 6, 9, 12), by orthogonal factors instead of normal equations.
 
@@ -139,10 +167,14 @@ def calibrate(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear', *,
         When the turns do not determine every column.
 
     """
-    return solve_linear(design_matrix(inputs, model), outputs, MODEL_COLUMNS[model], weights=weights)
+    return solve_linear(
+        design_matrix(inputs, model), outputs, MODEL_COLUMNS[model], weights=weights
+    )
 
 
-def calibrate_as_printed(inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear') -> np.ndarray:
+def calibrate_as_printed(
+    inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear'
+) -> np.ndarray:
     """Return X by the printed normal equations ``inv(G'G) G'U``, for a comparison of their accuracy."""
     design = design_matrix(inputs, model)
     return np.linalg.inv(design.T @ design) @ design.T @ outputs
@@ -160,7 +192,9 @@ class TiltedSolution:
     """Last linear step; its `unit_covariance` holds for the names in `linear.param_names`."""
 
 
-def calibrate_with_tilt(mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: str, *, iterations: int = 8) -> TiltedSolution:
+def calibrate_with_tilt(
+    mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: str, *, iterations: int = 8
+) -> TiltedSolution:
     """
     Estimate bias, matrix (n x 4 model) and two tilt parameters from all three accelerometers jointly, by Gauss-Newton steps.
 
@@ -170,7 +204,9 @@ def calibrate_with_tilt(mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: s
         When the positions do not separate tilt from matrix.
 
     """
-    names = tuple(f'{column}_{sensor}' for sensor in 'xyz' for column in MODEL_COLUMNS['linear']) + ('tilt_1', 'tilt_2')
+    names = tuple(
+        f'{column}_{sensor}' for sensor in 'xyz' for column in MODEL_COLUMNS['linear']
+    ) + ('tilt_1', 'tilt_2')
     tilt = np.zeros(2)
     coefficients = calibrate(gravity_readings(mat_bn, gravity_axis), outputs).values
     for _ in range(iterations):
@@ -178,15 +214,23 @@ def calibrate_with_tilt(mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: s
         slopes = mat_bn @ _tilt_derivative(gravity_axis, tilt)
         full = np.zeros((3, len(design), 14))
         for sensor in range(3):
-            full[sensor, :, 4 * sensor:4 * sensor + 4] = design
+            full[sensor, :, 4 * sensor : 4 * sensor + 4] = design
             full[sensor, :, 12:] = np.einsum('i,nij->nj', coefficients[1:, sensor], slopes)
-        step = solve_linear(full.reshape(-1, 14), (outputs - design @ coefficients).T.ravel(), names)
+        step = solve_linear(
+            full.reshape(-1, 14), (outputs - design @ coefficients).T.ravel(), names
+        )
         coefficients = coefficients + step.values[:12].reshape(3, 4).T
         tilt = tilt + step.values[12:]
     return TiltedSolution(coefficients, tilt, step)
 
 
-def reference_error(inputs: np.ndarray, input_changes: np.ndarray, coefficients: np.ndarray, *, model: str = 'linear') -> np.ndarray:
+def reference_error(
+    inputs: np.ndarray,
+    input_changes: np.ndarray,
+    coefficients: np.ndarray,
+    *,
+    model: str = 'linear',
+) -> np.ndarray:
     """
     Return the errors of the coefficients from errors of the reference inputs: ``G^+ dG X``, shape (n_params, 3).
 
@@ -200,7 +244,10 @@ def reference_error(inputs: np.ndarray, input_changes: np.ndarray, coefficients:
 
 def estimation_operator(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
     """Return B with ``X = B @ U``, eq. 13: ``inv(G'G) G'``, by orthogonal factors, shape (n_params, n)."""
-    return calibrate(inputs, np.zeros((len(inputs), 3)), model).unit_covariance @ design_matrix(inputs, model).T
+    return (
+        calibrate(inputs, np.zeros((len(inputs), 3)), model).unit_covariance
+        @ design_matrix(inputs, model).T
+    )
 
 
 def m_test_sd(errors: np.ndarray, as_printed: bool = True) -> np.ndarray:
@@ -221,8 +268,15 @@ def m_test_sd(errors: np.ndarray, as_printed: bool = True) -> np.ndarray:
     return np.sqrt((errors**2).sum(axis=0) / (len(errors) - as_printed))
 
 
-def error_budget(inputs: np.ndarray, coefficients: np.ndarray, model: str = 'linear', *, noise_sd: float = 0.0,
-                 common: dict[str, np.ndarray] | None = None, scattered: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+def error_budget(
+    inputs: np.ndarray,
+    coefficients: np.ndarray,
+    model: str = 'linear',
+    *,
+    noise_sd: float = 0.0,
+    common: dict[str, np.ndarray] | None = None,
+    scattered: dict[str, np.ndarray] | None = None,
+) -> dict[str, np.ndarray]:
     """
     Split the sd of every coefficient into its causes (section V of the paper).
 
@@ -244,7 +298,9 @@ def error_budget(inputs: np.ndarray, coefficients: np.ndarray, model: str = 'lin
 
     """
     inverse = estimation_operator(inputs, model)
-    budget = {'output noise': np.repeat(noise_sd * np.linalg.norm(inverse, axis=1)[:, None], 3, axis=1)}
+    budget = {
+        'output noise': np.repeat(noise_sd * np.linalg.norm(inverse, axis=1)[:, None], 3, axis=1)
+    }
     slope = _design_slope(inputs, model)
 
     def output_change(changes):
@@ -264,13 +320,20 @@ def tilt_changes(mat_bn: np.ndarray, gravity_axis: str, tilt_sd_rad: float) -> n
     return tilt_sd_rad * np.moveaxis(mat_bn @ _tilt_derivative(gravity_axis, np.zeros(2)), 2, 0)
 
 
-def encoder_changes(order: str, angles: np.ndarray, gravity_axis: str, *, encoder_sd_rad: float) -> np.ndarray:
+def encoder_changes(
+    order: str, angles: np.ndarray, gravity_axis: str, *, encoder_sd_rad: float
+) -> np.ndarray:
     """Return the change of the readings by one sd of each gimbal angle, g, shape (3, n, 3), for `error_budget`."""
     changes = []
     for gimbal in range(3):
         shift = np.pi / 2 * np.eye(3)[gimbal][:, None]
-        later, earlier = (gravity_readings(turn(order, np.asarray(angles) + sign * shift), gravity_axis) for sign in (1, -1))
-        changes.append(encoder_sd_rad * (later - earlier) / 2)  # exact: every element is affine in the sine and cosine of one angle
+        later, earlier = (
+            gravity_readings(turn(order, np.asarray(angles) + sign * shift), gravity_axis)
+            for sign in (1, -1)
+        )
+        changes.append(
+            encoder_sd_rad * (later - earlier) / 2
+        )  # exact: every element is affine in the sine and cosine of one angle
     return np.array(changes)
 
 
@@ -283,4 +346,10 @@ def _design_slope(inputs, model):
     """Return the derivative of the design by the inputs, shape (n, n_params, 3); exact, as the columns are quadratic at most."""
     inputs = np.asarray(inputs, float)
     steps = np.eye(3)
-    return np.stack([(design_matrix(inputs + step, model) - design_matrix(inputs - step, model)) / 2 for step in steps], axis=-1)
+    return np.stack(
+        [
+            (design_matrix(inputs + step, model) - design_matrix(inputs - step, model)) / 2
+            for step in steps
+        ],
+        axis=-1,
+    )

@@ -36,8 +36,13 @@ class LinearSolution:
         return np.sqrt(np.diag(self.unit_covariance))
 
 
-def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str, ...], *,
-                 weights: np.ndarray | None = None) -> LinearSolution:
+def solve_linear(
+    design: np.ndarray,
+    outputs: np.ndarray,
+    param_names: tuple[str, ...],
+    *,
+    weights: np.ndarray | None = None,
+) -> LinearSolution:
     """
     Solve ``outputs = design @ values`` by least squares through the SVD of the unit-column design.
 
@@ -73,10 +78,14 @@ def solve_linear(design: np.ndarray, outputs: np.ndarray, param_names: tuple[str
         return ((right.T / singular) @ (left.T @ weighted)).T / norms
 
     values = fit(outputs).T
-    values = values + fit(outputs - design @ values).T  # one refinement step: the residual is formed at full precision
+    values = (
+        values + fit(outputs - design @ values).T
+    )  # one refinement step: the residual is formed at full precision
     inverse = right.T / singular / norms[:, None]
     raw = np.linalg.svd(design * root[:, None], compute_uv=False)
-    return LinearSolution(values, names, inverse @ inverse.T, outputs - design @ values, _ratio(raw), _ratio(singular))
+    return LinearSolution(
+        values, names, inverse @ inverse.T, outputs - design @ values, _ratio(raw), _ratio(singular)
+    )
 
 
 def numerical_rank(design: np.ndarray) -> int:
@@ -104,7 +113,9 @@ def null_directions(design: np.ndarray, param_names: tuple[str, ...]) -> list[di
     return [] if len(weak) == 0 else _echelon(weak, norms, tuple(param_names))
 
 
-def predicted_sd(design: np.ndarray, weights: np.ndarray | None = None, sigma: float = 1.0) -> np.ndarray:
+def predicted_sd(
+    design: np.ndarray, weights: np.ndarray | None = None, sigma: float = 1.0
+) -> np.ndarray:
     """
     Return the sd that each parameter will have, before any data exist; infinite where the design does not reach it.
 
@@ -143,13 +154,24 @@ class ToleranceScaled:
         """Largest over smallest singular value."""
         return _ratio(self.singular_values)
 
-    def weak_directions(self, param_names: tuple[str, ...], share: float = 0.1) -> list[dict[str, float]]:
+    def weak_directions(
+        self, param_names: tuple[str, ...], share: float = 0.1
+    ) -> list[dict[str, float]]:
         """Return [{name: weight}] for directions whose sd exceeds the tolerance, the weakest first."""
         rows = self.directions[self.singular_values < 1.0][::-1]
-        return [{name: float(w) for name, w in zip(param_names, row) if abs(w) >= share * np.max(np.abs(row))} for row in rows]
+        return [
+            {
+                name: float(w)
+                for name, w in zip(param_names, row)
+                if abs(w) >= share * np.max(np.abs(row))
+            }
+            for row in rows
+        ]
 
 
-def tolerance_scaled(design: np.ndarray, tolerances: np.ndarray, sigma: float = 1.0) -> ToleranceScaled:
+def tolerance_scaled(
+    design: np.ndarray, tolerances: np.ndarray, sigma: float = 1.0
+) -> ToleranceScaled:
     """
     Scale a design to parameters in units of their tolerances and outputs in units of their noise.
 
@@ -162,23 +184,41 @@ def tolerance_scaled(design: np.ndarray, tolerances: np.ndarray, sigma: float = 
         Output noise sd.
 
     """
-    design = np.asarray(design, float) / np.broadcast_to(np.asarray(sigma, float), len(design))[:, None]
+    design = (
+        np.asarray(design, float) / np.broadcast_to(np.asarray(sigma, float), len(design))[:, None]
+    )
     tolerances = np.asarray(tolerances, float)
     singular, right = np.linalg.svd(np.linalg.qr(_padded(design * tolerances), mode='r'))[1:]
     return ToleranceScaled(singular, right, predicted_sd(design) / tolerances)
 
 
 def _checked(design, outputs, param_names, weights):
-    design, outputs, names = np.asarray(design, float), np.asarray(outputs, float), tuple(param_names)
+    design, outputs, names = (
+        np.asarray(design, float),
+        np.asarray(outputs, float),
+        tuple(param_names),
+    )
     if design.ndim != 2 or design.shape[1] != len(names):
-        raise InputError(f'the design must have one column per parameter ({len(names)}), got shape {design.shape}; correct one of them')
+        raise InputError(
+            f'the design must have one column per parameter ({len(names)}), got shape {design.shape}; correct one of them'
+        )
     if outputs.shape[:1] != design.shape[:1] or outputs.ndim > 2:
-        raise InputError(f'outputs must have {len(design)} rows like the design, got shape {outputs.shape}; correct one of them')
+        raise InputError(
+            f'outputs must have {len(design)} rows like the design, got shape {outputs.shape}; correct one of them'
+        )
     weights = np.ones(len(design)) if weights is None else np.asarray(weights, float)
     if weights.shape != (len(design),) or not np.all(weights >= 0):
-        raise InputError(f'weights must be {len(design)} numbers >= 0, got shape {weights.shape}; give inverse variances')
-    if not (np.all(np.isfinite(design)) and np.all(np.isfinite(outputs)) and np.all(np.isfinite(weights))):
-        raise InputError('design, outputs and weights must be finite, got NaN or infinity; remove those rows')
+        raise InputError(
+            f'weights must be {len(design)} numbers >= 0, got shape {weights.shape}; give inverse variances'
+        )
+    if not (
+        np.all(np.isfinite(design))
+        and np.all(np.isfinite(outputs))
+        and np.all(np.isfinite(weights))
+    ):
+        raise InputError(
+            'design, outputs and weights must be finite, got NaN or infinity; remove those rows'
+        )
     return design, outputs, names, np.sqrt(weights)
 
 
@@ -189,7 +229,7 @@ def _scaled_svd(design):
     norms = np.where(empty, 1.0, norms)
     orthogonal, factor = np.linalg.qr(_padded(np.where(empty, 0.0, design / norms)))
     left, singular, right = np.linalg.svd(factor)
-    return norms, (orthogonal @ left)[:len(design)], singular, right
+    return norms, (orthogonal @ left)[: len(design)], singular, right
 
 
 def _negligible(singular):
@@ -213,15 +253,19 @@ def _require_full_rank(design, norms, singular, right, names):
         raise NotObservableError(
             f'the design must determine {len(names)} parameters, got rank {int(np.sum(~weak))} from {len(design)} rows; not determined: '
             f'{"; ".join(map(_as_text, directions))}. Record motion that changes these columns independently, or hold a parameter.',
-            code='rank')
+            code='rank',
+        )
 
 
 def _echelon(weak, norms, names):
-    pivots = np.sort(scipy.linalg.qr(weak, pivoting=True, mode='r')[1][:len(weak)])
+    pivots = np.sort(scipy.linalg.qr(weak, pivoting=True, mode='r')[1][: len(weak)])
     rows = np.linalg.solve(weak[:, pivots], weak)
     shown = np.abs(rows) > 1e-6
     changes = rows / norms * norms[pivots, None]
-    return [{names[k]: float(change[k]) for k in np.flatnonzero(keep)} for change, keep in zip(changes, shown)]
+    return [
+        {names[k]: float(change[k]) for k in np.flatnonzero(keep)}
+        for change, keep in zip(changes, shown)
+    ]
 
 
 def _as_text(direction):

@@ -12,18 +12,33 @@ from imu_calibration.kinematics import strapdown
 from imu_calibration.kinematics.rotations import lever_matrix
 from papers.linear_least_squares import LinearSolution, solve_linear
 
-TABLE_1_ANGLES_DEG = np.array([[0.75997, 90.71425, 89.74038], [89.25516, 0.74486, 90.5630], [90.52202, 89.17706, 0.97456]])
+TABLE_1_ANGLES_DEG = np.array(
+    [[0.75997, 90.71425, 89.74038], [89.25516, 0.74486, 90.5630], [90.52202, 89.17706, 0.97456]]
+)
 """Installation angles as printed, row i: sensor axis i to body x, y, z."""
 TABLE_1_SCALE = np.array([0.39496, 0.39808, 0.40024])
 """Scale factors as printed, V/g."""
 TABLE_1_BIAS = np.array([2.405098, 2.380978, 2.435503])
 """Zero-bias voltages as printed, V."""
-TABLE_2_G = np.array([[1.00043, 1.00041, -0.99956, -0.99958], [0.01299, 0.00098, -0.01100, 0.00098], [-0.00911, 0.00023, 0.00953, 0.00020]])
+TABLE_2_G = np.array(
+    [
+        [1.00043, 1.00041, -0.99956, -0.99958],
+        [0.01299, 0.00098, -0.01100, 0.00098],
+        [-0.00911, 0.00023, 0.00953, 0.00020],
+    ]
+)
 """Readings at rest as printed, g, rows x, y, z; columns: x up before and after compensation, x down before and after."""
-TABLE_3_ARMS = -np.array([[-0.00834, -0.00042, -0.00132], [-0.00256, -0.00893, -0.00026], [-0.00060, -0.00050, -0.00824]])
+TABLE_3_ARMS = -np.array(
+    [[-0.00834, -0.00042, -0.00132], [-0.00256, -0.00893, -0.00026], [-0.00060, -0.00050, -0.00824]]
+)
 """Lever arms, m, row i: reference point to sensor i (the printed numbers times -1)."""
-TABLE_4_G = np.array([[0.998078, 0.998060, -1.001924, -1.001939], [0.000289, 0.000253, -0.003359, 0.000253],
-                      [-0.014150, 0.002402, 0.0093985, 0.002402]])
+TABLE_4_G = np.array(
+    [
+        [0.998078, 0.998060, -1.001924, -1.001939],
+        [0.000289, 0.000253, -0.003359, 0.000253],
+        [-0.014150, 0.002402, 0.0093985, 0.002402],
+    ]
+)
 """Readings in rotation as printed, g, laid out as `TABLE_2_G`."""
 
 
@@ -99,8 +114,15 @@ def fit_static(force_b: np.ndarray, outputs: np.ndarray) -> tuple[StaticModel, L
     return static_model_from_matrix(solution.values[1:].T, solution.values[0]), solution
 
 
-def closed_form(means_static: np.ndarray, means_spin: np.ndarray, rate: float, *, directions: np.ndarray,
-                spin_axes: np.ndarray | None = None, as_printed: bool = False) -> np.ndarray | None:
+def closed_form(
+    means_static: np.ndarray,
+    means_spin: np.ndarray,
+    rate: float,
+    *,
+    directions: np.ndarray,
+    spin_axes: np.ndarray | None = None,
+    as_printed: bool = False,
+) -> np.ndarray | None:
     """
     Return the lever arms by eq. 24 from three spins about orthonormal axes that point up, shape (..., 3, 3), one sensor per row.
 
@@ -128,13 +150,18 @@ def closed_form(means_static: np.ndarray, means_spin: np.ndarray, rate: float, *
     """
     axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
     if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
-        raise InputError('the three spin axes must be orthonormal for the closed form, got others; use the joint fit',
-                         code='not_orthonormal')
+        raise InputError(
+            'the three spin axes must be orthonormal for the closed form, got others; use the joint fit',
+            code='not_orthonormal',
+        )
     cosines = np.asarray(directions, float) @ axes.T
     if np.any(np.abs(cosines) < 1e-12):
         sensor, spin = np.argwhere(np.abs(cosines) < 1e-12)[0]
-        raise NotObservableError(f'sensor axis {"xyz"[sensor]} must not be square to spin axis {spin + 1} for the closed form; '
-                                 'skew the fixture, add oscillations, or use the joint fit', code='square_axes')
+        raise NotObservableError(
+            f'sensor axis {"xyz"[sensor]} must not be square to spin axis {spin + 1} for the closed form; '
+            'skew the fixture, add oscillations, or use the joint fit',
+            code='square_axes',
+        )
     means_static, means_spin = np.asarray(means_static, float), np.asarray(means_spin, float)
     change = np.swapaxes(means_spin - means_static, -1, -2)
     numerator = 2 * change - np.sum(change, axis=-1, keepdims=True)
@@ -143,7 +170,9 @@ def closed_form(means_static: np.ndarray, means_spin: np.ndarray, rate: float, *
     return numerator / (2 * rate**2 * cosines) @ axes
 
 
-def closed_form_sd(noise_sd: float, rate: float, directions: np.ndarray, *, spin_axes: np.ndarray | None = None) -> np.ndarray:
+def closed_form_sd(
+    noise_sd: float, rate: float, directions: np.ndarray, *, spin_axes: np.ndarray | None = None
+) -> np.ndarray:
     """Return the sd of each arm along the spin axes, ``sqrt(6) noise_sd / (2 rate^2 |cos|)``, shape (3, 3), one sensor per row."""
     axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
     return np.sqrt(6) * noise_sd / (2 * rate**2 * np.abs(np.asarray(directions, float) @ axes.T))
@@ -155,8 +184,17 @@ def average_rates(arms: np.ndarray, rates: np.ndarray, weighted: bool = True) ->
     return np.average(arms, axis=0, weights=rates**4 if weighted else None)
 
 
-def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Generator, *, n_draws: int = 400, seconds: float = 50.0,
-                      noise_sd_g: float = 1e-3, sample_rate: float = 100.0, calibration_seconds: float = 60.0) -> np.ndarray:
+def static_navigation(
+    model: StaticModel,
+    drift_sd_g: float,
+    rng: np.random.Generator,
+    *,
+    n_draws: int = 400,
+    seconds: float = 50.0,
+    noise_sd_g: float = 1e-3,
+    sample_rate: float = 100.0,
+    calibration_seconds: float = 60.0,
+) -> np.ndarray:
     """
     Return errors of navigation at rest with x up, attitude known: medians of velocity (m/s) and position (m), before and after calibration.
 
@@ -186,30 +224,45 @@ def static_navigation(model: StaticModel, drift_sd_g: float, rng: np.random.Gene
     steady = true.predict(upright) + drift * true.scale
     unscaled = np.broadcast_to(np.diag(model.scale), matrix.shape)
     ends = []
-    wander = np.array([_noise_at_end(rng, noise_sd_g * true.scale, seconds, sample_rate) for _ in range(n_draws)])
+    wander = np.array(
+        [_noise_at_end(rng, noise_sd_g * true.scale, seconds, sample_rate) for _ in range(n_draws)]
+    )
     for used_matrix, used_bias in ((unscaled, model.bias), (matrix, bias)):
         error = np.linalg.solve(used_matrix, (steady - used_bias)[..., None])[..., 0] - upright
         constant = np.stack(strapdown.constant_error_growth(STANDARD_GRAVITY * error, seconds))
         scatter = np.linalg.solve(used_matrix[:, None], wander[..., None])[..., 0]
-        ends.append(np.linalg.norm(constant + STANDARD_GRAVITY * np.moveaxis(scatter, 1, 0), axis=-1))
+        ends.append(
+            np.linalg.norm(constant + STANDARD_GRAVITY * np.moveaxis(scatter, 1, 0), axis=-1)
+        )
     return np.median(np.concatenate(ends), axis=1)
 
 
 def _noise_at_end(rng, noise_sd, seconds, sample_rate):
     """Return white output noise summed once and twice over the time, shape (2, 3)."""
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
-    velocity, position = strapdown.error_growth(time, noise_sd * rng.standard_normal((len(time), 3)))
+    velocity, position = strapdown.error_growth(
+        time, noise_sd * rng.standard_normal((len(time), 3))
+    )
     return velocity[-1], position[-1]
 
 
-def size_effect_error(cosines: np.ndarray, arms: np.ndarray, rate: np.ndarray, *, alpha: np.ndarray) -> np.ndarray:
+def size_effect_error(
+    cosines: np.ndarray, arms: np.ndarray, rate: np.ndarray, *, alpha: np.ndarray
+) -> np.ndarray:
     """Return the error in the body frame, m/s^2, shape (n, 3), of accelerometers that are taken to sit in one point (eq. 17)."""
     along_axes = np.einsum('ij,njk,ik->ni', cosines, lever_matrix(rate, alpha), arms)
     return np.linalg.solve(cosines, along_axes.T).T
 
 
-def spin_growth(cosines: np.ndarray, arms: np.ndarray, axis: tuple[float, float, float], *, rate_deg_s: float = 100.0,
-                seconds: float = 100.0, sample_rate: float = 100.0) -> dict[str, Any]:
+def spin_growth(
+    cosines: np.ndarray,
+    arms: np.ndarray,
+    axis: tuple[float, float, float],
+    *,
+    rate_deg_s: float = 100.0,
+    seconds: float = 100.0,
+    sample_rate: float = 100.0,
+) -> dict[str, Any]:
     """
     Return errors of an uncompensated size effect in a constant spin: (velocity, position) in n, the same summed in the body frame.
 
@@ -221,8 +274,12 @@ def spin_growth(cosines: np.ndarray, arms: np.ndarray, axis: tuple[float, float,
     rate = np.tile(np.deg2rad(rate_deg_s) * axis, (len(time), 1))
     error = size_effect_error(cosines, arms, rate, alpha=np.zeros_like(rate))
     mat_ns = Rotation.from_rotvec(rate * time[:, None]).as_matrix()
-    return {'time': time, 'level': strapdown.error_growth(time, error, mat_ns), 'body': strapdown.error_growth(time, error),
-            'axial_mg': 1e3 * float(error[0] @ axis) / STANDARD_GRAVITY}
+    return {
+        'time': time,
+        'level': strapdown.error_growth(time, error, mat_ns),
+        'body': strapdown.error_growth(time, error),
+        'axial_mg': 1e3 * float(error[0] @ axis) / STANDARD_GRAVITY,
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +296,14 @@ class Tumbling:
     """rad/s^2, shape (n, 3)."""
 
 
-def tumble(amplitude_deg: tuple[float, float, float], frequency_hz: tuple[float, float, float],
-           phase: tuple[float, float, float] = (0.3, 1.1, 2.0), *, seconds: float = 60.0, sample_rate: float = 200.0) -> Tumbling:
+def tumble(
+    amplitude_deg: tuple[float, float, float],
+    frequency_hz: tuple[float, float, float],
+    phase: tuple[float, float, float] = (0.3, 1.1, 2.0),
+    *,
+    seconds: float = 60.0,
+    sample_rate: float = 200.0,
+) -> Tumbling:
     """Return a `Tumbling` motion; each argument has one value per body axis, or one for all."""
     time = np.arange(int(round(seconds * sample_rate)) + 1) / sample_rate
     angular = 2 * np.pi * np.asarray(frequency_hz, float)
@@ -253,7 +316,9 @@ def tumble(amplitude_deg: tuple[float, float, float], frequency_hz: tuple[float,
 def arm_responses(motion: Tumbling, cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return velocity and position histories per metre of each arm component (sensor, component), shape (9, n, 3) each."""
     unit_arms = np.eye(9).reshape(9, 3, 3)
-    errors = np.array([size_effect_error(cosines, arms, motion.rate, alpha=motion.alpha) for arms in unit_arms])
+    errors = np.array(
+        [size_effect_error(cosines, arms, motion.rate, alpha=motion.alpha) for arms in unit_arms]
+    )
     return strapdown.error_growth(motion.time, errors, motion.mat_ns)
 
 

@@ -58,10 +58,14 @@ class AllanSums:
         self.squares = np.zeros((len(factors), n_columns))
         self.terms = np.zeros(len(factors), np.int64)
         self.lengths: list[int] = []
-        self._until: list[tuple[np.ndarray, np.ndarray]] = [(self.squares.copy(), self.terms.copy())]
+        self._until: list[tuple[np.ndarray, np.ndarray]] = [
+            (self.squares.copy(), self.terms.copy())
+        ]
         levels = _octaves_beyond(self.factors)
-        self._levels = [_Level(np.flatnonzero(levels == k), self.factors[levels == k] >> k, n_columns)
-                        for k in range(int(levels.max(initial=0)) + 1)]
+        self._levels = [
+            _Level(np.flatnonzero(levels == k), self.factors[levels == k] >> k, n_columns)
+            for k in range(int(levels.max(initial=0)) + 1)
+        ]
         self._offset, self._length = None, 0
 
     def push(self, values: np.ndarray, present: np.ndarray | None = None) -> None:
@@ -146,29 +150,40 @@ class _Level:
             if first >= self.sums.shape[1]:
                 continue
             if whole:
-                last, middle, begin = (self.sums[:, first - k:self.sums.shape[1] - k] for k in (0, m, 2 * m))
+                last, middle, begin = (
+                    self.sums[:, first - k : self.sums.shape[1] - k] for k in (0, m, 2 * m)
+                )
                 difference = last - 2.0 * middle
                 difference += begin
             else:
                 difference = self._with_holes(first, m)
-            squares[where] += np.einsum('ij,ij->i', difference, difference) / (m * size)**2
+            squares[where] += np.einsum('ij,ij->i', difference, difference) / (m * size) ** 2
             terms[where] += difference.shape[1]
         self._shorten()
 
     def _with_holes(self, first, m):
         """Return m times the differences of neighbouring means of the samples that are there."""
         end = self.sums.shape[1]
-        sums, counts = ([values[..., first - k:end - k] for k in (0, m, 2 * m)] for values in (self.sums, self.counts))
+        sums, counts = (
+            [values[..., first - k : end - k] for k in (0, m, 2 * m)]
+            for values in (self.sums, self.counts)
+        )
         late, early = counts[0] - counts[1], counts[1] - counts[2]
         usable = np.minimum(late, early) >= PRESENT * m
-        means = [(a - b)[:, usable] / n[usable] for a, b, n in ((sums[0], sums[1], late), (sums[1], sums[2], early))]
+        means = [
+            (a - b)[:, usable] / n[usable]
+            for a, b, n in ((sums[0], sums[1], late), (sums[1], sums[2], early))
+        ]
         return m * (means[0] - means[1])
 
     def _shorten(self):
         """Keep the sums that later differences need, from the first sample kept."""
         if self.sums.shape[1] > self.reach + 1:
             kept = slice(-self.reach - 1, None)
-            self.sums, self.counts = self.sums[:, kept] - self.sums[:, kept][:, :1], self.counts[kept] - self.counts[kept][0]
+            self.sums, self.counts = (
+                self.sums[:, kept] - self.sums[:, kept][:, :1],
+                self.counts[kept] - self.counts[kept][0],
+            )
 
 
 MAX_STEP_JITTER = 0.2
@@ -209,9 +224,13 @@ def _lost(step):
     if windows < 2:
         return lost
     late = np.cumsum(step - 1.0)
-    middle = np.median(late[:windows * STAMP_WINDOW_SAMPLES].reshape(windows, STAMP_WINDOW_SAMPLES), axis=1)
+    middle = np.median(
+        late[: windows * STAMP_WINDOW_SAMPLES].reshape(windows, STAMP_WINDOW_SAMPLES), axis=1
+    )
     for k in np.flatnonzero(np.diff(middle) > 0.75):
-        longest = (k * STAMP_WINDOW_SAMPLES) + int(np.argmax(step[k * STAMP_WINDOW_SAMPLES:(k + 2) * STAMP_WINDOW_SAMPLES]))
+        longest = (k * STAMP_WINDOW_SAMPLES) + int(
+            np.argmax(step[k * STAMP_WINDOW_SAMPLES : (k + 2) * STAMP_WINDOW_SAMPLES])
+        )
         lost[longest] += round(middle[k + 1] - middle[k])
     return lost
 
@@ -270,7 +289,10 @@ class Detrending:
         if not any(self.trends):
             return None
         warmth = None if self.temperature is None else np.interp(time, *self.temperature)
-        columns = [sum((trend.at(time, warmth, self.reference) for trend in trends), np.zeros(len(time))) for trends in self.trends]
+        columns = [
+            sum((trend.at(time, warmth, self.reference) for trend in trends), np.zeros(len(time)))
+            for trends in self.trends
+        ]
         return np.column_stack(columns)
 
 
@@ -307,7 +329,10 @@ class RestReader:
             grid = SampleGrid(self.period)
             for *_, imu in pieces:
                 values = np.concatenate([imu.force_s, imu.rate_s], axis=1)
-                steps, trend = grid.steps(imu.stamp_ns), self.detrending.at(self.time_of(epoch, imu.stamp_ns))
+                steps, trend = (
+                    grid.steps(imu.stamp_ns),
+                    self.detrending.at(self.time_of(epoch, imu.stamp_ns)),
+                )
                 flat = spread(values if trend is None else values - trend, steps)
                 for sink in bare:
                     sink.push(*flat)
@@ -318,20 +343,36 @@ class RestReader:
 
     def _pieces(self):
         """Yield (epoch, number of the part, accepted samples)."""
-        bounds = [np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2) for parts in self.parts]
+        bounds = [
+            np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2)
+            for parts in self.parts
+        ]
         for cleaned in BlockCleaner(nominal=self.nominal).all_of(self.source()):
             for epoch, imu in cleaned.imu:
-                for number, (first, last) in enumerate(np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()):
+                for number, (first, last) in enumerate(
+                    np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()
+                ):
                     if last > first:
                         yield epoch, number, imu.select(slice(first, last))
 
     def curve(self) -> AllanCurve:
         """Return the Allan variances of the parts."""
-        factors = averaging_factors(max(round(part.seconds / self.period) for of_epoch in self.parts for part in of_epoch))
-        bare, raw = AllanSums(factors, 6), AllanSums(factors, 6) if any(self.detrending.trends) else None
+        factors = averaging_factors(
+            max(round(part.seconds / self.period) for of_epoch in self.parts for part in of_epoch)
+        )
+        bare, raw = (
+            AllanSums(factors, 6),
+            AllanSums(factors, 6) if any(self.detrending.trends) else None,
+        )
         self.read(bare, raw=raw)
         usable = bare.terms > 0
         variance, terms = (values[:, usable] for values in bare.by_stretch())
         parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
-        return AllanCurve(self.period, bare.factors[usable], bare.variance()[usable], (raw or bare).variance()[usable],
-                          tuple(bare.lengths), parts)
+        return AllanCurve(
+            self.period,
+            bare.factors[usable],
+            bare.variance()[usable],
+            (raw or bare).variance()[usable],
+            tuple(bare.lengths),
+            parts,
+        )

@@ -8,7 +8,14 @@ import numpy as np
 from scipy.linalg import toeplitz
 
 from imu_calibration.allan.figures import HORIZON, SLOW_PROCESSES, AxisFigures, NoiseFigures
-from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
+from imu_calibration.allan.processes import (
+    FLICKER,
+    QUANTISATION,
+    RANDOM_WALK,
+    WHITE,
+    NoiseProcess,
+    mean_covariance,
+)
 from imu_calibration.allan.terms import GAUSS_MARKOV, TIME_KEY, Term
 from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.core.documents import finite, from_text, to_text
@@ -19,10 +26,29 @@ from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 
 NOISE_FORMAT = 'imu_calibration/noise/1'
 NOISE_UNITS = {
-    'accelerometer': {QUANTISATION.name: 'm/s', WHITE.name: 'm/s^2/sqrt(Hz)', FLICKER.name: 'm/s^2', GAUSS_MARKOV: 'm/s^2', TIME_KEY: 's',
-                      RANDOM_WALK.name: 'm/s^3/sqrt(Hz)', 'temperature': 'm/s^2/K', 'turn_on': 'm/s^2', 'ramp': 'm/s^3'},
-    'gyroscope': {QUANTISATION.name: 'rad', WHITE.name: 'rad/s/sqrt(Hz)', FLICKER.name: 'rad/s', GAUSS_MARKOV: 'rad/s', TIME_KEY: 's',
-                  RANDOM_WALK.name: 'rad/s^2/sqrt(Hz)', 'temperature': 'rad/s/K', 'turn_on': 'rad/s', 'ramp': 'rad/s^2'}}
+    'accelerometer': {
+        QUANTISATION.name: 'm/s',
+        WHITE.name: 'm/s^2/sqrt(Hz)',
+        FLICKER.name: 'm/s^2',
+        GAUSS_MARKOV: 'm/s^2',
+        TIME_KEY: 's',
+        RANDOM_WALK.name: 'm/s^3/sqrt(Hz)',
+        'temperature': 'm/s^2/K',
+        'turn_on': 'm/s^2',
+        'ramp': 'm/s^3',
+    },
+    'gyroscope': {
+        QUANTISATION.name: 'rad',
+        WHITE.name: 'rad/s/sqrt(Hz)',
+        FLICKER.name: 'rad/s',
+        GAUSS_MARKOV: 'rad/s',
+        TIME_KEY: 's',
+        RANDOM_WALK.name: 'rad/s^2/sqrt(Hz)',
+        'temperature': 'rad/s/K',
+        'turn_on': 'rad/s',
+        'ramp': 'rad/s^2',
+    },
+}
 """Unit of every figure."""
 TERMS = (QUANTISATION.name, WHITE.name, FLICKER.name, GAUSS_MARKOV, TIME_KEY, RANDOM_WALK.name)
 STATUSES = (DETERMINED, WEAK, HELD)
@@ -36,13 +62,20 @@ def noise_to_text(figures: NoiseFigures, horizon: float = HORIZON) -> str:
 
 def to_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
     """Return the document as plain dicts, lists, numbers and strings, in a fixed order."""
-    document = {'format': NOISE_FORMAT, 'frame_id': figures.frame_id, 'sampling_rate': float(f'{figures.rate:.9g}'),
-                'recording': figures.recording}
+    document = {
+        'format': NOISE_FORMAT,
+        'frame_id': figures.frame_id,
+        'sampling_rate': float(f'{figures.rate:.9g}'),
+        'recording': figures.recording,
+    }
     for sensor in SENSORS:
         document[sensor] = _sensor_section(sensor, figures.sensor(sensor))
-    document['for_filters'] = {'horizon': horizon} | {sensor: _for_filters(figures, sensor, horizon) for sensor in SENSORS}
+    document['for_filters'] = {'horizon': horizon} | {
+        sensor: _for_filters(figures, sensor, horizon) for sensor in SENSORS
+    }
     document['allan_deviation'] = {'tau': list(figures.tau)} | {
-        sensor: [list(axis.deviation) for axis in figures.sensor(sensor)] for sensor in SENSORS}
+        sensor: [list(axis.deviation) for axis in figures.sensor(sensor)] for sensor in SENSORS
+    }
     document['provenance'] = figures.provenance
     return document
 
@@ -51,38 +84,62 @@ def _sensor_section(sensor, axes):
     section: dict = {}
     for name in TERMS:
         if any(name in axis.terms for axis in axes):
-            section[name] = _entry([axis.terms.get(name) for axis in axes], NOISE_UNITS[sensor][name])
+            section[name] = _entry(
+                [axis.terms.get(name) for axis in axes], NOISE_UNITS[sensor][name]
+            )
     section['slow_part'] = [list(axis.form) for axis in axes]
     section['also_possible'] = [[list(form) for form in axis.others] for axis in axes]
-    section['alternatives'] = {name: _entry([axis.alternatives.get(name) for axis in axes], NOISE_UNITS[sensor][name])
-                               for name in TERMS if any(name in axis.alternatives for axis in axes)}
+    section['alternatives'] = {
+        name: _entry([axis.alternatives.get(name) for axis in axes], NOISE_UNITS[sensor][name])
+        for name in TERMS
+        if any(name in axis.alternatives for axis in axes)
+    }
     section['taken_out'] = _trends(sensor, axes)
-    section['record_for'] = {name: [axis.record_for.get(name) for axis in axes]
-                             for name in TERMS if any(name in axis.record_for for axis in axes)}
+    section['record_for'] = {
+        name: [axis.record_for.get(name) for axis in axes]
+        for name in TERMS
+        if any(name in axis.record_for for axis in axes)
+    }
     section['sample_sd'] = [float(axis.sample_sd) for axis in axes]
     section['shortest_averaging_time'] = [float(axis.shortest) for axis in axes]
     section['excess'] = [float(axis.excess) for axis in axes]
     section['scatter_between_rests'] = [float(axis.scatter) for axis in axes]
-    section['oscillation'] = [None if axis.oscillation is None else list(axis.oscillation) for axis in axes]
+    section['oscillation'] = [
+        None if axis.oscillation is None else list(axis.oscillation) for axis in axes
+    ]
     return section
 
 
 def _entry(terms, unit):
     """Return value, interval, status, reason and unit of three axes; None where an axis has no such figure."""
-    return {'value': [None if term is None or term.value is None else float(term.value) for term in terms],
-            'interval95': [None if term is None else [finite(end) for end in term.interval] for term in terms],
-            'status': [None if term is None else term.status for term in terms],
-            'reason': ['' if term is None else term.reason for term in terms], 'unit': unit}
+    return {
+        'value': [
+            None if term is None or term.value is None else float(term.value) for term in terms
+        ],
+        'interval95': [
+            None if term is None else [finite(end) for end in term.interval] for term in terms
+        ],
+        'status': [None if term is None else term.status for term in terms],
+        'reason': ['' if term is None else term.reason for term in terms],
+        'unit': unit,
+    }
 
 
 def _trends(sensor, axes):
     names = dict.fromkeys(trend.name for axis in axes for trend in axis.trends)
     found = {}
     for name in names:
-        trends = [next((trend for trend in axis.trends if trend.name == name), None) for axis in axes]
-        found[name] = {key: [None if trend is None else float(getattr(trend, key)) for trend in trends] for key in ('value', 'sd')}
+        trends = [
+            next((trend for trend in axis.trends if trend.name == name), None) for axis in axes
+        ]
+        found[name] = {
+            key: [None if trend is None else float(getattr(trend, key)) for trend in trends]
+            for key in ('value', 'sd')
+        }
         if name == 'turn_on':
-            found[name]['time_constant'] = [None if trend is None else float(trend.time) for trend in trends]
+            found[name]['time_constant'] = [
+                None if trend is None else float(trend.time) for trend in trends
+            ]
         found[name]['unit'] = NOISE_UNITS[sensor][name]
     return found
 
@@ -90,8 +147,13 @@ def _trends(sensor, axes):
 def _for_filters(figures, sensor, horizon):
     """Return the parameters of most filters, continuous and at the rate of the recording."""
     found = figures.densities(sensor, horizon)
-    return {'white_noise': found.white, 'random_walk': finite(found.walk), 'random_walk_is': found.basis,
-            'sample_sd': found.sample_sd(figures.rate), 'bias_step_sd': finite(found.step_sd(figures.rate))}
+    return {
+        'white_noise': found.white,
+        'random_walk': finite(found.walk),
+        'random_walk_is': found.basis,
+        'sample_sd': found.sample_sd(figures.rate),
+        'bias_step_sd': finite(found.step_sd(figures.rate)),
+    }
 
 
 def noise_from_text(text: str) -> NoiseFigures:
@@ -107,41 +169,92 @@ def noise_from_text(text: str) -> NoiseFigures:
     document = from_text(text, 'noise document')
     found = str(document.get('format'))
     if found != NOISE_FORMAT:
-        raise DocumentError(f"a noise document must have 'format: {NOISE_FORMAT}', got '{found}'; give a file written by "
-                            "'imu_calibration noise'", code='document_format')
+        raise DocumentError(
+            f"a noise document must have 'format: {NOISE_FORMAT}', got '{found}'; give a file written by "
+            "'imu_calibration noise'",
+            code='document_format',
+        )
     try:
         return _parse(document)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DocumentError(f'a noise document must have the parts of {NOISE_FORMAT}, one is missing or has another shape '
-                            f'({type(error).__name__}: {error}); identify the noise again', code='document_parts') from error
+        raise DocumentError(
+            f'a noise document must have the parts of {NOISE_FORMAT}, one is missing or has another shape '
+            f'({type(error).__name__}: {error}); identify the noise again',
+            code='document_parts',
+        ) from error
 
 
 def _parse(document):
     curve = document.get('allan_deviation') or {}
-    sensors = {sensor: tuple(_axis(document[sensor], k, (curve.get(sensor) or [[]] * 3)[k]) for k in range(len(AXES)))
-               for sensor in SENSORS}
+    sensors = {
+        sensor: tuple(
+            _axis(document[sensor], k, (curve.get(sensor) or [[]] * 3)[k]) for k in range(len(AXES))
+        )
+        for sensor in SENSORS
+    }
     rate = float(document['sampling_rate'])
     if not (math.isfinite(rate) and rate > 0):
-        raise DocumentError(f'the sampling rate must be above zero, got {rate:g}; write the noise document again', code='rate_not_positive')
-    return NoiseFigures(**sensors, rate=rate, frame_id=str(document.get('frame_id', '')), recording=dict(document.get('recording') or {}),
-                        tau=tuple(float(t) for t in curve.get('tau') or ()), provenance=dict(document.get('provenance') or {}))
+        raise DocumentError(
+            f'the sampling rate must be above zero, got {rate:g}; write the noise document again',
+            code='rate_not_positive',
+        )
+    return NoiseFigures(
+        **sensors,
+        rate=rate,
+        frame_id=str(document.get('frame_id', '')),
+        recording=dict(document.get('recording') or {}),
+        tau=tuple(float(t) for t in curve.get('tau') or ()),
+        provenance=dict(document.get('provenance') or {}),
+    )
 
 
 def _axis(section, k, deviation):
-    terms = {name: _term(name, section[name], k) for name in TERMS if name in section and section[name]['interval95'][k] is not None}
+    terms = {
+        name: _term(name, section[name], k)
+        for name in TERMS
+        if name in section and section[name]['interval95'][k] is not None
+    }
     for needed in (WHITE.name, RANDOM_WALK.name):
         if needed not in terms:
-            raise DocumentError(f"every axis must have '{needed}', it is missing; write the noise document again", code='part_missing')
-    alternatives = {name: _term(name, entry, k) for name, entry in (section.get('alternatives') or {}).items()
-                    if entry['interval95'][k] is not None}
-    trends = tuple(AxisTrend(name, float(entry['value'][k]), float(entry['sd'][k]), float(entry.get('time_constant', [0, 0, 0])[k]))
-                   for name, entry in (section.get('taken_out') or {}).items() if entry['value'][k] is not None)
-    record_for = {name: values[k] for name, values in (section.get('record_for') or {}).items() if terms[name].status != DETERMINED}
+            raise DocumentError(
+                f"every axis must have '{needed}', it is missing; write the noise document again",
+                code='part_missing',
+            )
+    alternatives = {
+        name: _term(name, entry, k)
+        for name, entry in (section.get('alternatives') or {}).items()
+        if entry['interval95'][k] is not None
+    }
+    trends = tuple(
+        AxisTrend(
+            name,
+            float(entry['value'][k]),
+            float(entry['sd'][k]),
+            float(entry.get('time_constant', [0, 0, 0])[k]),
+        )
+        for name, entry in (section.get('taken_out') or {}).items()
+        if entry['value'][k] is not None
+    )
+    record_for = {
+        name: values[k]
+        for name, values in (section.get('record_for') or {}).items()
+        if terms[name].status != DETERMINED
+    }
     others = tuple(tuple(form) for form in section['also_possible'][k])
-    return AxisFigures(terms, tuple(section['slow_part'][k]), others, alternatives, float(section['shortest_averaging_time'][k]),
-                       float(section['excess'][k]), _pair((section.get('oscillation') or [None] * 3)[k]),
-                       float((section.get('scatter_between_rests') or [0.0] * 3)[k]), trends=trends, record_for=record_for,
-                       sample_sd=float(section['sample_sd'][k]), deviation=tuple(float(v) for v in deviation))
+    return AxisFigures(
+        terms,
+        tuple(section['slow_part'][k]),
+        others,
+        alternatives,
+        float(section['shortest_averaging_time'][k]),
+        float(section['excess'][k]),
+        _pair((section.get('oscillation') or [None] * 3)[k]),
+        float((section.get('scatter_between_rests') or [0.0] * 3)[k]),
+        trends=trends,
+        record_for=record_for,
+        sample_sd=float(section['sample_sd'][k]),
+        deviation=tuple(float(v) for v in deviation),
+    )
 
 
 def _pair(values):
@@ -152,12 +265,24 @@ def _term(name, entry, k):
     value, status = entry['value'][k], entry['status'][k]
     interval = tuple(math.inf if end is None else float(end) for end in entry['interval95'][k])
     if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
-        raise DocumentError(f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in rising order, got "
-                            f'{status!r} and {list(interval)}; write the noise document again', code='status_or_interval')
+        raise DocumentError(
+            f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in rising order, got "
+            f'{status!r} and {list(interval)}; write the noise document again',
+            code='status_or_interval',
+        )
     if (value is None) != (status == HELD) or (value is not None and not np.isfinite(float(value))):
-        raise DocumentError(f"'{name}' must have a finite value unless it is held, got {value!r} and '{status}'; "
-                            'write the noise document again', code='value_missing')
-    return Term(name, None if value is None else float(value), interval, status, str((entry.get('reason') or [''] * 3)[k]))
+        raise DocumentError(
+            f"'{name}' must have a finite value unless it is held, got {value!r} and '{status}'; "
+            'write the noise document again',
+            code='value_missing',
+        )
+    return Term(
+        name,
+        None if value is None else float(value),
+        interval,
+        status,
+        str((entry.get('reason') or [''] * 3)[k]),
+    )
 
 
 MAX_RUN_BLOCKS, MAX_NAVIGATION_BLOCKS = 150, 1000
@@ -168,18 +293,38 @@ RUNS = (1.0, 10.0, 60.0, 600.0)
 
 def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]]]:
     """Return the standard deviation of the position along one horizontal axis after each of `RUNS`, m, by sensor, of the worst axes."""
-    return [(seconds, {sensor: max(_of_axis(axis, sensor, seconds) for axis in figures.sensor(sensor)) for sensor in SENSORS})
-            for seconds in RUNS]
+    return [
+        (
+            seconds,
+            {
+                sensor: max(_of_axis(axis, sensor, seconds) for axis in figures.sensor(sensor))
+                for sensor in SENSORS
+            },
+        )
+        for seconds in RUNS
+    ]
 
 
 def _of_axis(axis: AxisFigures, sensor: str, seconds: float) -> float:
     processes = axis.processes()
-    shares = position_sd([process for process, _ in processes], [coefficient for _, coefficient in processes], sensor, seconds=seconds)
+    shares = position_sd(
+        [process for process, _ in processes],
+        [coefficient for _, coefficient in processes],
+        sensor,
+        seconds=seconds,
+    )
     return float(np.sqrt((shares**2).sum()))
 
 
-def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float], sensor: str, *, seconds: float,
-                alignment: float = 60.0, gravity: float = STANDARD_GRAVITY) -> np.ndarray:
+def position_sd(
+    processes: Sequence[NoiseProcess],
+    coefficients: Sequence[float],
+    sensor: str,
+    *,
+    seconds: float,
+    alignment: float = 60.0,
+    gravity: float = STANDARD_GRAVITY,
+) -> np.ndarray:
     """
     Return the standard deviation of the position by each process of one axis, m, shape (n_processes,).
 
@@ -198,21 +343,37 @@ def position_sd(processes: Sequence[NoiseProcess], coefficients: Sequence[float]
         m/s^2.
 
     """
-    after = int(np.ceil(min(MAX_RUN_BLOCKS, MAX_NAVIGATION_BLOCKS * seconds / (seconds + alignment))))
+    after = int(
+        np.ceil(min(MAX_RUN_BLOCKS, MAX_NAVIGATION_BLOCKS * seconds / (seconds + alignment)))
+    )
     step = seconds / after
     before = max(round(alignment / step), 1)
     until_end = (after - np.arange(after) - 0.5) * step
     weights = until_end * step if sensor == 'accelerometer' else 0.5 * gravity * until_end**2 * step
     weights = np.concatenate([np.full(before, -weights.sum() / before), weights])
     lag = np.arange(before + after) * step
-    variances = [weights @ toeplitz(mean_covariance(process, lag, step)) @ weights for process in processes]
+    variances = [
+        weights @ toeplitz(mean_covariance(process, lag, step)) @ weights for process in processes
+    ]
     return np.sqrt(np.maximum(np.array(variances), 0.0) * np.asarray(coefficients, float))
 
 
-TITLES = {'quantisation': 'quantisation Q', 'white_noise': 'white noise N', 'bias_instability': 'bias instability B',
-          GAUSS_MARKOV: 'Gauss–Markov σ', TIME_KEY: 'correlation time τ', 'random_walk': 'random walk K',
-          'temperature': 'follows the temperature', 'turn_on': 'settles after turn-on', 'ramp': 'drifts steadily'}
-BASIS = {'walk': 'as found', 'equivalent': 'equivalent of the slow noise', 'bound': 'none detected: upper limit'}
+TITLES = {
+    'quantisation': 'quantisation Q',
+    'white_noise': 'white noise N',
+    'bias_instability': 'bias instability B',
+    GAUSS_MARKOV: 'Gauss–Markov σ',
+    TIME_KEY: 'correlation time τ',
+    'random_walk': 'random walk K',
+    'temperature': 'follows the temperature',
+    'turn_on': 'settles after turn-on',
+    'ramp': 'drifts steadily',
+}
+BASIS = {
+    'walk': 'as found',
+    'equivalent': 'equivalent of the slow noise',
+    'bound': 'none detected: upper limit',
+}
 NO_BOUND = 'no bound'
 WORTH_SAYING = 0.04
 """Scatter of the variances between rests above which it is reported: two per cent of the noise."""
@@ -261,7 +422,17 @@ def _row(sensor, letter, axis, term):
     else:
         value = _digits(term.value * factor, upper - lower)
         interval = f'{_digits(lower, upper - lower)} … {_digits(upper, upper - lower)}'
-    return FigureRow(sensor, letter, term.name, TITLES[term.name], value, interval, unit, term.status, _note(axis, term))
+    return FigureRow(
+        sensor,
+        letter,
+        term.name,
+        TITLES[term.name],
+        value,
+        interval,
+        unit,
+        term.status,
+        _note(axis, term),
+    )
 
 
 def _digits(value, width):
@@ -279,7 +450,9 @@ def _note(axis, term):
     parts = [term.reason] if term.reason else []
     if term.name in axis.record_for:
         seconds = axis.record_for[term.name]
-        parts.append('needs more than two days' if seconds is None else f'needs {duration(seconds)}')
+        parts.append(
+            'needs more than two days' if seconds is None else f'needs {duration(seconds)}'
+        )
     return '; '.join(parts)
 
 
@@ -301,7 +474,12 @@ def requested(axis: AxisFigures) -> list[Term]:
 
 def counts(figures: NoiseFigures) -> dict[str, int]:
     """Return how many of the figures that count are determined, weak and held."""
-    statuses = [term.status for sensor in SENSORS for axis in figures.sensor(sensor) for term in requested(axis)]
+    statuses = [
+        term.status
+        for sensor in SENSORS
+        for axis in figures.sensor(sensor)
+        for term in requested(axis)
+    ]
     return {status: statuses.count(status) for status in STATUSES}
 
 
@@ -317,20 +495,43 @@ def lines(figures: NoiseFigures) -> list[str]:
     for sensor in SENSORS:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
             found += _axis_lines(f'{sensor} {letter}', sensor, axis)
-    if any(name in SLOW_PROCESSES for sensor in SENSORS for axis in figures.sensor(sensor) for name in axis.form):
-        found.append('slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for this recording; '
-                     'values of a second recording can lie outside')
+    if any(
+        name in SLOW_PROCESSES
+        for sensor in SENSORS
+        for axis in figures.sensor(sensor)
+        for name in axis.form
+    ):
+        found.append(
+            'slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for this recording; '
+            'values of a second recording can lie outside'
+        )
     longest = _longest(figures)
-    runs = [f'{significant(float(np.linalg.norm(list(shares.values()))), 2)} m after {duration(seconds)}'
-            for seconds, shares in position_budget(figures)]
-    return [*found, *([longest] if longest else []), f'error of dead reckoning from rest by noise only: {", ".join(runs)}']
+    runs = [
+        f'{significant(float(np.linalg.norm(list(shares.values()))), 2)} m after {duration(seconds)}'
+        for seconds, shares in position_budget(figures)
+    ]
+    return [
+        *found,
+        *([longest] if longest else []),
+        f'error of dead reckoning from rest by noise only: {", ".join(runs)}',
+    ]
 
 
 def _rest_line(recording):
-    left = {name.replace('_', ' '): seconds for name, seconds in recording['left_out'].items() if seconds >= 0.05}
+    left = {
+        name.replace('_', ' '): seconds
+        for name, seconds in recording['left_out'].items()
+        if seconds >= 0.05
+    }
     said = ', '.join(f'{seconds:.1f} s of {name}' for name, seconds in left.items())
-    parts = '' if recording['parts'] == 1 else f' in {recording["parts"]} parts, the longest {duration(recording["longest_part"])}'
-    return f'at rest: {duration(recording["seconds_at_rest"])}{parts}' + (f'; left out: {said}' if said else '')
+    parts = (
+        ''
+        if recording['parts'] == 1
+        else f' in {recording["parts"]} parts, the longest {duration(recording["longest_part"])}'
+    )
+    return f'at rest: {duration(recording["seconds_at_rest"])}{parts}' + (
+        f'; left out: {said}' if said else ''
+    )
 
 
 def _axis_lines(name, sensor, axis):
@@ -344,10 +545,14 @@ def _axis_lines(name, sensor, axis):
         others = ' or '.join(said(form) for form in axis.others)
         found.append(f'{name}: {others} explains the curve as well as {said(axis.form)}')
     if axis.excess > 1:
-        found.append(f'{name}: the curve deviates from every model by {np.sqrt(axis.excess):.2g} times the chance limit'
-                     f'{_hump(sensor, axis)}; intervals are wider by that')
+        found.append(
+            f'{name}: the curve deviates from every model by {np.sqrt(axis.excess):.2g} times the chance limit'
+            f'{_hump(sensor, axis)}; intervals are wider by that'
+        )
     if axis.scatter > WORTH_SAYING:
-        found.append(f'{name}: from rest to rest the noise differs by {axis.scatter / 2:.0%} beyond chance; intervals are wider by that')
+        found.append(
+            f'{name}: from rest to rest the noise differs by {axis.scatter / 2:.0%} beyond chance; intervals are wider by that'
+        )
     return found
 
 
@@ -355,23 +560,41 @@ def _hump(sensor, axis):
     """Return the line of the periodogram at the hump of a curve, or ''."""
     if axis.oscillation is None:
         return ''
-    (frequency, amplitude), (factor, unit) = axis.oscillation, for_people(UNITS[sensor], NOISE_QUANTITY)
+    (frequency, amplitude), (factor, unit) = (
+        axis.oscillation,
+        for_people(UNITS[sensor], NOISE_QUANTITY),
+    )
     return f', with an oscillation of {significant(amplitude * factor, 2)} {unit} at {significant(frequency, 3)} Hz'
 
 
 def said(form: tuple[str, ...]) -> str:
     """Return a form as text."""
-    return ' and '.join(name.replace('_', ' ').replace('gauss markov', 'a Gauss–Markov process') for name in form) or 'white noise alone'
+    return (
+        ' and '.join(
+            name.replace('_', ' ').replace('gauss markov', 'a Gauss–Markov process')
+            for name in form
+        )
+        or 'white noise alone'
+    )
 
 
 def _longest(figures):
     """Return the recording time that determines all required figures, or ''."""
-    needed = [axis.record_for[term.name] for sensor in SENSORS for axis in figures.sensor(sensor) for term in requested(axis)
-              if term.name in axis.record_for]
+    needed = [
+        axis.record_for[term.name]
+        for sensor in SENSORS
+        for axis in figures.sensor(sensor)
+        for term in requested(axis)
+        if term.name in axis.record_for
+    ]
     if not needed:
         return ''
     most = None if any(seconds is None for seconds in needed) else max(needed)
-    return 'to determine all of them: record ' + ('more than two days' if most is None else duration(most)) + ' at rest'
+    return (
+        'to determine all of them: record '
+        + ('more than two days' if most is None else duration(most))
+        + ' at rest'
+    )
 
 
 def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HORIZON) -> list[str]:
@@ -380,8 +603,15 @@ def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HOR
     for sensor in SENSORS:
         densities = figures.densities(sensor, horizon)
         units = NOISE_UNITS[sensor]
-        found.append(f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]},')
-        found.append(f'    random walk {_bounded(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})')
-        found += [f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))} {UNITS[sensor]}, '
-                  f'bias step sd {_bounded(densities.step_sd(rate))} {UNITS[sensor]}' for rate in rates]
+        found.append(
+            f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]},'
+        )
+        found.append(
+            f'    random walk {_bounded(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})'
+        )
+        found += [
+            f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))} {UNITS[sensor]}, '
+            f'bias step sd {_bounded(densities.step_sd(rate))} {UNITS[sensor]}'
+            for rate in rates
+        ]
     return found

@@ -4,7 +4,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, WHITE, NoiseProcess, allan_variance, gauss_markov
+from imu_calibration.allan.processes import (
+    FLICKER,
+    QUANTISATION,
+    RANDOM_WALK,
+    WHITE,
+    NoiseProcess,
+    allan_variance,
+    gauss_markov,
+)
 from imu_calibration.allan.terms import GAUSS_MARKOV, PROCESSES, TIME_KEY, AxisNoise
 from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.effects.base import SENSORS
@@ -35,7 +43,14 @@ class AxisFigures(AxisNoise):
             term = self.terms.get(name)
             if term is not None and term.value is not None:
                 time = self.terms[TIME_KEY] if name == GAUSS_MARKOV else None
-                found.append((PROCESSES[name] if time is None else gauss_markov(time.value or time.interval[0]), term.value**2))
+                found.append(
+                    (
+                        PROCESSES[name]
+                        if time is None
+                        else gauss_markov(time.value or time.interval[0]),
+                        term.value**2,
+                    )
+                )
         return found
 
     @property
@@ -48,7 +63,11 @@ class AxisFigures(AxisNoise):
         term = self.terms[WHITE.name]
         if term.value is not None and term.interval[0] > 0:
             return term.value
-        return term.interval[1] if np.isfinite(term.interval[1]) else self.sample_sd * float(np.sqrt(self.shortest))
+        return (
+            term.interval[1]
+            if np.isfinite(term.interval[1])
+            else self.sample_sd * float(np.sqrt(self.shortest))
+        )
 
     def walk(self, horizon: float = HORIZON) -> tuple[float, str]:
         """
@@ -57,12 +76,21 @@ class AxisFigures(AxisNoise):
         The walk with the total Allan variance of the slow processes at the horizon; without a slow part in the curve, the
         largest walk that the curve allows.
         """
-        slow = [(process, coefficient) for process, coefficient in self.processes() if process.name in SLOW_PROCESSES]
+        slow = [
+            (process, coefficient)
+            for process, coefficient in self.processes()
+            if process.name in SLOW_PROCESSES
+        ]
         if not slow:
             return self.terms[RANDOM_WALK.name].interval[1], 'bound'
-        variance = sum(coefficient * float(allan_variance(process, np.array([horizon]))[0]) for process, coefficient in slow)
+        variance = sum(
+            coefficient * float(allan_variance(process, np.array([horizon]))[0])
+            for process, coefficient in slow
+        )
         density = float(np.sqrt(3.0 * variance / horizon))
-        return density, 'walk' if [process.name for process, _ in slow] == [RANDOM_WALK.name] else 'equivalent'
+        return density, 'walk' if [process.name for process, _ in slow] == [
+            RANDOM_WALK.name
+        ] else 'equivalent'
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,16 +155,28 @@ def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
 
     Figures that are held do not enter: a bound is no measurement.
     """
-    return {sensor: _processes([{p.name: (p, c) for p, c in axis.processes()} for axis in figures.sensor(sensor)]) for sensor in SENSORS}
+    return {
+        sensor: _processes(
+            [{p.name: (p, c) for p, c in axis.processes()} for axis in figures.sensor(sensor)]
+        )
+        for sensor in SENSORS
+    }
 
 
 def _processes(axes):
     share = 1.0 / len(axes)
-    flicker, walk = (share * sum(axis[name][1] for axis in axes if name in axis) for name in (FLICKER.name, RANDOM_WALK.name))
+    flicker, walk = (
+        share * sum(axis[name][1] for axis in axes if name in axis)
+        for name in (FLICKER.name, RANDOM_WALK.name)
+    )
     variances = {time: flicker * np.log(PROCESS_TIME_RATIO) / np.pi for time in PROCESS_TIMES}
     variances[PROCESS_TIMES[-1]] += walk * PROCESS_TIMES[-1] / 2.0
     for axis in axes:
         if GAUSS_MARKOV in axis:
             process, coefficient = axis[GAUSS_MARKOV]
             variances[process.time] = variances.get(process.time, 0.0) + share * coefficient
-    return tuple(BiasProcess(float(np.sqrt(variance)), float(time)) for time, variance in sorted(variances.items()) if variance > 0)
+    return tuple(
+        BiasProcess(float(np.sqrt(variance)), float(time))
+        for time, variance in sorted(variances.items())
+        if variance > 0
+    )

@@ -55,7 +55,11 @@ class ToneSearch:
         self._frequency, self._column = frequency, column
         self._block = max(int(1 / (PER_CYCLE * frequency * period)), 1)
         self._step = self._block * period
-        self._size = int(min(CYCLES / frequency, longest) / self._step) if longest * frequency >= FEWEST_CYCLES else 0
+        self._size = (
+            int(min(CYCLES / frequency, longest) / self._step)
+            if longest * frequency >= FEWEST_CYCLES
+            else 0
+        )
         self._power, self._count, self._samples = np.zeros(self._size // 2 + 1), 0, np.zeros(0)
 
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
@@ -64,11 +68,21 @@ class ToneSearch:
 
         if not self._size or not present.any():
             return
-        self._samples = np.concatenate([self._samples, np.where(present, values[:, self._column], values[present, self._column].mean())])
+        self._samples = np.concatenate(
+            [
+                self._samples,
+                np.where(present, values[:, self._column], values[present, self._column].mean()),
+            ]
+        )
         length = self._block * self._size
         while len(self._samples) >= length:
-            segment, self._samples = self._samples[:length].reshape(self._size, self._block).mean(axis=1), self._samples[length:]
-            self._power += periodogram(segment, window='hann', detrend='linear', scaling='spectrum')[1]
+            segment, self._samples = (
+                self._samples[:length].reshape(self._size, self._block).mean(axis=1),
+                self._samples[length:],
+            )
+            self._power += periodogram(
+                segment, window='hann', detrend='linear', scaling='spectrum'
+            )[1]
             self._count += 1
 
     def end_stretch(self) -> None:
@@ -82,20 +96,37 @@ class ToneSearch:
         bins = bins[(bins * hertz >= 0.5 * self._frequency) & (bins * hertz <= 2 * self._frequency)]
         if not self._count or not len(bins):
             return None
-        offsets = np.r_[-LINE_NEIGHBOUR_BINS:-LINE_HALF_BINS, LINE_HALF_BINS + 1:LINE_NEIGHBOUR_BINS + 1]
+        offsets = np.r_[
+            -LINE_NEIGHBOUR_BINS:-LINE_HALF_BINS, LINE_HALF_BINS + 1 : LINE_NEIGHBOUR_BINS + 1
+        ]
         around = self._power[bins[:, None] + offsets].mean(axis=1)
         ratio = self._power[bins] / around
         best = int(np.argmax(ratio))
-        if not f_sf(ratio[best], 2 * self._count, 2 * self._count * len(offsets) * HANN_INDEPENDENT_SHARE) * len(bins) < LINE_P_VALUE:
+        if (
+            not f_sf(
+                ratio[best],
+                2 * self._count,
+                2 * self._count * len(offsets) * HANN_INDEPENDENT_SHARE,
+            )
+            * len(bins)
+            < LINE_P_VALUE
+        ):
             return None
         lobe = np.arange(bins[best] - LINE_HALF_BINS, bins[best] + LINE_HALF_BINS + 1)
         power = self._power[lobe]
         place = float(power @ lobe / power.sum()) * hertz
-        square = max(power.sum() - len(lobe) * around[best], 0.0) / self._count * 2 * HANN_INDEPENDENT_SHARE
+        square = (
+            max(power.sum() - len(lobe) * around[best], 0.0)
+            / self._count
+            * 2
+            * HANN_INDEPENDENT_SHARE
+        )
         return place, float(np.sqrt(square) / np.sinc(place * self._step))
 
 
-LENGTHS = 60.0 * np.array([10, 15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 720, 1080, 1440, 2160, 2880], float)
+LENGTHS = 60.0 * np.array(
+    [10, 15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 720, 1080, 1440, 2160, 2880], float
+)
 """Recordings that are thought of, s: from ten minutes to two days."""
 RELATIVE_SD = 0.24
 """Standard deviation of a coefficient over the coefficient at which the 95 % interval of its root has a ratio of 1.6."""
@@ -118,18 +149,29 @@ class RecordingTimes:
         self._period = period
         self._scales: dict[float, ScaleCovariance] = {}
 
-    def needed(self, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, index: int) -> float | None:
+    def needed(
+        self, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, index: int
+    ) -> float | None:
         """Return the shortest of `LENGTHS` in which coefficient `index` of a model is determined, s; None when none is long enough."""
         for length in LENGTHS:
             if self.relative_sd(length, processes, coefficients, index=index) <= RELATIVE_SD:
                 return float(length)
         return None
 
-    def relative_sd(self, seconds: float, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, *, index: int) -> float:
+    def relative_sd(
+        self,
+        seconds: float,
+        processes: tuple[NoiseProcess, ...],
+        coefficients: np.ndarray,
+        *,
+        index: int,
+    ) -> float:
         """Return the standard deviation of a coefficient over the coefficient, from one recording at rest of this length."""
         moments = self._moments(seconds)
         design, tensor = moments.design(processes), moments.tensor(processes)
-        columns = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))(design * coefficients)
+        columns = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))(
+            design * coefficients
+        )
         information = columns.T @ columns
         size = np.sqrt(np.diag(information))
         inverse = np.linalg.pinv(information / np.outer(size, size), rcond=1e-12, hermitian=True)
@@ -183,7 +225,9 @@ class NoiseIdentification:
     """Force x, y, z, then rate x, y, z."""
 
 
-def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None) -> NoiseIdentification:
+def identify_noise(
+    source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None
+) -> NoiseIdentification:
     """
     Identify the noise of an IMU from a recording that holds rest.
 
@@ -201,25 +245,44 @@ def identify_noise(source: Callable[[], Iterable[SampleBlock]], nominal: Nominal
 
     """
     record = read_rest(source, nominal)
-    axes = [identify_axis(moments) for moments in reported('identifying the noise', record.moments, len(record.moments))]
+    axes = [
+        identify_axis(moments)
+        for moments in reported('identifying the noise', record.moments, len(record.moments))
+    ]
     longest = max(part.seconds for part in record.parts)
-    searches = {k: ToneSearch(axis.oscillation[0], record.curve.period, k, longest=longest)
-                for k, axis in enumerate(axes) if axis.oscillation}
+    searches = {
+        k: ToneSearch(axis.oscillation[0], record.curve.period, k, longest=longest)
+        for k, axis in enumerate(axes)
+        if axis.oscillation
+    }
     if searches:
         record.reader.read(*searches.values())
-    return NoiseIdentification(record, tuple(replace(axis, oscillation=searches[k].line() if k in searches else None)
-                                             for k, axis in enumerate(axes)))
+    return NoiseIdentification(
+        record,
+        tuple(
+            replace(axis, oscillation=searches[k].line() if k in searches else None)
+            for k, axis in enumerate(axes)
+        ),
+    )
 
 
-def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None) -> RestingRecord:
+def read_rest(
+    source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None
+) -> RestingRecord:
     """Read a recording twice, first for parts at rest and trends, then for the Allan curves; arguments as for `identify_noise`."""
     found = survey(source(), nominal)
     pieces = [still_parts(chunks, found.period) for chunks in found.epochs]
-    parts, left_out = [part for part, _ in pieces], {reason: sum(left[reason] for _, left in pieces) for reason in LEFT_OUT}
+    parts, left_out = (
+        [part for part, _ in pieces],
+        {reason: sum(left[reason] for _, left in pieces) for reason in LEFT_OUT},
+    )
     seconds = sum(part.seconds for of_epoch in parts for part in of_epoch)
     if seconds < MIN_CURVE_SAMPLES * found.period or not found.period:
-        raise InputError(f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for {seconds:.1f} s; '
-                         'record with the IMU lying still on something heavy, for an hour if you can', code='rest_too_short')
+        raise InputError(
+            f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for {seconds:.1f} s; '
+            'record with the IMU lying still on something heavy, for an hour if you can',
+            code='rest_too_short',
+        )
     clock = _Clock(found.epochs)
     search = TrendSearch(_blocks(found, parts, clock))
     trends = tuple(search.find(axis) for axis in range(6))
@@ -228,33 +291,64 @@ def read_rest(source: Callable[[], Iterable[SampleBlock]], nominal: NominalScali
     curve = reader.curve()
     _require_scatter(curve)
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
-    moments = tuple(Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]), curve.parts[axis])
-                    for axis, variance in enumerate(curve.variance.T))
+    moments = tuple(
+        Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]), curve.parts[axis])
+        for axis, variance in enumerate(curve.variance.T)
+    )
     flat = tuple(part for of_epoch in parts for part in of_epoch)
-    return RestingRecord(curve, moments, trends, flat, left_out, _sample_sd(found, parts), found, reader)
+    return RestingRecord(
+        curve, moments, trends, flat, left_out, _sample_sd(found, parts), found, reader
+    )
 
 
 def _require_scatter(curve):
     """Refuse an axis with constant readings: its quantisation hides the noise."""
     names = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
-    frozen = [name for name, variance in zip(names, curve.variance.T) if np.sum(variance > 0) < LEAST_SCALES]
+    frozen = [
+        name
+        for name, variance in zip(names, curve.variance.T)
+        if np.sum(variance > 0) < LEAST_SCALES
+    ]
     if frozen:
-        raise InputError(f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of its readings; '
-                         'record with a finer resolution', code='coarse_steps')
+        raise InputError(
+            f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of its readings; '
+            'record with a finer resolution',
+            code='coarse_steps',
+        )
 
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
     """Return what is written to noise.yaml: the figures of all axes and the excluded parts."""
     record, times = result.record, RecordingTimes(result.record.curve.period)
-    axes = [AxisFigures(**vars(axis), trends=trends, record_for=_record_for(axis, times), sample_sd=float(sample_sd),
-                        deviation=tuple(np.sqrt(variance).tolist()))
-            for axis, trends, sample_sd, variance in zip(result.axes, record.trends, record.sample_sd, record.curve.variance.T)]
-    recording = {'seconds_at_rest': float(record.curve.seconds), 'parts': len(record.parts),
-                 'longest_part': float(max(part.seconds for part in record.parts)),
-                 'left_out': record.left_out, 'dropped': dict(record.survey.dropped),
-                 'intervals_hold_for': 'this recording; the slow noise of another one can be outside'}
-    return NoiseFigures(tuple(axes[:3]), tuple(axes[3:]), 1.0 / record.curve.period, record.survey.frame_id, recording,
-                        tuple(float(tau) for tau in record.curve.tau), {'software': f'imu_calibration {__version__}'} | (provenance or {}))
+    axes = [
+        AxisFigures(
+            **vars(axis),
+            trends=trends,
+            record_for=_record_for(axis, times),
+            sample_sd=float(sample_sd),
+            deviation=tuple(np.sqrt(variance).tolist()),
+        )
+        for axis, trends, sample_sd, variance in zip(
+            result.axes, record.trends, record.sample_sd, record.curve.variance.T
+        )
+    ]
+    recording = {
+        'seconds_at_rest': float(record.curve.seconds),
+        'parts': len(record.parts),
+        'longest_part': float(max(part.seconds for part in record.parts)),
+        'left_out': record.left_out,
+        'dropped': dict(record.survey.dropped),
+        'intervals_hold_for': 'this recording; the slow noise of another one can be outside',
+    }
+    return NoiseFigures(
+        tuple(axes[:3]),
+        tuple(axes[3:]),
+        1.0 / record.curve.period,
+        record.survey.frame_id,
+        recording,
+        tuple(float(tau) for tau in record.curve.tau),
+        {'software': f'imu_calibration {__version__}'} | (provenance or {}),
+    )
 
 
 def _record_for(axis, times):
@@ -262,16 +356,25 @@ def _record_for(axis, times):
     found = {}
     for name, term in axis.terms.items():
         asked = name in (WHITE.name, RANDOM_WALK.name, *axis.form)
-        if term.status == DETERMINED or not asked or name not in PROCESSES or not np.isfinite(term.interval[1]):
+        if (
+            term.status == DETERMINED
+            or not asked
+            or name not in PROCESSES
+            or not np.isfinite(term.interval[1])
+        ):
             continue
         processes, coefficients = list(axis.fit.processes), list(axis.fit.coefficients)
         if name not in axis.fit.names:
             processes.insert(0, PROCESSES[name])
             coefficients.insert(0, 0.0)
         index = [process.name for process in processes].index(name)
-        coefficients[index] = (term.value or term.interval[1])**2
+        coefficients[index] = (term.value or term.interval[1]) ** 2
         some = [j for j in range(len(processes)) if coefficients[j] > 0]
-        found[name] = times.needed(tuple(processes[j] for j in some), np.array([coefficients[j] for j in some]), some.index(index))
+        found[name] = times.needed(
+            tuple(processes[j] for j in some),
+            np.array([coefficients[j] for j in some]),
+            some.index(index),
+        )
     return found
 
 
@@ -306,16 +409,31 @@ def _blocks(found, parts, clock):
             inside = part.chunks
             count = (inside.stop - inside.start) // size
             take = slice(inside.start, inside.start + count * size)
-            time.append(clock.time(epoch, chunks.first_ns + chunks.time[take].reshape(count, size).mean(axis=1) * 1e9))
+            time.append(
+                clock.time(
+                    epoch,
+                    chunks.first_ns + chunks.time[take].reshape(count, size).mean(axis=1) * 1e9,
+                )
+            )
             mean.append(chunks.mean[take].reshape(count, size, 6).mean(axis=1))
             number.append(np.full(count, len(number)))
             seconds = size * float(np.median(chunks.duration))
     time = np.concatenate(time)
     warmth = clock.temperature(found)
-    return Blocks(time, np.concatenate(mean), np.concatenate(number), seconds, None if warmth is None else np.interp(time, *warmth))
+    return Blocks(
+        time,
+        np.concatenate(mean),
+        np.concatenate(number),
+        seconds,
+        None if warmth is None else np.interp(time, *warmth),
+    )
 
 
 def _sample_sd(found, parts):
-    variances = [chunks.sd[part.chunks]**2 for chunks, of_epoch in zip(found.epochs, parts) for part in of_epoch]
+    variances = [
+        chunks.sd[part.chunks] ** 2
+        for chunks, of_epoch in zip(found.epochs, parts)
+        for part in of_epoch
+    ]
     size = found.epochs[0].size
     return np.sqrt(np.concatenate(variances).mean(axis=0) * size / (size - 1))

@@ -9,7 +9,13 @@ import numpy as np
 from scipy.linalg.lapack import dtrtri
 from scipy.special import gammainc, gammaincc, ndtr
 
-from imu_calibration.allan.processes import QUANTISATION, WHITE, NoiseProcess, ScaleCovariance, gauss_markov
+from imu_calibration.allan.processes import (
+    QUANTISATION,
+    WHITE,
+    NoiseProcess,
+    ScaleCovariance,
+    gauss_markov,
+)
 from imu_calibration.allan.trends import KeptShare, Parts
 
 MAX_WEIGHT_ROUNDS = 25
@@ -87,11 +93,16 @@ class Moments:
     def design(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
         """Return the expectations for unit coefficients, shape (n_used, n_processes)."""
         tau = self.scales.tau
-        return np.column_stack([self.scales.expectation(process) * self.kept.of(process, tau) for process in processes])[self.used]
+        return np.column_stack(
+            [self.scales.expectation(process) * self.kept.of(process, tau) for process in processes]
+        )[self.used]
 
     def tensor(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
         """Return the products of `ScaleCovariance.tensor` at the scales used; for weights a nearby correlation time will do."""
-        rounded = tuple(gauss_markov(_rounded(process.time)) if process.time else process for process in processes)
+        rounded = tuple(
+            gauss_markov(_rounded(process.time)) if process.time else process
+            for process in processes
+        )
         return self.scales.tensor(rounded)[:, :, self.used][:, :, :, self.used]
 
     @property
@@ -108,8 +119,13 @@ class Moments:
         return chance + np.outer(level, level)
 
 
-def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None,
-                  *, start: np.ndarray | None = None) -> MomentFit:
+def fit_processes(
+    moments: Moments,
+    processes: tuple[NoiseProcess, ...],
+    fixed: dict[int, float] | None = None,
+    *,
+    start: np.ndarray | None = None,
+) -> MomentFit:
     """
     Fit the coefficients of given processes.
 
@@ -137,7 +153,13 @@ def fit_processes(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: 
         new = values.copy()
         if len(free):
             columns = whitener(design[:, free])
-            rest = whitener(target - sum((design[:, k] * value for k, value in (fixed or {}).items()), np.zeros(len(target))))
+            rest = whitener(
+                target
+                - sum(
+                    (design[:, k] * value for k, value in (fixed or {}).items()),
+                    np.zeros(len(target)),
+                )
+            )
             size = np.linalg.norm(columns, axis=0)
             new[free] = nnls(columns / size, rest)[0] / size
         done = np.all(np.abs(new - values) <= 1e-7 * np.maximum(new, values))
@@ -156,7 +178,9 @@ class Whitener:
         self._sd = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(self._sd, self._sd)
         self._factor = _cholesky(correlation + RIDGE * np.eye(len(correlation)))
-        self._inverse = dtrtri(self._factor, lower=1)[0]   # well conditioned with the ridge; a solve of this size waits for threads
+        self._inverse = dtrtri(self._factor, lower=1)[
+            0
+        ]  # well conditioned with the ridge; a solve of this size waits for threads
 
     @property
     def log_determinant(self) -> float:
@@ -178,7 +202,9 @@ def _cholesky(matrix):
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
-        return np.linalg.cholesky(matrix + (RIDGE - np.linalg.eigvalsh(matrix)[0]) * np.eye(len(matrix)))
+        return np.linalg.cholesky(
+            matrix + (RIDGE - np.linalg.eigvalsh(matrix)[0]) * np.eye(len(matrix))
+        )
 
 
 def _rounded(time):
@@ -194,7 +220,9 @@ def _first_guess(design, target, moments):
     return np.maximum(values, 1e-6 * np.min(target[:, None] / design, axis=0))
 
 
-def fit_with_time(moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None) -> MomentFit:
+def fit_with_time(
+    moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None
+) -> MomentFit:
     """
     Fit given processes and, as the last one, a Gauss-Markov process whose correlation time is estimated too.
 
@@ -217,8 +245,14 @@ def _best_time(moments, processes, whitener, fixed):
     last = len(processes)
     known = whitener(moments.design(processes))
     wander, times = whitener(moments.wander), moments.times
-    target = whitener(moments.target) - sum((known[:, k] * value for k, value in fixed.items() if k < last), np.zeros(len(known)))
-    rest = target[:, None] - wander * fixed[last] if last in fixed else np.repeat(target[:, None], len(times), axis=1)
+    target = whitener(moments.target) - sum(
+        (known[:, k] * value for k, value in fixed.items() if k < last), np.zeros(len(known))
+    )
+    rest = (
+        target[:, None] - wander * fixed[last]
+        if last in fixed
+        else np.repeat(target[:, None], len(times), axis=1)
+    )
     free = [k for k in range(last) if k not in fixed]
     best = np.full(len(times), np.inf)
     for count in range(len(free) + 1):
@@ -231,9 +265,17 @@ def _costs(known, wander, rest, held):
     """Return the sums of squares with these columns and one of `wander` each; infinite where a coefficient would be negative."""
     basis, triangle = np.linalg.qr(known)
     own, beside = (values - basis @ (basis.T @ values) for values in (wander, rest))
-    amount = np.zeros(wander.shape[1]) if held else np.maximum(np.einsum('it,it->t', own, beside) / np.einsum('it,it->t', own, own), 0.0)
+    amount = (
+        np.zeros(wander.shape[1])
+        if held
+        else np.maximum(np.einsum('it,it->t', own, beside) / np.einsum('it,it->t', own, own), 0.0)
+    )
     cost = np.einsum('it,it->t', beside - amount * own, beside - amount * own)
-    values = np.linalg.solve(triangle, basis.T @ (rest - amount * wander)) if known.shape[1] else np.zeros((1, 1))
+    values = (
+        np.linalg.solve(triangle, basis.T @ (rest - amount * wander))
+        if known.shape[1]
+        else np.zeros((1, 1))
+    )
     return np.where((values >= 0).all(axis=0), cost, np.inf)
 
 
@@ -247,8 +289,14 @@ INTERVAL_ACCURACY_SDS = 0.02
 """Accuracy of the ends, in standard deviations."""
 
 
-def coefficient_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, name: str,
-                         excess: float = 1.0) -> tuple[float, float]:
+def coefficient_interval(
+    moments: Moments,
+    fits: Sequence[MomentFit],
+    weights: Sequence[float],
+    *,
+    name: str,
+    excess: float = 1.0,
+) -> tuple[float, float]:
     """
     Return the interval of the coefficient of a process: from 0 where the curve does without it.
 
@@ -283,13 +331,15 @@ def score_at_zero(moments: Moments, fit: MomentFit) -> float:
     return _ScoreOfCoefficient(moments, fit, 1.0, 0).tails(0.0)[0]
 
 
-def time_interval(moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0) -> tuple[float, float]:
+def time_interval(
+    moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0
+) -> tuple[float, float]:
     """Return the interval of the time of models whose last process is Gauss-Markov, s; infinite where a random walk fits as well."""
     times = moments.times
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
     members = [_ScoreOfTime(moments, fit, excess) for fit in fits]
     tails = partial(_averaged, members, np.asarray(weights, float) / np.sum(weights))
-    upper = _first(times[best + 1:], lambda time: tails(time)[1] < TAIL)
+    upper = _first(times[best + 1 :], lambda time: tails(time)[1] < TAIL)
     lower = _first(times[:best][::-1], lambda time: tails(time)[0] < TAIL)
     return 0.0 if lower is None else lower, np.inf if upper is None else upper
 
@@ -339,7 +389,10 @@ class _ScoreOfCoefficient(_Score):
             return np.inf
         whiten = Whitener(self._excess * self.fit.covariance)
         own, others = self._directions(self.fit)
-        return 1.0 / (np.linalg.norm(_beside(whiten(own), [whiten(other) for other in others])) * self.fit.coefficients[self.index])
+        return 1.0 / (
+            np.linalg.norm(_beside(whiten(own), [whiten(other) for other in others]))
+            * self.fit.coefficients[self.index]
+        )
 
     def at(self, value):
         """Return the fit with the coefficient fixed, its own direction, and the directions of the other parameters."""
@@ -347,12 +400,18 @@ class _ScoreOfCoefficient(_Score):
         if processes[-1].time and (value > 0 or self.index != len(processes) - 1):
             fit = fit_with_time(self.moments, processes[:-1], {self.index: value})
         else:
-            fit = fit_processes(self.moments, processes, {self.index: value}, start=self.fit.coefficients)
+            fit = fit_processes(
+                self.moments, processes, {self.index: value}, start=self.fit.coefficients
+            )
         return fit, *self._directions(fit)
 
     def _directions(self, fit):
         design = self.moments.design(fit.processes)
-        others = [design[:, k] for k in range(len(fit.processes)) if k != self.index and fit.coefficients[k] > 0]
+        others = [
+            design[:, k]
+            for k in range(len(fit.processes))
+            if k != self.index and fit.coefficients[k] > 0
+        ]
         if fit.processes[-1].time and fit.coefficients[-1] > 0:
             others.append(_by_time(self.moments, fit.processes[-1].time))
         return design[:, self.index], others
@@ -364,12 +423,19 @@ class _ScoreOfTime(_Score):
         processes = (*self.fit.processes[:-1], gauss_markov(value))
         fit = fit_processes(self.moments, processes, None, start=self.fit.coefficients)
         design = self.moments.design(processes)
-        return fit, _by_time(self.moments, value), [design[:, k] for k in range(len(processes)) if fit.coefficients[k] > 0]
+        return (
+            fit,
+            _by_time(self.moments, value),
+            [design[:, k] for k in range(len(processes)) if fit.coefficients[k] > 0],
+        )
 
 
 def _by_time(moments, time):
     """Return the derivative of the Gauss-Markov curve by the logarithm of its time, by a central difference."""
-    late, early = (moments.design((gauss_markov(time * factor),))[:, 0] for factor in (1 + LOG_TIME_STEP, 1 - LOG_TIME_STEP))
+    late, early = (
+        moments.design((gauss_markov(time * factor),))[:, 0]
+        for factor in (1 + LOG_TIME_STEP, 1 - LOG_TIME_STEP)
+    )
     return (late - early) / (2 * LOG_TIME_STEP)
 
 
@@ -382,7 +448,9 @@ def _tails(moments, fit, direction, others, excess):
     size = np.linalg.norm(own)
     score = float(own @ whiten(moments.target - expected)) / size
     weights = whiten.weights(own / size)
-    return pearson_tails(score, _third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target)))
+    return pearson_tails(
+        score, _third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target))
+    )
 
 
 def _beside(own, others):
@@ -400,9 +468,11 @@ def _third_moment(weights, covariance, expected):
     A variance of mean f and variance v from a sum of squares has the third moment 2 v^2 / f (chi-square); mixed ones are computed as
     ``2 (v_ij v_jk v_ki)^(2/3) / (f_i f_j f_k)^(1/3)``.
     """
-    pair = np.cbrt(np.abs(covariance))**2
+    pair = np.cbrt(np.abs(covariance)) ** 2
     scaled = weights / np.cbrt(expected)
-    return float(2.0 * np.einsum('i,j,k,ij,jk,ki->', scaled, scaled, scaled, pair, pair, pair, optimize=True))
+    return float(
+        2.0 * np.einsum('i,j,k,ij,jk,ki->', scaled, scaled, scaled, pair, pair, pair, optimize=True)
+    )
 
 
 def pearson_tails(score: float, skewness: float) -> tuple[float, float]:
@@ -411,7 +481,9 @@ def pearson_tails(score: float, skewness: float) -> tuple[float, float]:
         return float(ndtr(-score)), float(ndtr(score))
     shape = 4.0 / skewness**2
     at = shape + score * np.sqrt(shape) * np.sign(skewness)
-    above, below = (float(gammaincc(shape, at)), float(gammainc(shape, at))) if at > 0 else (1.0, 0.0)
+    above, below = (
+        (float(gammaincc(shape, at)), float(gammainc(shape, at))) if at > 0 else (1.0, 0.0)
+    )
     return (above, below) if skewness > 0 else (below, above)
 
 
@@ -426,4 +498,8 @@ def _crossing(function, start, step):
         near, far = far, far + 1.6 * (far - near)
         if abs(far - np.log(start)) > MAX_LOG_RATIO:
             return np.inf if step > 0 else 0.0
-    return float(np.exp(brentq(lambda x: function(np.exp(x)), near, far, xtol=INTERVAL_ACCURACY_SDS * abs(step))))
+    return float(
+        np.exp(
+            brentq(lambda x: function(np.exp(x)), near, far, xtol=INTERVAL_ACCURACY_SDS * abs(step))
+        )
+    )

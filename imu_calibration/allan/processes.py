@@ -30,7 +30,9 @@ class NoiseProcess:
 def allan_variance(process: NoiseProcess, tau: np.ndarray) -> np.ndarray:
     """Return the Allan variance of a process of unit coefficient: ``(3 G(0) - 4 G(tau) + G(2 tau)) / tau^2``."""
     tau = np.asarray(tau, float)
-    return (3 * process.kernel(0.0 * tau) - 4 * process.kernel(tau) + process.kernel(2 * tau)) / tau**2
+    return (
+        3 * process.kernel(0.0 * tau) - 4 * process.kernel(tau) + process.kernel(2 * tau)
+    ) / tau**2
 
 
 def mean_covariance(process: NoiseProcess, lag: np.ndarray, seconds: float) -> np.ndarray:
@@ -40,7 +42,9 @@ def mean_covariance(process: NoiseProcess, lag: np.ndarray, seconds: float) -> n
     For processes without a variance (random walk, flicker) it holds for combinations whose weights sum to zero.
     """
     lag = np.asarray(lag, float)
-    return (2 * process.kernel(lag) - process.kernel(lag + seconds) - process.kernel(lag - seconds)) / seconds**2
+    return (
+        2 * process.kernel(lag) - process.kernel(lag + seconds) - process.kernel(lag - seconds)
+    ) / seconds**2
 
 
 def _quantisation(lag):
@@ -57,7 +61,7 @@ def _flicker(lag):
 
 
 def _random_walk(lag):
-    return np.abs(lag)**3 / 12
+    return np.abs(lag) ** 3 / 12
 
 
 QUANTISATION = NoiseProcess('quantisation', _quantisation, lattice=True)
@@ -70,16 +74,18 @@ RANDOM_WALK = NoiseProcess('random_walk', _random_walk)
 @lru_cache(maxsize=512)
 def gauss_markov(time: float) -> NoiseProcess:
     """Return the first-order Gauss-Markov process of unit variance and correlation time `time`, s."""
+
     def kernel(lag):
         u = np.abs(lag) / time
         values = np.expm1(-u) + u - 0.5 * u**2
         small = u < SMALL
-        values[small] = -u[small]**3 * np.polyval(SERIES, -u[small])
-        return -time**2 * values
+        values[small] = -(u[small] ** 3) * np.polyval(SERIES, -u[small])
+        return -(time**2) * values
+
     return NoiseProcess('gauss_markov', kernel, time=time)
 
 
-FLATNESS = (2 * np.log(2) / np.pi)**0.5
+FLATNESS = (2 * np.log(2) / np.pi) ** 0.5
 """Deviation of flicker noise over B: 0.664."""
 
 
@@ -136,7 +142,11 @@ class ScaleCovariance:
         if other.lattice:
             one, other = other, one
         if (one, other) not in self._products:
-            values = self._sum_at_spikes(other) if one.lattice else self._sum(self._correlation(one), self._correlation(other))
+            values = (
+                self._sum_at_spikes(other)
+                if one.lattice
+                else self._sum(self._correlation(one), self._correlation(other))
+            )
             matrix = np.zeros((len(self.factors),) * 2)
             matrix[self._first, self._second] = matrix[self._second, self._first] = values
             self._products[one, other] = self._products[other, one] = matrix
@@ -167,15 +177,23 @@ class ScaleCovariance:
         """Return the number of pairs of terms at distance `lag`, over twice the product of the numbers of terms."""
         pairs, terms = np.zeros_like(lag), [np.zeros_like(self._short), np.zeros_like(self._long)]
         for length, number in zip(*self._lengths):
-            here = [np.maximum(length - 2 * factor + 1, 0.0) for factor in (self._short, self._long)]
-            pairs += number * np.maximum(np.minimum(here[0], here[1] - lag) - np.maximum(-lag, 0.0), 0.0) * (here[0] > 0)
+            here = [
+                np.maximum(length - 2 * factor + 1, 0.0) for factor in (self._short, self._long)
+            ]
+            pairs += (
+                number
+                * np.maximum(np.minimum(here[0], here[1] - lag) - np.maximum(-lag, 0.0), 0.0)
+                * (here[0] > 0)
+            )
             terms = [total + number * more for total, more in zip(terms, here)]
         return pairs / (2.0 * terms[0] * terms[1])
 
     def _correlation(self, process):
         """Return the covariance of second differences at the lags for a unit coefficient, shape (n_pairs, n_lags)."""
         if process not in self._correlations:
-            for known in [other for other in self._correlations if other.time]:   # too many to keep for all correlation times
+            for known in [
+                other for other in self._correlations if other.time
+            ]:  # too many to keep for all correlation times
                 del self._correlations[known]
             self._correlations[process] = self._evaluate(process, self._lag)
         return self._correlations[process]
@@ -184,7 +202,11 @@ class ScaleCovariance:
         total, size = np.zeros(lag.shape), np.zeros(lag.shape)
         for i, at_short in enumerate(SECOND_DIFFERENCE):
             for j, at_long in enumerate(SECOND_DIFFERENCE):
-                term = at_short * at_long * process.kernel((lag + j * self._long - i * self._short) * self.period)
+                term = (
+                    at_short
+                    * at_long
+                    * process.kernel((lag + j * self._long - i * self._short) * self.period)
+                )
                 total += term
                 size += np.abs(term)
         total[np.abs(total) < DIFFERENCE_ROUNDING * size] = 0.0
@@ -197,7 +219,9 @@ def _lags(short, long, length):
 
     Dense where one difference begins or ends inside the other, and where the number of pairs of terms in the longest stretch bends.
     """
-    far = 3.0 * LAG_GROWTH ** np.arange(1, int(np.log(MAX_LAG_RATIO * float((long / short).max())) / np.log(LAG_GROWTH)) + 2)
+    far = 3.0 * LAG_GROWTH ** np.arange(
+        1, int(np.log(MAX_LAG_RATIO * float((long / short).max())) / np.log(LAG_GROWTH)) + 2
+    )
     local = np.concatenate([-far[::-1], DENSE, far])[None, :] * short
     local = np.clip(local, -MAX_LAG_RATIO * long, MAX_LAG_RATIO * long)
     first, last = (np.maximum(length - 2 * factor + 1, 0.0) for factor in (short, long))
@@ -211,5 +235,10 @@ def _sorted_lengths(lengths):
     lengths = np.sort(np.asarray(lengths, float))
     if len(lengths) <= MOST_LENGTHS:
         return lengths, np.ones(len(lengths))
-    classes = [*np.array_split(lengths[:-1], MOST_LENGTHS - 1), lengths[-1:]]   # only the longest has terms at the longest scales
-    return np.array([part.mean() for part in classes]), np.array([float(len(part)) for part in classes])
+    classes = [
+        *np.array_split(lengths[:-1], MOST_LENGTHS - 1),
+        lengths[-1:],
+    ]  # only the longest has terms at the longest scales
+    return np.array([part.mean() for part in classes]), np.array(
+        [float(len(part)) for part in classes]
+    )

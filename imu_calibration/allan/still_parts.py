@@ -86,7 +86,14 @@ def _at_the_usual_rate(chunks, period):
     """Return the chunks around which most have the usual period; a chunk with a lost sample is longer, its neighbours are not."""
     if not len(chunks):
         return np.zeros(0, bool)
-    return np.abs(median_filter(chunks.duration / chunks.size, PERIOD_MEDIAN_CHUNKS, mode='nearest') / period - 1.0) <= SAME_PERIOD
+    return (
+        np.abs(
+            median_filter(chunks.duration / chunks.size, PERIOD_MEDIAN_CHUNKS, mode='nearest')
+            / period
+            - 1.0
+        )
+        <= SAME_PERIOD
+    )
 
 
 def _usual(chunks, still):
@@ -112,8 +119,10 @@ def _least_scatter(sd):
 
 def _stepping(mean, still, width):
     """Return the chunks at which the means of `width` chunks before and after differ by more than they usually do."""
-    sums, count = (np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
-                   for values in (np.where(still[:, None], mean - mean[0], 0.0), still[:, None].astype(float)))
+    sums, count = (
+        np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+        for values in (np.where(still[:, None], mean - mean[0], 0.0), still[:, None].astype(float))
+    )
     whole = (count[width:] - count[:-width])[:, 0] == width
     means = (sums[width:] - sums[:-width]) / width
     step, rests = np.abs(means[width:] - means[:-width]), whole[width:] & whole[:-width]
@@ -123,10 +132,12 @@ def _stepping(mean, still, width):
     for column in step.T:
         size = np.where(rests, column, 0.0)
         usual = 1.4826 * np.median(column[rests])
-        peaks = (size > OUTLIER * usual) & (size == maximum_filter1d(size, 2 * width + 1)) & (usual > 0)
+        peaks = (
+            (size > OUTLIER * usual) & (size == maximum_filter1d(size, 2 * width + 1)) & (usual > 0)
+        )
         for peak in np.flatnonzero(peaks):
             margin = max(width // 8, 1)
-            found[peak + width - margin:peak + width + margin] = True
+            found[peak + width - margin : peak + width + margin] = True
     return found
 
 
@@ -139,7 +150,11 @@ def _centre(values):
 def _part(chunks, first, last):
     begin = chunks.time[first] - 0.5 * chunks.duration[first]
     end = chunks.time[last - 1] + 0.5 * chunks.duration[last - 1]
-    return StillPart(chunks.first_ns + round(begin * 1e9), chunks.first_ns + round(end * 1e9), slice(int(first), int(last)))
+    return StillPart(
+        chunks.first_ns + round(begin * 1e9),
+        chunks.first_ns + round(end * 1e9),
+        slice(int(first), int(last)),
+    )
 
 
 MAX_STILL_CHUNKS = 1_000_000
@@ -182,22 +197,38 @@ def survey(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None)
         for epoch, imu in cleaned.imu:
             frame_id = frame_id or imu.frame_id
             columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
-            series.setdefault(epoch, ChunkSeries(CHUNK_SECONDS, MAX_STILL_CHUNKS)).push(imu.stamp_ns, columns)
+            series.setdefault(epoch, ChunkSeries(CHUNK_SECONDS, MAX_STILL_CHUNKS)).push(
+                imu.stamp_ns, columns
+            )
         for _, warmth in cleaned.temperature:
             temperature.push(warmth)
     dropped = Counter(cleaner.lost)
-    dropped.update({reason: count for reason, count in preflight.streams['imu'].dropped.items() if reason != 'clock reset'})
+    dropped.update(
+        {
+            reason: count
+            for reason, count in preflight.streams['imu'].dropped.items()
+            if reason != 'clock reset'
+        }
+    )
     epochs = [item.chunks() for _, item in sorted(series.items())]
-    return Survey(epochs, _period(epochs), temperature.result(), preflight.findings, dropped, frame_id)
+    return Survey(
+        epochs, _period(epochs), temperature.result(), preflight.findings, dropped, frame_id
+    )
 
 
 def _period(epochs):
     """Return the period of most chunks: the mean of those near the median, since stamps may be rounded to milliseconds."""
-    steps = np.concatenate([chunks.duration / chunks.size for chunks in epochs]) if epochs else np.zeros(0)
+    steps = (
+        np.concatenate([chunks.duration / chunks.size for chunks in epochs])
+        if epochs
+        else np.zeros(0)
+    )
     if not len(steps):
         return 0.0
     middle = np.median(steps)
-    return float(f'{np.mean(steps[np.abs(steps / middle - 1.0) < 0.02]):.9g}')   # without rounding errors in the file
+    return float(
+        f'{np.mean(steps[np.abs(steps / middle - 1.0) < 0.02]):.9g}'
+    )  # without rounding errors in the file
 
 
 class _Thinned:

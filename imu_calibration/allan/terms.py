@@ -20,7 +20,14 @@ from imu_calibration.allan.processes import FLICKER, QUANTISATION, RANDOM_WALK, 
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 
 GAUSS_MARKOV = 'gauss_markov'
-FORMS = ((), (RANDOM_WALK.name,), (FLICKER.name,), (GAUSS_MARKOV,), (FLICKER.name, RANDOM_WALK.name), (RANDOM_WALK.name, GAUSS_MARKOV))
+FORMS = (
+    (),
+    (RANDOM_WALK.name,),
+    (FLICKER.name,),
+    (GAUSS_MARKOV,),
+    (FLICKER.name, RANDOM_WALK.name),
+    (RANDOM_WALK.name, GAUSS_MARKOV),
+)
 """Slow parts that are tried, a Gauss-Markov process last."""
 PROCESSES = {process.name: process for process in (QUANTISATION, WHITE, FLICKER, RANDOM_WALK)}
 MAX_COST_EXCESS = 6.0
@@ -56,7 +63,9 @@ class Choice:
         """Other forms that explain the curve nearly as well, except supersets of a form named before."""
         found: list[MomentFit] = []
         for fit in self.fits:
-            if fit.cost - self.best.cost <= MAX_COST_EXCESS and not any(_is_part(known.form, fit.form) for known in (self.best, *found)):
+            if fit.cost - self.best.cost <= MAX_COST_EXCESS and not any(
+                _is_part(known.form, fit.form) for known in (self.best, *found)
+            ):
                 found.append(fit)
         return tuple(found)
 
@@ -64,7 +73,9 @@ class Choice:
         """Return the fits with a process, the best first, and the likelihood of each relative to it; negligible ones are omitted."""
         found = [fit for fit in self.fits if name in fit.names]
         weights = [1.0, *(float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found[1:])]
-        return [fit for fit, weight in zip(found, weights) if weight > MIN_FORM_WEIGHT], [w for w in weights if w > MIN_FORM_WEIGHT]
+        return [fit for fit, weight in zip(found, weights) if weight > MIN_FORM_WEIGHT], [
+            w for w in weights if w > MIN_FORM_WEIGHT
+        ]
 
     def widened(self, name: str) -> 'Choice':
         """Return a choice of one: the best form with a further process."""
@@ -74,13 +85,19 @@ class Choice:
 
     def close(self, name: str) -> MomentFit | None:
         """Return the best form with a process among those that explain the curve nearly as well, or None."""
-        near = [fit for fit in self.fits if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME]
+        near = [
+            fit
+            for fit in self.fits
+            if name in fit.form and fit.cost - self.best.cost <= MAX_COST_EXCESS + PRICE_OF_TIME
+        ]
         return near[0] if near else None
 
 
 def _is_part(form, wider):
     """Return whether a form is a special case of another one: a random walk is a Gauss-Markov process that never forgets."""
-    return all(name in wider or (name == RANDOM_WALK.name and GAUSS_MARKOV in wider) for name in form)
+    return all(
+        name in wider or (name == RANDOM_WALK.name and GAUSS_MARKOV in wider) for name in form
+    )
 
 
 def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
@@ -94,20 +111,32 @@ def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
 
 def _all_forms(moments, fast, excess):
     n_scales = int(moments.used.sum())
-    fits = [fit_form(moments, form, fast, excess=excess) for form in FORMS if len(fast) + 2 * len(form) + 3 <= n_scales]
+    fits = [
+        fit_form(moments, form, fast, excess=excess)
+        for form in FORMS
+        if len(fast) + 2 * len(form) + 3 <= n_scales
+    ]
     return tuple(sorted(fits, key=lambda found: found.cost))
 
 
-def fit_form(moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0) -> MomentFit:
+def fit_form(
+    moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0
+) -> MomentFit:
     """Fit white noise, `fast` processes and the slow ones of a form; squares are divided by `excess`."""
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
     fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
-    return replace(fit, cost=log_cost(moments, fit, excess) + PRICE * len(names) + PRICE_OF_TIME * (GAUSS_MARKOV in form))
+    return replace(
+        fit,
+        cost=log_cost(moments, fit, excess)
+        + PRICE * len(names)
+        + PRICE_OF_TIME * (GAUSS_MARKOV in form),
+    )
 
 
 def _likeliest(moments, fit):
     """Return the fit with another correlation time where one is plainly likelier: the weights of a long time can keep it long."""
+
     def at(time):
         found = fit_processes(moments, (*fit.processes[:-1], gauss_markov(time)))
         return log_cost(moments, found), found
@@ -123,7 +152,11 @@ def _likeliest(moments, fit):
 def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
     """Fit the processes of these names; a Gauss-Markov process is the last."""
     processes = tuple(PROCESSES[name] for name in names if name != GAUSS_MARKOV)
-    return fit_with_time(moments, processes) if GAUSS_MARKOV in names else fit_processes(moments, processes)
+    return (
+        fit_with_time(moments, processes)
+        if GAUSS_MARKOV in names
+        else fit_processes(moments, processes)
+    )
 
 
 def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
@@ -140,7 +173,9 @@ def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
     freedom = 2 * expected**2 / np.diag(covariance)
     spread = np.sqrt(polygamma(1, freedom / 2) * freedom / 2)
     whiten = Whitener(covariance / np.outer(expected, expected) * np.outer(spread, spread))
-    rest = whiten(np.log(moments.target[some] / expected) - digamma(freedom / 2) + np.log(freedom / 2))
+    rest = whiten(
+        np.log(moments.target[some] / expected) - digamma(freedom / 2) + np.log(freedom / 2)
+    )
     cost = float(rest @ rest) / excess + whiten.log_determinant
     return cost if np.isfinite(cost) else np.inf
 
@@ -227,9 +262,17 @@ def identify_axis(moments: Moments) -> AxisNoise:
     for other in (*rivals, *filter(None, [choice.close(GAUSS_MARKOV)])):
         for name in set(other.form) - set(best.form) - set(alternatives):
             alternatives |= _figures(choice, name, excess)
-    return AxisNoise(_doubted(terms, best, rivals), best.form, tuple(rival.form for rival in rivals), alternatives,
-                     float(moments.scales.tau[moments.used][0]), excess, _hump(moments, best) if excess > 1 else None, moments.scatter,
-                     best)
+    return AxisNoise(
+        _doubted(terms, best, rivals),
+        best.form,
+        tuple(rival.form for rival in rivals),
+        alternatives,
+        float(moments.scales.tau[moments.used][0]),
+        excess,
+        _hump(moments, best) if excess > 1 else None,
+        moments.scatter,
+        best,
+    )
 
 
 def scatter_of(moments: Moments) -> float:
@@ -245,7 +288,9 @@ def _hump(moments, fit):
     highest = int(np.argmax(beyond / np.sqrt(np.diag(fit.covariance))))
     if beyond[highest] <= 0:
         return None
-    return float(PEAK / moments.scales.tau[moments.used][highest]), float(np.sqrt(beyond[highest] / PEAK_HEIGHT))
+    return float(PEAK / moments.scales.tau[moments.used][highest]), float(
+        np.sqrt(beyond[highest] / PEAK_HEIGHT)
+    )
 
 
 def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray]:
@@ -257,7 +302,9 @@ def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray
     every = replace(moments, used=np.ones_like(moments.used))
     fit = axis.fit
     expected = every.design(fit.processes) @ fit.coefficients
-    spread = np.einsum('p,q,pqii->i', fit.coefficients, fit.coefficients, every.tensor(fit.processes))
+    spread = np.einsum(
+        'p,q,pqii->i', fit.coefficients, fit.coefficients, every.tensor(fit.processes)
+    )
     level = axis.scatter**2 * moments.parts.share() if axis.scatter else 0.0
     return expected, 2.0 / (spread * axis.excess / expected**2 + level)
 
@@ -277,7 +324,9 @@ def _fit_range(moments):
         Excess of the squares over their expectation, at least 1.
 
     """
-    most = min(int(np.sum(moments.scales.tau <= LONGEST_LEFT_OUT)), int(moments.used.sum()) - LEAST_SCALES)
+    most = min(
+        int(np.sum(moments.scales.tau <= LONGEST_LEFT_OUT)), int(moments.used.sum()) - LEAST_SCALES
+    )
     least, kept = np.inf, moments
     for count in range(max(most, 0) + 1):
         trial = without_finest(moments, count)
@@ -285,7 +334,10 @@ def _fit_range(moments):
         fit = min((fit_names(trial, names) for names in RICHEST), key=lambda found: found.misfit)
         if chdtrc(freedom, fit.misfit) > MISFIT_P_VALUE:
             return _with_margin(trial, count, most), 1.0
-        seen = fit.coefficient(WHITE.name) * trial.design((WHITE,))[0, 0] > WHITE_SHARE * trial.target[0]
+        seen = (
+            fit.coefficient(WHITE.name) * trial.design((WHITE,))[0, 0]
+            > WHITE_SHARE * trial.target[0]
+        )
         if not count or (seen and fit.misfit / freedom < least):
             least, kept = fit.misfit / freedom, trial
     return kept, max(float(least), 1.0)
@@ -294,7 +346,11 @@ def _fit_range(moments):
 def _with_margin(moments, count, most):
     """Return the moments without the scales at which a detected filter still bends the curve, by 1 - 3/2 (its time) / tau."""
     tau = moments.scales.tau
-    return without_finest(moments, min(int(np.sum(tau < FILTER_TIME_RATIO * tau[count])), most)) if count else moments
+    return (
+        without_finest(moments, min(int(np.sum(tau < FILTER_TIME_RATIO * tau[count])), most))
+        if count
+        else moments
+    )
 
 
 def _figures(choice, name, excess):
@@ -304,7 +360,11 @@ def _figures(choice, name, excess):
     interval = coefficient_interval(choice.moments, fits, weights, name=name, excess=excess)
     found = {name: _term(name, np.sqrt(fits[0].coefficients[index]), np.sqrt(interval))}
     if name == GAUSS_MARKOV:
-        found[TIME_KEY] = _term(TIME_KEY, fits[0].processes[index].time, time_interval(choice.moments, fits, weights, excess=excess))
+        found[TIME_KEY] = _term(
+            TIME_KEY,
+            fits[0].processes[index].time,
+            time_interval(choice.moments, fits, weights, excess=excess),
+        )
     return found
 
 
@@ -314,11 +374,15 @@ def _term(name, value, interval):
         return Term(name, None, (0.0, upper), HELD, 'not seen')
     if lower > 0 and upper / lower <= DETERMINED_RATIO:
         return Term(name, float(value), (lower, upper), DETERMINED)
-    return Term(name, float(value), (lower, upper), WEAK, 'too short' if lower > 0 else 'may be none')
+    return Term(
+        name, float(value), (lower, upper), WEAK, 'too short' if lower > 0 else 'may be none'
+    )
 
 
 def _held(term):
-    return replace(term, value=None, status=HELD, interval=(0.0, term.interval[1]), reason='not seen')
+    return replace(
+        term, value=None, status=HELD, interval=(0.0, term.interval[1]), reason='not seen'
+    )
 
 
 def _doubted(terms, best, rivals):

@@ -4,7 +4,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.allan.processes import FLICKER, RANDOM_WALK, WHITE, NoiseProcess, mean_covariance
+from imu_calibration.allan.processes import (
+    FLICKER,
+    RANDOM_WALK,
+    WHITE,
+    NoiseProcess,
+    mean_covariance,
+)
 
 MAX_TREND_BLOCKS = 200
 MIN_TREND_SDS = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
@@ -49,7 +55,9 @@ class AxisTrend:
     time: float = 0.0
     """Time constant of turn-on, s."""
 
-    def at(self, time: np.ndarray, temperature_c: np.ndarray | None, reference: 'TrendReference') -> np.ndarray:
+    def at(
+        self, time: np.ndarray, temperature_c: np.ndarray | None, reference: 'TrendReference'
+    ) -> np.ndarray:
         """Return the trend at instants (s since the beginning), shape (n,)."""
         return self.value * _shape_of(self.name, self.time)(time, temperature_c, reference)
 
@@ -68,9 +76,11 @@ class TrendReference:
 
 def _shape_of(name, constant=0.0):
     """Return the regressor of a trend as a function of (time, temperature, reference)."""
-    return {TEMPERATURE_TREND: lambda time, warmth, reference: warmth - reference.temperature_c,
-            TURN_ON_TREND: lambda time, warmth, reference: np.exp(-(time - reference.begin) / constant),
-            RAMP_TREND: lambda time, warmth, reference: time - reference.middle}[name]
+    return {
+        TEMPERATURE_TREND: lambda time, warmth, reference: warmth - reference.temperature_c,
+        TURN_ON_TREND: lambda time, warmth, reference: np.exp(-(time - reference.begin) / constant),
+        RAMP_TREND: lambda time, warmth, reference: time - reference.middle,
+    }[name]
 
 
 def _log_determinants(triangles):
@@ -93,15 +103,24 @@ class TrendSearch:
         self._constants = (blocks.part[:, None] == np.unique(blocks.part)[None, :]).astype(float)
         warmth = blocks.temperature_c
         begin = float(blocks.time[0] - blocks.seconds / 2)
-        self.reference = TrendReference(begin, float(blocks.time.mean()), 0.0 if warmth is None else float(warmth.mean()))
+        self.reference = TrendReference(
+            begin, float(blocks.time.mean()), 0.0 if warmth is None else float(warmth.mean())
+        )
         lag = blocks.time[:, None] - blocks.time[None, :]
         self._walk = mean_covariance(RANDOM_WALK, lag, blocks.seconds)
         self._lag = lag
-        centred = self._walk - self._walk.mean(axis=0) - self._walk.mean(axis=1)[:, None] + self._walk.mean()
+        centred = (
+            self._walk
+            - self._walk.mean(axis=0)
+            - self._walk.mean(axis=1)[:, None]
+            + self._walk.mean()
+        )
         self._scale = float(np.trace(centred)) / len(lag)
         # Unit white noise and, for each ratio, the change of a random walk since the first block.
         change = self._walk - self._walk[:1] - self._walk[:, :1] + self._walk[0, 0]
-        factors = np.linalg.cholesky(np.eye(len(lag)) + WALK_VARIANCE_RATIOS[:, None, None] / self._scale * change)
+        factors = np.linalg.cholesky(
+            np.eye(len(lag)) + WALK_VARIANCE_RATIOS[:, None, None] / self._scale * change
+        )
         self._inverses, self._logs = np.linalg.inv(factors), _log_determinants(factors)
 
     @property
@@ -116,22 +135,37 @@ class TrendSearch:
         chosen: list[tuple[str, float]] = []
         warmth = self.blocks.temperature_c
         while True:
-            asked = [TEMPERATURE_TREND] if not chosen and warmth is not None and np.ptp(warmth) > MIN_WARMTH_RANGE else []
-            found = self._clearest(axis, chosen, asked) or self._clearest(axis, chosen, [TURN_ON_TREND, RAMP_TREND])
+            asked = (
+                [TEMPERATURE_TREND]
+                if not chosen and warmth is not None and np.ptp(warmth) > MIN_WARMTH_RANGE
+                else []
+            )
+            found = self._clearest(axis, chosen, asked) or self._clearest(
+                axis, chosen, [TURN_ON_TREND, RAMP_TREND]
+            )
             if found is None:
                 break
             chosen.append(found)
         if not chosen:
             return ()
         values, sd, _ = self.regress(axis, chosen)
-        return tuple(AxisTrend(name, float(v), float(s), constant) for (name, constant), v, s in zip(chosen, values, sd))
+        return tuple(
+            AxisTrend(name, float(v), float(s), constant)
+            for (name, constant), v, s in zip(chosen, values, sd)
+        )
 
     def _clearest(self, axis, chosen, names):
         """Return the (name, time constant) of the most significant coefficient given the selected ones, or None."""
         span = np.ptp(self.blocks.time) + self.blocks.seconds
         taken = {name for name, _ in chosen}
-        tried = [(name, constant) for name in names if name not in taken
-                 for constant in ([share * span for share in SETTLING_SHARES] if name == TURN_ON_TREND else [0.0])]
+        tried = [
+            (name, constant)
+            for name in names
+            if name not in taken
+            for constant in (
+                [share * span for share in SETTLING_SHARES] if name == TURN_ON_TREND else [0.0]
+            )
+        ]
         scores = []
         for trial in tried:
             values, sd, _ = self.regress(axis, [*chosen, trial])
@@ -141,23 +175,36 @@ class TrendSearch:
 
     def columns(self, trends: list[tuple[str, float]]) -> np.ndarray:
         """Return the regressors of (name, time constant), shape (n_blocks, n_trends)."""
-        shapes = [_shape_of(*trend)(self.blocks.time, self.blocks.temperature_c, self.reference) for trend in trends]
-        return np.column_stack([self._constants, *shapes])[:, self._constants.shape[1]:]
+        shapes = [
+            _shape_of(*trend)(self.blocks.time, self.blocks.temperature_c, self.reference)
+            for trend in trends
+        ]
+        return np.column_stack([self._constants, *shapes])[:, self._constants.shape[1] :]
 
-    def regress(self, axis: int, trends: list[tuple[str, float]]) -> tuple[np.ndarray, np.ndarray, int]:
+    def regress(
+        self, axis: int, trends: list[tuple[str, float]]
+    ) -> tuple[np.ndarray, np.ndarray, int]:
         """Return coefficients, their standard deviations, and the index of the likeliest ratio of `WALK_VARIANCE_RATIOS`."""
-        design, target = np.column_stack([self._constants, self.columns(trends)]), self.blocks.mean[:, axis]
+        design, target = (
+            np.column_stack([self._constants, self.columns(trends)]),
+            self.blocks.mean[:, axis],
+        )
         size = np.linalg.norm(design, axis=0)
         basis, triangle = np.linalg.qr(self._inverses @ (design / size))
         rest = self._inverses @ target
         along = np.einsum('rnk,rn->rk', basis, rest)
         total, freedom = np.sum(rest**2, axis=1), len(target) - design.shape[1]
         # The residual of an axis with constant readings is a rounding error.
-        squares = np.maximum(total - np.sum(along**2, axis=1), np.finfo(float).eps * total + np.finfo(float).tiny)
+        squares = np.maximum(
+            total - np.sum(along**2, axis=1), np.finfo(float).eps * total + np.finfo(float).tiny
+        )
         best = int(np.argmin(self._logs + _log_determinants(triangle) + freedom * np.log(squares)))
         root = np.linalg.inv(triangle[best])
-        values, sd = root @ along[best] / size, np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / size
-        return values[-len(trends):], sd[-len(trends):], best
+        values, sd = (
+            root @ along[best] / size,
+            np.sqrt(squares[best] / freedom * np.einsum('ij,ij->i', root, root)) / size,
+        )
+        return values[-len(trends) :], sd[-len(trends) :], best
 
     def kept(self, axis: int, trends: tuple[AxisTrend, ...]) -> 'KeptShare':
         """Return the share of the Allan variance that remains after subtraction of these trends."""
@@ -168,8 +215,13 @@ class TrendSearch:
         design = np.column_stack([self._constants, self.columns(shapes)])
         whitened = inverse @ design
         taken = np.eye(len(design)) - design @ np.linalg.pinv(whitened) @ inverse
-        counts = np.unique(np.rint(2.0 ** np.arange(0, np.log2(max(len(design) / 2, 1)) + 0.01, 0.5)).astype(int))
-        shares = {process.name: self._shares(process, counts, taken) for process in (WHITE, FLICKER, RANDOM_WALK)}
+        counts = np.unique(
+            np.rint(2.0 ** np.arange(0, np.log2(max(len(design) / 2, 1)) + 0.01, 0.5)).astype(int)
+        )
+        shares = {
+            process.name: self._shares(process, counts, taken)
+            for process in (WHITE, FLICKER, RANDOM_WALK)
+        }
         return KeptShare(counts * self.blocks.seconds, shares)
 
     def _shares(self, process, counts, taken):
@@ -179,16 +231,22 @@ class TrendSearch:
             difference = self._differences(count)
             if len(difference):
                 left = difference @ taken
-                shares[k] = np.einsum('ij,jk,ik->', left, covariance, left) / np.einsum('ij,jk,ik->', difference, covariance, difference)
+                shares[k] = np.einsum('ij,jk,ik->', left, covariance, left) / np.einsum(
+                    'ij,jk,ik->', difference, covariance, difference
+                )
         return np.clip(shares, 0.02, 1.0)
 
     def _differences(self, count):
         """Return the second differences at `count` blocks per mean as rows, within parts only."""
         n = len(self.blocks.time)
-        starts = [k for k in range(n - 2 * count + 1) if self.blocks.part[k] == self.blocks.part[k + 2 * count - 1]]
+        starts = [
+            k
+            for k in range(n - 2 * count + 1)
+            if self.blocks.part[k] == self.blocks.part[k + 2 * count - 1]
+        ]
         rows = np.zeros((len(starts), n))
         for row, k in zip(rows, starts):
-            row[k:k + count], row[k + count:k + 2 * count] = -1.0 / count, 1.0 / count
+            row[k : k + count], row[k + count : k + 2 * count] = -1.0 / count, 1.0 / count
         return rows
 
 
@@ -220,7 +278,7 @@ class Parts:
 
     def share(self) -> np.ndarray:
         """Return the variance of the mean of all parts over that of a part, if only their levels differ, shape (n_scales,)."""
-        return (self.terms**2).sum(axis=0) / self.terms.sum(axis=0)**2
+        return (self.terms**2).sum(axis=0) / self.terms.sum(axis=0) ** 2
 
     def scatter(self, used: np.ndarray, chance: np.ndarray) -> float:
         """
@@ -242,11 +300,11 @@ class Parts:
         terms, variance = self.terms[:, used], self.variance[:, used]
         total, freedom = terms.sum(axis=0), (terms > 0).sum(axis=0) - 1
         level = (terms * variance).sum(axis=0) / total
-        squares = (terms * (variance / level - 1.0)**2).sum(axis=0)
+        squares = (terms * (variance / level - 1.0) ** 2).sum(axis=0)
         spread = total - (terms**2).sum(axis=0) / total
         known = freedom > 0
         if not known.any():
             return 0.0
         between = (squares - freedom * chance * total)[known] / spread[known]
-        precision = (spread / (chance * total))[known]**2 / freedom[known]
+        precision = (spread / (chance * total))[known] ** 2 / freedom[known]
         return float(np.sqrt(max(np.sum(precision * between) / precision.sum(), 0.0)))

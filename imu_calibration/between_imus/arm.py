@@ -7,7 +7,14 @@ import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.between_imus.pair import PairedImu, make_windows, relative_rotation, require_overlap, window_centres, window_length
+from imu_calibration.between_imus.pair import (
+    PairedImu,
+    make_windows,
+    relative_rotation,
+    require_overlap,
+    window_centres,
+    window_length,
+)
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.sensor_model import linear_names
@@ -103,7 +110,10 @@ def _fit_arm(rows):
         When the motion is the same in all windows, or about one axis only and free of noise.
 
     """
-    lever, lever_slope = _lever_rows(rows.alpha, rows.products), _lever_rows(rows.jerk, rows.products_slope)
+    lever, lever_slope = (
+        _lever_rows(rows.alpha, rows.products),
+        _lever_rows(rows.jerk, rows.products_slope),
+    )
     count, arm = len(lever), np.zeros(3)
     for number in range(3):  # the delay column needs the arm
         clocks = [-rows.force_slope[:, :, None], (lever_slope @ arm)[:, :, None]]
@@ -115,9 +125,13 @@ def _fit_arm(rows):
     try:
         seen = scipy.linalg.eigh(_reduced(normal), _reduced(raw))
     except np.linalg.LinAlgError as error:
-        raise NotObservableError('the motion must show the whole arm, one direction has no signal; '
-                                 'twist fast about all axes') from error
-    partial = Fit(values, design, rows.difference - design @ values, weights, weight_fall, normal, seen)
+        raise NotObservableError(
+            'the motion must show the whole arm, one direction has no signal; '
+            'twist fast about all axes'
+        ) from error
+    partial = Fit(
+        values, design, rows.difference - design @ values, weights, weight_fall, normal, seen
+    )
     hessian = partial.curvature(slice(None)) + (normal - raw)
     return replace(partial, hessian=hessian)
 
@@ -149,8 +163,10 @@ def _robust_fit(design, target, alpha_noise):
         excess = 2 * alpha_noise * np.sum(weights - weight_fall * size / 3)
         right = flat.T @ (target * weights[:, None]).ravel()
         before, values = values, np.linalg.solve(_normal(design, weights, excess), right)
-        size = np.sum((target.ravel() - flat @ values).reshape(-1, 3)**2, axis=1)
-        scale = np.median(size) / 2.366 + 1e-300  # the median of chi-square with three degrees of freedom
+        size = np.sum((target.ravel() - flat @ values).reshape(-1, 3) ** 2, axis=1)
+        scale = (
+            np.median(size) / 2.366 + 1e-300
+        )  # the median of chi-square with three degrees of freedom
         weights = (TAIL_DOF + 3) / (TAIL_DOF + size / scale)
         weight_fall = 2 * weights**2 / ((TAIL_DOF + 3) * scale)
         if np.all(np.abs(values - before) <= 1e-9 * np.abs(values)):
@@ -160,11 +176,15 @@ def _robust_fit(design, target, alpha_noise):
 
 def _jackknife_covariance(fit, centres):
     """Delete-one-cluster jackknife over stretches of time: errors within a stretch may have any correlation."""
-    label = np.unique(np.floor((centres - centres[0]) / CLUSTER).astype(int), return_inverse=True)[1]
+    label = np.unique(np.floor((centres - centres[0]) / CLUSTER).astype(int), return_inverse=True)[
+        1
+    ]
     shifts = []
     for group in range(label.max() + 1):
         inside = label == group
-        score = np.einsum('nip,ni,n->p', fit.design[inside], fit.residual[inside], fit.weights[inside])
+        score = np.einsum(
+            'nip,ni,n->p', fit.design[inside], fit.residual[inside], fit.weights[inside]
+        )
         shifts.append(np.linalg.solve(fit.hessian - fit.curvature(inside), score))
     shifts = np.array(shifts) - np.mean(shifts, axis=0)
     return (len(shifts) - 1) / len(shifts) * shifts.T @ shifts
@@ -172,7 +192,9 @@ def _jackknife_covariance(fit, centres):
 
 def response(fit: Fit, columns: np.ndarray) -> np.ndarray:
     """Return the derivative of the values by small changes of the left-hand side, columns (n, 3, k)."""
-    return np.linalg.solve(fit.hessian, np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True))
+    return np.linalg.solve(
+        fit.hessian, np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True)
+    )
 
 
 NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
@@ -216,9 +238,11 @@ class RelativeArm:
         d = self.diagnostics
         turn = np.degrees(Rotation.from_matrix(self.mat_ab).magnitude())
         yield f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f} ms late'
-        yield (f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f} % of the moving time left out '
-               f'as clipped; the arm explains the difference of the accelerometers from {d["signal_rms"]:.2f} '
-               f'down to {d["residual_rms"]:.2f} m/s^2')
+        yield (
+            f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f} % of the moving time left out '
+            f'as clipped; the arm explains the difference of the accelerometers from {d["signal_rms"]:.2f} '
+            f'down to {d["residual_rms"]:.2f} m/s^2'
+        )
         if not d['calibrated']:
             yield 'no poses at rest to calibrate the two IMUs with: scale errors of a consumer gyroscope are in the sd'
         for axis, status in zip('xyz', self.statuses):
@@ -269,26 +293,53 @@ def _build_rows(a, b, rotation, delay):
     """Integrate both sides over windows without clipping, the rates `delay` seconds later on their clocks."""
     length, offset = window_length(a, b), rotation.offset
     centres = window_centres(a, b, offset=offset, length=length)
-    force_a, force_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
-    rate_a, rate_b = make_windows(a.time, centres + delay, length), make_windows(b.time, centres + offset + delay, length)
-    free = ~(force_a.touches(a.flagged) | force_b.touches(b.flagged) | rate_a.touches(a.flagged) | rate_b.touches(b.flagged))
+    force_a, force_b = (
+        make_windows(a.time, centres, length),
+        make_windows(b.time, centres + offset, length),
+    )
+    rate_a, rate_b = (
+        make_windows(a.time, centres + delay, length),
+        make_windows(b.time, centres + offset + delay, length),
+    )
+    free = ~(
+        force_a.touches(a.flagged)
+        | force_b.touches(b.flagged)
+        | rate_a.touches(a.flagged)
+        | rate_b.touches(b.flagged)
+    )
     in_a = b.rate @ rotation.mat_ab.T
     alpha_a, alpha_b = rate_a.slope(a.rate), rate_b.slope(in_a)
     products = 0.5 * (_products(rate_a.mean, a.rate) + _products(rate_b.mean, in_a))
-    strength = np.sqrt(0.25 * np.sum((alpha_a + alpha_b)**2, axis=1) + np.trace(products, axis1=1, axis2=2)**2)
+    strength = np.sqrt(
+        0.25 * np.sum((alpha_a + alpha_b) ** 2, axis=1) + np.trace(products, axis1=1, axis2=2) ** 2
+    )
     moving = strength > MOTION_SHARE * np.quantile(strength, 0.99)
     keep = free & moving
     if keep.sum() < WINDOWS_LEAST:
-        raise NotObservableError(f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got {keep.sum()}; '
-                                 'twist both IMUs together about all axes for 20 s or more, below the range of the gyroscopes')
+        raise NotObservableError(
+            f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got {keep.sum()}; '
+            'twist both IMUs together about all axes for 20 s or more, below the range of the gyroscopes'
+        )
     lag = 0.1 * (centres[1] - centres[0])  # the second derivative, for the small delay column only
-    later, sooner = (make_windows(a.time, centres[keep] + delay + s * lag, length).slope(a.rate) for s in (1, -1))
+    later, sooner = (
+        make_windows(a.time, centres[keep] + delay + s * lag, length).slope(a.rate) for s in (1, -1)
+    )
     # half of the difference of two gyroscopes is the error of their mean, if their errors are independent
-    noise = np.mean((alpha_b - alpha_a)[keep]**2) / 4
+    noise = np.mean((alpha_b - alpha_a)[keep] ** 2) / 4
     force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
-    return ArmRows(centres[keep], force - force_a.select(keep).mean(a.force), 0.5 * (alpha_a + alpha_b)[keep], products[keep],
-                (later - sooner) / (2 * lag), _products(rate_a.select(keep).slope, a.rate), force_a.select(keep).slope(a.force),
-                force, float(noise), float(np.mean(~free[moving])), length)
+    return ArmRows(
+        centres[keep],
+        force - force_a.select(keep).mean(a.force),
+        0.5 * (alpha_a + alpha_b)[keep],
+        products[keep],
+        (later - sooner) / (2 * lag),
+        _products(rate_a.select(keep).slope, a.rate),
+        force_a.select(keep).slope(a.force),
+        force,
+        float(noise),
+        float(np.mean(~free[moving])),
+        length,
+    )
 
 
 def _products(integrate, rate):
@@ -304,9 +355,14 @@ def _calibration_covariance(fit, rows, a, b):
             turn = np.zeros((3, 3))
             turn[p, q] = 1.0
             product = rows.products @ turn.T
-            columns.append(-_lever_rows(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2)) @ fit.values[:3])
+            columns.append(
+                -_lever_rows(rows.alpha @ turn.T, product + np.swapaxes(product, 1, 2))
+                @ fit.values[:3]
+            )
     shift = response(fit, np.stack(columns, axis=2))
-    spread = sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4  # the mean of both rates is used
+    spread = (
+        sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4
+    )  # the mean of both rates is used
     return (shift @ spread @ shift.T)[:3, :3]
 
 
@@ -320,28 +376,47 @@ def _matrix_covariance(calibration):
 def _result(rows, fit, delay, rotation, streams):
     motion = _jackknife_covariance(fit, rows.centres)[:3, :3]
     shift = response(fit, -skew(rows.force))
-    calibration, turned = _calibration_covariance(fit, rows, *streams), (shift @ rotation.cov @ shift.T)[:3, :3]
+    calibration, turned = (
+        _calibration_covariance(fit, rows, *streams),
+        (shift @ rotation.cov @ shift.T)[:3, :3],
+    )
     total = motion + calibration + turned
     sd = np.sqrt(np.diag(total))
     _require_seen(fit.seen, sd)
     diagnostics = {
-        'windows': len(rows.centres), 'window': rows.length, 'clipped_share': rows.clipped_share,
+        'windows': len(rows.centres),
+        'window': rows.length,
+        'clipped_share': rows.clipped_share,
         'calibrated': all(s.calibration is not None for s in streams),
         'largest_rate': float(np.sqrt(np.max(np.trace(rows.products, axis1=1, axis2=2)))),
-        'signal_rms': float(np.sqrt(np.mean(rows.difference**2))), 'residual_rms': float(np.sqrt(np.mean(fit.residual**2))),
-        'residual_median': float(np.sqrt(np.median(np.sum(fit.residual**2, axis=1)))), 'attenuation': float(1 - fit.seen[0].min()),
-        'motion_sd': np.sqrt(np.diag(motion)).tolist(), 'calibration_sd': np.sqrt(np.diag(calibration)).tolist(),
-        'rotation_sd': np.sqrt(np.diag(turned)).tolist(), **{name: float(v) for name, v in zip(NUISANCE, [*fit.values[3:7], delay])}}
+        'signal_rms': float(np.sqrt(np.mean(rows.difference**2))),
+        'residual_rms': float(np.sqrt(np.mean(fit.residual**2))),
+        'residual_median': float(np.sqrt(np.median(np.sum(fit.residual**2, axis=1)))),
+        'attenuation': float(1 - fit.seen[0].min()),
+        'motion_sd': np.sqrt(np.diag(motion)).tolist(),
+        'calibration_sd': np.sqrt(np.diag(calibration)).tolist(),
+        'rotation_sd': np.sqrt(np.diag(turned)).tolist(),
+        **{name: float(v) for name, v in zip(NUISANCE, [*fit.values[3:7], delay])},
+    }
     statuses = tuple('determined' if s <= ARM_TOLERANCE else 'weak' for s in sd)
-    return RelativeArm(fit.values[:3], total, rotation.mat_ab, rotation.offset, statuses, diagnostics)
+    return RelativeArm(
+        fit.values[:3], total, rotation.mat_ab, rotation.offset, statuses, diagnostics
+    )
 
 
 def _require_seen(seen, sd):
     """Refuse when the signal of a direction of the arm is the gyroscopes' noise, or hardly above it."""
     shares, directions = seen
     direction = directions[:, np.argmin(shares)]
-    worst = int(np.argmax(np.abs(direction))) if shares.min() < 0.5 else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
+    worst = (
+        int(np.argmax(np.abs(direction)))
+        if shares.min() < 0.5
+        else int(np.argmax(np.where(np.isfinite(sd), sd, np.inf)))
+    )
     if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
-        raise NotObservableError(f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of the '
-                                 f'signal is not noise and the sd is {np.max(sd):.2g} m; '
-                                 f'rotate fast also about the axes perpendicular to {"xyz"[worst]}', code='arm_not_observable')
+        raise NotObservableError(
+            f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of the '
+            f'signal is not noise and the sd is {np.max(sd):.2g} m; '
+            f'rotate fast also about the axes perpendicular to {"xyz"[worst]}',
+            code='arm_not_observable',
+        )

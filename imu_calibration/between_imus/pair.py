@@ -82,13 +82,20 @@ def make_windows(time: np.ndarray, centres: np.ndarray, length: float) -> Window
     sine, share = np.sin(phase), np.gradient(time)[index] / length
     norm = 1 / 0.3125  # the mean of sin^6 over its half period is 5/16
     weight = np.where(inside, norm * sine**SINE_POWER * share, 0.0)
-    slope = np.where(inside, -norm * SINE_POWER * np.pi / length * sine**(SINE_POWER - 1) * np.cos(phase) * share, 0.0)
+    slope = np.where(
+        inside,
+        -norm * SINE_POWER * np.pi / length * sine ** (SINE_POWER - 1) * np.cos(phase) * share,
+        0.0,
+    )
     return Windows(index, weight, slope)
 
 
 def _weighted(index, weight, values):
     block = max(1, MAX_GATHERED_NUMBERS // (index.shape[1] * values.shape[1]))  # bounds memory
-    parts = [np.einsum('mw,mwk->mk', weight[k:k + block], values[index[k:k + block]]) for k in range(0, len(index), block)]
+    parts = [
+        np.einsum('mw,mwk->mk', weight[k : k + block], values[index[k : k + block]])
+        for k in range(0, len(index), block)
+    ]
     return np.concatenate(parts) if parts else np.zeros((0, values.shape[1]))
 
 
@@ -122,7 +129,11 @@ class PairedImu:
         keep = np.concatenate([[True], np.diff(time) > 0])  # repeated stamps add no new time
         imu, time = imu.select(keep), time[keep]
         period = float(np.median(np.diff(time)))
-        flagged = clipped(imu.force_s) | clipped(imu.rate_s) | holes(time, max(MAX_BRIDGED_SECONDS, 5 * period))
+        flagged = (
+            clipped(imu.force_s)
+            | clipped(imu.rate_s)
+            | holes(time, max(MAX_BRIDGED_SECONDS, 5 * period))
+        )
         still = find_still(imu)
         try:
             calibration = calibrate_by_hand(imu, HandOptions(), still)
@@ -151,12 +162,19 @@ def clipped(values: np.ndarray) -> np.ndarray:
 def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
     """Refuse IMUs that were not recorded at the same time."""
     if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
-        raise InputError(f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics',
-                         code='too_few_samples')
-    overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(imu_a.stamp_ns[0], imu_b.stamp_ns[0])
+        raise InputError(
+            f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics',
+            code='too_few_samples',
+        )
+    overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(
+        imu_a.stamp_ns[0], imu_b.stamp_ns[0]
+    )
     if overlap <= 0:
-        raise InputError(f'the two IMUs must have been recorded at the same time, their stamps differ by {-1e-9 * overlap:.1f} s; '
-                         'check the clocks', code='no_overlap')
+        raise InputError(
+            f'the two IMUs must have been recorded at the same time, their stamps differ by {-1e-9 * overlap:.1f} s; '
+            'check the clocks',
+            code='no_overlap',
+        )
 
 
 def window_length(a: PairedImu, b: PairedImu) -> float:
@@ -170,7 +188,9 @@ def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) 
     begin = max(a.time[0], b.time[0] - offset) + margin
     end = min(a.time[-1], b.time[-1] - offset) - margin
     if end - begin < step:
-        raise InputError(f'the two IMUs must overlap by more than {2 * margin:.1f} s, got {end - begin + 2 * margin:.1f} s; record longer')
+        raise InputError(
+            f'the two IMUs must overlap by more than {2 * margin:.1f} s, got {end - begin + 2 * margin:.1f} s; record longer'
+        )
     first = a.time[np.searchsorted(a.time, begin)]
     return first + step * np.arange(int((end - first) / step) + 1)
 
@@ -192,19 +212,26 @@ def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
     offset, length = 0.0, window_length(a, b)
     for _ in range(OFFSET_ROUNDS):
         centres = window_centres(a, b, offset=offset, length=length)
-        over_a, over_b = make_windows(a.time, centres, length), make_windows(b.time, centres + offset, length)
+        over_a, over_b = (
+            make_windows(a.time, centres, length),
+            make_windows(b.time, centres + offset, length),
+        )
         free = ~(over_a.touches(a.flagged) | over_b.touches(b.flagged))
         over_a, over_b = over_a.select(free), over_b.select(free)
         rate_a, rate_b, alpha = over_a.mean(a.rate), over_b.mean(b.rate), over_a.slope(a.rate)
         mat_ab = nearest_rotation(rate_a.T @ rate_b)
-        offset -= float(np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300))
+        offset -= float(
+            np.sum((rate_b @ mat_ab.T - rate_a) * alpha) / max(np.sum(alpha * alpha), 1e-300)
+        )
     at_rest = _directions_at_rest(a, b, offset)
     pairs, overlap = ((rate_a, rate_b), SAMPLES_LEAST) if at_rest is None else (at_rest, 1)
     mat_ab = nearest_rotation(pairs[0].T @ pairs[1])
     residual = pairs[0] - pairs[1] @ mat_ab.T
     cross = skew(pairs[0])
     information = np.einsum('nki,nkj->ij', cross, cross) + 1e-12 * np.eye(3)
-    return RelativeRotation(mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset)
+    return RelativeRotation(
+        mat_ab, overlap * np.mean(residual**2) * np.linalg.inv(information), offset
+    )
 
 
 def _directions_at_rest(a, b, offset):

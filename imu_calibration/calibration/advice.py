@@ -46,7 +46,9 @@ class HandStep:
     @property
     def seconds(self) -> float:
         """Duration, s."""
-        return HOLD_TIME + TURN_BEGINS + (0.5 * np.pi if self.axis is None else self.angle) / TURN_RATE
+        return (
+            HOLD_TIME + TURN_BEGINS + (0.5 * np.pi if self.axis is None else self.angle) / TURN_RATE
+        )
 
     @property
     def is_turn(self) -> bool:
@@ -63,7 +65,10 @@ class HandStep:
         """Numbers of the step for plan.yaml."""
         found: dict[str, Any] = {'up': [float(f'{c:.6g}') for c in self.up]}
         if self.axis is not None and self.is_turn:
-            found |= {'turn_axis': [float(f'{c:.6g}') for c in self.axis], 'turn_deg': round(float(np.degrees(self.angle)), 1)}
+            found |= {
+                'turn_axis': [float(f'{c:.6g}') for c in self.axis],
+                'turn_deg': round(float(np.degrees(self.angle)), 1),
+            }
         return found
 
     @property
@@ -105,10 +110,13 @@ def steps_from(up: np.ndarray | None) -> tuple[tuple[HandStep, ...], np.ndarray]
     return _steps_from(None if up is None else tuple(up.tolist()))
 
 
-@lru_cache(maxsize=256)   # plans revisit the same directions
+@lru_cache(maxsize=256)  # plans revisit the same directions
 def _steps_from(up):
     start = None if up is None else np.array(up)
-    steps = tuple(HandStep(to) if start is None else HandStep(to, *shortest_turn(start, to)) for to in DIRECTIONS)
+    steps = tuple(
+        HandStep(to) if start is None else HandStep(to, *shortest_turn(start, to))
+        for to in DIRECTIONS
+    )
     rows = np.array([turn_rows(start, to) for to in DIRECTIONS])
     rows.flags.writeable = False
     return steps, rows
@@ -118,7 +126,11 @@ def _rotation_slopes(about, angle=np.pi):
     """Return the derivative of the rotation error in the turned frame by the gyroscope's matrix, near the identity, shape (3, 9)."""
     cross = skew(about)
     # integral over the turn of the remaining rotation, C(angle - t)
-    to_come = angle * np.outer(about, about) + np.sin(angle) * (np.eye(3) - np.outer(about, about)) - (1 - np.cos(angle)) * cross
+    to_come = (
+        angle * np.outer(about, about)
+        + np.sin(angle) * (np.eye(3) - np.outer(about, about))
+        - (1 - np.cos(angle)) * cross
+    )
     return -np.einsum('ip,q->ipq', to_come, about).reshape(3, 9)
 
 
@@ -163,7 +175,9 @@ class HandKnowledge:
         # temperature and time at the reference point: one more pose there has no information about thermal effects
         count = len(ups)
         warmth = np.full(count, self.model.model.temperature_ref_c)
-        norms = self.model.norm_rows(self.values, forces, time=np.zeros(count), temperature_c=warmth)[1]
+        norms = self.model.norm_rows(
+            self.values, forces, time=np.zeros(count), temperature_c=warmth
+        )[1]
         rows = self.rows(norms, turns)
         return self.information + np.einsum('kri,krj->kij', rows, rows)
 
@@ -180,11 +194,15 @@ class HandKnowledge:
         inverse = np.linalg.inv(information + np.diag(1 / self.model.priors**2))
         return np.sqrt(np.diagonal(inverse, axis1=-2, axis2=-1))
 
-    def missing(self, information: np.ndarray, only: Sequence[int] | slice = slice(None)) -> np.ndarray:
+    def missing(
+        self, information: np.ndarray, only: Sequence[int] | slice = slice(None)
+    ) -> np.ndarray:
         """Return the remaining `excess` of all or some parameters given some information; leading axes are kept."""
         return excess(self.sd(information)[..., only], self.tolerances[only])
 
-    def best(self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0) -> tuple[HandStep, np.ndarray, np.ndarray]:
+    def best(
+        self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0
+    ) -> tuple[HandStep, np.ndarray, np.ndarray]:
         """
         Return (the step with the largest gain per second, relative gain of each of `DIRECTIONS`, information after the step).
 
@@ -196,15 +214,21 @@ class HandKnowledge:
         """
         steps, turns = steps_from(self.up)
         information = self.after(DIRECTIONS, turns)
-        worth = share_gained(float(self.missing(self.information, only)), self.missing(information, only))
+        worth = share_gained(
+            float(self.missing(self.information, only)), self.missing(information, only)
+        )
         if self.up is not None:
-            worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0   # the current attitude
-        place = int(np.argmax(worth / np.array([step.seconds for step in steps])**weight))
+            worth[DIRECTIONS @ self.up > np.cos(TURNED)] = 0.0  # the current attitude
+        place = int(np.argmax(worth / np.array([step.seconds for step in steps]) ** weight))
         return steps[place], worth, information[place]
 
     def then(self, step: HandStep) -> HandKnowledge:
         """Return the knowledge after a step."""
-        return replace(self, information=self.after(step.up[None], turn_rows(self.up, step.up)[None])[0], up=step.up)
+        return replace(
+            self,
+            information=self.after(step.up[None], turn_rows(self.up, step.up)[None])[0],
+            up=step.up,
+        )
 
 
 def foretold(knowledge: HandKnowledge) -> list[HandStep]:
@@ -236,15 +260,25 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     Recommended is the next step of the common plan, shown in the picture, if it serves the sensor; otherwise the best step for the sensor.
     """
     knowledge, lacking = knowledge_after(hand), {}
-    for name, status, sd, tolerance in zip(hand.param_names, hand.statuses, hand.judged_sd, hand.tolerances, strict=True):
+    for name, status, sd, tolerance in zip(
+        hand.param_names, hand.statuses, hand.judged_sd, hand.tolerances, strict=True
+    ):
         if status in LACKING:
             lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
-    parts = {sensor: [hand.param_names.index(name) for name in lacking[sensor]] for sensor in SENSORS if sensor in lacking}
+    parts = {
+        sensor: [hand.param_names.index(name) for name in lacking[sensor]]
+        for sensor in SENSORS
+        if sensor in lacking
+    }
     plan = foretold(knowledge)[:1] if parts else []
 
     def gain(part, step):
         after = knowledge.then(step).information
-        return float(knowledge.missing(knowledge.information, part) - knowledge.missing(after, part)) / step.seconds
+        return (
+            float(knowledge.missing(knowledge.information, part) - knowledge.missing(after, part))
+            / step.seconds
+        )
+
     found = []
     for sensor, part in parts.items():
         own = knowledge.best(part)[0]
@@ -253,9 +287,13 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     return tuple(found)
 
 
-def knowledge_at_first(model: HandModel, tolerances: np.ndarray, *,
-                       noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
-                       poses: Poses | None = None) -> HandKnowledge:
+def knowledge_at_first(
+    model: HandModel,
+    tolerances: np.ndarray,
+    *,
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    poses: Poses | None = None,
+) -> HandKnowledge:
     """
     Return the HandKnowledge before the first solution: from the poses only, at nominal values and with the default scatter.
 
@@ -270,13 +308,25 @@ def knowledge_at_first(model: HandModel, tolerances: np.ndarray, *,
 
     """
     scatter = np.hypot(SCATTER_SD, (TREMBLING, CREEPING, 0.0))
-    pose_sd, drift_sd, turn_sd = (float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True))
-    knowledge = HandKnowledge(model, model.nominal, np.zeros((model.size, model.size)), GOAL_SHARE * tolerances, pose_sd, drift_sd, turn_sd,
-                              None)
+    pose_sd, drift_sd, turn_sd = (
+        float(np.hypot(*pair)) for pair in zip(scatter, noise, strict=True)
+    )
+    knowledge = HandKnowledge(
+        model,
+        model.nominal,
+        np.zeros((model.size, model.size)),
+        GOAL_SHARE * tolerances,
+        pose_sd,
+        drift_sd,
+        turn_sd,
+        None,
+    )
     if poses is None:
         return knowledge
     ups = ups_of(poses)
-    turns = np.array([turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)])   # no turn before the first pose
+    turns = np.array(
+        [turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)]
+    )  # no turn before the first pose
     rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], turns)
     return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows), up=ups[-1])
 
@@ -290,8 +340,16 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])
     turn_sd = max(statistics['turn_scatter_sd'], 1e-4)
-    return HandKnowledge(model, hand.values, hand.information / wider**2, GOAL_SHARE * hand.tolerances,
-                         float(wider * pose_sd), float(wider * drift_sd), float(wider * turn_sd), ups_of(poses)[-1])
+    return HandKnowledge(
+        model,
+        hand.values,
+        hand.information / wider**2,
+        GOAL_SHARE * hand.tolerances,
+        float(wider * pose_sd),
+        float(wider * drift_sd),
+        float(wider * turn_sd),
+        ups_of(poses)[-1],
+    )
 
 
 def ups_of(poses: Poses | None) -> np.ndarray:

@@ -68,8 +68,15 @@ class EvidentResult:
     """Search result; None with too few windows."""
 
 
-def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-                          provenance: dict | None = None, mapper: Callable = map, names: Sequence[str] | None = None) -> EvidentResult:
+def calibrate_by_evidence(
+    sources: Sequence[Callable],
+    table: Table,
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    provenance: dict | None = None,
+    mapper: Callable = map,
+    names: Sequence[str] | None = None,
+) -> EvidentResult:
     """
     Calibrate from one or several recordings of the same IMU; effects that they support are added to the requested model.
 
@@ -85,13 +92,30 @@ def calibrate_by_evidence(sources: Sequence[Callable], table: Table, options: Ca
 
     """
     solve = partial(solve_recordings, sources, table, mapper=mapper, names=names)
-    found = solve_by_evidence(solve(options, keep_windows=not options.as_asked), table, options, solve_again=solve)
-    return EvidentResult(conclude(found.solution, found.gathered, found.model, table=table, options=found.extension.options(options),
-                                  provenance=provenance, changes=found.extension.changes), found.found)
+    found = solve_by_evidence(
+        solve(options, keep_windows=not options.as_asked), table, options, solve_again=solve
+    )
+    return EvidentResult(
+        conclude(
+            found.solution,
+            found.gathered,
+            found.model,
+            table=table,
+            options=found.extension.options(options),
+            provenance=provenance,
+            changes=found.extension.changes,
+        ),
+        found.found,
+    )
 
 
-def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, *,
-                      solve_again: Callable[[CalibrationOptions], Solved]) -> EvidentSolution:
+def solve_by_evidence(
+    first: Solved,
+    table: Table,
+    options: CalibrationOptions,
+    *,
+    solve_again: Callable[[CalibrationOptions], Solved],
+) -> EvidentSolution:
     """
     Return the solution of the requested model with the effects that the recordings support.
 
@@ -111,7 +135,10 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
     if not parts:
         return EvidentSolution(*first)
     baseline = _baseline_model(options, table, solution.model)
-    found, *others = (_examined(inquire(windows, table, baseline, bias_processes=options.bias_processes)) for windows in parts)
+    found, *others = (
+        _examined(inquire(windows, table, baseline, bias_processes=options.bias_processes))
+        for windows in parts
+    )
     found, more = _without_faint(found, solution), _named_elsewhere(found, others)
     added, point = (), {}
     while beyond := _beyond((*found.adopted, *more), first[2]):
@@ -119,7 +146,9 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
         added = tuple(question.effect.key for question in beyond)
         solution, gathered, model = solve_again(replace(options, added=added, point=point))
         sure = [question for question in more if not _is_faint(solution, question)]
-        if len(sure) < len(more):   # possible rivals of the effects found in the largest recording are removed first
+        if len(sure) < len(
+            more
+        ):  # possible rivals of the effects found in the largest recording are removed first
             more = sure
             continue
         found = _without_faint(found, solution)
@@ -127,11 +156,15 @@ def solve_by_evidence(first: Solved, table: Table, options: CalibrationOptions, 
             break
     else:
         added, point, (solution, gathered, model) = (), {}, first
-    extension = ModelExtension(added, point, _changes([found, *others], added), _moves(found), _clipped(found))
+    extension = ModelExtension(
+        added, point, _changes([found, *others], added), _moves(found), _clipped(found)
+    )
     return EvidentSolution(extension.applied(solution), gathered, model, extension, found)
 
 
-def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known: ModelExtension) -> EvidentSolution:
+def ask_kept(
+    solved: Solved, table: Table, options: CalibrationOptions, *, known: ModelExtension
+) -> EvidentSolution:
     """
     Return the supported effects when columns cannot be recomputed: missing effects are reported and widen the covariance.
 
@@ -149,23 +182,47 @@ def ask_kept(solved: Solved, table: Table, options: CalibrationOptions, *, known
     parts = windows_to_ask(gathered)
     if not parts:
         return EvidentSolution(*solved, known)
-    found = inquire(parts[0], table, _baseline_model(options, table, solution.model), bias_processes=options.bias_processes)
+    found = inquire(
+        parts[0],
+        table,
+        _baseline_model(options, table, solution.model),
+        bias_processes=options.bias_processes,
+    )
     found = _without_faint(_examined(found), solution)
-    lacking = [] if found.limits else _beyond(found.adopted, model)   # after a limit was found, the solution is that of the search
-    changes = replace(_changes([found], known.added), lacking=tuple(question.name for question in lacking))
-    extension = ModelExtension(known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found))
+    lacking = (
+        [] if found.limits else _beyond(found.adopted, model)
+    )  # after a limit was found, the solution is that of the search
+    changes = replace(
+        _changes([found], known.added), lacking=tuple(question.name for question in lacking)
+    )
+    extension = ModelExtension(
+        known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found)
+    )
     return EvidentSolution(extension.applied(solution), gathered, model, extension, found)
 
 
 def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
     """Return the windows of each recording that suffice for a search of effects, the largest recording first."""
-    return [windows for windows in (spread.windows for spread in gathered.spreads) if len(windows) >= MIN_FOLD_WINDOWS]
+    return [
+        windows
+        for windows in (spread.windows for spread in gathered.spreads)
+        if len(windows) >= MIN_FOLD_WINDOWS
+    ]
 
 
 def _clipped(found):
     """Return the solution of a search that found a limit, with only the saturated samples removed from its windows; else None."""
-    return extended_solution(found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.adopted,
-                             saturations=found.limits) if found.limits else None
+    return (
+        extended_solution(
+            found.problem.space,
+            found.problem.noise,
+            found.problem.baseline,
+            chosen=found.adopted,
+            saturations=found.limits,
+        )
+        if found.limits
+        else None
+    )
 
 
 def _examined(found):
@@ -177,10 +234,23 @@ def _examined(found):
 def _changes(searches, added):
     """Return the changes of the requested model by searches (the first has priority) and their effects."""
     found, model = searches[0], searches[0].problem.baseline
-    clipping = (model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name for limit in found.limits)
-    rests = {sensor: rest.entry for each in reversed(searches) for sensor, rest in each.released().items() if rest.significant}
-    return ModelChanges((*clipping, *(name for _, name in added)), tuple(question.name for question in found.unstable), _strange(searches),
-                        unexplained=rests, stamp_jitter=found.stamp_jitter.to_mapping())
+    clipping = (
+        model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name
+        for limit in found.limits
+    )
+    rests = {
+        sensor: rest.entry
+        for each in reversed(searches)
+        for sensor, rest in each.released().items()
+        if rest.significant
+    }
+    return ModelChanges(
+        (*clipping, *(name for _, name in added)),
+        tuple(question.name for question in found.unstable),
+        _strange(searches),
+        unexplained=rests,
+        stamp_jitter=found.stamp_jitter.to_mapping(),
+    )
 
 
 def _beyond(named, model):
@@ -196,8 +266,15 @@ def _is_faint(solution, question):
 def _without_faint(found, solution):
     """Return the Investigation without findings that are in a solution but not significant."""
     faint = [question for question in found.named if _is_faint(solution, question)]
-    return replace(found, named=[question for question in found.named if question not in faint],
-                   unstable=[*found.unstable, *faint]) if faint else found
+    return (
+        replace(
+            found,
+            named=[question for question in found.named if question not in faint],
+            unstable=[*found.unstable, *faint],
+        )
+        if faint
+        else found
+    )
 
 
 def _named_elsewhere(found, others):
@@ -205,7 +282,11 @@ def _named_elsewhere(found, others):
     more = {}
     for question in (question for other in others for question in other.adopted):
         more.setdefault(question.effect.key, question)
-    return [question for key, question in more.items() if key not in {known.effect.key for known in found.adopted}]
+    return [
+        question
+        for key, question in more.items()
+        if key not in {known.effect.key for known in found.adopted}
+    ]
 
 
 def stands_out(solution: Solution, question: Question) -> bool:
@@ -223,13 +304,21 @@ def stands_out(solution: Solution, question: Question) -> bool:
     if not one_significant(far, np.sqrt(np.diag(solution.covariance)[at])):
         return False
     sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
-    known = sizes > CONVENTION_SHARE * sizes[-1]   # the lever arms of three sensors sum to zero by convention
-    return bool(chi2_sf(((directions.T @ far)[known]**2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE)
+    known = (
+        sizes > CONVENTION_SHARE * sizes[-1]
+    )  # the lever arms of three sensors sum to zero by convention
+    return bool(
+        chi2_sf(((directions.T @ far)[known] ** 2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE
+    )
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
     """Return the options of the baseline model of the search: effects that were not requested have to be significant."""
-    return replace(options, accelerometer_model=options.accelerometer_model or BARE, reference_model=options.reference_model or 'none')
+    return replace(
+        options,
+        accelerometer_model=options.accelerometer_model or BARE,
+        reference_model=options.reference_model or 'none',
+    )
 
 
 def _baseline_model(options, table, solved):
@@ -246,31 +335,50 @@ def _baseline_model(options, table, solved):
     """
     model = choose_model(baseline_options(options), table)
     names = {effect.name for effect in model.effects}
-    return replace(model, point={name: value for name, value in solved.point.items() if name in names},
-                   temperature_ref_c=solved.temperature_ref_c)
+    return replace(
+        model,
+        point={name: value for name, value in solved.point.items() if name in names},
+        temperature_ref_c=solved.temperature_ref_c,
+    )
 
 
 def _strange(found):
     """Return implausible effect -> share of the excess variance that it explains; the first of several investigations has priority."""
-    return {question.name: each.explained.share(each.named, question) for each in reversed(found) for question in each.implausible}
+    return {
+        question.name: each.explained.share(each.named, question)
+        for each in reversed(found)
+        for question in each.implausible
+    }
 
 
 def _point(found):
     """Return effect -> values at which its columns are linearised, of the effects found."""
     model = found.problem.recording.model
-    return {question.name: model.point[question.name] for question in found.adopted if question.name in model.point}
+    return {
+        question.name: model.point[question.name]
+        for question in found.adopted
+        if question.name in model.point
+    }
 
 
 def _moves(found, lacking=()):
     """Return (changes of parameters by other choices of effects, weight): rejected, doubtful, implausible or missing effects, rivals."""
-    moves = [(found.search.moved_by(found.named, question, found.problem.space.names), 1.0)
-             for question in (*found.unstable, *found.rejected, *found.implausible, *lacking)]
+    moves = [
+        (found.search.moved_by(found.named, question, found.problem.space.names), 1.0)
+        for question in (*found.unstable, *found.rejected, *found.implausible, *lacking)
+    ]
     moves += [(moved, 1.0) for moved in biases_off(found.problem.baseline, found.rests)]
     return (*moves, *((rival.moves, rival.weight) for rival in found.rivals))
 
 
-def extended_solution(space: ParameterSpace, noise: dict[str, NoiseModel], baseline: SensorModel, *, chosen: Sequence[Question],
-                      saturations: Sequence[Saturation] = ()) -> Solution:
+def extended_solution(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    baseline: SensorModel,
+    *,
+    chosen: Sequence[Question],
+    saturations: Sequence[Saturation] = (),
+) -> Solution:
     """
     Return the Solution of the baseline extended by the chosen effects.
 
@@ -287,11 +395,17 @@ def extended_solution(space: ParameterSpace, noise: dict[str, NoiseModel], basel
 
     """
     wide = space.recording.model
-    model = replace(baseline, point={**baseline.point, **wide.point}, temperature_ref_c=wide.temperature_ref_c,
-                    folded_arms=wide.folded_arms)
+    model = replace(
+        baseline,
+        point={**baseline.point, **wide.point},
+        temperature_ref_c=wide.temperature_ref_c,
+        folded_arms=wide.folded_arms,
+    )
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
-    weighed = {sensor: _in_trusted_band(noise[sensor], space.slow_only[sensor]) for sensor in SENSORS}
+    weighed = {
+        sensor: _in_trusted_band(noise[sensor], space.slow_only[sensor]) for sensor in SENSORS
+    }
     solution = solve(space.recording.accumulated(model), model, noise=weighed)
     solution = replace(solution, model=replace(model, folded_arms=None))
     for limit in saturations:
@@ -301,8 +415,15 @@ def extended_solution(space: ParameterSpace, noise: dict[str, NoiseModel], basel
 
 def _in_trusted_band(noise, slow_only):
     """Return the noise with weight zero for fast parts on axes where only the slow part is compared."""
-    return replace(noise, moving={kind: replace(factors, every=np.where(slow_only, WEIGHTLESS * factors.every, factors.every))
-                                  for kind, factors in noise.moving.items()})
+    return replace(
+        noise,
+        moving={
+            kind: replace(
+                factors, every=np.where(slow_only, WEIGHTLESS * factors.every, factors.every)
+            )
+            for kind, factors in noise.moving.items()
+        },
+    )
 
 
 def _with_limit(solution, limit):
@@ -313,7 +434,16 @@ def _with_limit(solution, limit):
         matrix = np.insert(np.insert(matrix, place, 0.0, axis=0), place, 0.0, axis=1)
         matrix[place, place] = corner
         return matrix
-    terms = {name: grown(term, limit.level_sd**2 if name == SAMPLE_NOISE else 0.0) for name, term in solution.terms.items()}
-    return replace(solution, model=model, values=np.insert(solution.values, place, limit.level),
-                   held=np.insert(solution.held, place, False), terms=terms,
-                   information=grown(solution.information, limit.level_sd**-2))
+
+    terms = {
+        name: grown(term, limit.level_sd**2 if name == SAMPLE_NOISE else 0.0)
+        for name, term in solution.terms.items()
+    }
+    return replace(
+        solution,
+        model=model,
+        values=np.insert(solution.values, place, limit.level),
+        held=np.insert(solution.held, place, False),
+        terms=terms,
+        information=grown(solution.information, limit.level_sd**-2),
+    )

@@ -20,7 +20,11 @@ from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
-from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics, reduce_window
+from imu_calibration.estimation.window_statistics import (
+    SensorStatistics,
+    WindowStatistics,
+    reduce_window,
+)
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
@@ -42,19 +46,46 @@ from imu_calibration.references.turntable.session_data import (
 )
 
 SAVED_FORMAT = 'imu_calibration/accumulator/4'
-SAVED_PARTS = ('accumulator', 'held_out', 'poses', 'counts', 'frame_id', 'first_stamp_ns', 'last_stamp_ns', 'largest_rate', 'largest_force',
-               'temperature_c', 'judged_from')
+SAVED_PARTS = (
+    'accumulator',
+    'held_out',
+    'poses',
+    'counts',
+    'frame_id',
+    'first_stamp_ns',
+    'last_stamp_ns',
+    'largest_rate',
+    'largest_force',
+    'temperature_c',
+    'judged_from',
+)
 """Saved fields of a `SessionData`; windows with samples are not saved."""
 SAVED_PLAIN = (str, int, float, type(None))
-SAVED_TYPES: dict[str, Any] = {kind.__name__: kind for kind in (
-    dict, tuple, Counter, Accumulator, WindowBlock, WindowStatistics, SensorStatistics, HeldOut, HeldOutBlock, JointNames,
-    ModelChanges, ModelExtension)}
+SAVED_TYPES: dict[str, Any] = {
+    kind.__name__: kind
+    for kind in (
+        dict,
+        tuple,
+        Counter,
+        Accumulator,
+        WindowBlock,
+        WindowStatistics,
+        SensorStatistics,
+        HeldOut,
+        HeldOutBlock,
+        JointNames,
+        ModelChanges,
+        ModelExtension,
+    )
+}
 """Types that an archive may contain, in addition to arrays and plain values."""
 MOST_SAVED = 10**7
 """Values of a column at most: a damaged header may state any number of empty ones."""
 
 
-def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtension = ModelExtension()) -> bytes:
+def to_bytes(
+    gathered: SessionData, model: SensorModel, extension: ModelExtension = ModelExtension()
+) -> bytes:
     """
     Return a `SessionData` as an npz archive: numbers to the last bit, no pickled objects.
 
@@ -70,10 +101,19 @@ def to_bytes(gathered: SessionData, model: SensorModel, extension: ModelExtensio
     """
     arrays: list[np.ndarray] = []
     of_model = {f.name: getattr(model, f.name) for f in fields(model) if f.name != 'catalogue'}
-    content = ({name: getattr(gathered, name) for name in SAVED_PARTS}, of_model, model.definitions, replace(extension, clipped=None))
+    content = (
+        {name: getattr(gathered, name) for name in SAVED_PARTS},
+        of_model,
+        model.definitions,
+        replace(extension, clipped=None),
+    )
     header = json.dumps({'format': SAVED_FORMAT, 'content': _packed([content], arrays)})
     target = io.BytesIO()
-    np.savez(target, header=np.frombuffer(header.encode(), np.uint8), numbers=np.concatenate([np.zeros(0), *map(np.ravel, arrays)]))
+    np.savez(
+        target,
+        header=np.frombuffer(header.encode(), np.uint8),
+        numbers=np.concatenate([np.zeros(0), *map(np.ravel, arrays)]),
+    )
     return target.getvalue()
 
 
@@ -84,17 +124,36 @@ def _packed(values, arrays):
     kinds = [_kind(value) for value in values]
     if len(set(kinds)) > 1:
         each = list(dict.fromkeys(kinds))
-        return ['mixed', [each.index(kind) for kind in kinds],
-                [_packed([value for value, own in zip(values, kinds) if own == kind], arrays) for kind in each]]
+        return [
+            'mixed',
+            [each.index(kind) for kind in kinds],
+            [
+                _packed([value for value, own in zip(values, kinds) if own == kind], arrays)
+                for kind in each
+            ],
+        ]
     first = values[0]
     if isinstance(first, np.ndarray):
         arrays.append(np.array(values))
         return ['array', arrays[-1].shape]
     if isinstance(first, list):
-        return ['list', [len(value) for value in values], _packed([part for value in values for part in value], arrays)]
+        return [
+            'list',
+            [len(value) for value in values],
+            _packed([part for value in values for part in value], arrays),
+        ]
     keys = tuple(first) if isinstance(first, dict) else ()
-    rows = values if isinstance(first, tuple) else [(value if isinstance(value, dict) else vars(value)).values() for value in values]
-    return [type(first).__name__, len(values), [_packed(column, arrays) for column in zip(*rows)], _packed(keys, arrays)]
+    rows = (
+        values
+        if isinstance(first, tuple)
+        else [(value if isinstance(value, dict) else vars(value)).values() for value in values]
+    )
+    return [
+        type(first).__name__,
+        len(values),
+        [_packed(column, arrays) for column in zip(*rows)],
+        _packed(keys, arrays),
+    ]
 
 
 def _kind(value):
@@ -145,22 +204,36 @@ def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
         with load_arrays(data) as arrays:
             header = json.loads(bytes(arrays['header']).decode())
             if header.get('format') != SAVED_FORMAT:
-                raise DocumentError(f"an accumulator must have the format '{SAVED_FORMAT}', got "
-                                    f"{shortened(repr(header.get('format')))}; remove the file")
-            (parts, of_model, definitions, extension), = _unpacked(header['content'], io.BytesIO(arrays['numbers'].tobytes()))
-            return SessionData(**parts), SensorModel(**of_model, catalogue=CATALOGUE.with_definitions(definitions)), extension
+                raise DocumentError(
+                    f"an accumulator must have the format '{SAVED_FORMAT}', got "
+                    f'{shortened(repr(header.get("format")))}; remove the file'
+                )
+            ((parts, of_model, definitions, extension),) = _unpacked(
+                header['content'], io.BytesIO(arrays['numbers'].tobytes())
+            )
+            return (
+                SessionData(**parts),
+                SensorModel(**of_model, catalogue=CATALOGUE.with_definitions(definitions)),
+                extension,
+            )
     except ImuCalibrationError:
         raise
-    except Exception as error:   # damaged archives, arrays and headers raise many kinds
-        raise DocumentError(f'a saved accumulator must be a whole file of {SAVED_FORMAT}, this file of {len(data)} bytes is damaged or has '
-                            f'a different format ({shortened(str(error), 200)}); remove the file', code='accumulator_damaged') from error
+    except Exception as error:  # damaged archives, arrays and headers raise many kinds
+        raise DocumentError(
+            f'a saved accumulator must be a whole file of {SAVED_FORMAT}, this file of {len(data)} bytes is damaged or has '
+            f'a different format ({shortened(str(error), 200)}); remove the file',
+            code='accumulator_damaged',
+        ) from error
 
 
 def require_columns(known: SensorModel, model: SensorModel) -> None:
     """Raise a DocumentError unless the columns of a saved accumulator, of the model `known`, are those of `model`."""
     if not known.has_columns_of(model):
-        raise DocumentError(f'a saved accumulator must contain the columns of the requested model, it has {_text(known)}, '
-                            f'requested is {_text(model)}; start without resume, or with the old model', code='other_model')
+        raise DocumentError(
+            f'a saved accumulator must contain the columns of the requested model, it has {_text(known)}, '
+            f'requested is {_text(model)}; start without resume, or with the old model',
+            code='other_model',
+        )
 
 
 def _text(model):
@@ -171,11 +244,29 @@ def _text(model):
 class Collector:
     """Feeds blocks to the window finder and reduces its windows; the same object serves bags and live topics."""
 
-    def __init__(self, table: Table, model: SensorModel, settings: WindowSettings = WindowSettings(), *,
-                 nominal: NominalScaling | None = None, session: int = 0, watchers: Sequence[Watcher] = (),
-                 windows: list | StoredWindows | None = None, spread: bool = False, judged_from: float = 0.0):
-        self.table, self.model, self.session, self.windows, self.spread = table, model, session, windows, spread
-        self.gatherer = MotionGatherer(table, settings, windows is not None, nominal=nominal, watchers=watchers)
+    def __init__(
+        self,
+        table: Table,
+        model: SensorModel,
+        settings: WindowSettings = WindowSettings(),
+        *,
+        nominal: NominalScaling | None = None,
+        session: int = 0,
+        watchers: Sequence[Watcher] = (),
+        windows: list | StoredWindows | None = None,
+        spread: bool = False,
+        judged_from: float = 0.0,
+    ):
+        self.table, self.model, self.session, self.windows, self.spread = (
+            table,
+            model,
+            session,
+            windows,
+            spread,
+        )
+        self.gatherer = MotionGatherer(
+            table, settings, windows is not None, nominal=nominal, watchers=watchers
+        )
         self.gathered = SessionData(judged_from=judged_from)
 
     def push(self, block: SampleBlock) -> list[Window]:
@@ -208,7 +299,10 @@ class Collector:
         finite = temperature_c[np.isfinite(temperature_c)]
         if len(finite):
             low, high = self.gathered.temperature_c or (np.inf, -np.inf)
-            self.gathered.temperature_c = (float(min(low, finite.min())), float(max(high, finite.max())))
+            self.gathered.temperature_c = (
+                float(min(low, finite.min())),
+                float(max(high, finite.max())),
+            )
 
     def _take(self, windows):
         if self.windows is not None:
@@ -227,12 +321,17 @@ class Collector:
             found.poses.append((reduced.time, self.session, np.array(window.motion.position[0])))
             del found.poses[:-KEPT_POSES]
         else:
-            found.largest_rate = max(found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max())))
+            found.largest_rate = max(
+                found.largest_rate, float(np.sqrt((window.rate_s**2).sum(axis=1).max()))
+            )
         self._store(window, reduced)
 
     def _store(self, window, _reduced: WindowStatistics):
         kept = self.gathered.kept
-        if window.kind != 'static' and sum(len(w.time) for w in kept) + len(window.time) <= KEPT_SAMPLES:
+        if (
+            window.kind != 'static'
+            and sum(len(w.time) for w in kept) + len(window.time) <= KEPT_SAMPLES
+        ):
             kept.append(window)
         if self.spread:
             self.gathered.spreads[0].add(owned_window(window))
@@ -260,10 +359,18 @@ class GatherStep:
     def __call__(self, numbered: tuple[int, Callable]) -> SessionData:
         """Return the SessionData of a recording, given (its number, callable that yields its blocks)."""
         session, source = numbered
-        return naming(self.names, session)(self.read, source(), session, Preflight(self.table.gravity_value))
+        return naming(self.names, session)(
+            self.read, source(), session, Preflight(self.table.gravity_value)
+        )
 
-    def read(self, blocks: Iterable[SampleBlock], session: int, preflight: Preflight, *,
-             windows: list | StoredWindows | None = None) -> SessionData:
+    def read(
+        self,
+        blocks: Iterable[SampleBlock],
+        session: int,
+        preflight: Preflight,
+        *,
+        windows: list | StoredWindows | None = None,
+    ) -> SessionData:
         """
         Return the SessionData of a recording, which is read once, for its windows and for the checks.
 
@@ -275,8 +382,17 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        collector = Collector(self.table, self.model, self.windows, nominal=self.nominal, session=session, watchers=(preflight,),
-                              windows=windows, spread=self.spread, judged_from=self.judged_from)
+        collector = Collector(
+            self.table,
+            self.model,
+            self.windows,
+            nominal=self.nominal,
+            session=session,
+            watchers=(preflight,),
+            windows=windows,
+            spread=self.spread,
+            judged_from=self.judged_from,
+        )
         for block in blocks:
             collector.push(block)
         gathered = collector.finish()
@@ -287,7 +403,15 @@ class GatherStep:
 class LiveCollector(Collector):
     """A Collector that keeps a bounded number of windows."""
 
-    def __init__(self, table: Table, model: SensorModel, options: CalibrationOptions, *, session: int, store: WindowStore):
+    def __init__(
+        self,
+        table: Table,
+        model: SensorModel,
+        options: CalibrationOptions,
+        *,
+        session: int,
+        store: WindowStore,
+    ):
         super().__init__(table, model, options.windows, nominal=options.nominal, session=session)
         self.store = store
         self.gathered.spreads = [DecimatedWindows(MAX_LIVE_SAMPLES)]
@@ -299,7 +423,10 @@ class LiveCollector(Collector):
 
     def take_model(self, model: SensorModel) -> None:
         """Gather the columns of another model from now on; those of all kept windows are computed again."""
-        self.model, self.gathered = model, self.gathered.anew(self.store.reduced(model, self.table, self.session))
+        self.model, self.gathered = (
+            model,
+            self.gathered.anew(self.store.reduced(model, self.table, self.session)),
+        )
 
     def snapshot(self, pending: bool) -> tuple[SessionData, WindowStore]:
         """Return copies of the gathered data and of the store; with `pending`, open windows are closed in the copies."""
@@ -315,5 +442,12 @@ class LiveCollector(Collector):
 
 def copied(gathered: SessionData) -> SessionData:
     """Return a copy that shares only objects that are never changed in place."""
-    return replace(gathered, accumulator=gathered.accumulator.copy(), held_out=gathered.held_out.copy(), poses=list(gathered.poses),
-                   kept=[], counts=dict(gathered.counts), spreads=[spread.copy() for spread in gathered.spreads])
+    return replace(
+        gathered,
+        accumulator=gathered.accumulator.copy(),
+        held_out=gathered.held_out.copy(),
+        poses=list(gathered.poses),
+        kept=[],
+        counts=dict(gathered.counts),
+        spreads=[spread.copy() for spread in gathered.spreads],
+    )

@@ -11,7 +11,13 @@ from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.observability import ALL_MOTIONS, DIRECTIONS, MOTIONS, added_information, rest_with_up
+from imu_calibration.estimation.observability import (
+    ALL_MOTIONS,
+    DIRECTIONS,
+    MOTIONS,
+    added_information,
+    rest_with_up,
+)
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DETERMINED, LACKING
 from imu_calibration.estimation.weighted_system import GAUGE_SD, make_prior
@@ -60,19 +66,43 @@ def group_states(result: CalibrationResult) -> list[GroupState]:
         part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         status = calibration.status[part]
-        state = next((word for word in (Progress.HELD, Progress.WEAK) if word in status), Progress.DETERMINED)   # the worst
+        state = next(
+            (word for word in (Progress.HELD, Progress.WEAK) if word in status), Progress.DETERMINED
+        )  # the worst
         lacking = () if state == Progress.DETERMINED else (names[worst], *names[part])
         known = [result.needed[name] for name in lacking if name in result.needed]
         text, predicted = known[0] if known else ('', float('nan'))
-        states.append(GroupState(effect.sensor, effect.name, state, names[worst], float(sd[worst]), float(result.tolerances[worst]),
-                                 effect.unit_of(worst - part.start), text, predicted))
+        states.append(
+            GroupState(
+                effect.sensor,
+                effect.name,
+                state,
+                names[worst],
+                float(sd[worst]),
+                float(result.tolerances[worst]),
+                effect.unit_of(worst - part.start),
+                text,
+                predicted,
+            )
+        )
     return states
 
 
 def waiting_groups(model: SensorModel) -> list[GroupState]:
     """Return the GroupState of every effect of a model without data."""
-    return [GroupState(e.sensor, e.name, Progress.WAITING, e.param_names()[0], float('nan'), e.tolerance, e.unit_of(0),
-                       ALL_MOTIONS[e.motion[0]]) for e in model.effects]
+    return [
+        GroupState(
+            e.sensor,
+            e.name,
+            Progress.WAITING,
+            e.param_names()[0],
+            float('nan'),
+            e.tolerance,
+            e.unit_of(0),
+            ALL_MOTIONS[e.motion[0]],
+        )
+        for e in model.effects
+    ]
 
 
 MIN_CELL_WORTH = 0.02
@@ -122,10 +152,14 @@ class Coverage:
 
     def with_done(self, groups: Sequence[GroupState]) -> 'Coverage':
         """Return the coverage that is done where every group is determined; never without groups."""
-        return replace(self, done=bool(groups) and all(group.status == DETERMINED for group in groups))
+        return replace(
+            self, done=bool(groups) and all(group.status == DETERMINED for group in groups)
+        )
 
 
-NOTHING_SEEN = Coverage(np.ones(len(DIRECTIONS)), np.zeros((0, 3)), None, Step('move the table'), float('nan'))
+NOTHING_SEEN = Coverage(
+    np.ones(len(DIRECTIONS)), np.zeros((0, 3)), None, Step('move the table'), float('nan')
+)
 """Before anything is known."""
 
 
@@ -155,11 +189,12 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     solution = result.solution
     wanted = np.array(result.model.requested, bool)
     prior = make_prior(solution.model)
-    gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge   # as exact as sums of squares bear it
+    gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge  # as exact as sums of squares bear it
     base = solution.information + np.diag(1 / prior.sd**2) + gauge.T @ gauge
 
     def expected_sd(information):
         return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
+
     # unmodelled effects widen the standard deviations beyond those of the information matrix; the same factor is predicted
     wider = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
 
@@ -167,11 +202,18 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
         return excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
 
     def added(motion):
-        return added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity)
+        return added_information(
+            solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity
+        )
+
     after = np.array([left(base + added(rest_with_up(up))) for up in DIRECTIONS])
     worth = share_gained(left(base), after)
     possible = possible_motions(result.table)
-    motions = [motion for motion in (MOTIONS if possible is None else possible) if motion.seconds < MAX_MOTION_SECONDS]
+    motions = [
+        motion
+        for motion in (MOTIONS if possible is None else possible)
+        if motion.seconds < MAX_MOTION_SECONDS
+    ]
     first, seconds = _foretold(base, left, added, motions)
     step = _next_on_table(result) if first is None else _step(first.text)
     errors = result.window_errors()
@@ -187,7 +229,11 @@ def _foretold(information, left, added, motions):
         if not missing:
             return first, seconds
         remaining = [left(information + each) for each in more]
-        best = max(range(len(motions)), key=lambda k: (missing - remaining[k]) / motions[k].seconds, default=None)
+        best = max(
+            range(len(motions)),
+            key=lambda k: (missing - remaining[k]) / motions[k].seconds,
+            default=None,
+        )
         if best is None or missing - remaining[best] < MIN_MOTION_GAIN * missing:
             break
         first, seconds = first or motions[best], seconds + motions[best].seconds
@@ -201,13 +247,20 @@ def _next_on_table(result):
     if not needed:
         return Step('')
     names = list(result.calibration.param_names)
-    worst = max(needed, key=lambda name: result.calibration.sd[names.index(name)] / result.tolerances[names.index(name)])
+    worst = max(
+        needed,
+        key=lambda name: (
+            result.calibration.sd[names.index(name)] / result.tolerances[names.index(name)]
+        ),
+    )
     return _step(needed[worst][0])
 
 
 def _step(text):
     motion = next((motion for motion in MOTIONS if motion.text == text), None)
-    return Step(text, axis=None if motion is None or motion.axis is None else np.array(motion.axis, float))
+    return Step(
+        text, axis=None if motion is None or motion.axis is None else np.array(motion.axis, float)
+    )
 
 
 def _arms(result):
@@ -225,7 +278,13 @@ RADIUS = 0.5
 ARMS_TIMES = 10.0
 """Arms are millimetres."""
 WANTED, VISITED, DONE_COLOUR, ARROW, NOW, TEXT_COLOUR = (
-    (0.95, 0.55, 0.1), (0.25, 0.6, 0.95), (0.2, 0.75, 0.3), (0.9, 0.1, 0.5), (0.5, 0.5, 0.6), (0.9, 0.9, 0.9))
+    (0.95, 0.55, 0.1),
+    (0.25, 0.6, 0.95),
+    (0.2, 0.75, 0.3),
+    (0.9, 0.1, 0.5),
+    (0.5, 0.5, 0.6),
+    (0.9, 0.9, 0.9),
+)
 SEEN_DIAMETER = 0.03
 
 
@@ -234,11 +293,19 @@ def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...]
     most = max(float(coverage.worth.max()), MIN_CELL_WORTH)
     for direction, worth in zip(DIRECTIONS, coverage.worth, strict=True):
         share = 0.0 if coverage.done or worth < MIN_CELL_WORTH else float(worth) / most
-        yield RADIUS * direction, tuple(share * wanted + (1 - share) * done
-                                        for wanted, done in zip(WANTED, DONE_COLOUR, strict=True)), 0.06 + 0.1 * share
+        yield (
+            RADIUS * direction,
+            tuple(
+                share * wanted + (1 - share) * done
+                for wanted, done in zip(WANTED, DONE_COLOUR, strict=True)
+            ),
+            0.06 + 0.1 * share,
+        )
 
 
-def arrows_of(coverage: Coverage) -> Iterator[tuple[str, np.ndarray, np.ndarray, tuple[float, ...]]]:
+def arrows_of(
+    coverage: Coverage,
+) -> Iterator[tuple[str, np.ndarray, np.ndarray, tuple[float, ...]]]:
     """Yield (name, start, end, colour) of each arrow: up direction now, direction or axis of the next motion, arms that are not zero."""
     step, centre = coverage.next, np.zeros(3)
     if coverage.up is not None:
@@ -247,7 +314,9 @@ def arrows_of(coverage: Coverage) -> Iterator[tuple[str, np.ndarray, np.ndarray,
         yield 'next', centre, 1.25 * RADIUS * step.up, ARROW
     elif step.axis is not None:
         yield 'next', -1.25 * RADIUS * step.axis, 1.25 * RADIUS * step.axis, ARROW
-    for colour, arm in zip(0.9 * np.eye(3), [] if coverage.arms is None else coverage.arms, strict=False):
+    for colour, arm in zip(
+        0.9 * np.eye(3), [] if coverage.arms is None else coverage.arms, strict=False
+    ):
         if arm.any():
             yield 'arms', centre, ARMS_TIMES * arm, tuple(colour)
 
@@ -261,6 +330,10 @@ def label_of(coverage: Coverage) -> tuple[np.ndarray, tuple[float, ...], str]:
     """Return (place, colour, line of text) of the label above the sphere."""
     colour, line = DONE_COLOUR, 'all parameters are determined: save the calibration'
     if not coverage.done:
-        left = '' if np.isnan(coverage.seconds) or not coverage.seconds else f', about {coverage.seconds:.0f} s left'
+        left = (
+            ''
+            if np.isnan(coverage.seconds) or not coverage.seconds
+            else f', about {coverage.seconds:.0f} s left'
+        )
         colour, line = TEXT_COLOUR, (coverage.next.text or 'go on') + left
     return np.array([0.0, 0.0, 1.6 * RADIUS]), colour, line

@@ -53,12 +53,18 @@ class UnitResult:
     @property
     def verdicts(self) -> dict[str, str]:
         """Sensor -> decision, or 'refused'."""
-        return dict.fromkeys(SENSORS, self.verdict) if self.calibration is None else {**self.calibration.decisions}
+        return (
+            dict.fromkeys(SENSORS, self.verdict)
+            if self.calibration is None
+            else {**self.calibration.decisions}
+        )
 
     @property
     def verdict_text(self) -> str:
         """The decisions in one phrase, or 'refused'."""
-        return self.verdict if self.calibration is None else decisions_text(self.calibration.decisions)
+        return (
+            self.verdict if self.calibration is None else decisions_text(self.calibration.decisions)
+        )
 
 
 @dataclass(frozen=True)
@@ -78,16 +84,27 @@ class FleetStep:
             return self._calibrated(unit)
         except ImuCalibrationError as error:
             return UnitResult(unit.name, error=' '.join(str(error).split()), key=error.key)
-        except Exception as error:   # a failed unit does not end the run of the fleet
-            return UnitResult(unit.name, error=f'stopped by {type(error).__name__}: {" ".join(str(error).split())}')
+        except Exception as error:  # a failed unit does not end the run of the fleet
+            return UnitResult(
+                unit.name,
+                error=f'stopped by {type(error).__name__}: {" ".join(str(error).split())}',
+            )
 
     def _calibrated(self, unit):
         provenance = unit.provenance() if unit.provenance is not None else None
-        result = calibrate_by_evidence(unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None).result
+        result = calibrate_by_evidence(
+            unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None
+        ).result
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         if self.report is not None:
             texts['report.html'] = self.report(result)
-        return UnitResult(unit.name, result.calibration, str(result.verdict.word), exit_code(result.calibration), files=texts)
+        return UnitResult(
+            unit.name,
+            result.calibration,
+            str(result.verdict.word),
+            exit_code(result.calibration),
+            files=texts,
+        )
 
 
 @dataclass(frozen=True)
@@ -127,15 +144,26 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
         When no unit was calibrated.
 
     """
-    good = [(result.name, result.calibration) for result in results if result.calibration is not None]
+    good = [
+        (result.name, result.calibration) for result in results if result.calibration is not None
+    ]
     if not good:
         first = f'; the first, {results[0].name}: {results[0].error}' if results else ''
-        raise InputError(f'at least one unit must be calibrated, none of {len(results)} was{first}', code='no_unit_calibrated')
+        raise InputError(
+            f'at least one unit must be calibrated, none of {len(results)} was{first}',
+            code='no_unit_calibrated',
+        )
     values, units = {}, {}
     for unit, calibration in good:
         for effect in calibration.model.effects:
             units |= {name: effect.unit_of(k) for k, name in enumerate(effect.param_names())}
-        for name, value, sd, status in zip(calibration.param_names, calibration.values, calibration.sd, calibration.status, strict=True):
+        for name, value, sd, status in zip(
+            calibration.param_names,
+            calibration.values,
+            calibration.sd,
+            calibration.status,
+            strict=True,
+        ):
             found = values.setdefault(name, [])
             if status != HELD:
                 found.append((float(value), float(sd), unit))
@@ -149,4 +177,13 @@ def _spread(name, unit, found):
     value, sd = (np.array(column) for column in list(zip(*found, strict=True))[:2])
     low, high = found[int(np.argmin(value))], found[int(np.argmax(value))]
     spread = float(value.std(ddof=1)) if len(value) > 1 else float('nan')
-    return Spread(name, unit, len(value), float(value.mean()), spread, float(np.sqrt(np.mean(sd**2))), (low[0], low[2]), (high[0], high[2]))
+    return Spread(
+        name,
+        unit,
+        len(value),
+        float(value.mean()),
+        spread,
+        float(np.sqrt(np.mean(sd**2))),
+        (low[0], low[2]),
+        (high[0], high[2]),
+    )

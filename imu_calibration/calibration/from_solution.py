@@ -17,7 +17,14 @@ from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.observability import Motion, motions_about
-from imu_calibration.estimation.solution import GRAVITY, REJECTED, Solution, reasons_held, statuses, with_term
+from imu_calibration.estimation.solution import (
+    GRAVITY,
+    REJECTED,
+    Solution,
+    reasons_held,
+    statuses,
+    with_term,
+)
 from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import unusable, warnings
@@ -48,8 +55,13 @@ class ModelChanges:
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
-        return {{'unstable': 'denied'}.get(name, name): list(value) if isinstance(value, tuple) else value
-                for name, value in vars(self).items() if value}
+        return {
+            {'unstable': 'denied'}.get(name, name): list(value)
+            if isinstance(value, tuple)
+            else value
+            for name, value in vars(self).items()
+            if value
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +94,9 @@ class ModelExtension:
     def applied(self, solution: Solution) -> Solution:
         """Return a solution of `options`, or that without clipped samples, with the covariance of rejected and collinear effects."""
         found = self.clipped or solution
-        return replace(found, terms=with_term(found.terms, REJECTED, self.disagreement(found.param_names)))
+        return replace(
+            found, terms=with_term(found.terms, REJECTED, self.disagreement(found.param_names))
+        )
 
     @property
     def is_nothing(self) -> bool:
@@ -90,23 +104,43 @@ class ModelExtension:
         return not (self.added or self.moves or self.clipped or self.changes != ModelChanges())
 
 
-def motions_needed(solution: Solution, tolerances: np.ndarray, table: Table) -> dict[str, tuple[str, float]]:
+def motions_needed(
+    solution: Solution, tolerances: np.ndarray, table: Table
+) -> dict[str, tuple[str, float]]:
     """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
-    return observability.needed_motions(solution, tolerances, table.gravity_value, prior_sd=make_prior(solution.model).sd,
-                                        possible=possible_motions(table))
+    return observability.needed_motions(
+        solution,
+        tolerances,
+        table.gravity_value,
+        prior_sd=make_prior(solution.model).sd,
+        possible=possible_motions(table),
+    )
 
 
 def possible_motions(table: Table) -> tuple[Motion, ...] | None:
     """Return the standard motions that a table with a single joint can do; None: any."""
     if len(table.joints) != 1 or not table.joints[0].turns:
         return None
-    return motions_about(*(table.mat_sl @ np.asarray(direction) for direction in (table.joints[0].axis, table.up)))
+    return motions_about(
+        *(table.mat_sl @ np.asarray(direction) for direction in (table.joints[0].axis, table.up))
+    )
 
 
-def document(solution: Solution, tolerances: np.ndarray, gathered: SessionData, *, gravity: float, gauge: dict,
-             undetermined: tuple[dict, ...],
-             statistics: dict, provenance: dict | None, proof: dict | None, changes: ModelChanges, uncorrected: Uncorrected,
-             tested: Collection[str] = ()) -> Calibration:
+def document(
+    solution: Solution,
+    tolerances: np.ndarray,
+    gathered: SessionData,
+    *,
+    gravity: float,
+    gauge: dict,
+    undetermined: tuple[dict, ...],
+    statistics: dict,
+    provenance: dict | None,
+    proof: dict | None,
+    changes: ModelChanges,
+    uncorrected: Uncorrected,
+    tested: Collection[str] = (),
+) -> Calibration:
     """
     Return the Calibration for a solution, with statuses and the verdict.
 
@@ -131,35 +165,65 @@ def document(solution: Solution, tolerances: np.ndarray, gathered: SessionData, 
     values, slope = centred(final, solution.values, uncorrected.centre)
     terms = {name: slope @ term @ slope.T for name, term in solution.terms.items()}
     moved = replace(solution, values=values, terms=terms)
-    found = {**statistics, 'preflight': [finding.to_mapping() for finding in warnings(gathered.findings)],
-             'unusable': unusable(gathered.findings), **changes.to_mapping(), **uncorrected.to_mapping()}
-    calibration = Calibration(replace(final, centre=dict(uncorrected.centre)), values, moved.covariance,
-                              statuses(moved.judged_sd, moved.held, tolerances), gathered.frame_id, gauge, undetermined, found,
-                              conditions(gathered, gravity), {'software': imu_calibration.__version__, **(provenance or {})},
-                              proof=proof or {}, covariance_terms={name: np.diag(term) for name, term in terms.items()},
-                              held_reason=reasons_held(solution.held, solution.param_names, solution.replaced, tested=tested))
+    found = {
+        **statistics,
+        'preflight': [finding.to_mapping() for finding in warnings(gathered.findings)],
+        'unusable': unusable(gathered.findings),
+        **changes.to_mapping(),
+        **uncorrected.to_mapping(),
+    }
+    calibration = Calibration(
+        replace(final, centre=dict(uncorrected.centre)),
+        values,
+        moved.covariance,
+        statuses(moved.judged_sd, moved.held, tolerances),
+        gathered.frame_id,
+        gauge,
+        undetermined,
+        found,
+        conditions(gathered, gravity),
+        {'software': imu_calibration.__version__, **(provenance or {})},
+        proof=proof or {},
+        covariance_terms={name: np.diag(term) for name, term in terms.items()},
+        held_reason=reasons_held(
+            solution.held, solution.param_names, solution.replaced, tested=tested
+        ),
+    )
     return judged(calibration, tolerances)
 
 
-def weak_on_table(solution: Solution, tolerances: np.ndarray, needed: dict[str, tuple[str, float]]) -> tuple[dict, ...]:
+def weak_on_table(
+    solution: Solution, tolerances: np.ndarray, needed: dict[str, tuple[str, float]]
+) -> tuple[dict, ...]:
     """Return the weak directions with the motions that would help, and the parameters that none of them names."""
-    directions = observability.weak_directions(solution.covariance, tolerances, solution.param_names)
+    directions = observability.weak_directions(
+        solution.covariance, tolerances, solution.param_names
+    )
     others = _besides(directions, needed, dict(zip(solution.param_names, solution.sd / tolerances)))
-    return tuple({'parameters': weights, 'needs': need}
-                 for weights, need in (*((each, _need(each, needed)) for each in directions), *others))
+    return tuple(
+        {'parameters': weights, 'needs': need}
+        for weights, need in (*((each, _need(each, needed)) for each in directions), *others)
+    )
 
 
 def gauge_of(model: SensorModel) -> dict[str, Any]:
     """Return the conventions of origin and axes on a table."""
     both_arms = {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}
-    gauge: dict[str, Any] = {'origin': 'mean_of_sensitive_points' if both_arms else 'mount', 'axes': 'mount'}
+    gauge: dict[str, Any] = {
+        'origin': 'mean_of_sensitive_points' if both_arms else 'mount',
+        'axes': 'mount',
+    }
     if model.joint_names.angle_sd is not None:
         gauge['zeros_as_described'] = list(model.joint_names.taken_as_described)
     return gauge
 
 
 def _need(weights, needed):
-    texts = [needed[name][0] for name in sorted(weights, key=lambda n: -abs(weights[n])) if name in needed]
+    texts = [
+        needed[name][0]
+        for name in sorted(weights, key=lambda n: -abs(weights[n]))
+        if name in needed
+    ]
     return texts[0] if texts else 'more of the same motion'
 
 
@@ -177,7 +241,9 @@ def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
     direction = np.zeros(len(solution.values))
     part = solution.model.part('accelerometer', Role.LINEAR)
     direction[part] = solution.values[part] * table.gravity_sd_value / table.gravity_value
-    return replace(solution, terms=with_term(solution.terms, GRAVITY, np.outer(direction, direction)))
+    return replace(
+        solution, terms=with_term(solution.terms, GRAVITY, np.outer(direction, direction))
+    )
 
 
 def statistics(solution: Solution, gathered: SessionData) -> dict:
@@ -186,12 +252,20 @@ def statistics(solution: Solution, gathered: SessionData) -> dict:
     for sensor in SENSORS:
         noise = solution.noise[sensor]
         result[sensor] = {
-            'noise_sd': noise.white_sd, 'low_frequency_factor': noise.inflation, 'between_window_sd': noise.offset_sd,
-            'wander_sd': float(np.sqrt(noise.bias_variance)), 'wander_time_s': noise.bias_time,
+            'noise_sd': noise.white_sd,
+            'low_frequency_factor': noise.inflation,
+            'between_window_sd': noise.offset_sd,
+            'wander_sd': float(np.sqrt(noise.bias_variance)),
+            'wander_time_s': noise.bias_time,
             'residual_rms_moving': finite(solution.residual_rms[sensor][0]),
-            'residual_rms_window_means': solution.residual_rms[sensor][1], 'chi2_per_dof': solution.chi2_per_dof[sensor]}
+            'residual_rms_window_means': solution.residual_rms[sensor][1],
+            'chi2_per_dof': solution.chi2_per_dof[sensor],
+        }
         if sensor in solution.session_biases:
-            result[sensor] |= {'between_recordings_sd': noise.session_sd, 'bias_of_recordings': solution.session_biases[sensor]}
+            result[sensor] |= {
+                'between_recordings_sd': noise.session_sd,
+                'bias_of_recordings': solution.session_biases[sensor],
+            }
         if noise.left_out:
             result[sensor]['left_out_s'] = [time for _, time in sorted(noise.left_out)]
     if solution.not_believed:
@@ -200,12 +274,22 @@ def statistics(solution: Solution, gathered: SessionData) -> dict:
     result['windows'] = dict(sorted(accumulator.windows.items()))
     result['samples_used'] = dict(sorted(accumulator.samples.items()))
     result['dropped'] = dropped(gathered.counts)
-    result['stream'] = {key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']}
+    result['stream'] = {
+        key: value for key, value in sorted(gathered.counts.items()) if key not in result['dropped']
+    }
     return result
 
 
 def conditions(gathered: SessionData, gravity: float) -> dict:
     """Return the conditions section."""
-    date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
-    return {'temperature_range_c': gathered.temperature_c, 'largest_rate': gathered.largest_rate, 'largest_force': gathered.largest_force,
-            'gravity': gravity, 'duration_s': gathered.duration, 'date': date}
+    date = datetime.fromtimestamp((gathered.first_stamp_ns or 0) // 10**9, timezone.utc).strftime(
+        '%Y-%m-%dT%H:%M:%SZ'
+    )
+    return {
+        'temperature_range_c': gathered.temperature_c,
+        'largest_rate': gathered.largest_rate,
+        'largest_force': gathered.largest_force,
+        'gravity': gravity,
+        'duration_s': gathered.duration,
+        'date': date,
+    }

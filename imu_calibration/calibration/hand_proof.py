@@ -14,7 +14,13 @@ from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.strapdown import total_rotation
-from imu_calibration.references.gravity.equations import COMPONENTS, GravityRows, Poses, TurnData, between_middles
+from imu_calibration.references.gravity.equations import (
+    COMPONENTS,
+    GravityRows,
+    Poses,
+    TurnData,
+    between_middles,
+)
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import distinct_attitudes
@@ -52,12 +58,32 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     judged = poses.time >= judged_from_of(hand.model.at(hand.values), end_by_hand(poses))
     norms, angles = [], []
     for out, without in held_out_values(hand, turns):
-        values, part = applied_values(model.model, without, uncorrected.centre), _selected(poses, out & judged)
-        left = [turn for turn in turns if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]]
-        norms.append([np.linalg.norm(corrected_with(model, each, part.force, temperature_c=part.temperature_c).force, axis=1)
-                      - hand.gravity for each in (plain, values)])
+        values, part = (
+            applied_values(model.model, without, uncorrected.centre),
+            _selected(poses, out & judged),
+        )
+        left = [
+            turn
+            for turn in turns
+            if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]
+        ]
+        norms.append(
+            [
+                np.linalg.norm(
+                    corrected_with(model, each, part.force, temperature_c=part.temperature_c).force,
+                    axis=1,
+                )
+                - hand.gravity
+                for each in (plain, values)
+            ]
+        )
         if left and len(turns) - len(left) >= TURNS_LEAST:
-            angles.append([turn_errors(model, values, poses, turns=left, gyroscope=gyroscope) for gyroscope in (plain, values)])
+            angles.append(
+                [
+                    turn_errors(model, values, poses, turns=left, gyroscope=gyroscope)
+                    for gyroscope in (plain, values)
+                ]
+            )
     if not norms:
         return {}
     proof = {'accelerometer': entry_of(_joined(norms), 'm/s^2')}
@@ -66,24 +92,39 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     return proof
 
 
-def held_out_values(hand: HandCalibration, turns: Sequence[TurnData]) -> list[tuple[np.ndarray, np.ndarray]]:
+def held_out_values(
+    hand: HandCalibration, turns: Sequence[TurnData]
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return (mask of the held-out poses, parameters estimated without them) of each fold; none with too few poses."""
     folds = _folds(hand.poses)
     return list(zip(folds, values_without(hand, turns, folds)))
 
 
-def values_without(hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]) -> list[np.ndarray]:
+def values_without(
+    hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]
+) -> list[np.ndarray]:
     """Return the parameters without the poses of each mask and the turns that begin or end there: one Gauss-Newton step."""
     model = hand.hand_model
-    system = GravityRows(model, hand.used_poses, turns).linearise(replace(hand.state, values=hand.values))
-    scatter = np.array([*(hand.statistics[f'{name}_scatter_sd']**2 for name in COMPONENTS), 0.0])
+    system = GravityRows(model, hand.used_poses, turns).linearise(
+        replace(hand.state, values=hand.values)
+    )
+    scatter = np.array([*(hand.statistics[f'{name}_scatter_sd'] ** 2 for name in COMPONENTS), 0.0])
     free = ~hand.held & ~model.fixed
     rows = np.column_stack([system.nuisance, system.main[:, free], system.residual])
     rows /= np.sqrt(system.noise + scatter[system.component])[:, None]
-    prior = np.column_stack([np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors])[free][:, np.append(free, True)]
+    prior = np.column_stack(
+        [np.diag(1.0 / model.priors), (model.nominal - hand.values) / model.priors]
+    )[free][:, np.append(free, True)]
     found, last = [], slice(system.nuisance.shape[1], None)
     for out in folds:
-        kept = np.concatenate([triangular_of_band(rows[~np.append(out, False)[system.group].any(axis=1)])[last, last], prior])
+        kept = np.concatenate(
+            [
+                triangular_of_band(rows[~np.append(out, False)[system.group].any(axis=1)])[
+                    last, last
+                ],
+                prior,
+            ]
+        )
         moved = hand.values.copy()
         moved[free] += scaled_lstsq(kept[:, :-1], kept[:, -1])
         found.append(moved)
@@ -107,7 +148,9 @@ def end_by_hand(poses: Poses) -> float:
 
 def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
     """Return the effects in time that compensation replaces by a constant."""
-    return uncorrected_in_time(hand.model.at(hand.values), hand.values, hand.poses.time, end=end_by_hand(hand.poses))
+    return uncorrected_in_time(
+        hand.model.at(hand.values), hand.values, hand.poses.time, end=end_by_hand(hand.poses)
+    )
 
 
 def _joined(folds):
@@ -118,33 +161,62 @@ def _joined(folds):
 def entry_of(errors: Iterable[np.ndarray], unit: str) -> dict:
     """Return an entry of a proof, of the errors before and after, each shape (n, components)."""
     before, after = errors
-    found = compared((before**2).sum(axis=1), (after**2).sum(axis=1), np.ones(len(before)), components=before.shape[1])
+    found = compared(
+        (before**2).sum(axis=1),
+        (after**2).sum(axis=1),
+        np.ones(len(before)),
+        components=before.shape[1],
+    )
     return found | {'unit': unit, 'windows': len(before)}
 
 
 def _selected(poses, mask):
     """Return some of the poses."""
     parts = {f.name: getattr(poses, f.name) for f in fields(poses)}
-    return replace(poses, **{name: part[mask] for name, part in parts.items() if isinstance(part, np.ndarray)})
+    return replace(
+        poses, **{name: part[mask] for name, part in parts.items() if isinstance(part, np.ndarray)}
+    )
 
 
-def corrected_with(model: HandModel, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray | None = None,
-                   temperature_c: np.ndarray | None = None) -> Corrected:
+def corrected_with(
+    model: HandModel,
+    values: np.ndarray,
+    force: np.ndarray,
+    *,
+    rate: np.ndarray | None = None,
+    temperature_c: np.ndarray | None = None,
+) -> Corrected:
     """Return readings corrected as by compensation with the parameters `values` of `model`; shape (n, 3); without `rate` at rest."""
     rate = np.zeros_like(force) if rate is None else rate
-    known = Calibration(model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size)
+    known = Calibration(
+        model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size
+    )
     return compensate(known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c)
 
 
-def turn_errors(model: HandModel, values: np.ndarray, poses: Poses, *, turns: Sequence[TurnData], gyroscope: np.ndarray) -> np.ndarray:
+def turn_errors(
+    model: HandModel,
+    values: np.ndarray,
+    poses: Poses,
+    *,
+    turns: Sequence[TurnData],
+    gyroscope: np.ndarray,
+) -> np.ndarray:
     """Return the angle errors of turns, rad, with the accelerometer of `values` and the parameters `gyroscope` of the gyroscope."""
     mixed = values.copy()
     for part in (model.gyro_bias, model.gyro_matrix, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]
     true = corrected_with(model, values, poses.force, temperature_c=poses.temperature_c).force
     up = unit_rows(true)
-    rates = [corrected_with(model, mixed, turn.force, rate=turn.rate, temperature_c=turn.temperature_c).rate for turn in turns]
-    return np.array([turn_error(poses, turn, rate, up=up) for turn, rate in zip(turns, rates, strict=True)])
+    rates = [
+        corrected_with(
+            model, mixed, turn.force, rate=turn.rate, temperature_c=turn.temperature_c
+        ).rate
+        for turn in turns
+    ]
+    return np.array(
+        [turn_error(poses, turn, rate, up=up) for turn, rate in zip(turns, rates, strict=True)]
+    )
 
 
 def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarray) -> float:
@@ -162,5 +234,9 @@ def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarra
 
     """
     known = np.isfinite(rates).all(axis=1)
-    rotated, last = between_middles(poses, turn, total_rotation(turn.time[known], rates[known])) @ up[turn.first], up[turn.last]
+    rotated, last = (
+        between_middles(poses, turn, total_rotation(turn.time[known], rates[known]))
+        @ up[turn.first],
+        up[turn.last],
+    )
     return float(np.arctan2(np.linalg.norm(np.cross(rotated, last)), rotated @ last))

@@ -17,11 +17,22 @@ from imu_calibration.calibration.hand_proof import (
     turn_error,
     uncorrected_by_hand,
 )
-from imu_calibration.calibration.result import GRAVITY_SD, CalibrationResult, ErrorBudget, WindowErrors
+from imu_calibration.calibration.result import (
+    GRAVITY_SD,
+    CalibrationResult,
+    ErrorBudget,
+    WindowErrors,
+)
 from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_samples
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.samples import ImuSamples, JoinedParts, NominalScaling, SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import (
+    ImuSamples,
+    JoinedParts,
+    NominalScaling,
+    SampleBlock,
+    TemperatureSamples,
+)
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration, one_significant
 from imu_calibration.effects.base import SENSORS, UNITS, Role
@@ -43,7 +54,11 @@ from imu_calibration.references.gravity.hand_calibration import (
     gather_by_hand,
     solve_by_hand,
 )
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandOptions, hand_options
+from imu_calibration.references.gravity.hand_parameters import (
+    CROSS_TERMS,
+    HandOptions,
+    hand_options,
+)
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
 
@@ -63,7 +78,9 @@ class EvidentHand:
     """Changes of the requested model by the evidence."""
 
 
-def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False) -> EvidentHand:
+def solve_by_evidence(
+    data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False
+) -> EvidentHand:
     """
     Estimate from poses and turns, with the supported effects in addition to the requested model (`investigate_by_hand`).
 
@@ -80,16 +97,32 @@ def solve_by_evidence(data: HandData, options: HandOptions = HandOptions(), *, a
         As `solve_by_hand`.
 
     """
-    from imu_calibration.references.gravity.model_selection import MIN_FOLD_POSES, investigate_by_hand  # here, because its import is slow
+    from imu_calibration.references.gravity.model_selection import (
+        MIN_FOLD_POSES,
+        investigate_by_hand,
+    )  # here, because its import is slow
+
     if as_asked or len(data.poses.start) < MIN_FOLD_POSES:
         return EvidentHand(solve_by_hand(data, options))
     found, asked = investigate_by_hand(data, options), _asked(data, options)
     while faint := _faint(hand := _solved(data, found, options), found, asked):
-        found = replace(found, named=[q for q in found.named if q not in faint], unstable=[*found.unstable, *faint])
+        found = replace(
+            found,
+            named=[q for q in found.named if q not in faint],
+            unstable=[*found.unstable, *faint],
+        )
     added = tuple(q.name for q in found.adopted if q.name not in asked[q.sensor])
-    changes = ModelChanges(added, tuple(question.name for question in found.unstable),
-                           {question.name: found.problem.explained.share(found.named, question) for question in found.implausible},
-                           unexplained={sensor: rest.entry for sensor, rest in found.unexplained.items() if rest.significant})
+    changes = ModelChanges(
+        added,
+        tuple(question.name for question in found.unstable),
+        {
+            question.name: found.problem.explained.share(found.named, question)
+            for question in found.implausible
+        },
+        unexplained={
+            sensor: rest.entry for sensor, rest in found.unexplained.items() if rest.significant
+        },
+    )
     return EvidentHand(hand, found, changes)
 
 
@@ -97,7 +130,11 @@ def _solved(data, found, options):
     """Return the calibration with the requested model and the findings; if the model is unchanged, the one of the search."""
     asked, names, base = _asked(data, options), found.names, found.baseline.model
     same = all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS)
-    return found.baseline if same and not (found.unstable or found.implausible) else extended_by_hand(data, found, options)
+    return (
+        found.baseline
+        if same and not (found.unstable or found.implausible)
+        else extended_by_hand(data, found, options)
+    )
 
 
 def _faint(hand, found, asked):
@@ -107,15 +144,21 @@ def _faint(hand, found, asked):
         effect, part = question.effect, hand.model.slices[question.effect.key]
         at = np.arange(part.start, part.start + effect.n_amplitudes)
         values, sd = hand.values[at], hand.sd[at]
-        if question.name not in asked[question.sensor] and (effect.surpasses(values) or not one_significant(values, sd)):
+        if question.name not in asked[question.sensor] and (
+            effect.surpasses(values) or not one_significant(values, sd)
+        ):
             faint.append(question)
     return faint
 
 
-def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOptions) -> HandCalibration:
+def extended_by_hand(
+    data: HandData, found: 'HandInvestigation', options: HandOptions
+) -> HandCalibration:
     """Return the calibration with the requested model and the findings; unstable or implausible effects increase its covariance."""
     asked, names = _asked(data, options), found.names
-    extended = replace(options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS})
+    extended = replace(
+        options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}
+    )
     hand = solve_by_hand(data, extended, found.point(found.problem, found.named))
     terms = hand.terms
     for question in (*found.unstable, *found.implausible):
@@ -126,8 +169,10 @@ def extended_by_hand(data: HandData, found: 'HandInvestigation', options: HandOp
 
 
 def _asked(data, options):
-    return {'accelerometer': options.accelerometer or BASE,
-            'gyroscope': options.gyroscope or default_gyroscope(data.poses)[0]}
+    return {
+        'accelerometer': options.accelerometer or BASE,
+        'gyroscope': options.gyroscope or default_gyroscope(data.poses)[0],
+    }
 
 
 def _joined(asked, found):
@@ -148,17 +193,29 @@ class HandResult(CalibrationResult):
         hand, poses = self.hand, self.hand.poses
         force, rate = poses.force, poses.rate
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
-        corrected_force, corrected_rate = hand.compensate(force, rate, poses.time, temperature_c=poses.temperature_c)
+        corrected_force, corrected_rate = hand.compensate(
+            force, rate, poses.time, temperature_c=poses.temperature_c
+        )
         for out, values in held_out_values(hand, hand.used_turns):
             corrected = hand.hand_model.compensate(values, force, rate, **poses.conditions)
             corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
         samples = max(int(poses.stop[-1]), 1)
         time = (poses.start + poses.stop) / 2 * self.gathered.duration / max(samples - 1, 1)
-        scatter = [float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')]
-        return WindowErrors(time, np.full(len(force), WindowKind.STATIC), {'accelerometer': force, 'gyroscope': rate},
-                            {'accelerometer': true, 'gyroscope': zero}, {'accelerometer': force - true, 'gyroscope': rate},
-                            {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
-                            {'accelerometer': np.hypot(poses.force_sem, scatter[0]), 'gyroscope': np.hypot(poses.rate_sem, scatter[1])})
+        scatter = [
+            float(hand.statistics.get(f'{name}_scatter_sd', 0.0)) for name in ('pose', 'drift')
+        ]
+        return WindowErrors(
+            time,
+            np.full(len(force), WindowKind.STATIC),
+            {'accelerometer': force, 'gyroscope': rate},
+            {'accelerometer': true, 'gyroscope': zero},
+            {'accelerometer': force - true, 'gyroscope': rate},
+            {'accelerometer': corrected_force - true, 'gyroscope': corrected_rate},
+            {
+                'accelerometer': np.hypot(poses.force_sem, scatter[0]),
+                'gyroscope': np.hypot(poses.rate_sem, scatter[1]),
+            },
+        )
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
         """Empty: by hand no windows are stored."""
@@ -166,13 +223,26 @@ class HandResult(CalibrationResult):
 
     def error_budget(self) -> ErrorBudget:
         """Return noise and gravity, the only reference. The sds contain the uncertainty of a gravity that was not given."""
-        model, values, known = self.calibration.model, self.calibration.values, self.options.gravity is not None
+        model, values, known = (
+            self.calibration.model,
+            self.calibration.values,
+            self.options.gravity is not None,
+        )
         relative = self.calibration.common_scale.get('sd', GRAVITY_SD / self.gravity)
-        part, gravity, gravity_sd = model.part('accelerometer', Role.LINEAR), np.zeros(len(values)), relative * self.gravity
+        part, gravity, gravity_sd = (
+            model.part('accelerometer', Role.LINEAR),
+            np.zeros(len(values)),
+            relative * self.gravity,
+        )
         gravity[part] = np.abs(values[part]) * relative
-        return ErrorBudget(tuple(model.param_names), {'noise': self.calibration.own_sd, 'gravity': gravity},
-                           {'noise': 'noise, scatter of poses and turns, as this recording shows them',
-                            'gravity': f'gravity {"known" if known else "not given: the standard one is known"} to {gravity_sd:.2g} m/s²'})
+        return ErrorBudget(
+            tuple(model.param_names),
+            {'noise': self.calibration.own_sd, 'gravity': gravity},
+            {
+                'noise': 'noise, scatter of poses and turns, as this recording shows them',
+                'gravity': f'gravity {"known" if known else "not given: the standard one is known"} to {gravity_sd:.2g} m/s²',
+            },
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,14 +262,22 @@ class HandRecording:
     def gathered(self) -> SessionData:
         """Data of the recording for the document, without parameters."""
         imu, warm = self.imu, self.temperature_c
-        return SessionData(counts=self.counts, frame_id=imu.frame_id,
-                           first_stamp_ns=int(imu.stamp_ns[0]), last_stamp_ns=int(imu.stamp_ns[-1]),
-                        largest_rate=float(np.sqrt(np.einsum('ij,ij->i', imu.rate_s, imu.rate_s).max())),
-                        largest_force=float(max(imu.force_s.max(), -imu.force_s.min())),
-                        temperature_c=None if warm is None else (float(warm.min()), float(warm.max())))
+        return SessionData(
+            counts=self.counts,
+            frame_id=imu.frame_id,
+            first_stamp_ns=int(imu.stamp_ns[0]),
+            last_stamp_ns=int(imu.stamp_ns[-1]),
+            largest_rate=float(np.sqrt(np.einsum('ij,ij->i', imu.rate_s, imu.rate_s).max())),
+            largest_force=float(max(imu.force_s.max(), -imu.force_s.min())),
+            temperature_c=None if warm is None else (float(warm.min()), float(warm.max())),
+        )
 
 
-def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None, preflight: Preflight | None = None) -> HandRecording:
+def read_by_hand(
+    blocks: Iterable[SampleBlock],
+    nominal: NominalScaling | None = None,
+    preflight: Preflight | None = None,
+) -> HandRecording:
     """
     Return the `HandRecording` of a complete stream of SampleBlock, with the findings of `preflight`; `nominal` as for the `BlockCleaner`.
 
@@ -216,19 +294,34 @@ def read_by_hand(blocks: Iterable[SampleBlock], nominal: NominalScaling | None =
             joined.add(imu)
         temperatures += [temperature for _, temperature in cleaned.temperature]
     if not len(joined):
-        raise InputError('the recording must hold Imu messages that can be used, it holds none; check the topic')
+        raise InputError(
+            'the recording must hold Imu messages that can be used, it holds none; check the topic'
+        )
     imu, warm = joined.samples(), None
     if temperatures:
         known = TemperatureSamples.concatenate(temperatures)
         start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
-        warm = np.interp((imu.stamp_ns - start).astype(float), (known.stamp_ns - start).astype(float), known.temperature_c)
-    counts = cleaner.lost | {reason: count for reason, count in cleaner.counts.items() if reason.startswith('imu ')}
-    return HandRecording(imu, warm, {reason: count for reason, count in counts.items() if count},
-                         () if preflight is None else tuple(preflight.findings))
+        warm = np.interp(
+            (imu.stamp_ns - start).astype(float),
+            (known.stamp_ns - start).astype(float),
+            known.temperature_c,
+        )
+    counts = cleaner.lost | {
+        reason: count for reason, count in cleaner.counts.items() if reason.startswith('imu ')
+    }
+    return HandRecording(
+        imu,
+        warm,
+        {reason: count for reason, count in counts.items() if count},
+        () if preflight is None else tuple(preflight.findings),
+    )
 
 
-def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOptions = CalibrationOptions(),
-                            provenance: dict | None = None) -> HandResult:
+def calibrate_without_table(
+    sources: Sequence[Callable],
+    options: CalibrationOptions = CalibrationOptions(),
+    provenance: dict | None = None,
+) -> HandResult:
     """
     Calibrate by hand and return the HandResult: gravity is the reference (see `calibrate_by_hand`).
 
@@ -247,21 +340,38 @@ def calibrate_without_table(sources: Sequence[Callable], options: CalibrationOpt
 
     """
     if len(sources) != 1:
-        raise InputError(f'calibration by hand needs one recording, got {len(sources)}; calibrate them separately and compare the results')
-    return evident_result(read_by_hand(sources[0](), options.nominal, Preflight(options.gravity)), options, provenance)[0]
+        raise InputError(
+            f'calibration by hand needs one recording, got {len(sources)}; calibrate them separately and compare the results'
+        )
+    return evident_result(
+        read_by_hand(sources[0](), options.nominal, Preflight(options.gravity)), options, provenance
+    )[0]
 
 
-def evident_result(recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None, *,
-                   stills: Sequence[slice] | None = None) -> tuple[HandResult, EvidentHand]:
+def evident_result(
+    recording: HandRecording,
+    options: CalibrationOptions = CalibrationOptions(),
+    provenance: dict | None = None,
+    *,
+    stills: Sequence[slice] | None = None,
+) -> tuple[HandResult, EvidentHand]:
     """Return (the HandResult, the search results); `stills` as in `calibrate_by_hand`."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
     evident = solve_by_evidence(data, asked, as_asked=options.as_asked)
-    return hand_result(evident, recording, options, provenance=provenance, turns=data.turns), evident
+    return hand_result(
+        evident, recording, options, provenance=provenance, turns=data.turns
+    ), evident
 
 
-def hand_result(evident: EvidentHand, recording: HandRecording, options: CalibrationOptions = CalibrationOptions(), *,
-                provenance: dict | None = None, turns: Sequence[TurnData] = ()) -> HandResult:
+def hand_result(
+    evident: EvidentHand,
+    recording: HandRecording,
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    provenance: dict | None = None,
+    turns: Sequence[TurnData] = (),
+) -> HandResult:
     """
     Return an EvidentHand as a result for reports and documents, evaluated on its poses and `turns` if these are enough.
 
@@ -274,27 +384,69 @@ def hand_result(evident: EvidentHand, recording: HandRecording, options: Calibra
     hand = with_weak_replaced(evident.hand, evident.hand.tolerances)
     check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
     gathered = recording.gathered
-    gathered.findings = (*recording.findings, *notes(hand.statistics['bias_moved'], gathered.duration))
+    gathered.findings = (
+        *recording.findings,
+        *notes(hand.statistics['bias_moved'], gathered.duration),
+    )
     advice = missing_motion(hand)
-    calibration = document(hand, hand.tolerances, gathered, gravity=hand.gravity, gauge=dict(GAUGE), undetermined=advice,
-                           statistics=_statistics(hand, gathered.counts, len(recording.imu)), provenance=provenance,
-                           proof=prove_by_hand(hand, hand.used_turns if turns else ()), changes=evident.changes,
-                           uncorrected=uncorrected_by_hand(hand), tested=CROSS_TERMS)
-    needed = {name: (item['needs'], float('nan')) for item in reversed(advice) for name in item['parameters']}
-    return HandResult(calibration=calibration, gathered=gathered, tolerances=hand.tolerances, needed=needed, options=options,
-                      reference='gravity, by hand', gravity=hand.gravity, period=float(hand.statistics['period']), hand=hand)
+    calibration = document(
+        hand,
+        hand.tolerances,
+        gathered,
+        gravity=hand.gravity,
+        gauge=dict(GAUGE),
+        undetermined=advice,
+        statistics=_statistics(hand, gathered.counts, len(recording.imu)),
+        provenance=provenance,
+        proof=prove_by_hand(hand, hand.used_turns if turns else ()),
+        changes=evident.changes,
+        uncorrected=uncorrected_by_hand(hand),
+        tested=CROSS_TERMS,
+    )
+    needed = {
+        name: (item['needs'], float('nan'))
+        for item in reversed(advice)
+        for name in item['parameters']
+    }
+    return HandResult(
+        calibration=calibration,
+        gathered=gathered,
+        tolerances=hand.tolerances,
+        needed=needed,
+        options=options,
+        reference='gravity, by hand',
+        gravity=hand.gravity,
+        period=float(hand.statistics['period']),
+        hand=hand,
+    )
 
 
 def _statistics(hand, counts, n_samples):
     found = hand.statistics
-    keys = {'accelerometer': ('force_noise_sd', 'pose_scatter_sd'), 'gyroscope': ('rate_noise_sd', 'drift_scatter_sd')}
-    per_sensor = {s: {'noise_sd': [float(v) for v in found[keys[s][0]]], 'between_window_sd': float(found[keys[s][1]]), 'wander_sd': 0.0}
-                  for s in SENSORS}
-    return {**per_sensor, 'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)}, 'samples_used': {'all': n_samples},
-            'by_hand': found, 'dropped': {reason: int(count) for reason, count in sorted(counts.items())}}
+    keys = {
+        'accelerometer': ('force_noise_sd', 'pose_scatter_sd'),
+        'gyroscope': ('rate_noise_sd', 'drift_scatter_sd'),
+    }
+    per_sensor = {
+        s: {
+            'noise_sd': [float(v) for v in found[keys[s][0]]],
+            'between_window_sd': float(found[keys[s][1]]),
+            'wander_sd': 0.0,
+        }
+        for s in SENSORS
+    }
+    return {
+        **per_sensor,
+        'windows': {'static': found.get('poses', 0), 'turns': found.get('turns', 0)},
+        'samples_used': {'all': n_samples},
+        'by_hand': found,
+        'dropped': {reason: int(count) for reason, count in sorted(counts.items())},
+    }
 
 
-def check_by_hand(source: Callable, calibration: Calibration, options: CalibrationOptions = CalibrationOptions()) -> CheckResult:
+def check_by_hand(
+    source: Callable, calibration: Calibration, options: CalibrationOptions = CalibrationOptions()
+) -> CheckResult:
     """
     Prove a calibration on a recording of its IMU held still in some attitudes, with turns between them.
 
@@ -323,9 +475,16 @@ def check_by_hand(source: Callable, calibration: Calibration, options: Calibrati
     except NotObservableError as error:
         return CheckResult({}, recording.findings, str(error))
     check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
-    warm = None if recording.temperature_c is None else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
+    warm = (
+        None
+        if recording.temperature_c is None
+        else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
+    )
     corrected = compensate_samples(calibration, recording.imu, warm)
-    return CheckResult(prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)), recording.findings)
+    return CheckResult(
+        prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)),
+        recording.findings,
+    )
 
 
 def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
@@ -333,25 +492,51 @@ def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
     return options.gravity or calibration.conditions.get('gravity') or STANDARD_GRAVITY
 
 
-def prove_readings(data: HandData, before: ImuSamples, after: ImuSamples, *, gravity: float) -> dict:
+def prove_readings(
+    data: HandData, before: ImuSamples, after: ImuSamples, *, gravity: float
+) -> dict:
     """Return the proof of corrected samples `after` against the raw ones: sensor -> entry of a document (see `calibration.proof`)."""
     poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
     lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
-    norms, rest = (entry_of(errors, UNITS[sensor]) | {'seconds': rested} for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate))))
-    proof = {'accelerometer': norms | {'regimes': {'rest': norms}}, 'gyroscope': rest | {'regimes': {'rest': rest}}}
+    norms, rest = (
+        entry_of(errors, UNITS[sensor]) | {'seconds': rested}
+        for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate)))
+    )
+    proof = {
+        'accelerometer': norms | {'regimes': {'rest': norms}},
+        'gyroscope': rest | {'regimes': {'rest': rest}},
+    }
     if len(turns) >= TURNS_LEAST:
         up = unit_rows(force)
         # the first corrected readings are NaN where they need an angular acceleration
-        errors = (np.array([[turn_error(poses, turn, imu.rate_s[poses.stop[turn.first] - 1:poses.start[turn.last] + 1], up=up)]
-                            for turn in turns])
-                  for imu in (before, after))
-        angles = entry_of(errors, TURN_ANGLE_UNIT) | {'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))}
+        errors = (
+            np.array(
+                [
+                    [
+                        turn_error(
+                            poses,
+                            turn,
+                            imu.rate_s[poses.stop[turn.first] - 1 : poses.start[turn.last] + 1],
+                            up=up,
+                        )
+                    ]
+                    for turn in turns
+                ]
+            )
+            for imu in (before, after)
+        )
+        angles = entry_of(errors, TURN_ANGLE_UNIT) | {
+            'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))
+        }
         proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
     return proof
 
 
 def _means(imu, ranges):
-    return tuple(np.array([np.nanmean(values[part], axis=0) for part in ranges]) for values in (imu.force_s, imu.rate_s))
+    return tuple(
+        np.array([np.nanmean(values[part], axis=0) for part in ranges])
+        for values in (imu.force_s, imu.rate_s)
+    )

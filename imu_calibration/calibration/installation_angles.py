@@ -57,14 +57,26 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
     linear, offset = (calibration.model.part(sensor, role) for role in (Role.LINEAR, Role.OFFSET))
     covariance = calibration.covariance[linear, linear]
     scale, axes = split(matrix)
-    tangent = (np.eye(3) - axes[:, :, None] * axes[:, None, :]) / scale[:, None, None]  # d axes_i / d row_i
-    blocks = [covariance[3 * i:3 * i + 3, 3 * i:3 * i + 3] for i in range(3)]
+    tangent = (np.eye(3) - axes[:, :, None] * axes[:, None, :]) / scale[
+        :, None, None
+    ]  # d axes_i / d row_i
+    blocks = [covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(3)]
     scale_sd = np.array([np.sqrt(axes[i] @ blocks[i] @ axes[i]) for i in range(3)])
     spread = [tangent[i] @ blocks[i] @ tangent[i] for i in range(3)]
     angles_sd = np.array([[_angle_sd(axes[i], j, spread[i]) for j in range(3)] for i in range(3)])
     between = np.array([_angle(axes[i], axes[j]) for i, j in AXIS_PAIRS])
     between_sd = np.array([_between_sd(axes, tangent, covariance, i, j) for i, j in AXIS_PAIRS])
-    return Derived(sensor, scale, scale_sd, angles_of(axes), angles_sd, between, between_sd, bias, calibration.sd[offset])
+    return Derived(
+        sensor,
+        scale,
+        scale_sd,
+        angles_of(axes),
+        angles_sd,
+        between,
+        between_sd,
+        bias,
+        calibration.sd[offset],
+    )
 
 
 def split(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -98,14 +110,15 @@ def _angle_sd(axis, j, spread):
 
 def _between_sd(axes, tangent, covariance, i, j):
     slope = np.zeros(9)
-    slope[3 * i:3 * i + 3] = axes[j] @ tangent[i]
-    slope[3 * j:3 * j + 3] = axes[i] @ tangent[j]
+    slope[3 * i : 3 * i + 3] = axes[j] @ tangent[i]
+    slope[3 * j : 3 * j + 3] = axes[i] @ tangent[j]
     sine = max(np.linalg.norm(np.cross(axes[i], axes[j])), 1e-9)
     return float(np.sqrt(slope @ covariance @ slope) / sine)
 
 
-def in_paper_units(derived: Derived,
-                   nominal: NominalScaling | Mapping | None = None) -> tuple[tuple[str, str, np.ndarray, np.ndarray], ...]:
+def in_paper_units(
+    derived: Derived, nominal: NominalScaling | Mapping | None = None
+) -> tuple[tuple[str, str, np.ndarray, np.ndarray], ...]:
     """
     Return scale factors and biases in the units of the source papers, as (quantity, unit, values (3,), sds (3,)).
 
@@ -124,10 +137,22 @@ def in_paper_units(derived: Derived,
     name = 'g' if accelerometer else '(deg/s)'
     if nominal is None:
         bias_factor, unit = (1e3 / STANDARD_GRAVITY, 'mg') if accelerometer else (1 / DEG, 'deg/s')
-        return (('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd),
-                ('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor))
+        return (
+            ('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd),
+            ('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor),
+        )
     nominal = nominal if isinstance(nominal, NominalScaling) else NominalScaling(**nominal)
-    offset, per_si = ((nominal.accelerometer_offset, nominal.accelerometer_scale) if accelerometer
-                      else (nominal.gyroscope_offset, nominal.gyroscope_scale))
-    return (('scale factor', f'V/{name}', derived.scale * per_si * size, derived.scale_sd * abs(per_si) * size),
-            ('bias', 'V', offset + derived.bias * per_si, derived.bias_sd * abs(per_si)))
+    offset, per_si = (
+        (nominal.accelerometer_offset, nominal.accelerometer_scale)
+        if accelerometer
+        else (nominal.gyroscope_offset, nominal.gyroscope_scale)
+    )
+    return (
+        (
+            'scale factor',
+            f'V/{name}',
+            derived.scale * per_si * size,
+            derived.scale_sd * abs(per_si) * size,
+        ),
+        ('bias', 'V', offset + derived.bias * per_si, derived.bias_sd * abs(per_si)),
+    )

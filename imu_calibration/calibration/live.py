@@ -5,9 +5,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.by_evidence import EvidentSolution, Solved, ask_kept, solve_by_evidence
-from imu_calibration.calibration.collector import LiveCollector, copied, from_bytes, require_columns, to_bytes
-from imu_calibration.calibration.coverage import NOTHING_SEEN, Coverage, GroupState, group_states, table_coverage, waiting_groups
+from imu_calibration.calibration.by_evidence import (
+    EvidentSolution,
+    Solved,
+    ask_kept,
+    solve_by_evidence,
+)
+from imu_calibration.calibration.collector import (
+    LiveCollector,
+    copied,
+    from_bytes,
+    require_columns,
+    to_bytes,
+)
+from imu_calibration.calibration.coverage import (
+    NOTHING_SEEN,
+    Coverage,
+    GroupState,
+    group_states,
+    table_coverage,
+    waiting_groups,
+)
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.table_calibration import conclude, solve_gathered, solve_in_passes
 from imu_calibration.calibration.table_result import TableResult
@@ -51,7 +69,11 @@ class LiveSnapshot:
     def model_for(self, options: CalibrationOptions) -> SensorModel:
         """Return the model of the columns for options."""
         model = choose_model(options, self.table)
-        return model.with_reference_temperature(self.temperature_c) if model.needs_temperature and self.temperature_c is not None else model
+        return (
+            model.with_reference_temperature(self.temperature_c)
+            if model.needs_temperature and self.temperature_c is not None
+            else model
+        )
 
     def solved(self, options: CalibrationOptions) -> Solved:
         """
@@ -65,52 +87,118 @@ class LiveSnapshot:
 
         def solved(model, judged_from):
             known = model is self.model and judged_from == self.gathered.judged_from
-            total = self.gathered if known else self.gathered.anew(self.store.reduced(model, self.table, self.session), judged_from)
+            total = (
+                self.gathered
+                if known
+                else self.gathered.anew(
+                    self.store.reduced(model, self.table, self.session), judged_from
+                )
+            )
             return solve_gathered(total, model, options), total
+
         asked = self.model_for(options)
-        return solve_in_passes(self.model if asked.has_columns_of(self.model) else asked, options, solved)
+        return solve_in_passes(
+            self.model if asked.has_columns_of(self.model) else asked, options, solved
+        )
 
     def evidence(self) -> EvidentSolution:
         """Return the solution with the supported effects, as `calibrate_by_evidence`."""
         if self.store.complete:
-            return solve_by_evidence(self.solved(self.options), self.table, self.options, solve_again=self.solved)
-        return ask_kept(self.solved(self.extension.options(self.options)), self.table, self.options, known=self.extension)
+            return solve_by_evidence(
+                self.solved(self.options), self.table, self.options, solve_again=self.solved
+            )
+        return ask_kept(
+            self.solved(self.extension.options(self.options)),
+            self.table,
+            self.options,
+            known=self.extension,
+        )
 
 
 @dataclass(frozen=True)
 class LiveSettings:
     """Solving interval, storage and published data."""
 
-    solve_share: float = setting(0.1, '1', 'largest share of the time for solving after each window', (0.001, 1.0),
-                                 'too small: late results; too large: the node uses a whole core', live=True)
-    residual_rate: float = setting(20.0, 'Hz', 'residuals published per second of data; 0: none', (0.0, 10000.0),
-                                   'too large: publishing needs more time than calibration', live=True)
-    store_samples: int = setting(300_000, '1', 'samples in motion kept, '
-                                 'so that effects can be added to the model or linearised again (table tilt, delays); '
-                                 'about 250 bytes each', (0, 100_000_000),
-                                 'too small: effects that the data support cannot be added to the model, '
-                                 'and the result on a strongly tilted table is that of the first pass, see diagnostics',
-                                 fixed='windows that were not kept are lost')
-    diagnosis_period: float = setting(60.0, 's', 'shortest time between diagnoses, in a separate thread with a fifth '
-                                      'of the time at most; also when the streams stop and with ~/solve and ~/save; '
-                                      'supported effects are added to the model; '
-                                      '0: never', (0.0, 86400.0), 'too small: the diagnosis occupies a core', live=True)
+    solve_share: float = setting(
+        0.1,
+        '1',
+        'largest share of the time for solving after each window',
+        (0.001, 1.0),
+        'too small: late results; too large: the node uses a whole core',
+        live=True,
+    )
+    residual_rate: float = setting(
+        20.0,
+        'Hz',
+        'residuals published per second of data; 0: none',
+        (0.0, 10000.0),
+        'too large: publishing needs more time than calibration',
+        live=True,
+    )
+    store_samples: int = setting(
+        300_000,
+        '1',
+        'samples in motion kept, '
+        'so that effects can be added to the model or linearised again (table tilt, delays); '
+        'about 250 bytes each',
+        (0, 100_000_000),
+        'too small: effects that the data support cannot be added to the model, '
+        'and the result on a strongly tilted table is that of the first pass, see diagnostics',
+        fixed='windows that were not kept are lost',
+    )
+    diagnosis_period: float = setting(
+        60.0,
+        's',
+        'shortest time between diagnoses, in a separate thread with a fifth '
+        'of the time at most; also when the streams stop and with ~/solve and ~/save; '
+        'supported effects are added to the model; '
+        '0: never',
+        (0.0, 86400.0),
+        'too small: the diagnosis occupies a core',
+        live=True,
+    )
 
 
 @dataclass(frozen=True)
 class LiveByHandSettings:
     """Reference and memory of a calibration by hand."""
 
-    gravity: float = setting(0.0, 'm/s^2', 'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
-                             (0.0, 30.0), 'all three accelerometer scales are wrong together',
-                             live=True, session=True)
-    latitude: float = setting(100.0, 'deg', 'latitude, used without a table if gravity is 0 (WGS 84 normal gravity); above 90: unknown',
-                              (-90.0, 100.0), 'as with a wrong gravity', live=True, session=True)
-    height: float = setting(0.0, 'm', 'height above the ellipsoid, used with latitude', (-500.0, 9000.0), '3e-6 m/s^2 of gravity per metre',
-                            live=True, session=True)
-    hand_samples: int = setting(800_000, '1', 'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); '
-                                'beyond them the inside of the longest rest is forgotten, then the oldest', (2000, 100_000_000),
-                                'too small: poses are dropped, see diagnostics', live=True)
+    gravity: float = setting(
+        0.0,
+        'm/s^2',
+        'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
+        (0.0, 30.0),
+        'all three accelerometer scales are wrong together',
+        live=True,
+        session=True,
+    )
+    latitude: float = setting(
+        100.0,
+        'deg',
+        'latitude, used without a table if gravity is 0 (WGS 84 normal gravity); above 90: unknown',
+        (-90.0, 100.0),
+        'as with a wrong gravity',
+        live=True,
+        session=True,
+    )
+    height: float = setting(
+        0.0,
+        'm',
+        'height above the ellipsoid, used with latitude',
+        (-500.0, 9000.0),
+        '3e-6 m/s^2 of gravity per metre',
+        live=True,
+        session=True,
+    )
+    hand_samples: int = setting(
+        800_000,
+        '1',
+        'Imu samples kept without a table, about 60 bytes each (800000: over an hour at 200 Hz); '
+        'beyond them the inside of the longest rest is forgotten, then the oldest',
+        (2000, 100_000_000),
+        'too small: poses are dropped, see diagnostics',
+        live=True,
+    )
 
     def at_place(self, options: CalibrationOptions) -> CalibrationOptions:
         """Return the options with the gravity of these settings and its standard deviation."""
@@ -163,10 +251,18 @@ class LiveCalibration:
 
     """
 
-    def __init__(self, table: Table, options: CalibrationOptions = CalibrationOptions(), settings: LiveSettings = LiveSettings(), *,
-                 saved: bytes | None = None):
+    def __init__(
+        self,
+        table: Table,
+        options: CalibrationOptions = CalibrationOptions(),
+        settings: LiveSettings = LiveSettings(),
+        *,
+        saved: bytes | None = None,
+    ):
         self.table, self.options, self.settings = table, options, settings
-        self.earlier, known, extension = (None, None, ModelExtension()) if saved is None else from_bytes(saved)
+        self.earlier, known, extension = (
+            (None, None, ModelExtension()) if saved is None else from_bytes(saved)
+        )
         self.extension = ModelExtension() if options.as_asked else extension
         """Effects added to the requested model."""
         self._asked = choose_model(self.extension.options(options), table)
@@ -217,7 +313,11 @@ class LiveCalibration:
     @property
     def frame_id(self) -> str:
         """Frame of the sensor; '' before the first message."""
-        known = [part.frame_id for part in (self.earlier, self._collector and self._collector.gathered) if part]
+        known = [
+            part.frame_id
+            for part in (self.earlier, self._collector and self._collector.gathered)
+            if part
+        ]
         return next(filter(None, known), '')
 
     def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
@@ -249,7 +349,11 @@ class LiveCalibration:
             When the joint states do not contain the table's joints.
 
         """
-        if self._first_temperature_c is None and block.temperature is not None and len(block.temperature):
+        if (
+            self._first_temperature_c is None
+            and block.temperature is not None
+            and len(block.temperature)
+        ):
             self._first_temperature_c = float(block.temperature.temperature_c[0])
         if self._collector is None:
             return self._push_before_temperature(block)
@@ -269,7 +373,9 @@ class LiveCalibration:
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
         store = WindowStore(self.settings.store_samples, self.earlier is None)
-        self._collector = LiveCollector(self.table, model, self.options, session=session, store=store)
+        self._collector = LiveCollector(
+            self.table, model, self.options, session=session, store=store
+        )
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> TableResult:
         """
@@ -293,12 +399,27 @@ class LiveCalibration:
         """
         collector = self._begun()
         gathered, store = collector.snapshot(pending)
-        snapshot = LiveSnapshot(self._with_earlier(gathered), collector.model, self.table, self.options, self.extension, store,
-                                collector.session, self._first_temperature_c)
+        snapshot = LiveSnapshot(
+            self._with_earlier(gathered),
+            collector.model,
+            self.table,
+            self.options,
+            self.extension,
+            store,
+            collector.session,
+            self._first_temperature_c,
+        )
         options = self.extension.options(self.options)
         solution, total, model = snapshot.solved(options)
-        self.result = conclude(self.extension.applied(solution), total, model, table=self.table, options=options, provenance=provenance,
-                               changes=self.extension.changes)
+        self.result = conclude(
+            self.extension.applied(solution),
+            total,
+            model,
+            table=self.table,
+            options=options,
+            provenance=provenance,
+            changes=self.extension.changes,
+        )
         self.last, self.needs_linearising = snapshot, linearise_again(model, solution) is not None
         return self.result
 
@@ -309,7 +430,13 @@ class LiveCalibration:
         No change with the option `as_asked`, or when windows that need other columns are no longer kept.
         """
         collector = self._collector
-        if collector is None or self.last is None or self.options.as_asked or extension.is_nothing and self.extension.is_nothing:
+        if (
+            collector is None
+            or self.last is None
+            or self.options.as_asked
+            or extension.is_nothing
+            and self.extension.is_nothing
+        ):
             return False
         model = self.last.model_for(extension.options(self.options))
         if not model.has_columns_of(collector.model):
@@ -331,8 +458,10 @@ class LiveCalibration:
 
     def _begun(self) -> LiveCollector:
         if self._collector is None:
-            raise InputError('a thermal effect needs temperatures, none were received; publish imu/temperature or omit the effect',
-                             code='temperature_missing')
+            raise InputError(
+                'a thermal effect needs temperatures, none were received; publish imu/temperature or omit the effect',
+                code='temperature_missing',
+            )
         return self._collector
 
     def _with_earlier(self, gathered):
@@ -353,12 +482,22 @@ class LiveCalibration:
     def _residual(self, window):
         every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
         some = slice(every // 2 if len(window) > every // 2 else 0, None, every)
-        residuals = self.result.residuals_of(window)   # of all samples: a lag interpolates between them
-        return ImuSamples(window.stamp_ns[some], *(residuals[sensor][some] for sensor in SENSORS), self._collector.gathered.frame_id)
+        residuals = self.result.residuals_of(
+            window
+        )  # of all samples: a lag interpolates between them
+        return ImuSamples(
+            window.stamp_ns[some],
+            *(residuals[sensor][some] for sensor in SENSORS),
+            self._collector.gathered.frame_id,
+        )
 
     def coverage(self) -> Coverage:
         """Return the Coverage: the gain of each attitude, and the motion with the largest gain."""
-        return replace(NOTHING_SEEN, frame_id=self.frame_id) if self.result is None else table_coverage(self.result, self.frame_id)
+        return (
+            replace(NOTHING_SEEN, frame_id=self.frame_id)
+            if self.result is None
+            else table_coverage(self.result, self.frame_id)
+        )
 
     def groups(self) -> list[GroupState]:
         """Return the GroupState of every effect."""

@@ -10,8 +10,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.advice import HandKnowledge, foretold, knowledge_after, knowledge_at_first, ups_of
-from imu_calibration.calibration.coverage import DIRECTIONS, Coverage, GroupState, Progress, Step, group_states, waiting_groups
+from imu_calibration.calibration.advice import (
+    HandKnowledge,
+    foretold,
+    knowledge_after,
+    knowledge_at_first,
+    ups_of,
+)
+from imu_calibration.calibration.coverage import (
+    DIRECTIONS,
+    Coverage,
+    GroupState,
+    Progress,
+    Step,
+    group_states,
+    waiting_groups,
+)
 from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, evident_result
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError, with_hint
@@ -29,11 +43,19 @@ from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_calibration import MIN_ATTITUDES, POSES_FULL
 from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions, hand_options
-from imu_calibration.references.gravity.poses import average_poses, collect_turns, distinct_attitudes
+from imu_calibration.references.gravity.poses import (
+    average_poses,
+    collect_turns,
+    distinct_attitudes,
+)
 from imu_calibration.references.gravity.sample_store import HandStore
 from imu_calibration.references.options import CalibrationOptions
 
-FACE_DIRECTIONS = {f'{sign}{axis}': direction for axis, unit in zip('xyz', np.eye(3)) for sign, direction in (('+', unit), ('-', -unit))}
+FACE_DIRECTIONS = {
+    f'{sign}{axis}': direction
+    for axis, unit in zip('xyz', np.eye(3))
+    for sign, direction in (('+', unit), ('-', -unit))
+}
 """The six directions that can be turned up."""
 FACE_REACH = np.pi / 4
 """A face counts as seen when an attitude lies within this angle of it, rad."""
@@ -73,8 +95,13 @@ def look_for_poses(imu: ImuSamples, windows: WindowSettings) -> PoseScan:
     return PoseScan(rests, poses, distinct_attitudes(poses.force), len(turns), dropped, resting)
 
 
-def hand_status(found: PoseScan, calibration: Calibration | None, *, step: str,
-                hints: dict[str, str] | None = None) -> LiveState:
+def hand_status(
+    found: PoseScan,
+    calibration: Calibration | None,
+    *,
+    step: str,
+    hints: dict[str, str] | None = None,
+) -> LiveState:
     """
     Return the LiveState.
 
@@ -91,15 +118,30 @@ def hand_status(found: PoseScan, calibration: Calibration | None, *, step: str,
     """
     not_seen = unseen(found)
     word, needs = _needs(found, not_seen, calibration, step=step, hints=hints or {})
-    values = {'poses': len(found.rests), 'attitudes': found.attitudes, 'turns': found.turns,
-              **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
-              'directions of gravity not seen': ' '.join(not_seen), 'at rest for [s]': f'{found.resting:.1f}', 'next': '; '.join(needs)}
-    parts = [f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")}, {_plural(found.turns, "turn")}']
+    values = {
+        'poses': len(found.rests),
+        'attitudes': found.attitudes,
+        'turns': found.turns,
+        **{f'turns left out: {reason}': count for reason, count in found.dropped.items()},
+        'directions of gravity not seen': ' '.join(not_seen),
+        'at rest for [s]': f'{found.resting:.1f}',
+        'next': '; '.join(needs),
+    }
+    parts = [
+        f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")}, {_plural(found.turns, "turn")}'
+    ]
     if found.dropped:
-        parts.append('turns left out: ' + ', '.join(f'{count} {reason}' for reason, count in sorted(found.dropped.items())))
+        parts.append(
+            'turns left out: '
+            + ', '.join(f'{count} {reason}' for reason, count in sorted(found.dropped.items()))
+        )
     if found.resting:
         parts.append(f'at rest for {found.resting:.1f} s: this pose counts, move on')
-    parts += [f'next: {need}' for need in needs] if needs else ['all parameters are determined: save the calibration']
+    parts += (
+        [f'next: {need}' for need in needs]
+        if needs
+        else ['all parameters are determined: save the calibration']
+    )
     return LiveState(word, '; '.join(parts), values)
 
 
@@ -108,20 +150,36 @@ def unseen(found: PoseScan) -> list[str]:
     if found.poses is None:
         return list(FACE_DIRECTIONS)
     up = unit_rows(found.poses.force)
-    nearest = {name: float(np.arccos(np.clip(up @ face, -1, 1)).min()) for name, face in FACE_DIRECTIONS.items()}
-    return sorted((name for name, angle in nearest.items() if angle > FACE_REACH), key=lambda name: -nearest[name])
+    nearest = {
+        name: float(np.arccos(np.clip(up @ face, -1, 1)).min())
+        for name, face in FACE_DIRECTIONS.items()
+    }
+    return sorted(
+        (name for name, angle in nearest.items() if angle > FACE_REACH),
+        key=lambda name: -nearest[name],
+    )
 
 
 def _needs(found, not_seen, calibration, *, step, hints):
     if found.attitudes < MIN_ATTITUDES or calibration is None:
         more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
-        return Progress.WAITING, [f'{step}{more}; {MIN_ATTITUDES} attitudes at least, {POSES_FULL} for all parameters']
+        return Progress.WAITING, [
+            f'{step}{more}; {MIN_ATTITUDES} attitudes at least, {POSES_FULL} for all parameters'
+        ]
     lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
     if not lacking:
         return Progress.DETERMINED, []
     if lacking == [COMMON_SCALE]:
-        return Progress.WEAK, [with_hint('give the local gravity, which scales the accelerometer as a whole', 'gravity', hints)]
-    return Progress.WEAK, [step] if step else list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
+        return Progress.WEAK, [
+            with_hint(
+                'give the local gravity, which scales the accelerometer as a whole',
+                'gravity',
+                hints,
+            )
+        ]
+    return Progress.WEAK, [step] if step else list(
+        dict.fromkeys(item['needs'] for item in calibration.undetermined)
+    )
 
 
 def _plural(count, noun):
@@ -132,29 +190,50 @@ def knowledge_of(found: PoseScan, result: HandResult | None, options: HandOption
     """Return the HandKnowledge of a session: before the first solution from its poses, then from the solution."""
     if result is not None:
         return knowledge_after(result.hand)
-    model = HandModel(SensorModel(options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue), options.gravity)
-    return knowledge_at_first(model, tolerances_of(model.model, options.tolerances), poses=found.poses)
+    model = HandModel(
+        SensorModel(
+            options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue
+        ),
+        options.gravity,
+    )
+    return knowledge_at_first(
+        model, tolerances_of(model.model, options.tolerances), poses=found.poses
+    )
 
 
-def hand_coverage(found: PoseScan, result: HandResult | None, options: HandOptions, *, frame_id: str = '') -> Coverage:
+def hand_coverage(
+    found: PoseScan, result: HandResult | None, options: HandOptions, *, frame_id: str = ''
+) -> Coverage:
     """Return the Coverage of a session by hand: the cells, the next pose with the turn to it, and the remaining seconds."""
     seen = ups_of(found.poses)
     up = None if found.poses is None else seen[-1]
     knowledge = knowledge_of(found, result, options)
-    steps = [] if result is not None and not set(LACKING) & set(result.hand.statuses) else foretold(knowledge)
+    steps = (
+        []
+        if result is not None and not set(LACKING) & set(result.hand.statuses)
+        else foretold(knowledge)
+    )
     if not steps:
         return Coverage(np.zeros(len(DIRECTIONS)), seen, up, Step(''), 0.0, frame_id=frame_id)
     first, worth = steps[0], knowledge.best()[1]
-    return Coverage(worth, seen, up, Step(first.words, first.up, first.axis, first.angle), sum(step.seconds for step in steps),
-                    frame_id=frame_id)
+    return Coverage(
+        worth,
+        seen,
+        up,
+        Step(first.words, first.up, first.axis, first.angle),
+        sum(step.seconds for step in steps),
+        frame_id=frame_id,
+    )
 
 
 SEARCH_SHARE = 0.05
 """Largest share of time for the search for rest: after an hour at 200 Hz a search runs every ten seconds or so."""
 SEARCH_STEP = 0.5
 """Least duration of new samples between searches for rest, s."""
-_FIRST_NEEDS = {'accelerometer': f'hold it still in {POSES_FULL} different attitudes',
-                'gyroscope': 'turn it from one attitude to the next, within half a minute'}
+_FIRST_NEEDS = {
+    'accelerometer': f'hold it still in {POSES_FULL} different attitudes',
+    'gyroscope': 'turn it from one attitude to the next, within half a minute',
+}
 MAX_LIVE_POSES = 200
 """The computation time grows with the third power of the number of poses; the oldest are discarded."""
 
@@ -185,12 +264,23 @@ class LiveByHand:
 
     """
 
-    def __init__(self, options: CalibrationOptions, settings: LiveSettings, by_hand: LiveByHandSettings = LiveByHandSettings(), *,
-                 saved: bytes | None = None, clock: Callable[[], float] = time.monotonic):
+    def __init__(
+        self,
+        options: CalibrationOptions,
+        settings: LiveSettings,
+        by_hand: LiveByHandSettings = LiveByHandSettings(),
+        *,
+        saved: bytes | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
         self.options, self.settings, self._clock = by_hand.at_place(options), settings, clock
         self._asked = hand_options(self.options)
         _check_model(self.model)
-        self._check, self._store, self._drops = StreamCheck(), HandStore(by_hand.hand_samples), Counter()
+        self._check, self._store, self._drops = (
+            StreamCheck(),
+            HandStore(by_hand.hand_samples),
+            Counter(),
+        )
         if saved is not None:
             self._store.load(saved)
         self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
@@ -203,12 +293,14 @@ class LiveByHand:
     def model(self) -> SensorModel:
         """The model, as far as known before a solution."""
         asked = self._asked
-        return SensorModel(asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue)
+        return SensorModel(
+            asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue
+        )
 
     observations = HandResult.observations
     needs_joints, on_table = False, None
-    needs_linearising = False   # the solution is iterated to its end
-    needs_temperature = False   # no temperatures are kept with the poses
+    needs_linearising = False  # the solution is iterated to its end
+    needs_temperature = False  # no temperatures are kept with the poses
 
     @property
     def frame_id(self) -> str:
@@ -239,7 +331,10 @@ class LiveByHand:
     @property
     def counts(self) -> dict[str, int]:
         """Unusable samples, by reason."""
-        return dict(self._drops + Counter({f'imu {reason}': count for reason, count in self._check.counts.items()}))
+        return dict(
+            self._drops
+            + Counter({f'imu {reason}': count for reason, count in self._check.counts.items()})
+        )
 
     def push(self, block: SampleBlock) -> list[ImuSamples]:
         """Add arriving samples; return the poses completed since the last call, as mean ImuSamples, one each, in a list."""
@@ -268,12 +363,23 @@ class LiveByHand:
     def _newly_over(self):
         imu, found = self._store.samples(), self.found
         over = found.rests if not found.resting else found.rests[:-1]
-        new = [k for k, rest in enumerate(over) if self._reported_ns is None or imu.stamp_ns[rest.start] > self._reported_ns]
+        new = [
+            k
+            for k, rest in enumerate(over)
+            if self._reported_ns is None or imu.stamp_ns[rest.start] > self._reported_ns
+        ]
         if new:
             self._reported_ns = int(imu.stamp_ns[over[new[-1]].stop - 1])
         middle = [(found.rests[k].start + found.rests[k].stop) // 2 for k in new]
-        return [ImuSamples(self._store.true_stamps(imu.stamp_ns[[m]]), found.poses.force[[k]], found.poses.rate[[k]], imu.frame_id)
-                for k, m in zip(new, middle)]
+        return [
+            ImuSamples(
+                self._store.true_stamps(imu.stamp_ns[[m]]),
+                found.poses.force[[k]],
+                found.poses.rate[[k]],
+                imu.frame_id,
+            )
+            for k, m in zip(new, middle)
+        ]
 
     def solve(self, pending: bool = False, provenance: dict | None = None) -> HandResult:
         """
@@ -300,11 +406,16 @@ class LiveByHand:
             store.add(copy.deepcopy(self._check).finish())
         imu = store.samples()
         if imu is None or len(imu) < 3:
-            raise NotObservableError(f'calibration by hand needs {MIN_ATTITUDES} different attitudes at rest, no sample was received; '
-                                     'check the topic', code='no_samples')
+            raise NotObservableError(
+                f'calibration by hand needs {MIN_ATTITUDES} different attitudes at rest, no sample was received; '
+                'check the topic',
+                code='no_samples',
+            )
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
-        self.result = evident_result(recording, self.options, provenance, stills=self.found.rests)[0]
+        self.result = evident_result(recording, self.options, provenance, stills=self.found.rests)[
+            0
+        ]
         return self.result
 
     def saved(self, pending: bool = False) -> bytes:
@@ -326,32 +437,61 @@ class LiveByHand:
         time = 1e-9 * (mean.stamp_ns - self.result.gathered.first_stamp_ns)
         true, turning = hand.compensate(mean.force_s, mean.rate_s, time)
         gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]
-        return ImuSamples(mean.stamp_ns, (true - gravity_s) @ hand.accelerometer[1].T, turning @ hand.gyroscope[1].T, mean.frame_id)
+        return ImuSamples(
+            mean.stamp_ns,
+            (true - gravity_s) @ hand.accelerometer[1].T,
+            turning @ hand.gyroscope[1].T,
+            mean.frame_id,
+        )
 
     def groups(self) -> list[GroupState]:
         """Return the GroupState of every effect."""
         if self.result is None:
-            return [replace(group, needs=_FIRST_NEEDS[group.sensor]) for group in waiting_groups(self.model)]
+            return [
+                replace(group, needs=_FIRST_NEEDS[group.sensor])
+                for group in waiting_groups(self.model)
+            ]
         return group_states(self.result)
 
     def coverage(self) -> Coverage:
         """Return the Coverage: useful attitudes, and the next one."""
         known = (self.found, self.result, self.options.gravity)
-        if self._shown is None or any(a is not b for a, b in zip(known, self._shown[0], strict=True)):
-            self._shown = known, hand_coverage(self.found, self.result, hand_options(self.options), frame_id=self.frame_id)
+        if self._shown is None or any(
+            a is not b for a, b in zip(known, self._shown[0], strict=True)
+        ):
+            self._shown = (
+                known,
+                hand_coverage(
+                    self.found, self.result, hand_options(self.options), frame_id=self.frame_id
+                ),
+            )
         return self._shown[1]
 
     def status(self, hints: dict[str, str] | None = None) -> LiveState:
         """Return the LiveState: progress, and the pose or turn with the largest gain; `hints` as for `errors.with_hint`."""
-        status = hand_status(self.found, self.result.calibration if self.result else None,
-                             step=self.coverage().next.text, hints=hints)
-        return replace(status, values={**status.values, 'samples kept': len(self._store), 'samples forgotten': self._store.forgotten})
+        status = hand_status(
+            self.found,
+            self.result.calibration if self.result else None,
+            step=self.coverage().next.text,
+            hints=hints,
+        )
+        return replace(
+            status,
+            values={
+                **status.values,
+                'samples kept': len(self._store),
+                'samples forgotten': self._store.forgotten,
+            },
+        )
 
 
 def _check_model(model):
     """Refuse effects that need a table, and effects of temperature: a live session stores no temperatures with the poses."""
     thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
     if thermal:
-        raise InputError(f"{', '.join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; "
-                         "record a bag and run 'imu_calibration calibrate BAG', or omit it", code='offline_only')
+        raise InputError(
+            f'{", ".join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; '
+            "record a bag and run 'imu_calibration calibrate BAG', or omit it",
+            code='offline_only',
+        )
     HandModel(model, STANDARD_GRAVITY)

@@ -42,7 +42,9 @@ class Errors:
     """Sum of squared errors without an estimate of the delay."""
 
 
-def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: SensorModel, *, centre: Centre) -> dict:
+def prove_solution(
+    held_out: HeldOut, solution: Solution, gathered_model: SensorModel, *, centre: Centre
+) -> dict:
     """
     Return the proof of a solution on held-out windows: sensor -> entry of a document (see `prove`).
 
@@ -65,13 +67,19 @@ def prove_solution(held_out: HeldOut, solution: Solution, gathered_model: Sensor
     nominal = nominal_values(model)
     folds = [applied_values(model, values, centre) for values in dealt.values_without(solution)]
     described = [with_reference(model, values, nominal) for values in folds]
-    proof = prove(model, before=(dealt, ([nominal], [with_reference(model, nominal, solution.values)])), after=(dealt, (folds, described)))
+    proof = prove(
+        model,
+        before=(dealt, ([nominal], [with_reference(model, nominal, solution.values)])),
+        after=(dealt, (folds, described)),
+    )
     if proof and one_attitude([block.accumulator for block in dealt.blocks], model):
         proof['accelerometer']['one_attitude'] = True
     return proof
 
 
-def prove_readings(before: HeldOut, after: HeldOut, model: SensorModel, *, reference: np.ndarray) -> dict:
+def prove_readings(
+    before: HeldOut, after: HeldOut, model: SensorModel, *, reference: np.ndarray
+) -> dict:
     """
     Return the proof of corrected readings `after` and raw readings `before`, with the columns of `model`: bias, matrix, reference.
 
@@ -101,13 +109,29 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
         return {}
     proof = {}
     for sensor in SENSORS:
-        was, now = (min((_errors(dealt, model, sensor, each, regimes) for each in candidates), key=lambda errors: errors.squares.sum())
-                    for dealt, candidates in (before, after))
+        was, now = (
+            min(
+                (_errors(dealt, model, sensor, each, regimes) for each in candidates),
+                key=lambda errors: errors.squares.sum(),
+            )
+            for dealt, candidates in (before, after)
+        )
         entry = _entry(was.squares.sum(axis=1), now.squares.sum(axis=1), counts.sum(axis=1))
-        moving = {str(name): _entry(was.squares[:, k], now.squares[:, k], counts[:, k]) for k, name in enumerate(regimes)
-                  if (counts[:, k] > 0).sum() >= MIN_REGIME_BLOCKS}
-        late = {'delay_s': now.delay, 'delay_explains': 1.0 - now.squares.sum() / max(now.without_delay, 1e-300)}
-        proof[sensor] = entry | {'unit': UNITS[sensor], 'windows': before[0].n_judged} | late | {'regimes': moving}
+        moving = {
+            str(name): _entry(was.squares[:, k], now.squares[:, k], counts[:, k])
+            for k, name in enumerate(regimes)
+            if (counts[:, k] > 0).sum() >= MIN_REGIME_BLOCKS
+        }
+        late = {
+            'delay_s': now.delay,
+            'delay_explains': 1.0 - now.squares.sum() / max(now.without_delay, 1e-300),
+        }
+        proof[sensor] = (
+            entry
+            | {'unit': UNITS[sensor], 'windows': before[0].n_judged}
+            | late
+            | {'regimes': moving}
+        )
     return proof
 
 
@@ -120,13 +144,30 @@ def nominal_values(model: SensorModel) -> np.ndarray:
 def reference_model(calibration: Calibration, table: Table) -> SensorModel:
     """Return the model of a recording of corrected readings: bias, matrix, and the effects of the table and the clock that are known."""
     known, same_joints = calibration.model, calibration.model.joint_names == table.joint_names
-    names = {sensor: tuple(effect.name for effect in known.effects if effect.sensor == sensor and (
-        effect.role in (Role.OFFSET, Role.LINEAR) or same_joints and _of_reference(effect))) for sensor in SENSORS}
-    model = SensorModel(names['accelerometer'], names['gyroscope'], reference=known.reference if same_joints else (),
-                        joint_names=table.joint_names, temperature_ref_c=known.temperature_ref_c, catalogue=known.catalogue)
+    names = {
+        sensor: tuple(
+            effect.name
+            for effect in known.effects
+            if effect.sensor == sensor
+            and (effect.role in (Role.OFFSET, Role.LINEAR) or same_joints and _of_reference(effect))
+        )
+        for sensor in SENSORS
+    }
+    model = SensorModel(
+        names['accelerometer'],
+        names['gyroscope'],
+        reference=known.reference if same_joints else (),
+        joint_names=table.joint_names,
+        temperature_ref_c=known.temperature_ref_c,
+        catalogue=known.catalogue,
+    )
     model = model.at(reference_values(model, calibration))
     # The position of the sensor on the table is no error of either side: it is estimated for each.
-    return model if model.find('accelerometer', Role.ARM) or table.mount_xyz is not None else model.with_role('accelerometer', Role.ARM)
+    return (
+        model
+        if model.find('accelerometer', Role.ARM) or table.mount_xyz is not None
+        else model.with_role('accelerometer', Role.ARM)
+    )
 
 
 def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray:
@@ -134,7 +175,9 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
     values = nominal_values(model)
     for effect in calibration.model.effects:
         if effect.key in model.slices and _of_reference(effect):
-            values[model.slices[effect.key]] = calibration.values[calibration.model.slices[effect.key]]
+            values[model.slices[effect.key]] = calibration.values[
+                calibration.model.slices[effect.key]
+            ]
     return values
 
 
@@ -153,8 +196,12 @@ def _of_reference(effect: Effect) -> bool:
 
 def _errors(held_out, model, sensor, folds, regimes):
     """Return the Errors of parameters (one set for each fold in turn), with the delay and the common arm that suit them best."""
-    parts = [(k, regimes.index(regime), rows, folds[k % len(folds)]) for k, block in enumerate(held_out.blocks)
-             for (name, regime), rows in block.pieces.items() if name == sensor and len(rows)]
+    parts = [
+        (k, regimes.index(regime), rows, folds[k % len(folds)])
+        for k, block in enumerate(held_out.blocks)
+        for (name, regime), rows in block.pieces.items()
+        if name == sensor and len(rows)
+    ]
     known = {id(values): _Correction(model, sensor, values) for values in folds}
     stacks = [known[id(values)].errors(rows) for _, _, rows, values in parts]
     best, delay_free = _nuisances(np.concatenate(stacks, axis=1))
@@ -192,9 +239,17 @@ class _Correction:
 
     def errors(self, rows):
         """Return errors and their change with each nuisance, (1 + n_nuisances, k, 3): the delay, s, and the arm, m."""
-        columns, slope, output = rows[:, :-2 * N_AXES], rows[:, -2 * N_AXES:-N_AXES], rows[:, -N_AXES:]
+        columns, slope, output = (
+            rows[:, : -2 * N_AXES],
+            rows[:, -2 * N_AXES : -N_AXES],
+            rows[:, -N_AXES:],
+        )
         # measured(t) = matrix @ true(t - delay): the error is the delay times the slope.
-        parts = [output - columns @ self.total, slope @ self.matrix.T, *(-columns @ arm for arm in self.arms)]
+        parts = [
+            output - columns @ self.total,
+            slope @ self.matrix.T,
+            *(-columns @ arm for arm in self.arms),
+        ]
         return np.stack(parts) @ self.inverse.T
 
 
@@ -202,7 +257,9 @@ def _entry(before, after, count):
     return compared(before, after, count) | {'seconds': float(count.sum() * PIECE_TIME)}
 
 
-def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = N_AXES) -> dict:
+def compared(
+    before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = N_AXES
+) -> dict:
     """
     Return {'before', 'after', 'ci95'}: rms per component, and the interval of their ratio over resamples of complete blocks.
 
@@ -222,4 +279,8 @@ def compared(before: np.ndarray, after: np.ndarray, count: np.ndarray, *, compon
         ratio = np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))
     low, high = np.nan_to_num(np.quantile(ratio, (0.025, 0.975)), nan=1.0, posinf=1e9)
     total = components * count.sum()
-    return {'before': float(np.sqrt(before.sum() / total)), 'after': float(np.sqrt(after.sum() / total)), 'ci95': [float(low), float(high)]}
+    return {
+        'before': float(np.sqrt(before.sum() / total)),
+        'after': float(np.sqrt(after.sum() / total)),
+        'ci95': [float(low), float(high)],
+    }

@@ -82,7 +82,9 @@ class CalibrationResult(ABC):
     @property
     def verdict(self) -> Verdict:
         """The decision per sensor with all statements."""
-        assert self.calibration.judgement is not None, 'a result is made of a calibration that was judged'
+        assert self.calibration.judgement is not None, (
+            'a result is made of a calibration that was judged'
+        )
         return self.calibration.judgement
 
     @property
@@ -117,4 +119,10 @@ def exit_code(calibration: Calibration) -> int:
     """Return 0 when each sensor helps, every requested parameter is determined and no data were lost, else 3."""
     harmful = most_cautious(calibration.decisions.values()) is not HELPS
     lacking = harmful or any(status != DETERMINED for status in calibration.requested.values())
-    return 3 if lacking or calibration.statistics.get('dropped') or calibration.statistics.get('unusable') else 0
+    return (
+        3
+        if lacking
+        or calibration.statistics.get('dropped')
+        or calibration.statistics.get('unusable')
+        else 0
+    )

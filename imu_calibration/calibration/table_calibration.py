@@ -17,7 +17,12 @@ from imu_calibration.calibration.from_solution import (
     weak_on_table,
     with_gravity_uncertainty,
 )
-from imu_calibration.calibration.proof import prove_readings, prove_solution, reference_model, reference_values
+from imu_calibration.calibration.proof import (
+    prove_readings,
+    prove_solution,
+    reference_model,
+    reference_values,
+)
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.compensation.compensate import invertible
 from imu_calibration.compensation.stream import CompensationStream
@@ -42,9 +47,15 @@ from imu_calibration.references.turntable.session_data import HeldOut, SessionDa
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
 
 
-def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-              provenance: dict | None = None, mapper: Callable = map,
-              names: Sequence[str] | None = None) -> TableResult:
+def calibrate(
+    sources: Sequence[Callable],
+    table: Table,
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    provenance: dict | None = None,
+    mapper: Callable = map,
+    names: Sequence[str] | None = None,
+) -> TableResult:
     """
     Calibrate from one or several recordings of the same IMU on a table.
 
@@ -72,13 +83,23 @@ def calibrate(sources: Sequence[Callable], table: Table, options: CalibrationOpt
         When a recording cannot be used or is of another frame, with its name when there are several.
 
     """
-    return conclude(*solve_recordings(sources, table, options, mapper=mapper, names=names), table=table, options=options,
-                    provenance=provenance)
+    return conclude(
+        *solve_recordings(sources, table, options, mapper=mapper, names=names),
+        table=table,
+        options=options,
+        provenance=provenance,
+    )
 
 
-def solve_recordings(sources: Sequence[Callable], table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-                     mapper: Callable = map, names: Sequence[str] | None = None,
-                     keep_windows: bool = False) -> tuple[Solution, SessionData, SensorModel]:
+def solve_recordings(
+    sources: Sequence[Callable],
+    table: Table,
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    mapper: Callable = map,
+    names: Sequence[str] | None = None,
+    keep_windows: bool = False,
+) -> tuple[Solution, SessionData, SensorModel]:
     """
     Return (Solution, SessionData, SensorModel of the gathered columns) of recordings; arguments as in `calibrate`.
 
@@ -91,15 +112,23 @@ def solve_recordings(sources: Sequence[Callable], table: Table, options: Calibra
         model = model.with_reference_temperature(_first_temperature(sources))
 
     def solved(model, judged_from):
-        step = GatherStep(table, model, options.windows, options.nominal, names, keep_windows, judged_from)
-        gathered = join(list(mapper(step, enumerate(sources))), names, partial(check_units, model=model, table=table))
+        step = GatherStep(
+            table, model, options.windows, options.nominal, names, keep_windows, judged_from
+        )
+        gathered = join(
+            list(mapper(step, enumerate(sources))),
+            names,
+            partial(check_units, model=model, table=table),
+        )
         report('solving')
         return solve_gathered(gathered, model, options), gathered
 
     return solve_in_passes(model, options, solved)
 
 
-def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Callable) -> tuple[Solution, SessionData, SensorModel]:
+def solve_in_passes(
+    model: SensorModel, options: CalibrationOptions, solved: Callable
+) -> tuple[Solution, SessionData, SensorModel]:
     """
     Return (Solution, SessionData, SensorModel of the gathered columns) at the solution of a linearisation that is valid there.
 
@@ -110,7 +139,9 @@ def solve_in_passes(model: SensorModel, options: CalibrationOptions, solved: Cal
         model = again
         solution, gathered = solved(model, judged_from)
         again = linearise_again(model, solution)
-        last_third = judged_from_of(solution.model.at(solution.values), end_of(gathered.accumulator))
+        last_third = judged_from_of(
+            solution.model.at(solution.values), end_of(gathered.accumulator)
+        )
         if again is None and judged_from == last_third:
             break
         again, judged_from = again or model, last_third
@@ -126,7 +157,10 @@ def _at_time_constants(model, options, solved):
     for effect in model.effects:
         if effect.time_constant and effect.name not in options.point:
             duration = end_of(solved(model)[1].accumulator)
-            model = min(at_time_constants(model, effect, duration), key=lambda trial: solved(trial)[0].residual_rms[effect.sensor][1])
+            model = min(
+                at_time_constants(model, effect, duration),
+                key=lambda trial: solved(trial)[0].residual_rms[effect.sensor][1],
+            )
     return model
 
 
@@ -135,21 +169,31 @@ def _first_temperature(sources):
     for block in sources[0]():
         if block.temperature is not None and len(block.temperature):
             return float(block.temperature.temperature_c[0])
-    raise InputError('a thermal effect needs temperatures, the recording has none; record imu/temperature or omit the effect')
+    raise InputError(
+        'a thermal effect needs temperatures, the recording has none; record imu/temperature or omit the effect'
+    )
 
 
-def solve_gathered(gathered: SessionData, model: SensorModel, options: CalibrationOptions = CalibrationOptions()) -> Solution:
+def solve_gathered(
+    gathered: SessionData, model: SensorModel, options: CalibrationOptions = CalibrationOptions()
+) -> Solution:
     """Return the Solution of gathered data with the columns of `model` for the requested effects: the reduce step."""
     narrow = settle_model(model, options, gathered)
-    accumulator = gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
+    accumulator = (
+        gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
+    )
     solution = solve(accumulator, narrow, bias_processes=options.bias_processes)
     if options.accelerometer_model is None and _size_effect_unseen(solution):
         smaller = narrow.without_arms()
-        solution = solve(restrict(accumulator, narrow, smaller), smaller, bias_processes=options.bias_processes)
+        solution = solve(
+            restrict(accumulator, narrow, smaller), smaller, bias_processes=options.bias_processes
+        )
     return shrunk(solution, _by_default(solution.model, options))
 
 
-def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()) -> Calibration:
+def calibration_of_saved(
+    data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()
+) -> Calibration:
     """
     Return the calibration of a saved live session (`LiveCalibration.saved`), with the model of its columns and the added effects.
 
@@ -163,42 +207,95 @@ def calibration_of_saved(data: bytes, table: Table, options: CalibrationOptions 
     """
     gathered, model, extension = from_bytes(data)
     if model.joint_names != table.joint_names:
-        raise DocumentError(f"a saved accumulator must be of the joints {', '.join(table.joint_names)}, "
-                            f"this is of {', '.join(model.joint_names) or 'none'}; "
-                            'give the table or the arm that it was gathered on', key='table')
+        raise DocumentError(
+            f'a saved accumulator must be of the joints {", ".join(table.joint_names)}, '
+            f'this is of {", ".join(model.joint_names) or "none"}; '
+            'give the table or the arm that it was gathered on',
+            key='table',
+        )
     options = extension.options(options)
-    return conclude(extension.applied(solve_gathered(gathered, model, options)), gathered, model, table=table, options=options,
-                    changes=extension.changes).calibration
+    return conclude(
+        extension.applied(solve_gathered(gathered, model, options)),
+        gathered,
+        model,
+        table=table,
+        options=options,
+        changes=extension.changes,
+    ).calibration
 
 
-def conclude(solution: Solution, gathered: SessionData, model: SensorModel, *, table: Table,
-             options: CalibrationOptions = CalibrationOptions(), provenance: dict | None = None,
-             changes: ModelChanges = ModelChanges()) -> TableResult:
+def conclude(
+    solution: Solution,
+    gathered: SessionData,
+    model: SensorModel,
+    *,
+    table: Table,
+    options: CalibrationOptions = CalibrationOptions(),
+    provenance: dict | None = None,
+    changes: ModelChanges = ModelChanges(),
+) -> TableResult:
     """Judge a solution of data gathered with `model`, name the missing motions, and return the TableResult."""
     tolerances = tolerances_of(solution.model, options.tolerances)
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)
-    uncorrected = uncorrected_on_table(solution.model.at(solution.values), solution.values, gathered.accumulator, gathered=model)
+    uncorrected = uncorrected_on_table(
+        solution.model.at(solution.values), solution.values, gathered.accumulator, gathered=model
+    )
     proof = prove_solution(gathered.held_out, solution, model, centre=uncorrected.centre)
-    calibration = document(solution, tolerances, gathered, gravity=table.gravity_value, gauge=gauge_of(solution.model),
-                           undetermined=weak_on_table(solution, tolerances, needed), statistics=statistics(solution, gathered),
-                           provenance=provenance, proof=proof, changes=changes, uncorrected=uncorrected)
-    period = float(np.median([row.duration / max(row.count - 1, 1) for row in gathered.accumulator.rows]))
-    return TableResult(calibration=calibration, gathered=gathered, tolerances=tolerances, needed=needed, options=options,
-                       reference=f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})', gravity=table.gravity_value,
-                       period=period, solution=solution, table=table, model=solution.model, gathered_model=model)
+    calibration = document(
+        solution,
+        tolerances,
+        gathered,
+        gravity=table.gravity_value,
+        gauge=gauge_of(solution.model),
+        undetermined=weak_on_table(solution, tolerances, needed),
+        statistics=statistics(solution, gathered),
+        provenance=provenance,
+        proof=proof,
+        changes=changes,
+        uncorrected=uncorrected,
+    )
+    period = float(
+        np.median([row.duration / max(row.count - 1, 1) for row in gathered.accumulator.rows])
+    )
+    return TableResult(
+        calibration=calibration,
+        gathered=gathered,
+        tolerances=tolerances,
+        needed=needed,
+        options=options,
+        reference=f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})',
+        gravity=table.gravity_value,
+        period=period,
+        solution=solution,
+        table=table,
+        model=solution.model,
+        gathered_model=model,
+    )
 
 
 def _by_default(model, options):
     """Return the parameters of each effect that is in the model unasked: levelling, the Earth's rate, arms of the accelerometers."""
     arms = options.accelerometer_model is None
-    return [model.slices[effect.key] for effect in model.effects if effect.role is Role.ARMS and arms
-            or effect.sensor == 'reference' and effect.nuisance and options.reference_model is None and effect.key not in options.added]
+    return [
+        model.slices[effect.key]
+        for effect in model.effects
+        if effect.role is Role.ARMS
+        and arms
+        or effect.sensor == 'reference'
+        and effect.nuisance
+        and options.reference_model is None
+        and effect.key not in options.added
+    ]
 
 
 def _size_effect_unseen(solution):
-    arms, arm = (solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM))
-    return len(arms) > 0 and bool(arms.all() and arm.all())   # an arm that is seen would bias the bias if left out
+    arms, arm = (
+        solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM)
+    )
+    return len(arms) > 0 and bool(
+        arms.all() and arm.all()
+    )  # an arm that is seen would bias the bias if left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,19 +331,38 @@ class CheckResult:
         """The decision on each sensor with its reason, then the regimes with a larger error."""
         if not self.proof:
             return [f'unproven: {self.why}']
-        return [*(f'{sensor} {decide(entry)}: {reason_of(entry)}' for sensor, entry in self.proof.items()),
-                *(f'{sensor}: {line}' for sensor, entry in self.proof.items() for line in worse_regimes(entry))]
+        return [
+            *(
+                f'{sensor} {decide(entry)}: {reason_of(entry)}'
+                for sensor, entry in self.proof.items()
+            ),
+            *(
+                f'{sensor}: {line}'
+                for sensor, entry in self.proof.items()
+                for line in worse_regimes(entry)
+            ),
+        ]
 
     def __str__(self):
         helped = ', '.join(self.helped)
-        answer = 'the calibration helps' if self.helps else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
+        answer = (
+            'the calibration helps'
+            if self.helps
+            else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
+        )
         return '\n'.join([answer, *(f'  {line}' for line in (*self.lines, *self.notes))])
 
     __repr__ = __str__
 
 
-def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calibration, *,
-                   options: CalibrationOptions = CalibrationOptions(), names: Sequence[str] = ()) -> CheckResult:
+def check_on_table(
+    sources: Sequence[Callable],
+    table: Table,
+    calibration: Calibration,
+    *,
+    options: CalibrationOptions = CalibrationOptions(),
+    names: Sequence[str] = (),
+) -> CheckResult:
     """
     Return the errors of a calibration on recordings of its IMU on a table, of the readings that compensation writes.
 
@@ -273,14 +389,24 @@ def check_on_table(sources: Sequence[Callable], table: Table, calibration: Calib
     step = GatherStep(table, model, options.windows, options.nominal, names)
     for session, source in enumerate(sources):
         windows: list[Window] = []
-        parts.append(naming(names, session)(step.read, _with_corrected(source, calibration, options), session,
-                                            Preflight(table.gravity_value), windows=windows))
+        parts.append(
+            naming(names, session)(
+                step.read,
+                _with_corrected(source, calibration, options),
+                session,
+                Preflight(table.gravity_value),
+                windows=windows,
+            )
+        )
         for raw, corrected in map(_both, (window for window in windows if window.kind != 'unused')):
             for held_out, window in ((before, raw), (after, corrected)):
                 if len(window) > 1:
                     held_out.add(reduce_window(window, model, table, session=session))
     gathered = join(parts, names, lambda part: check_units(part, model, table))
-    return CheckResult(prove_readings(before, after, model, reference=reference_values(model, calibration)), gathered.findings)
+    return CheckResult(
+        prove_readings(before, after, model, reference=reference_values(model, calibration)),
+        gathered.findings,
+    )
 
 
 def _with_corrected(source, calibration, options):
@@ -292,8 +418,12 @@ def _with_corrected(source, calibration, options):
     stream = CompensationStream(calibration, temperature=temperature)
     for block in source():
         if block.imu is not None and len(block.imu):
-            found = stream.correct(options.nominal.apply(block.imu) if options.nominal else block.imu)
-            block = replace(block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate])))
+            found = stream.correct(
+                options.nominal.apply(block.imu) if options.nominal else block.imu
+            )
+            block = replace(
+                block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate]))
+            )
         yield block
 
 

@@ -14,10 +14,21 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from imu_calibration.calibration.proof import nominal_values
-from imu_calibration.calibration.result import GRAVITY_SD, CalibrationResult, ErrorBudget, WindowErrors
+from imu_calibration.calibration.result import (
+    GRAVITY_SD,
+    CalibrationResult,
+    ErrorBudget,
+    WindowErrors,
+)
 from imu_calibration.core.units import ARCMIN
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import References, coefficient_jacobian, coefficients, columns, sensor_output
+from imu_calibration.effects.forward_equations import (
+    References,
+    coefficient_jacobian,
+    coefficients,
+    columns,
+    sensor_output,
+)
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
@@ -55,14 +66,23 @@ def error_budget(result: 'TableResult') -> ErrorBudget:
 
     """
     table = result.table
-    gravity_sd = GRAVITY_SD if table.gravity is not None and table.gravity_sd is None else table.gravity_sd_value
-    causes, texts = {'noise': result.solution.sd}, {'noise': 'noise and wander of the sensors, as this recording shows them'}
+    gravity_sd = (
+        GRAVITY_SD
+        if table.gravity is not None and table.gravity_sd is None
+        else table.gravity_sd_value
+    )
+    causes, texts = (
+        {'noise': result.solution.sd},
+        {'noise': 'noise and wander of the sensors, as this recording shows them'},
+    )
     declared = _causes(result, gravity_sd)
-    shifts = parameter_shifts(result, [change for _, _, _, changes in declared for change in changes])
+    shifts = parameter_shifts(
+        result, [change for _, _, _, changes in declared for change in changes]
+    )
     start = 0
     for name, text, scattered, changes in declared:
-        moved = shifts[start:start + len(changes)]
-        total = moved**2 if scattered else moved.sum(axis=1, keepdims=True)**2
+        moved = shifts[start : start + len(changes)]
+        total = moved**2 if scattered else moved.sum(axis=1, keepdims=True) ** 2
         causes[name], texts[name] = np.sqrt(total.sum(axis=(0, 1))), text
         start += len(changes)
     return ErrorBudget(tuple(result.solution.param_names), causes, texts)
@@ -73,13 +93,29 @@ def _causes(result, gravity_sd):
     found = []
     if result.solution.model.find('reference', Role.TILT) is None:
         text = f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated'
-        found.append(('levelling', text, False, [partial(_tilted, angles) for angles in LEVELLING_SD * np.eye(2)]))
-    text = f'joint positions {JOINT_POSITION_SD / ARCMIN * 60:.2g} arcsec, independent in every window'
+        found.append(
+            (
+                'levelling',
+                text,
+                False,
+                [partial(_tilted, angles) for angles in LEVELLING_SD * np.eye(2)],
+            )
+        )
+    text = (
+        f'joint positions {JOINT_POSITION_SD / ARCMIN * 60:.2g} arcsec, independent in every window'
+    )
     turns = JOINT_POSITION_SD * np.eye(len(result.table.joints))
     found.append(('joint position', text, True, [partial(_turned, angles) for angles in turns]))
     text = f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows'
     found.append(('table rate', text, False, [partial(_faster, 1 + TABLE_RATE_SD)]))
-    found.append(('gravity', f'gravity known to {gravity_sd:.2g} m/s²', False, [partial(_heavier, gravity_sd)]))
+    found.append(
+        (
+            'gravity',
+            f'gravity known to {gravity_sd:.2g} m/s²',
+            False,
+            [partial(_heavier, gravity_sd)],
+        )
+    )
     return found
 
 
@@ -92,7 +128,9 @@ def _turned(angles, table, motion):
 
 
 def _faster(factor, table, motion):
-    return table, replace(motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration)
+    return table, replace(
+        motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration
+    )
 
 
 def _heavier(change, table, motion):
@@ -110,12 +148,19 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(sources), len(solution.values)))
-    counts, times = (np.array([getattr(source, name) for source in sources]) for name in ('samples', 'time'))
+    counts, times = (
+        np.array([getattr(source, name) for source in sources]) for name in ('samples', 'time')
+    )
     for sensor in SENSORS:
-        slope, noise = coefficient_jacobian(solution.model, sensor, solution.values), solution.noise[sensor]
+        slope, noise = (
+            coefficient_jacobian(solution.model, sensor, solution.values),
+            solution.noise[sensor],
+        )
         designs = [np.einsum('nq,qap->nap', own[sensor][0], slope) for own in outputs]
         means = np.array([design.mean(axis=0) for design in designs])
-        variance = noise.mean_variance([source.kind for source in sources], counts) + noise.offset_sd**2
+        variance = (
+            noise.mean_variance([source.kind for source in sources], counts) + noise.offset_sd**2
+        )
         whitening = Whitening(variance, times, sessions_of(sources), processes=noise.bias_processes)
         weighted = whitening.adjoint(whitening(means))
         normal = normal + np.tensordot(weighted, means, ([0, 1], [0, 1]))
@@ -123,7 +168,9 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
             centred, moved = design - means[k], own[sensor][1]
             within = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
             normal += np.tensordot(within, centred, ([0, 1], [0, 1]))
-            right[:, k] += moved.mean(axis=1) @ weighted[k] + np.tensordot(moved, within, ([1, 2], [0, 1]))
+            right[:, k] += moved.mean(axis=1) @ weighted[k] + np.tensordot(
+                moved, within, ([1, 2], [0, 1])
+            )
     index = np.flatnonzero(~fixed_parameters(solution.model) & ~solution.held)
     shifts = np.zeros_like(right)
     shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
@@ -144,7 +191,11 @@ class _Source(NamedTuple):
 
 def _sources(result):
     """Yield the windows at rest, and the moving ones that were kept."""
-    rows = {(row.session, row.time): row.count for row in result.gathered.accumulator.rows if row.kind == 'static'}
+    rows = {
+        (row.session, row.time): row.count
+        for row in result.gathered.accumulator.rows
+        if row.kind == 'static'
+    }
     typical = float(np.median(list(rows.values()))) if rows else 1.0
     for time, session, position in result.gathered.poses:
         motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
@@ -153,19 +204,40 @@ def _sources(result):
     for window in result.gathered.kept:
         some = slice(None, None, stride)
         temperature = None if window.temperature_c is None else window.temperature_c[some]
-        yield _Source(window.kind, float(window.time.mean()), 0, len(window), stride, window.motion.select(some), temperature)
+        yield _Source(
+            window.kind,
+            float(window.time.mean()),
+            0,
+            len(window),
+            stride,
+            window.motion.select(some),
+            temperature,
+        )
 
 
 def _outputs(result, source, changes):
     """Return sensor -> (columns, changes of the output, shape (n_changes, n, 3)) at the samples of a window."""
-    model, temperature, known = result.solution.model, source.temperature_c, (result.table, source.motion)
-    if model.needs_temperature and temperature is None:   # the mean at rest is not kept
+    model, temperature, known = (
+        result.solution.model,
+        source.temperature_c,
+        (result.table, source.motion),
+    )
+    if model.needs_temperature and temperature is None:  # the mean at rest is not kept
         temperature = np.full(len(source.motion), model.temperature_ref_c)
-    references = [References(model, *pair, temperature_c=temperature) for pair in (known, *(change(*known) for change in changes))]
+    references = [
+        References(model, *pair, temperature_c=temperature)
+        for pair in (known, *(change(*known) for change in changes))
+    ]
     found = {}
     for sensor in SENSORS:
-        output, *moved = (sensor_output(model, sensor, result.solution.values, ref=each.at(sensor)) for each in references)
-        found[sensor] = columns(references[0], sensor), np.array(moved).reshape(-1, *output.shape) - output
+        output, *moved = (
+            sensor_output(model, sensor, result.solution.values, ref=each.at(sensor))
+            for each in references
+        )
+        found[sensor] = (
+            columns(references[0], sensor),
+            np.array(moved).reshape(-1, *output.shape) - output,
+        )
     return found
 
 
@@ -187,28 +259,55 @@ class TableResult(CalibrationResult):
     @property
     def singular_values(self) -> np.ndarray:
         """Singular values of the design in units of the tolerances; directions that the gauge fixes by convention are left out."""
-        convention = make_prior(self.solution.model).root[len(self.tolerances):]
-        values = tolerance_scaled_singular_values(self.solution.information + convention.T @ convention, self.tolerances)
-        return values[len(convention):]
+        convention = make_prior(self.solution.model).root[len(self.tolerances) :]
+        values = tolerance_scaled_singular_values(
+            self.solution.information + convention.T @ convention, self.tolerances
+        )
+        return values[len(convention) :]
 
     def window_errors(self) -> WindowErrors:
         """Return the errors of window means before and after, against the table; after: predicted without the fold of the window."""
-        held_out = self.gathered.held_out if self.gathered.held_out.n_windows else HeldOut([HeldOutBlock(self.gathered.accumulator)])
+        held_out = (
+            self.gathered.held_out
+            if self.gathered.held_out.n_windows
+            else HeldOut([HeldOutBlock(self.gathered.accumulator)])
+        )
         held_out, model = held_out.restricted(self.gathered_model, self.model), self.model
-        folds = held_out.values_without(self.solution) if len(held_out.blocks) > 1 else [self.solution.values]
+        folds = (
+            held_out.values_without(self.solution)
+            if len(held_out.blocks) > 1
+            else [self.solution.values]
+        )
         rows = [row for block in held_out.blocks for row in block.accumulator.rows]
-        fold = [k % len(folds) for k, block in enumerate(held_out.blocks) for _ in block.accumulator.rows]
+        fold = [
+            k % len(folds)
+            for k, block in enumerate(held_out.blocks)
+            for _ in block.accumulator.rows
+        ]
         count = np.array([row.count for row in rows], float)
         parts = {name: {} for name in ('measured', 'true', 'before', 'after', 'floor')}
         for sensor in SENSORS:
-            means, noise = np.array([row.sensors[sensor].mean for row in rows]), self.solution.noise[sensor]
+            means, noise = (
+                np.array([row.sensors[sensor].mean for row in rows]),
+                self.solution.noise[sensor],
+            )
             after = np.array([coefficients(model, sensor, values) for values in folds])[fold]
-            parts['measured'][sensor], parts['true'][sensor] = means[:, -3:], means[:, model.columns_of(sensor, Role.LINEAR)]
-            parts['before'][sensor] = means[:, -3:] - means[:, :-3] @ coefficients(model, sensor, nominal_values(model))
-            parts['after'][sensor] = (means[:, -3:] - np.einsum('ni,nij->nj', means[:, :-3], after)) \
-                @ np.linalg.inv(self.calibration.of(sensor, Role.LINEAR)).T
-            parts['floor'][sensor] = np.sqrt(noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance)
-        return WindowErrors(np.array([row.time for row in rows]), np.array([row.kind for row in rows]), **parts)
+            parts['measured'][sensor], parts['true'][sensor] = (
+                means[:, -3:],
+                means[:, model.columns_of(sensor, Role.LINEAR)],
+            )
+            parts['before'][sensor] = means[:, -3:] - means[:, :-3] @ coefficients(
+                model, sensor, nominal_values(model)
+            )
+            parts['after'][sensor] = (
+                means[:, -3:] - np.einsum('ni,nij->nj', means[:, :-3], after)
+            ) @ np.linalg.inv(self.calibration.of(sensor, Role.LINEAR)).T
+            parts['floor'][sensor] = np.sqrt(
+                noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance
+            )
+        return WindowErrors(
+            np.array([row.time for row in rows]), np.array([row.kind for row in rows]), **parts
+        )
 
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
         """Return measured values minus those predicted from the motion of the table."""

@@ -3,15 +3,29 @@
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
-EXAMPLES = ('session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
-            'session --imu-topic /imus --frame-id front --imu-topic /imus --frame-id rear')
+EXAMPLES = (
+    'session --imu-topic /imu_a/data_raw --imu-topic /imu_b/data_raw',
+    'session --imu-topic /imus --frame-id front --imu-topic /imus --frame-id rear',
+)
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    parser.common('--imu-topic', metavar='TOPIC', action='append', required=True, help='give it twice: first A, then B')
-    parser.common('--frame-id', metavar='FRAME', action='append', default=[], help='frame_id of A, then of B; for a topic with several')
+    parser.common(
+        '--imu-topic',
+        metavar='TOPIC',
+        action='append',
+        required=True,
+        help='give it twice: first A, then B',
+    )
+    parser.common(
+        '--frame-id',
+        metavar='FRAME',
+        action='append',
+        default=[],
+        help='frame_id of A, then of B; for a topic with several',
+    )
 
 
 def run(options: Options) -> VerbResult:
@@ -22,15 +36,23 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, warnings
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
+
     if len(options.imu_topic) != 2:
-        raise InputError(f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both IMUs')
+        raise InputError(
+            f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both IMUs'
+        )
     frames = options.frame_id or [None, None]
     if len(frames) != 2:
-        raise InputError(f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both frames')
+        raise InputError(
+            f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both frames'
+        )
     topics = [Topics(imu=topic, frame=frame) for topic, frame in zip(options.imu_topic, frames)]
     if len({(topic.lstrip('/'), frame) for topic, frame in zip(options.imu_topic, frames)}) == 1:
-        raise InputError(f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a frame_id for each',
-                         key='frame_id', code='same_imu')
+        raise InputError(
+            f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a frame_id for each',
+            key='frame_id',
+            code='same_imu',
+        )
     imus = []
     for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
@@ -45,4 +67,6 @@ def run(options: Options) -> VerbResult:
         print_line(f'{axis}: {shown} +- {spread} mm')
     for line in result.lines():
         print_line(line)
-    return VerbResult(0, {'arm': result.arm, 'sd': result.arm_sd, 'unit': 'm', 'notes': list(result.lines())})
+    return VerbResult(
+        0, {'arm': result.arm, 'sd': result.arm_sd, 'unit': 'm', 'notes': list(result.lines())}
+    )

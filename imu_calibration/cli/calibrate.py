@@ -2,14 +2,21 @@
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
 
-EXAMPLES = ('session --table table.yaml --output result', 'by_hand_session --gravity 9.81 --output result')
+EXAMPLES = (
+    'session --table table.yaml --output result',
+    'by_hand_session --gravity 9.81 --output result',
+)
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bags', nargs='+', metavar='BAG', help=BAG)
-    parser.common('--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html')
-    parser.expert('--earlier', metavar='FILE', help='earlier calibration.yaml to compare (table only)')
+    parser.common(
+        '--output', metavar='DIR', required=True, help='folder for calibration.yaml and report.html'
+    )
+    parser.expert(
+        '--earlier', metavar='FILE', help='earlier calibration.yaml to compare (table only)'
+    )
     parser.common('--no-report', action='store_true', help='write calibration.yaml only')
     parser.expert('--jobs', type=int, help='recordings read at a time, default one per core')
     parser.add_session()
@@ -21,10 +28,13 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.document.calibration_text import to_mapping
     from imu_calibration.use_cases.calibrate import calibrate
+
     options.require_place(options.bags)
     with files.output_folder(options.output) as folder:
         choices = options.choices()
-        found = calibrate(options.bags, options.stand(), jobs=options.jobs, earlier=options.earlier, **choices)
+        found = calibrate(
+            options.bags, options.stand(), jobs=options.jobs, earlier=options.earlier, **choices
+        )
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report)
         show_calibration(found, folder, options.hints(), report=not options.no_report)

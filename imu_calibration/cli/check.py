@@ -2,8 +2,10 @@
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
 
-EXAMPLES = ('later_session --calibration result/calibration.yaml --table table.yaml',
-            'by_hand_session --calibration result/calibration.yaml --json')
+EXAMPLES = (
+    'later_session --calibration result/calibration.yaml --table table.yaml',
+    'by_hand_session --calibration result/calibration.yaml --json',
+)
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -21,15 +23,25 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.document.decision import ratio_text
     from imu_calibration.preprocessing.checks import warnings
     from imu_calibration.use_cases.calibrate import check
+
     found = check(options.bag, options.calibration, options.stand(), **options.choices())
     warn([finding.to_mapping() for finding in warnings(found.findings)])
     out, numbers = Terminal.of(), ('seconds', 'before', 'after', 'after / before, 95 %')
     rows = []
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
-            rows.append((sensor, motion, f'{part["seconds"]:.0f}',
-                         *(error_text(part[when], part.get('unit', entry['unit'])) for when in ('before', 'after')),
-                         ratio_text(part)))
+            rows.append(
+                (
+                    sensor,
+                    motion,
+                    f'{part["seconds"]:.0f}',
+                    *(
+                        error_text(part[when], part.get('unit', entry['unit']))
+                        for when in ('before', 'after')
+                    ),
+                    ratio_text(part),
+                )
+            )
     show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
     out.print(str(found))
     return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})

@@ -2,8 +2,10 @@
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 
-EXAMPLES = ('drive --calibration result/calibration.yaml --output drive_corrected',
-            'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2 --output drive_corrected')
+EXAMPLES = (
+    'drive --calibration result/calibration.yaml --output drive_corrected',
+    'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2 --output drive_corrected',
+)
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -11,27 +13,67 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument('bag', metavar='BAG', help=BAG)
     parser.common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
     parser.common('--output', metavar='BAG2', required=True, help='rosbag2 folder to make')
-    parser.common('--corrected-topic', metavar='TOPIC', default='/imu/data_corrected', help='default /imu/data_corrected')
-    parser.common('--target-frame', metavar='FRAME', default='',
-                  help='move the corrected readings to another frame of the same rigid body')
-    parser.expert('--target-xyz', metavar='M', nargs=3, type=float, default=(0.0, 0.0, 0.0),
-                  help='place of the sensor in the target frame, m')
-    parser.expert('--target-rpy', metavar='RAD', nargs=3, type=float, default=(0.0, 0.0, 0.0),
-                  help='roll, pitch, yaw of the sensor in the target frame, rad')
-    parser.common('--anyway', action='store_true', help='also correct a sensor with the decision harms')
-    parser.expert('--noise', metavar='FILE', help='noise.yaml of this IMU, for the covariances where the messages bring none')
-    parser.expert('--correct-stamps', action='store_true', help="move the stamps back by the calibration's time_offset")
+    parser.common(
+        '--corrected-topic',
+        metavar='TOPIC',
+        default='/imu/data_corrected',
+        help='default /imu/data_corrected',
+    )
+    parser.common(
+        '--target-frame',
+        metavar='FRAME',
+        default='',
+        help='move the corrected readings to another frame of the same rigid body',
+    )
+    parser.expert(
+        '--target-xyz',
+        metavar='M',
+        nargs=3,
+        type=float,
+        default=(0.0, 0.0, 0.0),
+        help='place of the sensor in the target frame, m',
+    )
+    parser.expert(
+        '--target-rpy',
+        metavar='RAD',
+        nargs=3,
+        type=float,
+        default=(0.0, 0.0, 0.0),
+        help='roll, pitch, yaw of the sensor in the target frame, rad',
+    )
+    parser.common(
+        '--anyway', action='store_true', help='also correct a sensor with the decision harms'
+    )
+    parser.expert(
+        '--noise',
+        metavar='FILE',
+        help='noise.yaml of this IMU, for the covariances where the messages bring none',
+    )
+    parser.expert(
+        '--correct-stamps',
+        action='store_true',
+        help="move the stamps back by the calibration's time_offset",
+    )
     parser.add_topics(joints=False)
 
 
 def run(options: Options) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
     from imu_calibration.use_cases.compensate import compensate
+
     found = compensate(options.bag, **options.arguments_for(compensate))
     for line in found.warnings:
         print_line(f'note: {line}')
     print_line(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')
     if found.lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in found.lost.items()))
-    return VerbResult(found.exit_code, {'output': str(options.output), 'topic': options.corrected_topic, 'count': found.count,
-                                     'warnings': list(found.warnings), 'lost': found.lost})
+    return VerbResult(
+        found.exit_code,
+        {
+            'output': str(options.output),
+            'topic': options.corrected_topic,
+            'count': found.count,
+            'warnings': list(found.warnings),
+            'lost': found.lost,
+        },
+    )

@@ -5,16 +5,28 @@ from dataclasses import asdict
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from msg_adapters.storages import identifiers
 
-EXAMPLES = ('log.csv --output session', 'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session')
+EXAMPLES = (
+    'log.csv --output session',
+    'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session',
+)
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('log', metavar='FILE', help='text with a header and columns separated by comma, semicolon, tab or spaces')
+    parser.add_argument(
+        'log',
+        metavar='FILE',
+        help='text with a header and columns separated by comma, semicolon, tab or spaces',
+    )
     parser.common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
-    parser.common('--columns', metavar='QUANTITY=NAMES:UNIT', nargs='+', default=[],
-                  help='replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C joint.JOINT=NAME:deg; a name may '
-                  'be a column number, a leading minus reverses the sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s mdeg/s, rad deg')
+    parser.common(
+        '--columns',
+        metavar='QUANTITY=NAMES:UNIT',
+        nargs='+',
+        default=[],
+        help='replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C joint.JOINT=NAME:deg; a name may '
+        'be a column number, a leading minus reverses the sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s mdeg/s, rad deg',
+    )
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 
@@ -22,12 +34,22 @@ def run(options: Options) -> VerbResult:
     """Read the log, print the columns used, write the bag."""
     from msg_adapters.csv_log import read_csv
     from msg_adapters.write import write_session
+
     log = read_csv(options.log, options.columns)
     for columns in log.columns:
         print(columns)
     if log.unused:
         print_line(f'unused: {", ".join(log.unused)}')
-    write_session(options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage)
+    write_session(
+        options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage
+    )
     print_line(f'written: {options.output} ({len(log.imu)} Imu)')
-    return VerbResult(0, {'output': str(options.output), 'count': len(log.imu), 'columns': list(map(asdict, log.columns)),
-                          'unused': log.unused})
+    return VerbResult(
+        0,
+        {
+            'output': str(options.output),
+            'count': len(log.imu),
+            'columns': list(map(asdict, log.columns)),
+            'unused': log.unused,
+        },
+    )

@@ -8,8 +8,17 @@ EXAMPLES = ('session --table table.yaml --output finding', 'by_hand_session --ou
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    parser.common('--output', metavar='DIR', required=True, help='folder for diagnosis.json, calibration.yaml and report.html')
-    parser.common('--mcap', metavar='FILE', help='also write measured and simulated signals and the residuals as MCAP for Foxglove')
+    parser.common(
+        '--output',
+        metavar='DIR',
+        required=True,
+        help='folder for diagnosis.json, calibration.yaml and report.html',
+    )
+    parser.common(
+        '--mcap',
+        metavar='FILE',
+        help='also write measured and simulated signals and the residuals as MCAP for Foxglove',
+    )
     parser.add_session(searched=False)
 
 
@@ -19,8 +28,9 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.use_cases.diagnose import diagnose
     from imu_calibration.use_cases.view import foxglove
+
     if options.mcap:
-        foxglove()   # before the work, not after it
+        foxglove()  # before the work, not after it
     options.require_place([options.bag])
     with files.output_folder(options.output) as folder:
         found = diagnose(options.bag, options.stand(), **options.choices())
@@ -28,7 +38,14 @@ def run(options: Options) -> VerbResult:
         found.save(folder)
         if options.mcap:
             found.save_overlay(options.mcap)
-        also = '' if found.proposed is None else ', and extended.yaml with the proposed formula in the model,'
-        for line in (*str(found).splitlines(), f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}'):
+        also = (
+            ''
+            if found.proposed is None
+            else ', and extended.yaml with the proposed formula in the model,'
+        )
+        for line in (
+            *str(found).splitlines(),
+            f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}',
+        ):
             print_line(line)
         return VerbResult(found.exit_code, found.document)

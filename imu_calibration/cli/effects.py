@@ -13,10 +13,14 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Options) -> VerbResult:
     """Print one paragraph per effect."""
     from imu_calibration.use_cases.choices import effect_rows
+
     rows = effect_rows(options.catalogue)
     for row in rows:
-        print_line(f'{row["effect"]} ({row["sensor"]}, {row["unit"]}, tolerance {row["tolerance"]:g}, '
-                   f'compensation {row["compensation"]})', 4 * ' ')
+        print_line(
+            f'{row["effect"]} ({row["sensor"]}, {row["unit"]}, tolerance {row["tolerance"]:g}, '
+            f'compensation {row["compensation"]})',
+            4 * ' ',
+        )
         for label in ('text', 'equation', 'needs'):
             if row[label]:
                 print_line(f'    {"" if label == "text" else label + ": "}{row[label]}', 8 * ' ')

@@ -3,19 +3,37 @@
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
 
-EXAMPLES = ('--list', 'result/calibration.yaml --to kalibr --noise noise/noise.yaml --output imu.yaml')
+EXAMPLES = (
+    '--list',
+    'result/calibration.yaml --to kalibr --noise noise/noise.yaml --output imu.yaml',
+)
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('document', metavar='CALIBRATION', nargs='?', help='calibration.yaml')
     parser.common('--to', metavar='NAME', help='name of the program, listed by --list')
-    parser.common('--list', action='store_true', help='list the programs and the parameters that each accepts')
+    parser.common(
+        '--list', action='store_true', help='list the programs and the parameters that each accepts'
+    )
     parser.common('--noise', metavar='FILE', help='noise.yaml of the verb noise')
-    parser.expert('--rate', metavar='HZ', type=float, help='rate at which the program gets the readings; default that of noise.yaml')
+    parser.expert(
+        '--rate',
+        metavar='HZ',
+        type=float,
+        help='rate at which the program gets the readings; default that of noise.yaml',
+    )
     parser.common('--output', metavar='FILE', help='the file to write')
-    parser.expert('--bag', metavar='BAG', help='recording on which the loss is measured; default: a standard motion')
-    parser.expert('--anyway', action='store_true', help='also write a sensor with the decision harms; without it nominal values')
+    parser.expert(
+        '--bag',
+        metavar='BAG',
+        help='recording on which the loss is measured; default: a standard motion',
+    )
+    parser.expert(
+        '--anyway',
+        action='store_true',
+        help='also write a sensor with the decision harms; without it nominal values',
+    )
     parser.add_recording('motion of --bag; without it: from its readings')
 
 
@@ -23,7 +41,11 @@ def run(options: Options) -> VerbResult:
     """Show the list, or write the file and print the information that is lost."""
     if options.list:
         return VerbResult(0, {'targets': _show_targets()})
-    for name, given in (('CALIBRATION', options.document), ('--to NAME', options.to), ('--output FILE', options.output)):
+    for name, given in (
+        ('CALIBRATION', options.document),
+        ('--to NAME', options.to),
+        ('--output FILE', options.output),
+    ):
         if not given:
             raise InputError(f'an export must have {name}, none was given; give it, or see --list')
     stand = options.stand()
@@ -31,7 +53,13 @@ def run(options: Options) -> VerbResult:
         raise InputError('a table or arm needs the recording --bag BAG, none was given; give both')
     from imu_calibration.use_cases.choices import topics_of
     from imu_calibration.use_cases.exporting import export_calibration
-    found = export_calibration(options.document, stand=stand, topics=topics_of(vars(options)), **options.arguments_for(export_calibration))
+
+    found = export_calibration(
+        options.document,
+        stand=stand,
+        topics=topics_of(vars(options)),
+        **options.arguments_for(export_calibration),
+    )
     for line in (*found.lines, f'written: {options.output}'):
         print_line(line)
     return VerbResult(found.exit_code, {'output': options.output, 'lines': found.lines})
@@ -41,7 +69,21 @@ def _show_targets():
     from imu_calibration.cli.show import show_table
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document.exports.export import all_targets, holds_in_words
-    rows = [(target.name, target.title, holds_in_words(target), target.noise_is or '-', 'yes' if target.read else '-')
-            for target in all_targets().values() if target.write is not None]
-    show_table(Terminal.of(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows)
-    return [dict(zip(('name', 'file', 'holds', 'noise', 'import'), row, strict=True)) for row in rows]
+
+    rows = [
+        (
+            target.name,
+            target.title,
+            holds_in_words(target),
+            target.noise_is or '-',
+            'yes' if target.read else '-',
+        )
+        for target in all_targets().values()
+        if target.write is not None
+    ]
+    show_table(
+        Terminal.of(), ('name', 'file', 'of the calibration it holds', 'noise', 'read'), rows
+    )
+    return [
+        dict(zip(('name', 'file', 'holds', 'noise', 'import'), row, strict=True)) for row in rows
+    ]

@@ -22,7 +22,15 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.report.page import render
 from imu_calibration.use_cases.choices import provenance_with, topics_of
-from imu_calibration.use_cases.recordings import Topics, cluster_mapper, jobs_for, process_mapper, provenance_of, source_of, table_of
+from imu_calibration.use_cases.recordings import (
+    Topics,
+    cluster_mapper,
+    jobs_for,
+    process_mapper,
+    provenance_of,
+    source_of,
+    table_of,
+)
 from msg_adapters.storages import suffixes
 
 
@@ -45,14 +53,26 @@ def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
     """
     folder, output = Path(folder), Path(output).resolve()
     if not folder.is_dir():
-        raise InputError(f'the folder of units {folder} must exist, there is none; correct the path')
-    members = [path for path in sorted(folder.iterdir()) if not path.name.startswith('.') and path.resolve() != output]
-    units = [(path.name if path.is_dir() else path.stem, bags_of(path)) for path in members if path.is_dir() or is_bag(path)]
+        raise InputError(
+            f'the folder of units {folder} must exist, there is none; correct the path'
+        )
+    members = [
+        path
+        for path in sorted(folder.iterdir())
+        if not path.name.startswith('.') and path.resolve() != output
+    ]
+    units = [
+        (path.name if path.is_dir() else path.stem, bags_of(path))
+        for path in members
+        if path.is_dir() or is_bag(path)
+    ]
     units = [(name, bags or [folder / name]) for name, bags in units]
     names = [name for name, _ in units]
     units = [(name if names.count(name) == 1 else bags[0].name, bags) for name, bags in units]
     if not units:
-        raise InputError(f'{folder} must hold one bag or one sub-folder with bags per unit, there is none; give the folder above the bags')
+        raise InputError(
+            f'{folder} must hold one bag or one sub-folder with bags per unit, there is none; give the folder above the bags'
+        )
     return units
 
 
@@ -65,18 +85,40 @@ def is_bag(path: Path) -> bool:
     """Return whether a path has the form of a recording."""
     if not path.is_dir():
         return path.suffix in (*suffixes(), '.bag')
-    return (path / 'metadata.yaml').exists() or any(inner.suffix in suffixes() for inner in path.iterdir())
+    return (path / 'metadata.yaml').exists() or any(
+        inner.suffix in suffixes() for inner in path.iterdir()
+    )
 
 
-def unit_of(name: str, paths: Sequence[Path], topics: Topics, *, joint_names: JointNames, options: dict[str, Any]) -> Unit:
+def unit_of(
+    name: str,
+    paths: Sequence[Path],
+    topics: Topics,
+    *,
+    joint_names: JointNames,
+    options: dict[str, Any],
+) -> Unit:
     """Return the Unit with sources that read the bags without reporting progress."""
     paths = [path.resolve() for path in paths]
     sources = tuple(source_of(path, topics, joint_names, quiet=True) for path in paths)
-    return Unit(name, sources, tuple(path.name for path in paths), partial(provenance_of, paths, options))
+    return Unit(
+        name, sources, tuple(path.name for path in paths), partial(provenance_of, paths, options)
+    )
 
 
-CSV_KEYS = ('parameter', 'unit', 'units_determining', 'mean', 'spread', 'typical_sd', 'spread_over_sd', 'lowest', 'lowest_unit', 'highest',
-            'highest_unit')
+CSV_KEYS = (
+    'parameter',
+    'unit',
+    'units_determining',
+    'mean',
+    'spread',
+    'typical_sd',
+    'spread_over_sd',
+    'lowest',
+    'lowest_unit',
+    'highest',
+    'highest_unit',
+)
 
 
 def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
@@ -85,29 +127,44 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     table = _table(options, [path for _, paths in found for path in paths])
     choices = options.choices()
     used = provenance_with('fleet', (), choices, stand=options.stand())['options']
-    units = [unit_of(name, paths, topics_of(choices), joint_names=table.joint_names, options=used) for name, paths in found]
+    units = [
+        unit_of(name, paths, topics_of(choices), joint_names=table.joint_names, options=used)
+        for name, paths in found
+    ]
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
-        mapper = cluster_mapper(options.scheduler, lambda result: advance(1)) if options.scheduler else \
-            process_mapper(jobs_for(options.jobs, len(units)), lambda result: advance(1))
-        results = mapper(FleetStep(table, settings, None if options.no_report else calibration_report), units)
+        mapper = (
+            cluster_mapper(options.scheduler, lambda result: advance(1))
+            if options.scheduler
+            else process_mapper(jobs_for(options.jobs, len(units)), lambda result: advance(1))
+        )
+        results = mapper(
+            FleetStep(table, settings, None if options.no_report else calibration_report), units
+        )
         spreads = summarise(results)
         for result in results:
             if result.files:
                 files.write_texts(folder / result.name, result.files)
         rows = {'summary.csv': parameter_rows(spreads), 'units.csv': unit_rows(results)}
-        files.write_texts(folder, {name: csv_text(table) for name, table in rows.items()} | {
-            'summary.html': summary_html(results, spreads)})
+        files.write_texts(
+            folder,
+            {name: csv_text(table) for name, table in rows.items()}
+            | {'summary.html': summary_html(results, spreads)},
+        )
         show_fleet(results, spreads, folder, hints=options.hints())
-    return VerbResult(3 if any(result.exit_code for result in results) else 0,
-                      {'units': rows['units.csv'], 'parameters': rows['summary.csv']})
+    return VerbResult(
+        3 if any(result.exit_code for result in results) else 0,
+        {'units': rows['units.csv'], 'parameters': rows['summary.csv']},
+    )
 
 
 def _table(options, bags):
     """Return the chain of joints; a description in recordings is read from the first readable one."""
     stand, topics = options.stand(), topics_of(options.choices())
     if stand is None:
-        raise InputError('a fleet is calibrated on a table or an arm, got none; describe it', key='table')
+        raise InputError(
+            'a fleet is calibrated on a table or an arm, got none; describe it', key='table'
+        )
     for bag in bags[:-1]:
         try:
             return table_of(stand, [bag], topics)
@@ -118,22 +175,65 @@ def _table(options, bags):
 
 def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
     """Return the summary: one row per parameter, SI."""
-    return [dict(zip(CSV_KEYS, (s.name, s.unit, s.count, s.mean, s.spread, s.typical_sd, s.ratio, *s.lowest, *s.highest))) for s in spreads]
+    return [
+        dict(
+            zip(
+                CSV_KEYS,
+                (
+                    s.name,
+                    s.unit,
+                    s.count,
+                    s.mean,
+                    s.spread,
+                    s.typical_sd,
+                    s.ratio,
+                    *s.lowest,
+                    *s.highest,
+                ),
+            )
+        )
+        for s in spreads
+    ]
 
 
 def unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
     """Return one row per unit: decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI; None: unknown."""
-    names = list(dict.fromkeys(name for result in results if result.calibration for name in result.calibration.param_names))
+    names = list(
+        dict.fromkeys(
+            name
+            for result in results
+            if result.calibration
+            for name in result.calibration.param_names
+        )
+    )
     headings = [heading for name in names for heading in (name, f'{name}.sd')]
     rows = []
     for result in results:
         known, dropped = {}, None
         if result.calibration is not None:
-            known = dict(zip(result.calibration.param_names, zip(result.calibration.values, result.calibration.sd)))
+            known = dict(
+                zip(
+                    result.calibration.param_names,
+                    zip(result.calibration.values, result.calibration.sd),
+                )
+            )
             dropped = sum((result.calibration.statistics.get('dropped') or {}).values())
-        row = {'name': result.name, 'decision': result.verdict, **result.verdicts, 'exit_code': result.exit_code, 'error': result.error,
-               'dropped': dropped}
-        rows.append(row | dict(zip(headings, (number for name in names for number in known.get(name, (None, None))))))
+        row = {
+            'name': result.name,
+            'decision': result.verdict,
+            **result.verdicts,
+            'exit_code': result.exit_code,
+            'error': result.error,
+            'dropped': dropped,
+        }
+        rows.append(
+            row
+            | dict(
+                zip(
+                    headings, (number for name in names for number in known.get(name, (None, None)))
+                )
+            )
+        )
     return rows
 
 
@@ -160,29 +260,73 @@ def shown(spread: Spread) -> tuple[str, ...]:
     mean, sd = with_sd(spread.mean * factor, spread.typical_sd * factor)
     if spread.count == 1:
         return spread.name, mean, '', sd, unit, '', spread.lowest[1]
-    return (spread.name, mean, significant(spread.spread * factor), sd, unit, significant(spread.ratio),
-            f'{spread.lowest[1]} .. {spread.highest[1]}')
+    return (
+        spread.name,
+        mean,
+        significant(spread.spread * factor),
+        sd,
+        unit,
+        significant(spread.ratio),
+        f'{spread.lowest[1]} .. {spread.highest[1]}',
+    )
 
 
-SPREAD_HEADINGS = ('parameter', 'mean', 'spread', 'typical sd', 'unit', 'spread / sd', 'lowest .. highest unit')
+SPREAD_HEADINGS = (
+    'parameter',
+    'mean',
+    'spread',
+    'typical sd',
+    'unit',
+    'spread / sd',
+    'lowest .. highest unit',
+)
 
 
-def show_fleet(results: Sequence[UnitResult], spreads: Sequence[Spread], folder: Path, *, hints: dict[str, str]) -> None:
+def show_fleet(
+    results: Sequence[UnitResult], spreads: Sequence[Spread], folder: Path, *, hints: dict[str, str]
+) -> None:
     """Print the spread of each parameter, the units, and where the files are."""
     out = Terminal.of()
-    show_table(out, SPREAD_HEADINGS, map(shown, spreads), numbers=[SPREAD_HEADINGS[k] for k in (1, 2, 3, 5)])
+    show_table(
+        out,
+        SPREAD_HEADINGS,
+        map(shown, spreads),
+        numbers=[SPREAD_HEADINGS[k] for k in (1, 2, 3, 5)],
+    )
     for result in results:
-        out.print(f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}')
+        out.print(
+            f'{result.name}: {with_hint(result.error, result.key, hints) or result.verdict_text}'
+        )
         if result.calibration is not None:
-            warn({'text': f'{result.name}: {found["text"]}'} for found in result.calibration.statistics['preflight'])
+            warn(
+                {'text': f'{result.name}: {found["text"]}'}
+                for found in result.calibration.statistics['preflight']
+            )
     calibrated = sum(result.calibration is not None for result in results)
-    out.print(f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}')
+    out.print(
+        f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}'
+    )
 
 
 def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> str:
     """Return the summary as one page."""
     verdicts = [result.verdict for result in results]
-    word = HELPS if set(verdicts) == {HELPS} else UNPROVEN if set(verdicts) <= {HELPS, UNPROVEN} else HARMS
-    headline = f'The calibration helps both sensors of {verdicts.count(HELPS)} of {len(results)} units'
-    return render('fleet.html', title='Calibration of a fleet', headline=headline, word=word, results=results, columns=SPREAD_HEADINGS,
-                  rows=[shown(spread) for spread in spreads])
+    word = (
+        HELPS
+        if set(verdicts) == {HELPS}
+        else UNPROVEN
+        if set(verdicts) <= {HELPS, UNPROVEN}
+        else HARMS
+    )
+    headline = (
+        f'The calibration helps both sensors of {verdicts.count(HELPS)} of {len(results)} units'
+    )
+    return render(
+        'fleet.html',
+        title='Calibration of a fleet',
+        headline=headline,
+        word=word,
+        results=results,
+        columns=SPREAD_HEADINGS,
+        rows=[shown(spread) for spread in spreads],
+    )

@@ -2,25 +2,42 @@
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 
-EXAMPLES = ('imu.yaml --from kalibr --output calibration.yaml', 'params.txt --from px4 --output calibration.yaml')
+EXAMPLES = (
+    'imu.yaml --from kalibr --output calibration.yaml',
+    'params.txt --from px4 --output calibration.yaml',
+)
 
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('file', metavar='FILE', help='file of the other program')
-    parser.common('--from', dest='source', metavar='NAME', required=True, help="the program, as 'export --list' shows it")
+    parser.common(
+        '--from',
+        dest='source',
+        metavar='NAME',
+        required=True,
+        help="the program, as 'export --list' shows it",
+    )
     parser.common('--output', metavar='FILE', required=True, help='calibration.yaml to write')
-    parser.common('--frame-id', metavar='FRAME', default='', help='frame_id of the Imu messages, where it shall be checked')
+    parser.common(
+        '--frame-id',
+        metavar='FRAME',
+        default='',
+        help='frame_id of the Imu messages, where it shall be checked',
+    )
 
 
 def run(options: Options) -> VerbResult:
     """Read, write, and list the parameters that the file lacks."""
     from imu_calibration.estimation.solution import HELD
     from imu_calibration.use_cases.exporting import import_calibration
+
     found = import_calibration(options.file, **options.arguments_for(import_calibration))
     held = [name for name, status in found.requested.items() if status == HELD]
     for sensor, word in found.decisions.items():
-        print_line(': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])]))
+        print_line(
+            ': '.join([f'{sensor} {word}', *filter(None, [found.decision_reasons.get(sensor)])])
+        )
     for line in found.notes:
         print_line(line)
     if held:

@@ -12,7 +12,9 @@ TOPICS = (('imu_topic', 'imu'), ('joint_topic', 'joints'), ('temperature_topic',
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=BAG)
-    parser.add_recording('with it, axes and units are compared with the joints and the motions are listed')
+    parser.add_recording(
+        'with it, axes and units are compared with the joints and the motions are listed'
+    )
     parser.add_model(searched=False)
 
 
@@ -24,9 +26,19 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.choices import calibration_options, topics_of
     from imu_calibration.use_cases.inspect import imu_topics_of, inspect
     from imu_calibration.use_cases.recordings import Topics, existing, table_of
-    bag, choices, stand, hints = existing(options.bag), options.choices(), options.stand(), options.hints()
+
+    bag, choices, stand, hints = (
+        existing(options.bag),
+        options.choices(),
+        options.stand(),
+        options.hints(),
+    )
     topics = imu_topics_of(bag, topics_of(choices))
-    table = None if stand is None else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
+    table = (
+        None
+        if stand is None
+        else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
+    )
     looks = inspect(bag, topics, table, options=calibration_options(choices))
     out = Terminal.of()
     _show_topics(out, looks)
@@ -36,39 +48,65 @@ def run(options: Options) -> VerbResult:
         out.print()
         if len(looks) > 1:
             frame = look.recording.frame_id
-            out.print(look.recording.imu_topic + ('' if frame is None else f' ({frame})'), style='bold')
+            out.print(
+                look.recording.imu_topic + ('' if frame is None else f' ({frame})'), style='bold'
+            )
         show_findings(out, look.findings, hints)
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
         codes.append(max(look.exit_code, _judge(out, look, hints)))
         if look.by_hand is not None:
             _show_by_hand(out, look.by_hand, hints)
-    if set(codes) == {1}:   # no topic is usable: also one line on standard error, as every refusal
+    if set(codes) == {1}:  # no topic is usable: also one line on standard error, as every refusal
         refuse(looks[0].findings)
-    return VerbResult(3 if any(codes) else 0, {'topics': [asdict(topic) for topic in looks[0].recording.topics],
-                                            'imu': [_document(look) for look in looks]})
+    return VerbResult(
+        3 if any(codes) else 0,
+        {
+            'topics': [asdict(topic) for topic in looks[0].recording.topics],
+            'imu': [_document(look) for look in looks],
+        },
+    )
 
 
 def _document(look):
     """Return the findings, streams and parameter statuses of one Imu topic as data."""
     found = look.calibrated if look.by_hand is None else look.by_hand
-    document = {'topic': look.recording.imu_topic, 'frame_id': look.recording.frame_id,
-                'findings': [finding.to_mapping() for finding in look.findings], 'lost': look.lost,
-                'streams': {name: {'count': s.count, 'rate': s.rate, 'duration': s.duration, 'gaps': s.n_gaps, 'dropped': s.dropped}
-                            for name, s in look.streams.items()}}
+    document = {
+        'topic': look.recording.imu_topic,
+        'frame_id': look.recording.frame_id,
+        'findings': [finding.to_mapping() for finding in look.findings],
+        'lost': look.lost,
+        'streams': {
+            name: {
+                'count': s.count,
+                'rate': s.rate,
+                'duration': s.duration,
+                'gaps': s.n_gaps,
+                'dropped': s.dropped,
+            }
+            for name, s in look.streams.items()
+        },
+    }
     if isinstance(found, ImuCalibrationError):
         return document | {'not_usable': str(found)}
     if found is None:
         return document
-    return document | {'status': dict(zip(found.calibration.param_names, found.calibration.status, strict=True)),
-                       'needs': list(found.calibration.undetermined)}
+    return document | {
+        'status': dict(zip(found.calibration.param_names, found.calibration.status, strict=True)),
+        'needs': list(found.calibration.undetermined),
+    }
 
 
 def _show_topics(out, looks):
     """Print the topics; for the topics that are read also rate, gaps and step of the stamps."""
     from imu_calibration.cli.show import show_table
-    used = {getattr(look.recording, attribute): look.streams.get(name) for look in looks for attribute, name in TOPICS
-            if getattr(look.recording, attribute)}
+
+    used = {
+        getattr(look.recording, attribute): look.streams.get(name)
+        for look in looks
+        for attribute, name in TOPICS
+        if getattr(look.recording, attribute)
+    }
     numbers = ('messages', 'Hz', 'seconds', 'gaps', 'stamp step')
     rows = []
     for topic in sorted(looks[0].recording.topics, key=lambda topic: topic.name not in used):
@@ -77,14 +115,25 @@ def _show_topics(out, looks):
             rows.append((topic.name, topic.type, str(topic.count), *[''] * 5))
         else:
             gaps = f'{found.n_gaps} ({found.gap_total:.2f} s)' if found.n_gaps else 'none'
-            rows.append((topic.name, topic.type, str(topic.count), f'{found.rate:.2f}', f'{found.duration:.1f}', gaps,
-                         _step(found.stamp_step_ns), 'read'))
+            rows.append(
+                (
+                    topic.name,
+                    topic.type,
+                    str(topic.count),
+                    f'{found.rate:.2f}',
+                    f'{found.duration:.1f}',
+                    gaps,
+                    _step(found.stamp_step_ns),
+                    'read',
+                )
+            )
     show_table(out, ('topic', 'type', *numbers, ''), rows, numbers=numbers, dimmed=True)
 
 
 def _show_unread(out, recording, hints):
     """Print the topics that are not read because several fit."""
     from msg_adapters.bag import TOPIC_KEYS
+
     for message_type, key in TOPIC_KEYS.items():
         names = [topic.name for topic in recording.topics if topic.type == message_type]
         if names and getattr(recording, key) is None:
@@ -103,6 +152,7 @@ def _step(step_ns):
 def _judge(out, look, hints):
     """Print which motions were found and which parameters they determine; return the exit code."""
     from imu_calibration.calibration.result import exit_code
+
     result = look.calibrated
     if result is None or look.refused:
         return 0
@@ -111,7 +161,9 @@ def _judge(out, look, hints):
         return 3
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
-        out.print(f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]} samples')
+        out.print(
+            f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]} samples'
+        )
     _show_parameters(out, result.calibration)
     return exit_code(result.calibration)
 
@@ -122,7 +174,9 @@ def _show_by_hand(out, found, hints):
         out.print(f'not usable for calibration without a table: {found.with_hint(hints)}')
         return
     windows = found.calibration.statistics['windows']
-    out.print(f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:')
+    out.print(
+        f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:'
+    )
     _show_parameters(out, found.calibration)
 
 

@@ -11,7 +11,10 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from typing import Any, TextIO
 
-SHARE_BAR, RUNNING_BAR = '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}', '{desc} |{bar:40}| {elapsed}'
+SHARE_BAR, RUNNING_BAR = (
+    '{desc} {percentage:3.0f}% |{bar:40}| {elapsed}',
+    '{desc} |{bar:40}| {elapsed}',
+)
 """Lines of progress with a known and an unknown total."""
 SWEEP, SWEEP_STEP_SECONDS = 10, 0.2
 """Steps and seconds per step of the bar of an unknown total."""
@@ -54,7 +57,14 @@ class ProgressBars:
             return
         if self._bar is None:
             from tqdm import tqdm
-            self._bar = tqdm(total=SWEEP, bar_format=RUNNING_BAR, leave=False, dynamic_ncols=True, file=self._streams[1])
+
+            self._bar = tqdm(
+                total=SWEEP,
+                bar_format=RUNNING_BAR,
+                leave=False,
+                dynamic_ncols=True,
+                file=self._streams[1],
+            )
             self._refresher = threading.Thread(target=self._refresh, name='progress', daemon=True)
             self._refresher.start()
         self._bar.total, self._bar.bar_format = total or SWEEP, SHARE_BAR if total else RUNNING_BAR
@@ -103,6 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         from imu_calibration.cli.parser import make_parser
+
         options = make_parser(*arguments[:1]).parse_args(arguments)
     except KeyboardInterrupt:
         return _interrupted('imu_calibration')
@@ -114,22 +125,31 @@ def run(options: Namespace) -> int:
     from imu_calibration.cli.parser import complain
     from imu_calibration.core.errors import ImuCalibrationError, printable
     from imu_calibration.core.progress import listening
+
     prog = f'imu_calibration {options.verb}'
     try:
         with contextlib.ExitStack() as stack:
             if options.json or options.quiet:
                 stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
             if not options.quiet:
-                stack.enter_context(listening(stack.enter_context(ProgressBars(verbose=options.verbose))))
+                stack.enter_context(
+                    listening(stack.enter_context(ProgressBars(verbose=options.verbose)))
+                )
             code, document = options.run(options)
     except BrokenPipeError:
-        sys.stdout = None   # a later flush would fail again
+        sys.stdout = None  # a later flush would fail again
         return 1
     except (ImuCalibrationError, OSError, MemoryError, RecursionError) as error:
         if isinstance(error, ImuCalibrationError):
             text, key, name = error.with_hint(options.hints()), error.key, error.code
         else:
-            text, key, name = printable(f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'), None, ''
+            text, key, name = (
+                printable(
+                    f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'
+                ),
+                None,
+                '',
+            )
         complain(f'{prog}: {text}')
         code, document = 1, {'error': text, 'key': key, 'code': name}
     except KeyboardInterrupt:
@@ -150,5 +170,9 @@ CLI_FORMAT = 'imu_calibration/cli/1'
 def json_text(verb: str, exit_code: int, document: Mapping[str, Any]) -> str:
     """Return one JSON document: format, verb, exit code, and the result or the error; numbers that are not finite become null."""
     from imu_calibration.core.documents import json_types
+
     part = 'error' if 'error' in document else 'result'
-    return json.dumps({'format': CLI_FORMAT, 'verb': verb, 'exit_code': exit_code, part: json_types(document)}, allow_nan=False)
+    return json.dumps(
+        {'format': CLI_FORMAT, 'verb': verb, 'exit_code': exit_code, part: json_types(document)},
+        allow_nan=False,
+    )

@@ -9,13 +9,33 @@ EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('bag', metavar='BAG', help='a recording that holds rest, an hour if possible; motion is found and left out')
-    parser.common('--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html')
-    parser.common('--rate', metavar='HZ', type=float, action='append', default=[],
-                  help='also print the discrete figures for this sampling rate; may be repeated')
-    parser.expert('--horizon', metavar='S', type=float,
-                  help='averaging time at which a random walk replaces other slow noise, default 100 s')
-    parser.expert('--nominal', metavar='FILE', help='YAML with offsets and scales for recordings in volts or counts')
+    parser.add_argument(
+        'bag',
+        metavar='BAG',
+        help='a recording that holds rest, an hour if possible; motion is found and left out',
+    )
+    parser.common(
+        '--output', metavar='DIR', required=True, help='folder for noise.yaml and report.html'
+    )
+    parser.common(
+        '--rate',
+        metavar='HZ',
+        type=float,
+        action='append',
+        default=[],
+        help='also print the discrete figures for this sampling rate; may be repeated',
+    )
+    parser.expert(
+        '--horizon',
+        metavar='S',
+        type=float,
+        help='averaging time at which a random walk replaces other slow noise, default 100 s',
+    )
+    parser.expert(
+        '--nominal',
+        metavar='FILE',
+        help='YAML with offsets and scales for recordings in volts or counts',
+    )
     parser.common('--no-report', action='store_true', help='write noise.yaml only')
     parser.add_topics(joints=False)
 
@@ -25,23 +45,44 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.allan.document import to_mapping
     from imu_calibration.document import files
     from imu_calibration.use_cases.noise import noise
+
     with files.output_folder(options.output) as folder:
-        found = noise(options.bag, **{name: value for name, value in options.arguments_for(noise).items() if value is not None})
+        found = noise(
+            options.bag,
+            **{
+                name: value
+                for name, value in options.arguments_for(noise).items()
+                if value is not None
+            },
+        )
         for warning in found.warnings:
             complain(f'warning: {warning}')
         found.save(folder, report=not options.no_report)
-        _show(found, [found.figures.rate, *options.rate], folder, 'noise.yaml' + ('' if options.no_report else ' and report.html'))
+        _show(
+            found,
+            [found.figures.rate, *options.rate],
+            folder,
+            'noise.yaml' + ('' if options.no_report else ' and report.html'),
+        )
         return VerbResult(found.exit_code, to_mapping(found.figures, found.horizon))
 
 
 def _show(found, rates, folder, names):
     """Print the figures, their remarks, and the figures for filters."""
     from imu_calibration.allan import document
-    for head, rows in groupby(document.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'):
+
+    for head, rows in groupby(
+        document.rows(found.figures), lambda row: f'{row.sensor}, {row.title}, {row.unit}'
+    ):
         print(head)
         for row in rows:
-            print(f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'.rstrip())
+            print(
+                f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'.rstrip()
+            )
     print()
-    for line in [*document.lines(found.figures), *document.filter_lines(found.figures, rates, found.horizon)]:
+    for line in [
+        *document.lines(found.figures),
+        *document.filter_lines(found.figures, rates, found.horizon),
+    ]:
         print_line(line, '    ')
     print_line(f'written: {names} in {folder}')

@@ -39,8 +39,10 @@ VERBS = {
 }
 """Name -> one line of help; each is a module of this package with EXAMPLES, `add_arguments` and `run`."""
 
-EXIT_CODES = ('Exit codes: 0 done; 1 refused, nothing written; 3 written, but a parameter is not determined, a sensor is unproven or '
-              'harmful, or part of the input was unusable; 130 interrupted.')
+EXIT_CODES = (
+    'Exit codes: 0 done; 1 refused, nothing written; 3 written, but a parameter is not determined, a sensor is unproven or '
+    'harmful, or part of the input was unusable; 130 interrupted.'
+)
 
 
 class VerbResult(NamedTuple):
@@ -70,7 +72,9 @@ class OneLineParser(argparse.ArgumentParser):
         if extra:
             known = getattr(options, 'verb_options', ())
             self.prog += f' {options.verb}'
-            self.error(f'unrecognized arguments: {" ".join(extra)}{did_you_mean(extra[0].partition("=")[0], known)}')
+            self.error(
+                f'unrecognized arguments: {" ".join(extra)}{did_you_mean(extra[0].partition("=")[0], known)}'
+            )
         return options
 
     def error(self, message: str) -> NoReturn:
@@ -80,20 +84,51 @@ class OneLineParser(argparse.ArgumentParser):
 
     def add_topics(self, *, joints: bool = True) -> None:
         """Add the options that choose topics."""
-        self.common('--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic')
-        self.expert('--frame-id', metavar='FRAME', help='frame_id of the Imu messages; for a topic with several')
+        self.common(
+            '--imu-topic', metavar='TOPIC', help='default /imu/data_raw, else the only Imu topic'
+        )
+        self.expert(
+            '--frame-id',
+            metavar='FRAME',
+            help='frame_id of the Imu messages; for a topic with several',
+        )
         if joints:
-            self.common('--joint-topic', metavar='TOPIC', help='default /joint_states, else the only JointState topic')
-        self.expert('--temperature-topic', metavar='TOPIC', help='default /imu/temperature, else the only one')
+            self.common(
+                '--joint-topic',
+                metavar='TOPIC',
+                help='default /joint_states, else the only JointState topic',
+            )
+        self.expert(
+            '--temperature-topic',
+            metavar='TOPIC',
+            help='default /imu/temperature, else the only one',
+        )
 
     def add_stand(self, without: str) -> None:
         """Add the options of the table or arm that moves the IMU; `without` describes the case without them."""
         self.common('--table', metavar='TABLE', help=f'description of the table (YAML); {without}')
-        self.common('--urdf', metavar='FILE', help='robot description in place of a table; --table adds up, gravity, mount, limits')
-        self.common('--imu-link', metavar='LINK',
-                    help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag')
-        self.expert('--allow-xacro', action='store_true', help='expand a .xacro file; it is a program: only from authors you trust')
-        self.expert('--up', type=float, nargs=3, metavar=('X', 'Y', 'Z'), help='up in the root frame; default TABLE, /tf_static or z')
+        self.common(
+            '--urdf',
+            metavar='FILE',
+            help='robot description in place of a table; --table adds up, gravity, mount, limits',
+        )
+        self.common(
+            '--imu-link',
+            metavar='LINK',
+            help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag',
+        )
+        self.expert(
+            '--allow-xacro',
+            action='store_true',
+            help='expand a .xacro file; it is a program: only from authors you trust',
+        )
+        self.expert(
+            '--up',
+            type=float,
+            nargs=3,
+            metavar=('X', 'Y', 'Z'),
+            help='up in the root frame; default TABLE, /tf_static or z',
+        )
 
     def add_recording(self, without: str) -> None:
         """Add the options of the table or arm and of the topics of a recording; `without` as for `add_stand`."""
@@ -102,33 +137,74 @@ class OneLineParser(argparse.ArgumentParser):
 
     def add_session(self, *, searched: bool = True) -> None:
         """Add the options of a calibration: local gravity, recording, labels of the result, and model (`add_model`)."""
-        self.common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
-        self.common('--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)')
-        self.common('--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m')
+        self.common(
+            '--gravity',
+            type=float,
+            help='local gravity, m/s^2, by hand or with --urdf; default 9.80665',
+        )
+        self.common(
+            '--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)'
+        )
+        self.common(
+            '--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m'
+        )
         self.add_recording('without it: by hand, gravity is the reference')
-        self.common('--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml')
+        self.common(
+            '--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml'
+        )
         self.common('--operator', metavar='TEXT', help='name of the operator, likewise')
-        self.common('--force', action='store_true', help='overwrite the result of another verb or other inputs')
+        self.common(
+            '--force',
+            action='store_true',
+            help='overwrite the result of another verb or other inputs',
+        )
         self.add_model(searched=searched)
 
     def add_model(self, *, searched: bool = True) -> None:
         """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
-        self.expert('--accelerometer-model', metavar='MODEL',
-                    help='effects joined by +; default bias+matrix, and accel_size_effect if observable')
+        self.expert(
+            '--accelerometer-model',
+            metavar='MODEL',
+            help='effects joined by +; default bias+matrix, and accel_size_effect if observable',
+        )
         self.expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
-        self.expert('--reference-model', metavar='MODEL', help="effects of table and clock, or 'none'; default table_tilt")
+        self.expert(
+            '--reference-model',
+            metavar='MODEL',
+            help="effects of table and clock, or 'none'; default table_tilt",
+        )
         self.add_effects(self.expert)
-        self.expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
-        self.expert('--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts')
-        self.expert('--noise', metavar='FILE', help='noise.yaml of this IMU: model of its biases (table only)')
-        self.expert('--setting', metavar='NAME=VALUE', action='append', default=[],
-                    help='of the window detection; an unknown name lists all')
+        self.expert(
+            '--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect'
+        )
+        self.expert(
+            '--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts'
+        )
+        self.expert(
+            '--noise',
+            metavar='FILE',
+            help='noise.yaml of this IMU: model of its biases (table only)',
+        )
+        self.expert(
+            '--setting',
+            metavar='NAME=VALUE',
+            action='append',
+            default=[],
+            help='of the window detection; an unknown name lists all',
+        )
         if searched:
-            self.expert('--model-as-asked', action='store_true', help='add no effect to the requested model')
+            self.expert(
+                '--model-as-asked', action='store_true', help='add no effect to the requested model'
+            )
 
     def add_effects(self, add: Callable[..., Any]) -> None:
         """Add the option of effects in addition to the catalogue, by `common` or `expert`."""
-        add('--effects', dest='catalogue', metavar='FILE', help='YAML or calibration.yaml with additional effects')
+        add(
+            '--effects',
+            dest='catalogue',
+            metavar='FILE',
+            help='YAML or calibration.yaml with additional effects',
+        )
 
 
 class Options(argparse.Namespace):
@@ -139,12 +215,17 @@ class Options(argparse.Namespace):
         if self.urdf is None and self.imu_link is None:
             return self.table
         from imu_calibration.use_cases.recordings import Arm
+
         return Arm(self.urdf, self.imu_link, self.table, self.up, self.allow_xacro)
 
     def choices(self) -> Choices:
         """Return the choices for a use case."""
         from imu_calibration.use_cases.choices import Choices
-        return cast(Choices, {name: value for name, value in vars(self).items() if name in Choices.__annotations__})
+
+        return cast(
+            Choices,
+            {name: value for name, value in vars(self).items() if name in Choices.__annotations__},
+        )
 
     def hints(self) -> dict[str, str]:
         """Return {key of an error: option}, of the options that this verb has."""
@@ -154,11 +235,18 @@ class Options(argparse.Namespace):
         """Refuse an output folder with the result of another verb or of other inputs, except with --force."""
         if not self.force and (Path(self.output) / 'calibration.yaml').exists():
             from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
-            require_same_inputs(self.output, provenance_with(self.verb, bags, self.choices(), stand=self.stand()))
+
+            require_same_inputs(
+                self.output, provenance_with(self.verb, bags, self.choices(), stand=self.stand())
+            )
 
     def arguments_for(self, function: Callable) -> dict[str, Any]:
         """Return the options whose names are parameters of a function."""
-        return {name: value for name, value in vars(self).items() if name in signature(function).parameters}
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if name in signature(function).parameters
+        }
 
 
 def complain(text: str) -> None:
@@ -178,37 +266,65 @@ def folded(text: str, indent: str = '', last: str = '') -> str:
 
 def make_parser(verb: str | None = None) -> OneLineParser:
     """Return the parser of the plain command; `verb` as for `add_verbs`."""
-    parser = OneLineParser(prog='imu_calibration', epilog=EXIT_CODES,
-                           description='Calibrate, compensate and diagnose inertial measurement units from recordings.')
-    parser.add_argument('--version', action='version', version=f'imu_calibration {imu_calibration.__version__}')
+    parser = OneLineParser(
+        prog='imu_calibration',
+        epilog=EXIT_CODES,
+        description='Calibrate, compensate and diagnose inertial measurement units from recordings.',
+    )
+    parser.add_argument(
+        '--version', action='version', version=f'imu_calibration {imu_calibration.__version__}'
+    )
     add_verbs(parser, verb)
     return parser
 
 
-def add_verbs(parser: argparse.ArgumentParser, verb: str | None = None, *, required: bool = True) -> None:
+def add_verbs(
+    parser: argparse.ArgumentParser, verb: str | None = None, *, required: bool = True
+) -> None:
     """Add the verbs to a parser; only the module of `verb` is imported and declares its arguments; an unknown verb is refused."""
     if verb is not None and not verb.startswith('-') and verb not in VERBS:
-        complain(f"{parser.prog}: the verb must be one of {', '.join(VERBS)}, got '{verb}'{did_you_mean(verb, VERBS)}; "
-                 f"see '{parser.prog} --help'")
+        complain(
+            f"{parser.prog}: the verb must be one of {', '.join(VERBS)}, got '{verb}'{did_you_mean(verb, VERBS)}; "
+            f"see '{parser.prog} --help'"
+        )
         raise SystemExit(1)
-    verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=required, parser_class=OneLineParser)
+    verbs = parser.add_subparsers(
+        dest='verb', metavar='VERB', required=required, parser_class=OneLineParser
+    )
     for name, text in VERBS.items():
-        added = verbs.add_parser(name, help=text, description=folded(text), formatter_class=argparse.RawDescriptionHelpFormatter)
+        added = verbs.add_parser(
+            name,
+            help=text,
+            description=folded(text),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
         if name != verb:
             continue
         module = import_module(f'imu_calibration.cli.{name}')
         module.add_arguments(added)
         added.common('--json', action='store_true', help='print the result as one JSON document')
         added.common('--quiet', action='store_true', help='print errors and warnings only')
-        added.common('--verbose', action='store_true', help='print each phase with its time on standard error')
+        added.common(
+            '--verbose',
+            action='store_true',
+            help='print each phase with its time on standard error',
+        )
         added.set_defaults(run=module.run, verb_options=sorted(added._option_string_actions))
         words = [action for action in added._actions if action.required]
         added.usage = ' '.join(['%(prog)s', *map(_usage, words), '[options]'])
         examples = (f'  imu_calibration {name} {example}'.rstrip() for example in module.EXAMPLES)
-        added.epilog = '\n'.join(['examples:', *(folded(example, 6 * ' ', ' \\') for example in examples)])
+        added.epilog = '\n'.join(
+            ['examples:', *(folded(example, 6 * ' ', ' \\') for example in examples)]
+        )
 
 
 def _usage(action):
     """Return a required argument as the usage line shows it."""
     name = action.metavar or action.dest.upper()
-    return f'{action.option_strings[0]} {name}' if action.option_strings else f'{name} [{name} ...]' if action.nargs == '+' else name
+    return (
+        f'{action.option_strings[0]} {name}'
+        if action.option_strings
+        else f'{name} [{name} ...]'
+        if action.nargs == '+'
+        else name
+    )

@@ -12,26 +12,81 @@ MAX_PRINTED_MOTIONS = 12
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.common('--output', metavar='DIR', required=True, help='folder for plan.yaml, the trajectory and report.html')
+    parser.common(
+        '--output',
+        metavar='DIR',
+        required=True,
+        help='folder for plan.yaml, the trajectory and report.html',
+    )
     parser.add_stand('with limits')
-    parser.common('--by-hand', action='store_true', help='without a table: poses and turns in text and pictures')
-    parser.common('--calibration', '--known', metavar='FILE', help='known already: calibration.yaml or .accumulator.npz')
-    parser.common('--around', metavar='NAME=DEG,...', default='', help='pose that the motion keeps near, every joint (sliding: m)')
-    parser.common('--reach', metavar='DEG', type=float, help='largest angle from that pose; sliding joints do not move')
-    parser.expert('--motion', choices=('any', 'yaw-only'), default='any', help='yaw-only: turns by known angles about the vertical')
-    parser.expert('--separate', metavar='A,B', default='', help='separate these effects; the first is in --calibration')
-    parser.expert('--diagnosis', metavar='FILE', help='diagnosis.json: separate the effects that it names together')
-    parser.expert('--grade', choices=sorted(GRADES), default='industrial', metavar='GRADE', help=f'of the IMU: {", ".join(sorted(GRADES))}')
+    parser.common(
+        '--by-hand',
+        action='store_true',
+        help='without a table: poses and turns in text and pictures',
+    )
+    parser.common(
+        '--calibration',
+        '--known',
+        metavar='FILE',
+        help='known already: calibration.yaml or .accumulator.npz',
+    )
+    parser.common(
+        '--around',
+        metavar='NAME=DEG,...',
+        default='',
+        help='pose that the motion keeps near, every joint (sliding: m)',
+    )
+    parser.common(
+        '--reach',
+        metavar='DEG',
+        type=float,
+        help='largest angle from that pose; sliding joints do not move',
+    )
+    parser.expert(
+        '--motion',
+        choices=('any', 'yaw-only'),
+        default='any',
+        help='yaw-only: turns by known angles about the vertical',
+    )
+    parser.expert(
+        '--separate',
+        metavar='A,B',
+        default='',
+        help='separate these effects; the first is in --calibration',
+    )
+    parser.expert(
+        '--diagnosis',
+        metavar='FILE',
+        help='diagnosis.json: separate the effects that it names together',
+    )
+    parser.expert(
+        '--grade',
+        choices=sorted(GRADES),
+        default='industrial',
+        metavar='GRADE',
+        help=f'of the IMU: {", ".join(sorted(GRADES))}',
+    )
     parser.expert('--noise', metavar='FILE', help='noise.yaml of this IMU in place of a grade')
-    parser.expert('--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect')
+    parser.expert(
+        '--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect'
+    )
     parser.expert('--imu-rate', type=float, default=100.0, metavar='HZ', help='default 100')
     parser.expert('--gravity', type=float, help='local gravity for a robot description, m/s^2')
     parser.expert('--accelerometer-model', metavar='MODEL', help='default size_effect')
     parser.expert('--gyroscope-model', metavar='MODEL', help='default bias+matrix')
     parser.expert('--reference-model', metavar='MODEL', help='default table_tilt')
     parser.add_effects(parser.expert)
-    parser.expert('--storage', choices=identifiers(), default='sqlite3', help='of the trajectory, default sqlite3')
-    parser.expert('--no-bound', action='store_true', help='no lower bound on the time (saves most of the run time)')
+    parser.expert(
+        '--storage',
+        choices=identifiers(),
+        default='sqlite3',
+        help='of the trajectory, default sqlite3',
+    )
+    parser.expert(
+        '--no-bound',
+        action='store_true',
+        help='no lower bound on the time (saves most of the run time)',
+    )
     parser.expert('--no-report', action='store_true', help='no report.html')
 
 
@@ -40,14 +95,24 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
     from imu_calibration.use_cases.plan import by_hand, plan
+
     stand = None if options.by_hand and options.motion == 'any' else _stand(options)
     with files.output_folder(options.output) as folder:
         if stand is None:
             made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **options.choices())
         else:
-            made = plan(stand, calibration=options.calibration, grade=options.grade, imu_rate=options.imu_rate,
-                        with_bound=not options.no_bound, separate=[name for name in options.separate.split(',') if name],
-                        diagnosis=options.diagnosis, around=_pose(options.around), reach=options.reach, **options.choices())
+            made = plan(
+                stand,
+                calibration=options.calibration,
+                grade=options.grade,
+                imu_rate=options.imu_rate,
+                with_bound=not options.no_bound,
+                separate=[name for name in options.separate.split(',') if name],
+                diagnosis=options.diagnosis,
+                around=_pose(options.around),
+                reach=options.reach,
+                **options.choices(),
+            )
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made, folder)
     return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance))
@@ -56,23 +121,32 @@ def run(options: Options) -> VerbResult:
 def _pose(text):
     """Return joint -> number of 'NAME=NUMBER,...'."""
     try:
-        return {name.strip(): float(value) for name, value in (part.split('=') for part in text.split(',') if part)}
+        return {
+            name.strip(): float(value)
+            for name, value in (part.split('=') for part in text.split(',') if part)
+        }
     except ValueError:
-        raise InputError(f"a pose must be NAME=DEG,..., got '{text}'; name every joint once") from None
+        raise InputError(
+            f"a pose must be NAME=DEG,..., got '{text}'; name every joint once"
+        ) from None
 
 
 def _stand(options):
     from imu_calibration.planning.motion_library import yaw_table
+
     if options.motion == 'yaw-only':
         return yaw_table(options.gravity)
     stand = options.stand()
     if stand is None:
-        raise InputError('a table or a robot description is required, none was given; give one', key='table')
+        raise InputError(
+            'a table or a robot description is required, none was given; give one', key='table'
+        )
     return stand
 
 
 def _show(planned, folder):
     from imu_calibration.use_cases.plan import summary
+
     made, most = planned.plan, None if planned.table is None else MAX_PRINTED_MOTIONS
     for end, motion in list(zip(made.ends, made.motions, strict=True))[:most]:
         print_line(f'until {end:6.1f} s  {motion.words}', ' ' * 16)
@@ -80,4 +154,6 @@ def _show(planned, folder):
         print(f'... and {len(made.motions) - most} more, in plan.yaml')
     for line in [*summary(made), *planned.notes]:
         print_line(line, '    ')
-    print_line(f'written: plan.yaml{"" if planned.table is None else " and the trajectory"} in {folder}')
+    print_line(
+        f'written: plan.yaml{"" if planned.table is None else " and the trajectory"} in {folder}'
+    )

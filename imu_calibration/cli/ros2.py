@@ -14,12 +14,20 @@ from imu_calibration.cli.parser import EXIT_CODES, OneLineParser, Options, add_v
 class ImuCommand(CommandExtension):
     """Calibrate, compensate and diagnose inertial measurement units."""
 
-    def add_arguments(self, parser: ArgumentParser, cli_name: str, *, argv: Sequence[str] | None = None) -> None:
+    def add_arguments(
+        self, parser: ArgumentParser, cli_name: str, *, argv: Sequence[str] | None = None
+    ) -> None:
         """Add the verbs; of the one that is called, only its module is imported."""
         self._parser, parser.epilog = parser, EXIT_CODES
-        setattr(parser, 'error', MethodType(OneLineParser.error, parser))   # one line, and the exit code of the plain command
+        setattr(
+            parser, 'error', MethodType(OneLineParser.error, parser)
+        )  # one line, and the exit code of the plain command
         words = list(sys.argv[1:] if argv is None else argv)
-        after = words[words.index(cli_name.split()[-1]) + 1:][:1] if cli_name.split()[-1] in words else []
+        after = (
+            words[words.index(cli_name.split()[-1]) + 1 :][:1]
+            if cli_name.split()[-1] in words
+            else []
+        )
         add_verbs(parser, *after, required=False)
 
     def main(self, *, args: Namespace, **_: ArgumentParser) -> int:

@@ -38,7 +38,9 @@ class Terminal:
         stream = stream or sys.stdout
         moves = stream.isatty()
         coloured = moves and not os.environ.get('NO_COLOR') and os.environ.get('TERM') != 'dumb'
-        return cls(stream, shutil.get_terminal_size().columns if moves else UNLIMITED, moves, coloured)
+        return cls(
+            stream, shutil.get_terminal_size().columns if moves else UNLIMITED, moves, coloured
+        )
 
     def styled(self, text: str, style: str) -> str:
         """Return the text in a style of `CODES`; '' is plain."""
@@ -46,7 +48,11 @@ class Terminal:
 
     def print(self, text: str = '', style: str = '', indent: str | None = None) -> None:
         """Print the lines of a text; `indent` as for `wrapped`."""
-        self.write(self.styled(part, style) for line in text.splitlines() or [''] for part in wrapped(line, self.width, indent))
+        self.write(
+            self.styled(part, style)
+            for line in text.splitlines() or ['']
+            for part in wrapped(line, self.width, indent)
+        )
 
     def write(self, lines: Iterable[str]) -> None:
         """Print lines as they are."""
@@ -62,7 +68,9 @@ class Terminal:
         self.stream.flush()
         return len(lines)
 
-    def table(self, rows: Sequence[Sequence[Cell]], *, right: Sequence[int] = (), gap: int = 2) -> list[str]:
+    def table(
+        self, rows: Sequence[Sequence[Cell]], *, right: Sequence[int] = (), gap: int = 2
+    ) -> list[str]:
         """
         Return the lines of a table without rules; a column that is too wide is at least as wide as its longest word.
 
@@ -79,18 +87,30 @@ class Terminal:
             return []
         cells = [[cell if isinstance(cell, tuple) else (cell, '') for cell in row] for row in rows]
         columns = [[text for text, _ in column] for column in zip(*cells, strict=True)]
-        widths = [max(len(word) for text in column for word in [*text.split(), '']) for column in columns]
+        widths = [
+            max(len(word) for text in column for word in [*text.split(), '']) for column in columns
+        ]
         room = self.width - sum(widths) - gap * (len(widths) - 1)
         for k in sorted(range(len(widths)), key=lambda k: k not in right):
             wider = max(0, min(room, max(map(len, columns[k])) - widths[k]))
             widths[k], room = widths[k] + wider, room - wider
         lines = []
         for row in cells:
-            for parts in zip_longest(*(wrapped(text, width) for (text, _), width in zip(row, widths, strict=True)), fillvalue=''):
-                padded = [part.rjust(width) if k in right else part.ljust(width) for k, (part, width) in enumerate(zip(parts, widths))]
+            for parts in zip_longest(
+                *(wrapped(text, width) for (text, _), width in zip(row, widths, strict=True)),
+                fillvalue='',
+            ):
+                padded = [
+                    part.rjust(width) if k in right else part.ljust(width)
+                    for k, (part, width) in enumerate(zip(parts, widths))
+                ]
                 last = len(padded) - 1
                 padded[last] = padded[last].rstrip()
-                lines.append((' ' * gap).join(self.styled(part, style) for part, (_, style) in zip(padded, row)).rstrip())
+                lines.append(
+                    (' ' * gap)
+                    .join(self.styled(part, style) for part, (_, style) in zip(padded, row))
+                    .rstrip()
+                )
         return lines
 
 
@@ -99,4 +119,6 @@ def wrapped(text: str, width: int, indent: str | None = None) -> list[str]:
     if len(text) <= width:
         return [text]
     indent = ' ' * (len(text) - len(text.lstrip())) if indent is None else indent
-    return textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return textwrap.wrap(
+        text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )

@@ -7,10 +7,18 @@ EXAMPLES = ('session --table table.yaml --output session.mcap', 'result --output
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('source', metavar='BAG|RESULT', help='a recording, which is calibrated, or calibration.yaml (its folder), of which '
-                        'the parameters are shown')
+    parser.add_argument(
+        'source',
+        metavar='BAG|RESULT',
+        help='a recording, which is calibrated, or calibration.yaml (its folder), of which '
+        'the parameters are shown',
+    )
     parser.common('--output', metavar='FILE', required=True, help='the MCAP to write')
-    parser.common('--gravity', type=float, help='local gravity, m/s^2, by hand or with --urdf; default 9.80665')
+    parser.common(
+        '--gravity',
+        type=float,
+        help='local gravity, m/s^2, by hand or with --urdf; default 9.80665',
+    )
     parser.add_recording('without it: by hand, gravity is the reference')
     parser.add_model()
 
@@ -19,11 +27,15 @@ def run(options: Options) -> VerbResult:
     """Write the file, print the layout to open it with and the missing parts; return the exit code."""
     from imu_calibration.use_cases.resources import config_file
     from imu_calibration.use_cases.view import foxglove, view
-    foxglove()   # before the work, not after it
+
+    foxglove()  # before the work, not after it
     layout = config_file('view.foxglove.json')
     found = view(options.source, options.stand(), **options.choices())
     found.save(options.output)
     for line in found.lacks:
         complain(f'warning: {line}')
     print_line(f'written: {options.output}; open it in Foxglove with the layout {layout}')
-    return VerbResult(found.exit_code, {'output': str(options.output), 'layout': str(layout), 'lacks': found.lacks})
+    return VerbResult(
+        found.exit_code,
+        {'output': str(options.output), 'layout': str(layout), 'lacks': found.lacks},
+    )

@@ -17,8 +17,19 @@ WATCH_PERIOD_SECONDS = 0.25
 
 def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
-    parser.common('--node', metavar='NAME', default='calibration_node', help='full name of the node, default calibration_node')
-    parser.common('--patience', metavar='SECONDS', type=float, default=10.0, help='how long to wait for it, default 10')
+    parser.common(
+        '--node',
+        metavar='NAME',
+        default='calibration_node',
+        help='full name of the node, default calibration_node',
+    )
+    parser.common(
+        '--patience',
+        metavar='SECONDS',
+        type=float,
+        default=10.0,
+        help='how long to wait for it, default 10',
+    )
     parser.common('--once', action='store_true', help='show the present status and end')
 
 
@@ -27,9 +38,12 @@ def run(options: Options) -> VerbResult:
     try:
         import rclpy
     except ImportError as error:
-        raise InputError('to watch a node rclpy must be installed, it is not; source ROS, or install ros-jazzy-rclpy') from error
+        raise InputError(
+            'to watch a node rclpy must be installed, it is not; source ROS, or install ros-jazzy-rclpy'
+        ) from error
     from rclpy.context import Context
     from rclpy.executors import ExternalShutdownException
+
     context = Context()
     rclpy.init(context=context)
     try:
@@ -47,12 +61,20 @@ def _watch(watcher, options):
         watcher.spin(WATCH_PERIOD_SECONDS)
     if not watcher.statuses:
         others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
-        raise InputError(f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s; start it, or name it "
-                         f'with --node, as `ros2 node list` shows it{others}')
+        raise InputError(
+            f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s; start it, or name it "
+            f'with --node, as `ros2 node list` shows it{others}'
+        )
     out = Terminal.of()
     if options.once or options.json:
         out.write(watcher.screen(out))
-        return VerbResult(0, {'node': watcher.name, 'status': {name: asdict(status) for name, status in watcher.statuses.items()}})
+        return VerbResult(
+            0,
+            {
+                'node': watcher.name,
+                'status': {name: asdict(status) for name, status in watcher.statuses.items()},
+            },
+        )
     drawn = out.redraw(watcher.screen(out), 0)
     while time.monotonic() - watcher.heard < GONE:
         watcher.spin(WATCH_PERIOD_SECONDS)
@@ -72,7 +94,14 @@ class NodeWatcher:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from visualization_msgs.msg import MarkerArray
-        self.name, self.statuses, self.others, self.picture, self.heard = name, {}, set(), '', time.monotonic()
+
+        self.name, self.statuses, self.others, self.picture, self.heard = (
+            name,
+            {},
+            set(),
+            '',
+            time.monotonic(),
+        )
         self._node = rclpy.create_node('imu_calibration_watch', context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self._node)
@@ -91,13 +120,17 @@ class NodeWatcher:
             node, _, name = status.name.partition(': ')
             if node == self.name:
                 values = {printable(pair.key): printable(pair.value) for pair in status.values}
-                self.statuses[printable(name)] = NodeStatus(status.level[0], printable(status.message), values)
+                self.statuses[printable(name)] = NodeStatus(
+                    status.level[0], printable(status.message), values
+                )
                 self.heard = time.monotonic()
             else:
                 self.others.add(printable(node))
 
     def _draw(self, array):
-        self.picture = next((marker.text for marker in array.markers if marker.ns == 'text'), self.picture)   # the planner adds its own
+        self.picture = next(
+            (marker.text for marker in array.markers if marker.ns == 'text'), self.picture
+        )  # the planner adds its own
 
     def spin(self, seconds: float) -> None:
         """Listen for so long."""
@@ -146,7 +179,17 @@ def bar(ratio: float, width: int = BAR) -> str:
     tick = round(width * math.log(1 / EMPTY_RATIO) / math.log(FULL_RATIO / EMPTY_RATIO))
     if math.isnan(ratio):
         return ' ' * tick + '|' + '?' * (width - tick - 1)
-    filled = round(width * min(max(math.log(max(ratio, EMPTY_RATIO) / EMPTY_RATIO) / math.log(FULL_RATIO / EMPTY_RATIO), 0.0), 1.0))
+    filled = round(
+        width
+        * min(
+            max(
+                math.log(max(ratio, EMPTY_RATIO) / EMPTY_RATIO)
+                / math.log(FULL_RATIO / EMPTY_RATIO),
+                0.0,
+            ),
+            1.0,
+        )
+    )
     cells = ['#' if k < filled else ' ' for k in range(width)]
     cells[min(tick, width - 1)] = '|'
     return ''.join(cells)
@@ -168,17 +211,33 @@ def screen(node: str, statuses: dict[str, NodeStatus], picture: str, *, out: Ter
 
     """
     lines = [out.styled(node, 'bold')]
-    for title, name in (('streams', 'streams'), ('verdict', 'calibration'), ('finding', 'diagnosis')):
+    for title, name in (
+        ('streams', 'streams'),
+        ('verdict', 'calibration'),
+        ('finding', 'diagnosis'),
+    ):
         if name in statuses:
             status = statuses[name]
-            lines += out.table([((title, 'dim'), (status.message.partition('; ')[0], STYLES[LEVELS[min(status.level, 2)]]))])
+            lines += out.table(
+                [
+                    (
+                        (title, 'dim'),
+                        (status.message.partition('; ')[0], STYLES[LEVELS[min(status.level, 2)]]),
+                    )
+                ]
+            )
     rows: list[list[Cell]] = []
     for name, status in statuses.items():
         if name not in NOT_GROUPS:
             ratio = ratio_of(status)
             style = 'dim' if math.isnan(ratio) else 'green' if ratio <= 1 else 'yellow'
-            rows.append([name.replace('accelerometer', 'accel.').replace('gyroscope', 'gyro.'), (bar(ratio), style),
-                         '-' if math.isnan(ratio) else f'{ratio:.2g}'])
+            rows.append(
+                [
+                    name.replace('accelerometer', 'accel.').replace('gyroscope', 'gyro.'),
+                    (bar(ratio), style),
+                    '-' if math.isnan(ratio) else f'{ratio:.2g}',
+                ]
+            )
     if rows:
         headings = ('parameters', f'{"":{round(BAR / 4)}}| determined', 'x tolerance')
         lines += out.table([[(heading, 'dim') for heading in headings], *rows], right=[2])

@@ -43,7 +43,9 @@ MAX_DERIVATIVE_DELAY = 0.02
 """The window of a derivative does not grow beyond this delay, s."""
 
 
-def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: float) -> CausalDerivative:
+def choose_derivative(
+    period: float, rate_sd: float, arm: float, *, force_sd: float
+) -> CausalDerivative:
     """
     Return the shortest window whose noise, through the arm, is below a third of the accelerometer's noise.
 
@@ -61,7 +63,10 @@ def choose_derivative(period: float, rate_sd: float, arm: float, *, force_sd: fl
     if not (rate_sd > 0 and force_sd > 0):
         return CausalDerivative((longest + 2) // 2, period)
     candidates = [CausalDerivative(taps, period) for taps in range(2, longest + 1)]
-    return next((each for each in candidates if each.noise_sd(rate_sd) * arm <= force_sd / 3), candidates[-1])
+    return next(
+        (each for each in candidates if each.noise_sd(rate_sd) * arm <= force_sd / 3),
+        candidates[-1],
+    )
 
 
 RESET_NS = 1_000_000_000
@@ -96,7 +101,11 @@ class StampedDerivative:
         self.taps, self.period = derivative.taps, derivative.period
         self._period_ns = derivative.period * 1e9
         self._least = max(2, (self.taps + 1) // 2)
-        self._scale = [0.0, 0.0, *(12.0 / (n * (n * n - 1.0)) / self.period for n in range(2, self.taps + 1))]
+        self._scale = [
+            0.0,
+            0.0,
+            *(12.0 / (n * (n * n - 1.0)) / self.period for n in range(2, self.taps + 1)),
+        ]
         self._restart()
         self._newest: int | None = None
         self.alpha: tuple = NO_SLOPE
@@ -113,7 +122,11 @@ class StampedDerivative:
             if not MIN_REGULAR_STEP < step <= MAX_REGULAR_STEP:
                 if step <= 0 and stamp_ns - self._newest > -RESET_NS:
                     return self.alpha
-                if step <= 0 or (step > MAX_REGULAR_STEP and abs(step - round(step)) <= WHOLE_GAP_SHARE) or step > MAX_LATE_STEP:
+                if (
+                    step <= 0
+                    or (step > MAX_REGULAR_STEP and abs(step - round(step)) <= WHOLE_GAP_SHARE)
+                    or step > MAX_LATE_STEP
+                ):
                     self._hole(step, x, y, z)
         self._newest = stamp_ns
         self._add(x, y, z)
@@ -123,7 +136,11 @@ class StampedDerivative:
         else:
             sx, sy, sz, px, py, pz = self._sums
             middle, scale = 0.5 * (n - 1), self._scale[n]
-            self.alpha = ((px - middle * sx) * scale, (py - middle * sy) * scale, (pz - middle * sz) * scale)
+            self.alpha = (
+                (px - middle * sx) * scale,
+                (py - middle * sy) * scale,
+                (pz - middle * sz) * scale,
+            )
         return self.alpha
 
     def _add(self, x, y, z):
@@ -163,14 +180,20 @@ class StampedDerivative:
     def seed(self, other: 'StampedDerivative') -> None:
         """Copy the past of another derivative of the same stream, within the length of this window."""
         self._newest = other._newest
-        for x, y, z in list(other._window)[-self.taps:]:
+        for x, y, z in list(other._window)[-self.taps :]:
             self._add(x, y, z)
 
     def push_block(self, stamp_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
         out = np.empty(values.shape)
         steps = np.diff(stamp_ns) / self._period_ns
-        bounds = np.concatenate([[0], 1 + np.flatnonzero((steps <= MIN_REGULAR_STEP) | (steps > MAX_REGULAR_STEP)), [len(values)]])
+        bounds = np.concatenate(
+            [
+                [0],
+                1 + np.flatnonzero((steps <= MIN_REGULAR_STEP) | (steps > MAX_REGULAR_STEP)),
+                [len(values)],
+            ]
+        )
         for start, end in zip(bounds[:-1].tolist(), bounds[1:].tolist()):
             for k in range(start, end):
                 if k == start + self.taps + 1 and self._newest == stamp_ns[k - 1]:
@@ -183,10 +206,12 @@ class StampedDerivative:
         """Fill out[start:end], where every step is regular and the window is full of samples of this very stretch."""
         taps = self.taps
         index = (taps - 1) / 2 - np.arange(taps)
-        stretch = values[start - taps + 1:end]
-        out[start:end] = np.stack([np.convolve(axis, index * self._scale[taps], 'valid') for axis in stretch.T], axis=1)
+        stretch = values[start - taps + 1 : end]
+        out[start:end] = np.stack(
+            [np.convolve(axis, index * self._scale[taps], 'valid') for axis in stretch.T], axis=1
+        )
         self._newest, self.alpha = int(stamp_ns[end - 1]), tuple(out[end - 1].tolist())
-        self._window = deque(map(tuple, values[end - taps:end].tolist()))
+        self._window = deque(map(tuple, values[end - taps : end].tolist()))
         self._refresh()
 
 
@@ -225,7 +250,7 @@ class TimedDerivative:
         self._stamps.append(stamp_ns)
         self._values.append((x, y, z))
         past = np.array([stamp_ns - other for other in reversed(self._stamps)], float)
-        spread = np.cumsum(past**2) - np.cumsum(past)**2 / np.arange(1, len(past) + 1)
+        spread = np.cumsum(past**2) - np.cumsum(past) ** 2 / np.arange(1, len(past) + 1)
         n = min(int(np.searchsorted(spread, self._enough)) + 1, len(past))
         for _ in range(len(past) - n):
             self._stamps.popleft()
@@ -234,12 +259,18 @@ class TimedDerivative:
             self.alpha = NO_SLOPE
         else:
             values = np.array(self._values)[::-1]
-            self.alpha = tuple((-1e9 * (past[:n] - past[:n].mean()) @ values / spread[n - 1]).tolist())
+            self.alpha = tuple(
+                (-1e9 * (past[:n] - past[:n].mean()) @ values / spread[n - 1]).tolist()
+            )
         return self.alpha
 
     def seed(self, other: 'TimedDerivative') -> None:
         """Copy the past of another derivative of the same stream."""
-        self._stamps, self._values, self.alpha = other._stamps.copy(), other._values.copy(), other.alpha
+        self._stamps, self._values, self.alpha = (
+            other._stamps.copy(),
+            other._values.copy(),
+            other.alpha,
+        )
 
 
 def typical_period(stamp_ns: Sequence[float] | np.ndarray) -> float | None:

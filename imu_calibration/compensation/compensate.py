@@ -93,7 +93,12 @@ class Transfer:
     """From the target's origin to the sensor, in the target frame, m, shape (3,)."""
 
     @classmethod
-    def from_pose(cls, frame_id: str, xyz: Sequence[float] = (0.0, 0.0, 0.0), rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> 'Transfer':
+    def from_pose(
+        cls,
+        frame_id: str,
+        xyz: Sequence[float] = (0.0, 0.0, 0.0),
+        rpy: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> 'Transfer':
         """
         Return the transfer to a frame in which the sensor sits at `xyz` (m), turned by `rpy`.
 
@@ -105,14 +110,21 @@ class Transfer:
 
         """
         if len(xyz) != 3 or len(rpy) != 3 or not np.all(np.isfinite([*xyz, *rpy])):
-            raise InputError(f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; '
-                             'correct it', code='pose_numbers')
+            raise InputError(
+                f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; '
+                'correct it',
+                code='pose_numbers',
+            )
         return cls(frame_id, rotation_from_rpy(np.asarray(rpy)), np.asarray(xyz, float))
 
     def is_close(self, other: 'Transfer | None') -> bool:
         """Return whether another transfer has the same frames and, within a micrometre and a microradian, the same pose."""
-        return other is not None and self.frame_id == other.frame_id and np.allclose(self.mat_ts, other.mat_ts, rtol=0, atol=1e-6) \
+        return (
+            other is not None
+            and self.frame_id == other.frame_id
+            and np.allclose(self.mat_ts, other.mat_ts, rtol=0, atol=1e-6)
             and np.allclose(self.arm_t, other.arm_t, rtol=0, atol=1e-6)
+        )
 
     @cached_property
     def _quaternion_st(self):
@@ -122,8 +134,12 @@ class Transfer:
         """Return the orientation of the target frame for that of the sensor, both (x, y, z, w); zeros remain zeros."""
         px, py, pz, pw = quaternion
         qx, qy, qz, qw = self._quaternion_st
-        return (pw * qx + px * qw + py * qz - pz * qy, pw * qy - px * qz + py * qw + pz * qx,
-                pw * qz + px * qy - py * qx + pz * qw, pw * qw - px * qx - py * qy - pz * qz)
+        return (
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+            pw * qw - px * qx - py * qy - pz * qz,
+        )
 
     def turned_covariance(self, covariance: np.ndarray) -> np.ndarray:
         """Return a covariance in the target frame, shape (3, 3)."""
@@ -132,20 +148,37 @@ class Transfer:
 
 def invertible(model: SensorModel) -> SensorModel:
     """Return the model with only those effects that compensation inverts."""
-    keep = {sensor: tuple(e.name for e in model.effects if e.sensor == sensor and e.compensation == 'exact') for sensor in SENSORS}
-    return replace(model, accelerometer=keep['accelerometer'], gyroscope=keep['gyroscope'], reference=())
+    keep = {
+        sensor: tuple(
+            e.name for e in model.effects if e.sensor == sensor and e.compensation == 'exact'
+        )
+        for sensor in SENSORS
+    }
+    return replace(
+        model, accelerometer=keep['accelerometer'], gyroscope=keep['gyroscope'], reference=()
+    )
 
 
 def invertible_values(calibration: FittedErrors) -> tuple[SensorModel, np.ndarray]:
     """Return (model, values) of the part of a calibration that compensation applies."""
     model = invertible(calibration.model)
-    values = np.concatenate([calibration.values[calibration.model.slices[e.key]] for e in model.effects])
+    values = np.concatenate(
+        [calibration.values[calibration.model.slices[e.key]] for e in model.effects]
+    )
     return model, values
 
 
-def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray,
-               temperature_c: np.ndarray | None = None, thermal_branch: np.ndarray | None = None,
-               vibration: np.ndarray | None = None, transfer: Transfer | None = None) -> Corrected:
+def compensate(
+    calibration: FittedErrors,
+    force_s: np.ndarray,
+    rate_s: np.ndarray,
+    *,
+    alpha_s: np.ndarray,
+    temperature_c: np.ndarray | None = None,
+    thermal_branch: np.ndarray | None = None,
+    vibration: np.ndarray | None = None,
+    transfer: Transfer | None = None,
+) -> Corrected:
     """
     Return corrected samples.
 
@@ -173,10 +206,14 @@ def compensate(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarra
     """
     model, values = invertible_values(calibration)
     if temperature_c is None and model.needs_temperature:
-        raise InputError('the calibration has thermal effects and needs temperatures, none were received; provide imu/temperature',
-                         code='temperature_missing')
+        raise InputError(
+            'the calibration has thermal effects and needs temperatures, none were received; provide imu/temperature',
+            code='temperature_missing',
+        )
     with np.errstate(over='ignore', invalid='ignore'):
-        true_force, true_rate, left = _invert(model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch, vibration))
+        true_force, true_rate, left = _invert(
+            model, values, force_s, rate_s, alpha_s, (temperature_c, thermal_branch, vibration)
+        )
     beyond = left > CONVERGED
     true_force[beyond] = true_rate[beyond] = np.nan
     marks = saturation_marks(calibration, force_s, rate_s)
@@ -195,17 +232,33 @@ def _invert(model, values, force_s, rate_s, alpha_s, beside):
     for _ in range(MAX_INVERSION_STEPS):
         change = np.zeros(len(force_s))
         for sensor in ('gyroscope', 'accelerometer'):
-            ref = Reference(np.zeros(len(force_s)), attitude, true['accelerometer'], true['gyroscope'], alpha_s, 0.0, *beside)
-            step = (measured[sensor] - sensor_output(model, sensor, values, ref=ref)) @ inverse[sensor].T
+            ref = Reference(
+                np.zeros(len(force_s)),
+                attitude,
+                true['accelerometer'],
+                true['gyroscope'],
+                alpha_s,
+                0.0,
+                *beside,
+            )
+            step = (measured[sensor] - sensor_output(model, sensor, values, ref=ref)) @ inverse[
+                sensor
+            ].T
             true[sensor] = true[sensor] + step
             change = np.maximum(change, np.max(np.abs(step), axis=1, initial=0.0))
         if np.max(change, initial=0.0) < 1e-14:
             break
     given = np.isfinite(force_s).all(axis=1) & np.isfinite(rate_s).all(axis=1)
-    return true['accelerometer'], true['gyroscope'], np.where(np.isnan(change) & given, np.inf, change)
+    return (
+        true['accelerometer'],
+        true['gyroscope'],
+        np.where(np.isnan(change) & given, np.inf, change),
+    )
 
 
-def moved(transfer: Transfer, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def moved(
+    transfer: Transfer, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (force, rate) at the target point in the target frame."""
     force, rate, alpha = (vector @ transfer.mat_ts.T for vector in (force_s, rate_s, alpha_s))
     return force - lever_matrix(rate, alpha) @ transfer.arm_t, rate
@@ -217,7 +270,9 @@ def saturation_level(calibration: FittedErrors, sensor: str) -> float:
     return np.inf if level is None else float(level) * (1 - 1e-6)
 
 
-def saturation_marks(calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray) -> np.ndarray:
+def saturation_marks(
+    calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray
+) -> np.ndarray:
     """Return the square of the saturation level where a component of (force, rate) reaches it, otherwise 0; shape (n, 2)."""
     marks = np.zeros((len(force_s), 2))
     for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):
@@ -233,16 +288,22 @@ def arms_of(calibration: FittedErrors) -> np.ndarray:
     return np.zeros((3, 3)) if arms is None else arms
 
 
-def outside_conditions(calibration: FittedErrors, fastest: float = 0.0, temperature_c: Sequence[float] | None = None) -> list[str]:
+def outside_conditions(
+    calibration: FittedErrors, fastest: float = 0.0, temperature_c: Sequence[float] | None = None
+) -> list[str]:
     """Return lines on a largest rate (rad/s) and temperatures outside the range of the calibration."""
     lines = []
     largest = calibration.conditions.get('largest_rate')
     if largest is not None and fastest > 1.1 * largest + 0.1:
-        lines.append(f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up to the rates of use')
+        lines.append(
+            f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up to the rates of use'
+        )
     limits = calibration.conditions.get('temperature_range_c')
     if limits and temperature_c:
         low, high = min(temperature_c), max(temperature_c)
         if low < limits[0] - 5 or high > limits[1] + 5:
-            lines.append(f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw {limits[0]:.1f} to {limits[1]:.1f} C; '
-                         'calibrate there')
+            lines.append(
+                f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw {limits[0]:.1f} to {limits[1]:.1f} C; '
+                'calibrate there'
+            )
     return lines

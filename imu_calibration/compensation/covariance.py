@@ -22,7 +22,11 @@ MAX_KNOWN_COVARIANCE = 1e30
 
 def is_known(covariance: np.ndarray) -> bool:
     """Return whether a covariance from a message is usable: neither NaN nor huge, variances not negative, not all zero."""
-    return bool(np.all(np.abs(covariance) < MAX_KNOWN_COVARIANCE) and np.any(covariance) and np.all(np.diag(covariance) >= 0))
+    return bool(
+        np.all(np.abs(covariance) < MAX_KNOWN_COVARIANCE)
+        and np.any(covariance)
+        and np.all(np.diag(covariance) >= 0)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +49,9 @@ class Sensitivity:
     slope_error: SlopeError
     """Error of the derivative in the present motion."""
 
-    def covariances(self, force_cov: np.ndarray, rate_cov: np.ndarray, with_parameters: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def covariances(
+        self, force_cov: np.ndarray, rate_cov: np.ndarray, with_parameters: bool = True
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the covariances of corrected (force, rate), each shape (3, 3).
 
@@ -54,11 +60,13 @@ class Sensitivity:
         """
         results, error_cov = [], self.slope_error.covariance(rate_cov)
         for k in (0, 3):
-            by_force, by_rate, by_derivative = (self.gain[k:k + 3, j:j + 3] for j in (0, 3, 6))
+            by_force, by_rate, by_derivative = (self.gain[k : k + 3, j : j + 3] for j in (0, 3, 6))
             now = by_rate + self.newest * by_derivative
             total = by_force @ force_cov @ by_force.T + now @ rate_cov @ now.T
             total = total + by_derivative @ (self.earlier * rate_cov + error_cov) @ by_derivative.T
-            results.append(total + self.parameters[k:k + 3, k:k + 3] if with_parameters else total)
+            results.append(
+                total + self.parameters[k : k + 3, k : k + 3] if with_parameters else total
+            )
         return tuple(results)
 
 
@@ -77,24 +85,47 @@ class Uncertainty:
         self._model, self._values = invertible_values(calibration)
         self._kernel, self._inside = make_kernel(calibration, transfer), make_kernel(calibration)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
-        index = np.concatenate([np.arange(len(calibration.values))[calibration.model.slices[e.key]] for e in self._model.effects])
+        index = np.concatenate(
+            [
+                np.arange(len(calibration.values))[calibration.model.slices[e.key]]
+                for e in self._model.effects
+            ]
+        )
         self._covariance = calibration.covariance[np.ix_(index, index)]
-        steps = 1e-30j * np.eye(len(self._values))   # complex steps give d(coefficients) / d(parameters), shape (n_params, n_columns, 3)
-        self._slopes = [np.stack([coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30 for step in steps])
-                        for sensor in SENSORS]
+        steps = 1e-30j * np.eye(
+            len(self._values)
+        )  # complex steps give d(coefficients) / d(parameters), shape (n_params, n_columns, 3)
+        self._slopes = [
+            np.stack(
+                [
+                    coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30
+                    for step in steps
+                ]
+            )
+            for sensor in SENSORS
+        ]
         self._calibration = calibration
         self.use(None)
 
     def use(self, derivative: CausalDerivative | None, period: float | None = None) -> None:
         """Use the angular acceleration of another CausalDerivative, or of none, and the noise of samples `period` s apart."""
-        self.noise = tuple(np.diag(self._calibration.noise(sensor, period)[0]**2) for sensor in SENSORS)
+        self.noise = tuple(
+            np.diag(self._calibration.noise(sensor, period)[0] ** 2) for sensor in SENSORS
+        )
         weights = np.zeros(1) if derivative is None else derivative.weights
-        self._newest, self._earlier = float(weights[0]), float((weights[1:]**2).sum())
+        self._newest, self._earlier = float(weights[0]), float((weights[1:] ** 2).sum())
 
-    def at(self, force: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 9.8),
-           rate: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
-           derivative: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0), *, dt: float = 0.0, branch: float = 0.0,
-           vibration: tuple[float, ...] = (0.0, 0.0, 0.0), slope_error: SlopeError | None = None) -> Sensitivity:
+    def at(
+        self,
+        force: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 9.8),
+        rate: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
+        derivative: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
+        *,
+        dt: float = 0.0,
+        branch: float = 0.0,
+        vibration: tuple[float, ...] = (0.0, 0.0, 0.0),
+        slope_error: SlopeError | None = None,
+    ) -> Sensitivity:
         """
         Return the Sensitivity at a measured sample.
 
@@ -113,19 +144,43 @@ class Uncertainty:
 
         """
         sample, beside = np.concatenate([force, rate, derivative]), (dt, branch, *vibration)
-        gain = np.stack([self._slope(sample, step, beside) for step in np.diag(DIFFERENCE_STEPS)], axis=1)
+        gain = np.stack(
+            [self._slope(sample, step, beside) for step in np.diag(DIFFERENCE_STEPS)], axis=1
+        )
         true = self._inside(*sample.tolist(), *beside)
-        jacobian = gain[:, :6] @ self._parameter_slopes(np.array(true), self._inverse_rate @ sample[6:], beside)
-        return Sensitivity(gain, jacobian @ self._covariance @ jacobian.T, self._newest, self._earlier, slope_error or SlopeError())
+        jacobian = gain[:, :6] @ self._parameter_slopes(
+            np.array(true), self._inverse_rate @ sample[6:], beside
+        )
+        return Sensitivity(
+            gain,
+            jacobian @ self._covariance @ jacobian.T,
+            self._newest,
+            self._earlier,
+            slope_error or SlopeError(),
+        )
 
     def _slope(self, sample, step, beside):
-        above, below = self._kernel(*(sample + step).tolist(), *beside), self._kernel(*(sample - step).tolist(), *beside)
+        above, below = (
+            self._kernel(*(sample + step).tolist(), *beside),
+            self._kernel(*(sample - step).tolist(), *beside),
+        )
         return (np.array(above) - below) / (2 * step.sum())
 
     def _parameter_slopes(self, true, alpha, beside):
         """Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params)."""
         temperature = np.full(1, self._model.temperature_ref_c + beside[0])
-        ref = Reference(np.zeros(1), np.eye(3)[None], true[None, :3], true[None, 3:], alpha[None], 0.0, temperature, np.full(1, beside[1]),
-                        np.array([beside[2:]]))
+        ref = Reference(
+            np.zeros(1),
+            np.eye(3)[None],
+            true[None, :3],
+            true[None, 3:],
+            alpha[None],
+            0.0,
+            temperature,
+            np.full(1, beside[1]),
+            np.array([beside[2:]]),
+        )
         rows = [columns_at_point(self._model, sensor, ref)[0] for sensor in SENSORS]
-        return np.concatenate([np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)])
+        return np.concatenate(
+            [np.einsum('c,pci->ip', row, slopes) for row, slopes in zip(rows, self._slopes)]
+        )

@@ -68,7 +68,7 @@ class StopDetector:
 
     def __init__(self, noise_sd: np.ndarray):
         self._noise_sd = np.asarray(noise_sd, float)
-        self._most_variance = (MOST_SHAKE + 4 * self._noise_sd)**2
+        self._most_variance = (MOST_SHAKE + 4 * self._noise_sd) ** 2
         self._rest: np.ndarray = np.zeros((0, 1))
         self._blocks: list[np.ndarray] = []
         """Start, end, samples, means of the columns, variances of force and rate; shape (3 + 6 + k + 6,) each."""
@@ -97,8 +97,14 @@ class StopDetector:
         """Process one block, or restart after a gap."""
         if self._blocks and rows[0, 0] - self._blocks[-1][1] > HEALTH_BLOCK_SECONDS:
             self._blocks, self._stand = [], []
-        block = np.concatenate([[rows[0, 0], rows[-1, 0], len(rows)], rows[:, 1:].mean(axis=0), rows[:, 1:7].var(axis=0)])
-        self._blocks = [*self._blocks[-N_BLOCKS + 1:], block]
+        block = np.concatenate(
+            [
+                [rows[0, 0], rows[-1, 0], len(rows)],
+                rows[:, 1:].mean(axis=0),
+                rows[:, 1:7].var(axis=0),
+            ]
+        )
+        self._blocks = [*self._blocks[-N_BLOCKS + 1 :], block]
         if not self._may_be_still(block) or not self._is_still():
             self._stand = []
         elif self._stand and block[1] - self._stand[0][0] <= MAX_STOP_SECONDS:
@@ -109,7 +115,9 @@ class StopDetector:
 
     def _may_be_still(self, block):
         """Return whether a block turns and shakes little enough by itself; most blocks of a robot that drives do not."""
-        return block[6:9] @ block[6:9] < MOST_RATE**2 and bool((block[-6:] <= self._most_variance).all())
+        return block[6:9] @ block[6:9] < MOST_RATE**2 and bool(
+            (block[-6:] <= self._most_variance).all()
+        )
 
     def _is_still(self):
         if len(self._blocks) < N_BLOCKS:
@@ -117,16 +125,31 @@ class StopDetector:
         blocks = np.array(self._blocks)
         variance = blocks[:, -6:].max(axis=0)
         # Vibration of the robot is noise for the means as well.
-        allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * np.maximum(self._noise_sd, np.sqrt(variance)) / np.sqrt(blocks[:, 2].min())
-        return bool((np.ptp(blocks[:, 3:9], axis=0) <= allowed).all() and (variance <= self._most_variance).all())
+        allowed = MAX_BLOCK_CHANGE + TIMES_NOISE * np.maximum(
+            self._noise_sd, np.sqrt(variance)
+        ) / np.sqrt(blocks[:, 2].min())
+        return bool(
+            (np.ptp(blocks[:, 3:9], axis=0) <= allowed).all()
+            and (variance <= self._most_variance).all()
+        )
 
 
 def _stop_of(stand):
     """Return the `Stop` of the blocks of a rest, shape (n, 3 + 6 + k + 6)."""
     half = len(stand) // 2
-    early, late = (np.average(part[:, 3:], axis=0, weights=part[:, 2]) for part in (stand[:half or None], stand[half:]))
-    return Stop(float(stand[0, 0]), float(stand[-1, 1]), int(stand[half:, 2].sum()), late[:6], late[6:-6], np.sqrt(late[-6:]),
-                (late - early)[:6])
+    early, late = (
+        np.average(part[:, 3:], axis=0, weights=part[:, 2])
+        for part in (stand[: half or None], stand[half:])
+    )
+    return Stop(
+        float(stand[0, 0]),
+        float(stand[-1, 1]),
+        int(stand[half:, 2].sum()),
+        late[:6],
+        late[6:-6],
+        np.sqrt(late[-6:]),
+        (late - early)[:6],
+    )
 
 
 MOST_MOVED = 0.02
@@ -151,7 +174,7 @@ class GyroBiasUpdate:
     """
 
     def __init__(self, prior_sd: np.ndarray, time: float):
-        prior = np.asarray(prior_sd, float)**2
+        prior = np.asarray(prior_sd, float) ** 2
         self._time, self._stop, self.n_stops = time, float('nan'), 0
         self._now = self._before = _State(np.zeros(3), prior, prior, np.zeros(3))
 
@@ -175,13 +198,17 @@ class GyroBiasUpdate:
         """
         if start != self._stop:
             self._stop, self._before, self.n_stops = start, self._now, self.n_stops + 1
-        variance = variance + EARTH_RATE**2 / 3   # about axes that are unknown here
+        variance = variance + EARTH_RATE**2 / 3  # about axes that are unknown here
         bias, spread, seen, weight = self._before.after(now, self._time)
         seen, weight = seen + rate**2, weight + 1
         stationary = np.maximum(self._before.stationary, seen / weight)
-        spread = spread + np.maximum(stationary - self._before.stationary, 0)   # it has been as wide before anybody saw it
+        spread = spread + np.maximum(
+            stationary - self._before.stationary, 0
+        )  # it has been as wide before anybody saw it
         gain = spread / (spread + variance)
-        self._now = _State(bias + gain * (rate - bias), (1 - gain) * spread, stationary, seen, weight, now)
+        self._now = _State(
+            bias + gain * (rate - bias), (1 - gain) * spread, stationary, seen, weight, now
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +225,12 @@ class _State:
     def after(self, now, time):
         """Return (bias, variance, seen, weight) at `now`."""
         phi = np.exp(-max(now - self.at, 0.0) / time) if self.weight else 0.0
-        return phi * self.bias, phi**2 * self.variance + (1 - phi**2) * self.stationary, phi * self.seen, phi * self.weight
+        return (
+            phi * self.bias,
+            phi**2 * self.variance + (1 - phi**2) * self.stationary,
+            phi * self.seen,
+            phi * self.weight,
+        )
 
 
 LIMIT = 4.0
@@ -253,16 +285,25 @@ class CalibrationHealth:
 
     """
 
-    def __init__(self, calibration: FittedErrors, transfer: Transfer | None, options: HealthOptions):
+    def __init__(
+        self, calibration: FittedErrors, transfer: Transfer | None, options: HealthOptions
+    ):
         self.options, self.n_stops = options, 0
         found = [calibration.noise(sensor) for sensor in SENSORS]
         turn = np.eye(3) if transfer is None else transfer.mat_ts
         self.noise_sd = np.concatenate([np.sqrt(turn**2 @ np.square(sd)) for sd, _ in found])
-        wander = np.repeat([float(np.max(offset))**2 for _, offset in found], 3)
+        wander = np.repeat([float(np.max(offset)) ** 2 for _, offset in found], 3)
         self._known = Uncertainty(calibration, transfer).at().parameters + np.diag(wander)
         given = options.gravity or calibration.conditions.get('gravity')
-        self._gravity, self._place = float(given or STANDARD_GRAVITY), 0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE
-        self.update = GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time) if options.update else None
+        self._gravity, self._place = (
+            float(given or STANDARD_GRAVITY),
+            0.1 * GRAVITY_PLACE_SHARE if options.gravity else GRAVITY_PLACE_SHARE,
+        )
+        self.update = (
+            GyroBiasUpdate(np.sqrt(np.diag(self._known)[3:]), options.bias_time)
+            if options.update
+            else None
+        )
         self._judged: float | None = None
         self._last: tuple | None = None
         """Arguments of `_evaluated`; replaced as a whole, so that another thread may read it."""
@@ -278,19 +319,30 @@ class CalibrationHealth:
 
         """
         if stop.seconds < MIN_STOP_SECONDS or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
-            return   # too short, or a slow and steady turn
+            return  # too short, or a slow and steady turn
         if self._judged != stop.start:
             self._judged, self.n_stops = stop.start, self.n_stops + 1
         # A mean with a trend is not rest: motion that decays is an error of the mean of about its change.
-        of_mean = np.maximum(stop.shake_sd, self.noise_sd)**2 / stop.n_samples + (2 * stop.change)**2
+        of_mean = (
+            np.maximum(stop.shake_sd, self.noise_sd) ** 2 / stop.n_samples + (2 * stop.change) ** 2
+        )
         if self.update is not None:
             self.update.measure(stop.start, stop.end, rate=stop.mean[3:], variance=of_mean[3:])
-        self._last = stop, of_mean, self.n_stops, None if self.update is None else self.update.predict(stop.end)
+        self._last = (
+            stop,
+            of_mean,
+            self.n_stops,
+            None if self.update is None else self.update.predict(stop.end),
+        )
 
     @property
     def state(self) -> LiveState:
         """Result of the last stop, computed on request."""
-        return LiveState(WAITING, 'no stop of two seconds yet') if self._last is None else self._evaluated(*self._last)
+        return (
+            LiveState(WAITING, 'no stop of two seconds yet')
+            if self._last is None
+            else self._evaluated(*self._last)
+        )
 
     def _evaluated(self, stop, of_mean, n_stops, bias_update):
         """Return the state after a stop, from the variance of its mean, (6,), and the corrected bias with its variance, or None."""
@@ -301,36 +353,72 @@ class CalibrationHealth:
         rate, length = stop.mean[3:], float(np.linalg.norm(stop.mean[:3]))
         force_off = max(abs(length - self._gravity) - self._place * self._gravity, 0) / gravity_sd
         axis = int(np.argmax(rate_off))
-        values = {'stops': n_stops, 'seconds of the last stop': f'{stop.seconds:.1f}',
-                  'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate), 'rate at rest [sd]': f'{rate_off.max():.1f}',
-                  'gravity read [m/s^2]': f'{length:.4f}', 'gravity expected [m/s^2]': f'{self._gravity:.4f}',
-                  'gravity off [sd]': f'{force_off:.1f}'}
-        measured_length, measured_rate = (float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6)))
+        values = {
+            'stops': n_stops,
+            'seconds of the last stop': f'{stop.seconds:.1f}',
+            'rate at rest [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in rate),
+            'rate at rest [sd]': f'{rate_off.max():.1f}',
+            'gravity read [m/s^2]': f'{length:.4f}',
+            'gravity expected [m/s^2]': f'{self._gravity:.4f}',
+            'gravity off [sd]': f'{force_off:.1f}',
+        }
+        measured_length, measured_rate = (
+            float(np.linalg.norm(stop.others[part])) for part in (slice(3), slice(3, 6))
+        )
         if unit := unit_of_rest(measured_length):
-            return LiveState(UNIT, f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit}, it must be m/s^2; '
-                                   'correct the driver', values)
+            return LiveState(
+                UNIT,
+                f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit}, it must be m/s^2; '
+                'correct the driver',
+                values,
+            )
         lines = []
         if rate_off[axis] > LIMIT:
-            lines.append(f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, '
-                         f'{rate_off[axis]:.0f} times its sd')
+            lines.append(
+                f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, '
+                f'{rate_off[axis]:.0f} times its sd'
+            )
         if force_off > LIMIT:
-            lines.append(f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f} times its sd beyond what '
-                         'places differ by')
+            lines.append(
+                f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f} times its sd beyond what '
+                'places differ by'
+            )
         if bias_update is not None:
             bias, variance = bias_update
-            values |= {'bias update [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in bias),
-                       'bias update, sd [deg/s]': ', '.join(f'{value / DEG:.4f}' for value in np.sqrt(variance))}
+            values |= {
+                'bias update [deg/s]': ', '.join(f'{value / DEG:+.4f}' for value in bias),
+                'bias update, sd [deg/s]': ', '.join(
+                    f'{value / DEG:.4f}' for value in np.sqrt(variance)
+                ),
+            }
         if not lines:
             off = f'{rate_off.max():.1f} and {force_off:.1f} sd'
-            return LiveState(HOLDS, f'the calibration holds: at the last stop rate and gravity were off by {off}', values)
+            return LiveState(
+                HOLDS,
+                f'the calibration holds: at the last stop rate and gravity were off by {off}',
+                values,
+            )
         harms = (rate_off[axis] > LIMIT and np.linalg.norm(rate) > WORSE * measured_rate) or (
-            force_off > LIMIT and abs(length - self._gravity) > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd)
+            force_off > LIMIT
+            and abs(length - self._gravity)
+            > WORSE * abs(measured_length - self._gravity) + LIMIT * gravity_sd
+        )
         if harms:
-            return LiveState(HARMS, '; '.join(lines) + ': without the calibration it would be less; is it the right one? calibrate again',
-                             values)
+            return LiveState(
+                HARMS,
+                '; '.join(lines)
+                + ': without the calibration it would be less; is it the right one? calibrate again',
+                values,
+            )
         if bias_update is not None and force_off <= LIMIT:
-            return LiveState(FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values)
-        return LiveState(MOVED, '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there', values)
+            return LiveState(
+                FOLLOWED, '; '.join(lines) + ': corrected as long as stops confirm it', values
+            )
+        return LiveState(
+            MOVED,
+            '; '.join(lines) + ': calibrate again, unless it turned slowly and steadily there',
+            values,
+        )
 
 
 SIX = tuple[float, ...]
@@ -373,8 +461,13 @@ class StopWatch:
         return np.diag(self.health.update.predict(self._look * 1e-9)[1])
 
     def _take(self, stamp_ns):
-        if stamp_ns < self._first_ns or not self._first_ns:   # the beginning, or a clock set back
-            self._first_ns, self._look, self._waiting, self._detector = stamp_ns, 0, [], StopDetector(self.health.noise_sd)
+        if stamp_ns < self._first_ns or not self._first_ns:  # the beginning, or a clock set back
+            self._first_ns, self._look, self._waiting, self._detector = (
+                stamp_ns,
+                0,
+                [],
+                StopDetector(self.health.noise_sd),
+            )
             return
         samples = np.array(self._waiting)
         since = int(samples[-1, 0])

@@ -11,7 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import CONVERGED, MAX_INVERSION_STEPS, FittedErrors, Transfer, invertible_values
+from imu_calibration.compensation.compensate import (
+    CONVERGED,
+    MAX_INVERSION_STEPS,
+    FittedErrors,
+    Transfer,
+    invertible_values,
+)
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import AXES, LEVER, SENSORS, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
@@ -49,8 +55,10 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     """
     namespace, text = dict(SCALAR_FUNCTIONS), kernel_text(calibration, transfer)
     if len(text) > MAX_KERNEL_CHARACTERS:
-        raise InputError(f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS} characters of arithmetic, got '
-                         f'{len(text)}; use fewer or shorter effects')
+        raise InputError(
+            f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS} characters of arithmetic, got '
+            f'{len(text)}; use fewer or shorter effects'
+        )
     exec(compile(text, '<compensation kernel>', 'exec'), namespace)
     return namespace['kernel']
 
@@ -60,12 +68,22 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     model, values = invertible_values(calibration)
     known = _known(model.temperature_ref_c)
     accel, gyro = (_Part(model, sensor, values, known) for sensor in SENSORS)
-    turn, arm = (np.eye(3), np.zeros(3)) if transfer is None else (transfer.mat_ts, transfer.mat_ts.T @ transfer.arm_t)
+    turn, arm = (
+        (np.eye(3), np.zeros(3))
+        if transfer is None
+        else (transfer.mat_ts, transfer.mat_ts.T @ transfer.arm_t)
+    )
     products = LEVER.products(known)
-    at_arm = [_sum(arm, products[start:start + 3]) for start in (0, 3, 6)]
+    at_arm = [_sum(arm, products[start : start + 3]) for start in (0, 3, 6)]
     slope = _turned(gyro.inverse, _vector('a'))
-    lines = ['def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch=0.0, sx=0.0, sy=0.0, sz=0.0):']
-    if gyro.uses <= BEFOREHAND and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'} and not accel.bends:
+    lines = [
+        'def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch=0.0, sx=0.0, sy=0.0, sz=0.0):'
+    ]
+    if (
+        gyro.uses <= BEFOREHAND
+        and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'}
+        and not accel.bends
+    ):
         # No iteration is needed: the rate follows from the readings, and the disturbance of the force follows from the rate.
         lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
         force = [_with_slope(row, slope) for row in _less(_less(accel.alone, accel.rest), at_arm)]
@@ -83,7 +101,9 @@ class _Part:
         matrix, bias = (model.value(sensor, role, values) for role in (Role.LINEAR, Role.OFFSET))
         self.inverse = np.linalg.inv(matrix)
         measured = _turned(self.inverse, _vector('f' if sensor == 'accelerometer' else 'w'))
-        self.alone = [added(row, {(): -constant}) for row, constant in zip(measured, self.inverse @ bias)]
+        self.alone = [
+            added(row, {(): -constant}) for row, constant in zip(measured, self.inverse @ bias)
+        ]
         layout, total = model.layout(sensor), coefficients_at_point(model, sensor, values)
         total[model.columns_of(sensor, Role.OFFSET)] -= bias
         total[model.columns_of(sensor, Role.LINEAR)] -= matrix.T
@@ -92,35 +112,56 @@ class _Part:
             block = total[layout.rows[name]]
             if np.any(block):
                 columns = group.products(known)
-                self.rest = [added(row, _sum(block[:, axis], columns)) for axis, row in enumerate(self.rest)]
+                self.rest = [
+                    added(row, _sum(block[:, axis], columns)) for axis, row in enumerate(self.rest)
+                ]
                 self.uses |= group.uses
 
     @property
     def bends(self):
         """Whether the angular acceleration enters the rest in a product or a function."""
-        return any(re.search(r'\bg[xyz]\b', ' '.join(factors)) and len(' '.join(factors)) > 2 for row in self.rest for factors in row)
+        return any(
+            re.search(r'\bg[xyz]\b', ' '.join(factors)) and len(' '.join(factors)) > 2
+            for row in self.rest
+            for factors in row
+        )
 
 
 def _known(temperature_ref_c):
     """Return name in a column -> the sum of products that replaces it in the function."""
     letters = {'f': 'u', 'w': 'v', 'alpha': 'g', 'vibration': 's'}
-    vectors = {f'{name}_{k}': {(f'{variable}{k}',): 1.0} for name, variable in letters.items() for k in AXES}
-    return vectors | {'temperature_c': {('dt',): 1.0, (): temperature_ref_c}, 'temperature_ref_c': {(): temperature_ref_c},
-                      'thermal_branch': {('branch',): 1.0}}
+    vectors = {
+        f'{name}_{k}': {(f'{variable}{k}',): 1.0}
+        for name, variable in letters.items()
+        for k in AXES
+    }
+    return vectors | {
+        'temperature_c': {('dt',): 1.0, (): temperature_ref_c},
+        'temperature_ref_c': {(): temperature_ref_c},
+        'thermal_branch': {('branch',): 1.0},
+    }
 
 
 def _iteration(accel, gyro):
     """Return the lines that compute the true force in u and the true rate in v, by the same steps as `compensation.compensate`."""
     # ax, ay, az are already in gx, gy, gz: a is the force, b the rate, from matrix and bias only.
     lines = _assigned('a', accel.alone, '    ') + _assigned('b', gyro.alone, '    ')
-    lines += ['    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz', f'    for _ in range({MAX_INVERSION_STEPS}):',
-              '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz']
+    lines += [
+        '    ux, uy, uz, vx, vy, vz = ax, ay, az, bx, by, bz',
+        f'    for _ in range({MAX_INVERSION_STEPS}):',
+        '        px, py, pz, qx, qy, qz = ux, uy, uz, vx, vy, vz',
+    ]
     for part, true, alone in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
         if any(part.rest):
             lines += _assigned(true, _less(_vector(alone), part.rest), '        ')
     change = ' + '.join(f'abs({a}{k} - {b}{k})' for a, b in (('u', 'p'), ('v', 'q')) for k in AXES)
-    return lines + [f'        change = {change}', f'        if change < {CONVERGED_CHANGE}:', '            break',
-                    f'    if not change < {CONVERGED}:', "        return (float('nan'),) * 6"]
+    return lines + [
+        f'        change = {change}',
+        f'        if change < {CONVERGED_CHANGE}:',
+        '            break',
+        f'    if not change < {CONVERGED}:',
+        "        return (float('nan'),) * 6",
+    ]
 
 
 def _vector(letter):
@@ -143,7 +184,12 @@ def _less(rows, others):
 def _with_slope(row, slope):
     """Return a sum in which the angular acceleration, which enters as it is, is replaced by the derivative of the measured rate."""
     places = {(f'g{axis}',): measured for axis, measured in zip(AXES, slope)}
-    return added(*(scaled(places[factors], c) if factors in places else {factors: c} for factors, c in row.items()))
+    return added(
+        *(
+            scaled(places[factors], c) if factors in places else {factors: c}
+            for factors, c in row.items()
+        )
+    )
 
 
 def _assigned(letter, rows, indent):
@@ -164,6 +210,12 @@ def _worked_out(rows, indent):
 
     for row in rows:
         factors = {key: [f if f.isidentifier() else name_of(f) for f in key] for key in row}
-        sums.append({(name_of(' * '.join(found)) if len(found) > 1 else found[0],) if key else (): row[key] for key,
-                     found in factors.items()})
+        sums.append(
+            {
+                (name_of(' * '.join(found)) if len(found) > 1 else found[0],) if key else (): row[
+                    key
+                ]
+                for key, found in factors.items()
+            }
+        )
     return lines, [as_text(terms) for terms in sums]

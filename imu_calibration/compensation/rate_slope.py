@@ -6,9 +6,24 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from imu_calibration.compensation.angular_acceleration import NO_SLOPE, RESET_NS, CausalDerivative, StampedDerivative, TimedDerivative
+from imu_calibration.compensation.angular_acceleration import (
+    NO_SLOPE,
+    RESET_NS,
+    CausalDerivative,
+    StampedDerivative,
+    TimedDerivative,
+)
 from imu_calibration.preprocessing import stamping
-from imu_calibration.preprocessing.stamping import CLOCK_BLOCK, COUNTED, IRREGULAR, LAG, PAUSE_NS, REGULAR, StampLine, describe_stamps
+from imu_calibration.preprocessing.stamping import (
+    CLOCK_BLOCK,
+    COUNTED,
+    IRREGULAR,
+    LAG,
+    PAUSE_NS,
+    REGULAR,
+    StampLine,
+    describe_stamps,
+)
 
 REVIEWED_STAMPS = 4 * LAG + 1
 """Stamps needed to separate counted from irregular stamps."""
@@ -58,7 +73,11 @@ class RateSlope:
 
     """
 
-    def __init__(self, choose: Callable[[float], CausalDerivative], changed: Callable[[], None] = lambda: None):
+    def __init__(
+        self,
+        choose: Callable[[float], CausalDerivative],
+        changed: Callable[[], None] = lambda: None,
+    ):
         self._choose, self._changed = choose, changed
         self.line: StampLine | None = None
         """Class of the stamps; None while they are too few."""
@@ -90,7 +109,7 @@ class RateSlope:
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple:
         """Return the derivative (x, y, z) after one more sample, per second."""
-        if stamp_ns == self._newest and (x, y, z) == self._reading:   # the same message again
+        if stamp_ns == self._newest and (x, y, z) == self._reading:  # the same message again
             return self._slope
         step_ns = 0 if self._newest is None else stamp_ns - self._newest
         self._newest, self._reading = stamp_ns, (x, y, z)
@@ -116,7 +135,9 @@ class RateSlope:
         while start < len(values):
             stop = self._usual_until(stamp_ns, values, start)
             if stop > start:
-                assert isinstance(self._tracker, StampedDerivative), 'regular stamps have equal steps'
+                assert isinstance(self._tracker, StampedDerivative), (
+                    'regular stamps have equal steps'
+                )
                 out[start:stop] = self._tracker.push_block(stamp_ns[start:stop], values[start:stop])
                 self._note(stamp_ns[start:stop], values[stop - 1], out[start:stop])
             if stop < len(values):
@@ -127,15 +148,25 @@ class RateSlope:
     def settle(self, line: StampLine) -> None:
         """Use the derivative for stamps of that kind; the window is kept while the period is unchanged."""
         self.line, self._doubtful, self._agreeing = line, [], 0
-        self._longest_ns = line.high_ns - line.low_ns + stamping.MAX_REGULAR_STEP * line.period_ns if line.word == COUNTED else 0.0
+        self._longest_ns = (
+            line.high_ns - line.low_ns + stamping.MAX_REGULAR_STEP * line.period_ns
+            if line.word == COUNTED
+            else 0.0
+        )
         if isinstance(self._tracker, StampedDerivative) and self._suits(line):
-            self._tracker.rebase(round(self._count * 1e9 * self._tracker.period) if self._longest_ns else self._stamps[-2])
+            self._tracker.rebase(
+                round(self._count * 1e9 * self._tracker.period)
+                if self._longest_ns
+                else self._stamps[-2]
+            )
             return
         self._all_of_it = self._size_of_all(np.array(self._recent).reshape(-1, 3))
         self.derivative = self._tracker = None
         if not _stand_still(line):
             self.derivative = self._choose(line.period_ns * 1e-9)
-            self._tracker = (TimedDerivative if line.word == IRREGULAR else StampedDerivative)(self.derivative)
+            self._tracker = (TimedDerivative if line.word == IRREGULAR else StampedDerivative)(
+                self.derivative
+            )
         seconds, least, most = RECENT_SPAN
         self._recent = deque(maxlen=int(min(max(seconds * 1e9 / line.period_ns, least), most)))
         self._slope, self._young = NO_SLOPE, True
@@ -143,7 +174,9 @@ class RateSlope:
 
     def _suits(self, line: StampLine) -> bool:
         """Return whether the derivative in use suits stamps of that kind."""
-        if self._tracker is None or isinstance(self._tracker, TimedDerivative) != (line.word == IRREGULAR):
+        if self._tracker is None or isinstance(self._tracker, TimedDerivative) != (
+            line.word == IRREGULAR
+        ):
             return self._tracker is None and _stand_still(line)
         return abs(1e-9 * line.period_ns / self._tracker.period - 1) <= CHANGED[line.word]
 
@@ -157,9 +190,13 @@ class RateSlope:
         """Continue from another one, after `prepare`."""
         self._stamps, self._due, self._count = before._stamps, before._due, before._count
         self._newest, self._reading = before._newest, before._reading
-        self._agreeing, self._ahead_ns, self._doubtful = before._agreeing, before._ahead_ns, before._doubtful
+        self._agreeing, self._ahead_ns, self._doubtful = (
+            before._agreeing,
+            before._ahead_ns,
+            before._doubtful,
+        )
         if self._tracker is not None and isinstance(before._tracker, type(self._tracker)):
-            self._tracker.seed(before._tracker)   # type: ignore[arg-type]
+            self._tracker.seed(before._tracker)  # type: ignore[arg-type]
 
     def error(self) -> SlopeError:
         """
@@ -178,23 +215,31 @@ class RateSlope:
         lag = max(round(late + 0.01), 1)
         if len(recent) <= lag + 1:
             return SlopeError()
-        share, weights = (late / lag)**2, self.derivative.weights
+        share, weights = (late / lag) ** 2, self.derivative.weights
         apart = np.convolve(weights, [1.0] + [0.0] * (lag - 1) + [-1.0])
-        return SlopeError(share * _moment(recent[lag:] - recent[:-lag]), share * float(apart @ apart))
+        return SlopeError(
+            share * _moment(recent[lag:] - recent[:-lag]), share * float(apart @ apart)
+        )
 
     def _size_of_all(self, rates: np.ndarray) -> SlopeError:
         """Return the size of the derivative, from rates, or from the derivative in use."""
         if self.derivative is not None and len(rates):
-            return SlopeError(_moment(rates), float(self.derivative.weights @ self.derivative.weights))
-        step = np.diff(np.array(list(self._stamps)[-len(rates):], np.int64))
+            return SlopeError(
+                _moment(rates), float(self.derivative.weights @ self.derivative.weights)
+            )
+        step = np.diff(np.array(list(self._stamps)[-len(rates) :], np.int64))
         step = step[np.abs(step) <= PAUSE_NS]
         period = max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
         if len(rates) < 3 or not period:
             return SlopeError()
         lag = int(min(max(round(ROUGH / period), 1), len(rates) - 2))
-        return SlopeError(_moment((rates[lag:] - rates[:-lag]) / (lag * period)), 2.0 / (lag * period)**2)
+        return SlopeError(
+            _moment((rates[lag:] - rates[:-lag]) / (lag * period)), 2.0 / (lag * period) ** 2
+        )
 
-    def _count_on(self, tracker: StampedDerivative | TimedDerivative, step_ns: int, reading: tuple) -> tuple:
+    def _count_on(
+        self, tracker: StampedDerivative | TimedDerivative, step_ns: int, reading: tuple
+    ) -> tuple:
         """
         Return the derivative after a sample that is counted.
 
@@ -205,7 +250,9 @@ class RateSlope:
         self._doubtful.append(reading)
         usual_ns = self._longest_ns + 1e9 * tracker.period * (len(self._doubtful) - 1)
         in_order = -RESET_NS < step_ns and self._ahead_ns <= usual_ns
-        may_return = step_ns > 0 and self._ahead_ns <= usual_ns + 1e9 * tracker.period * tracker.taps
+        may_return = (
+            step_ns > 0 and self._ahead_ns <= usual_ns + 1e9 * tracker.period * tracker.taps
+        )
         if not in_order and may_return and 2 * len(self._doubtful) <= tracker.taps:
             return self._slope
         self._count += 0 if in_order else tracker.taps
@@ -227,17 +274,25 @@ class RateSlope:
             line = describe_stamps(stamps)
         else:
             self._due = CLOCK_BLOCK
-            if self.line.word == REGULAR and _usual(stamps[-CLOCK_BLOCK - 1:], self.line.period_ns):
+            if self.line.word == REGULAR and _usual(
+                stamps[-CLOCK_BLOCK - 1 :], self.line.period_ns
+            ):
                 return
             # Counted stamps may appear regular for some time; regular ones are identified at once.
-            line = None if self.line.word == COUNTED else describe_stamps(stamps[-CLOCK_BLOCK - 1:])
+            line = (
+                None if self.line.word == COUNTED else describe_stamps(stamps[-CLOCK_BLOCK - 1 :])
+            )
             line = line or (describe_stamps(stamps) if len(stamps) == REVIEWED_STAMPS else None)
         if line is None:
             if self.line is None:
-                self._changed()   # so that the omitted part is known
+                self._changed()  # so that the omitted part is known
             return
-        if self.line is not None and (self.line.word, line.word) == (IRREGULAR, COUNTED) and self._tracker is not None:
-            self._agreeing += 1   # independent steps appear counted in one of four reviews
+        if (
+            self.line is not None
+            and (self.line.word, line.word) == (IRREGULAR, COUNTED)
+            and self._tracker is not None
+        ):
+            self._agreeing += 1  # independent steps appear counted in one of four reviews
             if self._agreeing < AGREE:
                 return
         self._agreeing = 0
@@ -252,20 +307,28 @@ class RateSlope:
         before = np.array(self._stamps, np.int64)[-CLOCK_BLOCK:]
         stamps = np.concatenate([before, stamp_ns[start:]])
         step = np.diff(stamps)
-        again = np.flatnonzero(step[max(len(before) - 1, 0):] == 0)   # the counting branch compares their readings
+        again = np.flatnonzero(
+            step[max(len(before) - 1, 0) :] == 0
+        )  # the counting branch compares their readings
         stop = len(values) - start if not len(again) else int(again[0]) + (0 if len(before) else 1)
         due = np.arange(self._due - 1, stop, CLOCK_BLOCK)
         first = due + len(before) - CLOCK_BLOCK
         unusual = first < 0
-        unusual[~unusual] = ~_usual(stamps[first[~unusual, None] + np.arange(CLOCK_BLOCK + 1)], self.line.period_ns)
+        unusual[~unusual] = ~_usual(
+            stamps[first[~unusual, None] + np.arange(CLOCK_BLOCK + 1)], self.line.period_ns
+        )
         return start + (int(due[unusual][0]) if unusual.any() else stop)
 
     def _note(self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray) -> None:
         """Store the state after a block that was processed as a whole."""
         self._stamps.extend(stamp_ns[-REVIEWED_STAMPS:].tolist())
-        self._newest, self._reading, self._slope = int(stamp_ns[-1]), tuple(reading.tolist()), tuple(slopes[-1].tolist())
+        self._newest, self._reading, self._slope = (
+            int(stamp_ns[-1]),
+            tuple(reading.tolist()),
+            tuple(slopes[-1].tolist()),
+        )
         self._due = (self._due - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
-        self._recent.extend(map(tuple, slopes[-(self._recent.maxlen or len(slopes)):].tolist()))
+        self._recent.extend(map(tuple, slopes[-(self._recent.maxlen or len(slopes)) :].tolist()))
 
 
 def _stand_still(line: StampLine) -> bool:
@@ -276,7 +339,10 @@ def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
     """Return whether stamps, shape (..., n), are from a clock of that period, without a missing one."""
     step = np.diff(stamps, axis=-1)
     within = np.all(stamping.is_regular(step, period_ns), axis=-1)
-    return within & (np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1) <= CHANGED[REGULAR])
+    return within & (
+        np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1)
+        <= CHANGED[REGULAR]
+    )
 
 
 def _moment(rows: np.ndarray) -> np.ndarray:

@@ -8,7 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.compensation.angular_acceleration import NO_SLOPE, CausalDerivative, choose_derivative, typical_period
+from imu_calibration.compensation.angular_acceleration import (
+    NO_SLOPE,
+    CausalDerivative,
+    choose_derivative,
+    typical_period,
+)
 from imu_calibration.compensation.compensate import (
     Corrected,
     FittedErrors,
@@ -46,14 +51,23 @@ class CompensationStream:
 
     """
 
-    def __init__(self, calibration: FittedErrors, temperature: TemperatureSamples | None = None, transfer: Transfer | None = None):
+    def __init__(
+        self,
+        calibration: FittedErrors,
+        temperature: TemperatureSamples | None = None,
+        transfer: Transfer | None = None,
+    ):
         self.calibration, self.transfer, self.temperature = calibration, transfer, temperature
         model = invertible(calibration.model)
         if model.needs_temperature and temperature is None:
-            raise InputError('the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature',
-                             code='temperature_missing')
+            raise InputError(
+                'the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature',
+                code='temperature_missing',
+            )
         if temperature is not None and model.uses('thermal branch'):
-            self.temperature = replace(temperature, branch=ThermalBranch().of(temperature.temperature_c))
+            self.temperature = replace(
+                temperature, branch=ThermalBranch().of(temperature.temperature_c)
+            )
         self._vibration = BandVariance() if model.uses('vibration') else None
         self.count, self.flagged, self.frame_id = 0, 0, ''
         self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer))
@@ -70,28 +84,53 @@ class CompensationStream:
         """
         if self.slope.line is None and len(imu):
             first = imu.stamp_ns[:10_000]
-            self.slope.settle(describe_stamps(first) or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01)))
+            self.slope.settle(
+                describe_stamps(first) or StampLine(REGULAR, 1e9 * (typical_period(first) or 0.01))
+            )
         temperature, branch = self._warmth_at(imu.stamp_ns)
-        has_force, has_rate = (np.isfinite(values).all(axis=1) for values in (imu.force_s, imu.rate_s))
+        has_force, has_rate = (
+            np.isfinite(values).all(axis=1) for values in (imu.force_s, imu.rate_s)
+        )
         slope = np.zeros_like(imu.rate_s)
         slope[has_rate] = self.slope.push_block(imu.stamp_ns[has_rate], imu.rate_s[has_rate])
-        force_s, rate_s = (np.where(given[:, None], values, self.calibration.of(sensor, Role.OFFSET)) for sensor, values, given
-                           in (('accelerometer', imu.force_s, has_force), ('gyroscope', imu.rate_s, has_rate)))
+        force_s, rate_s = (
+            np.where(given[:, None], values, self.calibration.of(sensor, Role.OFFSET))
+            for sensor, values, given in (
+                ('accelerometer', imu.force_s, has_force),
+                ('gyroscope', imu.rate_s, has_rate),
+            )
+        )
         vibration = self._vibration_of(imu.force_s, has_force)
-        corrected = compensate(self.calibration, force_s, rate_s, alpha_s=slope @ self._inverse_rate.T, temperature_c=temperature,
-                               thermal_branch=branch, vibration=vibration, transfer=self.transfer)
+        corrected = compensate(
+            self.calibration,
+            force_s,
+            rate_s,
+            alpha_s=slope @ self._inverse_rate.T,
+            temperature_c=temperature,
+            thermal_branch=branch,
+            vibration=vibration,
+            transfer=self.transfer,
+        )
         corrected.force[~has_force] = np.nan
         corrected.rate[~has_rate] = np.nan
         self.count, self.frame_id = self.count + len(imu), imu.frame_id
         self.flagged += int(corrected.flagged.sum())
-        self._fastest = max(self._fastest, float(np.sqrt((imu.rate_s[has_rate]**2).sum(axis=1).max(initial=0.0))))
+        self._fastest = max(
+            self._fastest, float(np.sqrt((imu.rate_s[has_rate] ** 2).sum(axis=1).max(initial=0.0)))
+        )
         usable = np.flatnonzero(has_force & has_rate)
         if len(usable):
             k = usable[-1]
-            self._last = {'force': imu.force_s[k], 'rate': imu.rate_s[k], 'derivative': slope[k],
-                          'dt': 0.0 if temperature is None else float(temperature[k]) - self.calibration.model.temperature_ref_c,
-                          'branch': 0.0 if branch is None else float(branch[k]),
-                          'vibration': (0.0,) * 3 if vibration is None else tuple(vibration[k].tolist())}
+            self._last = {
+                'force': imu.force_s[k],
+                'rate': imu.rate_s[k],
+                'derivative': slope[k],
+                'dt': 0.0
+                if temperature is None
+                else float(temperature[k]) - self.calibration.model.temperature_ref_c,
+                'branch': 0.0 if branch is None else float(branch[k]),
+                'vibration': (0.0,) * 3 if vibration is None else tuple(vibration[k].tolist()),
+            }
         return corrected
 
     def _vibration_of(self, force_s, finite):
@@ -112,9 +151,13 @@ class CompensationStream:
         if len(values):
             self._temperatures += [float(values.min()), float(values.max())]
             self._temperatures = [min(self._temperatures), max(self._temperatures)]
-        return values, None if self.temperature.branch is None else np.interp(at, known, self.temperature.branch)
+        return values, None if self.temperature.branch is None else np.interp(
+            at, known, self.temperature.branch
+        )
 
-    def propagate(self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def propagate(
+        self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the covariances of corrected (force, rate), each (3, 3), at the last sample.
 
@@ -125,34 +168,55 @@ class CompensationStream:
 
         """
         self._uncertainty.use(self.slope.derivative, self.slope.period)
-        force, rate = (c if c is not None and is_known(c) else noise for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise))
-        return self._uncertainty.at(**self._last, slope_error=self.slope.error()).covariances(force, rate)
+        force, rate = (
+            c if c is not None and is_known(c) else noise
+            for c, noise in zip((force_cov, rate_cov), self._uncertainty.noise)
+        )
+        return self._uncertainty.at(**self._last, slope_error=self.slope.error()).covariances(
+            force, rate
+        )
 
     def warnings(self) -> list[str]:
         """Return lines on samples outside the conditions of the calibration, or without correction."""
         lines = outside_conditions(self.calibration, self._fastest, self._temperatures)
-        if self.frame_id and self.calibration.frame_id and self.frame_id != self.calibration.frame_id:
-            lines.append(f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
-                         'make sure that it is the same sensor')
+        if (
+            self.frame_id
+            and self.calibration.frame_id
+            and self.frame_id != self.calibration.frame_id
+        ):
+            lines.append(
+                f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
+                'make sure that it is the same sensor'
+            )
         if self.slope.n_without and uses_slope(self.calibration, self.transfer):
-            lines.append(f'the stamps of {self.slope.n_without} of {self.count} samples are frozen{WITHOUT}')
+            lines.append(
+                f'the stamps of {self.slope.n_without} of {self.count} samples are frozen{WITHOUT}'
+            )
         if self.flagged:
-            lines.append(f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted')
+            lines.append(
+                f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted'
+            )
         return lines
 
 
-def derivative_for(calibration: FittedErrors, period: float, transfer: Transfer | None = None) -> CausalDerivative:
+def derivative_for(
+    calibration: FittedErrors, period: float, transfer: Transfer | None = None
+) -> CausalDerivative:
     """Return the causal derivative that suits the arms and the noise of a calibration."""
     arm = float(np.max(np.linalg.norm(arms_of(calibration), axis=1)))
     if transfer is not None:
         arm = max(arm, float(np.linalg.norm(transfer.arm_t)))
-    (force_sd, _), (rate_sd, _) = (calibration.noise(sensor, period) for sensor in ('accelerometer', 'gyroscope'))
+    (force_sd, _), (rate_sd, _) = (
+        calibration.noise(sensor, period) for sensor in ('accelerometer', 'gyroscope')
+    )
     return choose_derivative(period, float(rate_sd.max()), arm, force_sd=float(force_sd.min()))
 
 
 def uses_slope(calibration: FittedErrors, transfer: Transfer | None = None) -> bool:
     """Return whether the correction uses the angular acceleration: there is a lever arm."""
-    return bool(np.any(arms_of(calibration))) or (transfer is not None and bool(np.any(transfer.arm_t)))
+    return bool(np.any(arms_of(calibration))) or (
+        transfer is not None and bool(np.any(transfer.arm_t))
+    )
 
 
 def refuse_corrected(topic: str) -> None:
@@ -166,11 +230,16 @@ def refuse_corrected(topic: str) -> None:
 
     """
     if topic.rstrip('/').endswith(CORRECTED_TOPIC_ENDINGS):
-        raise InputError(f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic", key='imu_topic',
-                         code='corrected_already')
+        raise InputError(
+            f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic",
+            key='imu_topic',
+            code='corrected_already',
+        )
 
 
-def requested_transfer(frame_id: str, xyz: Sequence[float], rpy: Sequence[float]) -> Transfer | None:
+def requested_transfer(
+    frame_id: str, xyz: Sequence[float], rpy: Sequence[float]
+) -> Transfer | None:
     """
     Return the Transfer of options or parameters, None without a target frame.
 
@@ -183,8 +252,11 @@ def requested_transfer(frame_id: str, xyz: Sequence[float], rpy: Sequence[float]
     if frame_id:
         return Transfer.from_pose(frame_id, xyz, rpy)
     if any(xyz) or any(rpy):
-        raise InputError('a pose in the target frame needs the name of that frame, none was given; give the target frame as well',
-                         key='target_frame', code='frame_name_missing')
+        raise InputError(
+            'a pose in the target frame needs the name of that frame, none was given; give the target frame as well',
+            key='target_frame',
+            code='frame_name_missing',
+        )
     return None
 
 
@@ -198,15 +270,24 @@ Vectors = Sequence[Sequence[float]] | np.ndarray
 Temperatures = Sequence[float] | np.ndarray | TemperatureSamples | float
 
 
-def compensate_samples(calibration: FittedErrors, imu: ImuSamples, temperature_c: Temperatures | None = None) -> ImuSamples:
+def compensate_samples(
+    calibration: FittedErrors, imu: ImuSamples, temperature_c: Temperatures | None = None
+) -> ImuSamples:
     """Return samples without the calibrated errors; as `compensate_readings`."""
-    corrected = CompensationStream(calibration, _as_temperatures(temperature_c, imu.stamp_ns)).correct(imu)
+    corrected = CompensationStream(
+        calibration, _as_temperatures(temperature_c, imu.stamp_ns)
+    ).correct(imu)
     return ImuSamples(imu.stamp_ns, corrected.force, corrected.rate, imu.frame_id)
 
 
-def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples, rate_s: Vectors | None = None, *,
-                        time: Sequence[float] | np.ndarray | None = None,
-                        temperature_c: Temperatures | None = None) -> tuple[np.ndarray, np.ndarray] | ImuSamples:
+def compensate_readings(
+    calibration: FittedErrors,
+    samples: Vectors | ImuSamples,
+    rate_s: Vectors | None = None,
+    *,
+    time: Sequence[float] | np.ndarray | None = None,
+    temperature_c: Temperatures | None = None,
+) -> tuple[np.ndarray, np.ndarray] | ImuSamples:
     """
     Return readings without the calibrated errors.
 
@@ -235,7 +316,9 @@ def compensate_readings(calibration: FittedErrors, samples: Vectors | ImuSamples
     """
     if isinstance(samples, ImuSamples):
         return compensate_samples(calibration, samples, temperature_c)
-    found = compensate_samples(calibration, _as_samples(calibration, samples, rate_s, time), temperature_c)
+    found = compensate_samples(
+        calibration, _as_samples(calibration, samples, rate_s, time), temperature_c
+    )
     return found.force_s, found.rate_s
 
 
@@ -243,8 +326,10 @@ def _as_samples(calibration, force_s, rate_s, time):
     """Return arrays as ImuSamples; times may be missing if no arm needs angular acceleration."""
     if time is None:
         if np.any(arms_of(calibration)):
-            raise InputError('the calibration has lever arms and needs the time of each reading, none was given; give `time` in seconds',
-                             code='time_missing')
+            raise InputError(
+                'the calibration has lever arms and needs the time of each reading, none was given; give `time` in seconds',
+                code='time_missing',
+            )
         time = np.arange(len(force_s)) * 0.01
     return SampleBlock.from_arrays(time, force_s, rate_s).imu
 
@@ -252,7 +337,9 @@ def _as_samples(calibration, force_s, rate_s, time):
 def _as_temperatures(temperature_c, stamp_ns):
     if temperature_c is None or isinstance(temperature_c, TemperatureSamples):
         return temperature_c
-    return TemperatureSamples(stamp_ns, np.broadcast_to(np.asarray(temperature_c, float), stamp_ns.shape))
+    return TemperatureSamples(
+        stamp_ns, np.broadcast_to(np.asarray(temperature_c, float), stamp_ns.shape)
+    )
 
 
 class SampleCompensation:
@@ -269,21 +356,43 @@ class SampleCompensation:
 
     """
 
-    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None, with_parameters: bool = True):
-        self.calibration, self.transfer, self.with_parameters = calibration, transfer, with_parameters
+    def __init__(
+        self,
+        calibration: FittedErrors,
+        transfer: Transfer | None = None,
+        with_parameters: bool = True,
+    ):
+        self.calibration, self.transfer, self.with_parameters = (
+            calibration,
+            transfer,
+            with_parameters,
+        )
         self.counts, self.corrected, self.fastest_squared = Counter(), 0, 0.0
         model = invertible(calibration.model)
         self.needs_temperature = model.needs_temperature
         self.dt = None if self.needs_temperature else 0.0
         self.branch, self.vibration = ThermalBranch(), BandVariance()
         self._shakes = model.uses('vibration')
-        self.at_zero = {sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS}
+        self.at_zero = {
+            sensor: tuple(calibration.of(sensor, Role.OFFSET).tolist()) for sensor in SENSORS
+        }
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
         self.needs_slope = uses_slope(calibration, transfer)
-        self._follows = self.needs_slope or self._shakes or calibration.knows_density   # the stamps determine the noise of a sample
-        self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer), self._take_derivative)
+        self._follows = (
+            self.needs_slope or self._shakes or calibration.knows_density
+        )  # the stamps determine the noise of a sample
+        self.slope = RateSlope(
+            partial(derivative_for, calibration, transfer=transfer), self._take_derivative
+        )
         self._kernel = make_kernel(calibration, transfer)
-        self.last: tuple[Any, ...] = ((0.0, 0.0, 9.8), (0.0, 0.0, 0.0), NO_SLOPE, 0.0, 0.0, NO_SLOPE)
+        self.last: tuple[Any, ...] = (
+            (0.0, 0.0, 9.8),
+            (0.0, 0.0, 0.0),
+            NO_SLOPE,
+            0.0,
+            0.0,
+            NO_SLOPE,
+        )
         self.revision = 0
         """Number of updates of the covariances."""
         self._uncertainty = Uncertainty(calibration, transfer)
@@ -297,15 +406,23 @@ class SampleCompensation:
         if self.needs_temperature:
             self.dt = temperature_c - self.calibration.model.temperature_ref_c
 
-    def correct(self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float) -> tuple[float, ...] | None:
+    def correct(
+        self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float
+    ) -> tuple[float, ...] | None:
         """Return corrected rate and specific force, six floats, or None if no sample can be published; `counts` has the reason."""
         total, dt = wx + wy + wz + fx + fy + fz, self.dt
         if total - total != 0.0 or dt is None:
             self.counts['no temperature yet' if dt is None else 'not finite'] += 1
             return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
-        vibration = self.vibration.push(self.slope.period or 0.0, (fx, fy, fz)) if self._shakes else NO_SLOPE
-        ux, uy, uz, vx, vy, vz = self._kernel(fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now, *vibration)
+        vibration = (
+            self.vibration.push(self.slope.period or 0.0, (fx, fy, fz))
+            if self._shakes
+            else NO_SLOPE
+        )
+        ux, uy, uz, vx, vy, vz = self._kernel(
+            fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now, *vibration
+        )
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
             self.counts['outside the invertible range'] += 1
@@ -316,20 +433,29 @@ class SampleCompensation:
         self.corrected += 1
         return vx, vy, vz, ux, uy, uz
 
-    def covariances(self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def covariances(
+        self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the covariances of corrected (force, rate), each (3, 3), at the sample of their last update.
 
         Covariances of the readings, (3, 3), may be zero or invalid: the noise of the calibration is used; or None: not measured.
         """
-        force, rate = (np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise
-                       for cov, noise in zip((force_cov, rate_cov), self._uncertainty.noise))
+        force, rate = (
+            np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise
+            for cov, noise in zip((force_cov, rate_cov), self._uncertainty.noise)
+        )
         return self._sensitivity.covariances(force, rate, self.with_parameters)
 
     def refresh(self) -> None:
         """Update the covariances of the corrected readings at the latest sample."""
-        self._sensitivity = self._uncertainty.at(*self.last[:3], dt=self.last[3], branch=self.last[4], vibration=self.last[5],
-                                                 slope_error=self.slope.error() if self.needs_slope else None)
+        self._sensitivity = self._uncertainty.at(
+            *self.last[:3],
+            dt=self.last[3],
+            branch=self.last[4],
+            vibration=self.last[5],
+            slope_error=self.slope.error() if self.needs_slope else None,
+        )
         self.revision += 1
 
     def prepare(self, before: 'SampleCompensation') -> None:
@@ -340,9 +466,17 @@ class SampleCompensation:
 
     def follow(self, before: 'SampleCompensation') -> None:
         """Continue from another compensation: same past of the rate, same temperature, same counts."""
-        self.counts, self.corrected, self.fastest_squared = before.counts, before.corrected, before.fastest_squared
+        self.counts, self.corrected, self.fastest_squared = (
+            before.counts,
+            before.corrected,
+            before.fastest_squared,
+        )
         if before.dt is not None and before.needs_temperature and self.dt is None:
-            self.dt = before.dt + before.calibration.model.temperature_ref_c - self.calibration.model.temperature_ref_c
+            self.dt = (
+                before.dt
+                + before.calibration.model.temperature_ref_c
+                - self.calibration.model.temperature_ref_c
+            )
         self.branch, self.vibration = before.branch, before.vibration
         self.slope.follow(before.slope)
 

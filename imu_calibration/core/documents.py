@@ -94,6 +94,7 @@ def to_text(document: dict[str, Any]) -> str:
 def _with_floats(name: str) -> Any:
     """Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`: a text that resembles a number is then quoted."""
     import yaml
+
     kind: Any = type(name, (getattr(yaml, f'C{name}', getattr(yaml, name)),), {})
     kind.add_implicit_resolver('tag:yaml.org,2002:float', FLOAT, list('-+.0123456789'))
     return kind
@@ -103,7 +104,10 @@ def from_text(text: str, what: str = 'document') -> dict[str, Any]:
     """Return the mapping in a YAML text; raises as `parsed`, also when it is not a mapping."""
     document = parsed(text, what)
     if not isinstance(document, dict):
-        raise DocumentError(f'a {what} must be a mapping, got {type(document).__name__}; correct the file', code='not_a_mapping')
+        raise DocumentError(
+            f'a {what} must be a mapping, got {type(document).__name__}; correct the file',
+            code='not_a_mapping',
+        )
     return document
 
 
@@ -127,41 +131,56 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
 
     """
     import yaml
+
     loader = _with_floats('SafeLoader')
     _within_limits(len(text), MAX_DOCUMENT_CHARACTERS, what, 'characters')
     try:
         _look_through(yaml.parse(text, Loader=loader), what, aliases)
         return yaml.load(text, Loader=loader)
     except (yaml.YAMLError, *NO_SUCH_VALUE) as error:
-        raise DocumentError(f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file',
-                            code='not_yaml') from error
+        raise DocumentError(
+            f'a {what} must be YAML, this is not: {shortened(str(error), 500)}; correct the file',
+            code='not_yaml',
+        ) from error
 
 
 def _look_through(events, what, aliases):
     """Refuse documents that need much time or memory, from the events of the parser, which need neither."""
-    count, sizes, open_parts = 0, {}, []   # parts with aliases expanded; those of each anchor; [anchor, count, keys or None, key is next]
+    count, sizes, open_parts = (
+        0,
+        {},
+        [],
+    )  # parts with aliases expanded; those of each anchor; [anchor, count, keys or None, key is next]
     for event in events:
         kind = type(event).__name__
-        if kind.endswith(('StreamStartEvent', 'DocumentStartEvent', 'StreamEndEvent', 'DocumentEndEvent')):
+        if kind.endswith(
+            ('StreamStartEvent', 'DocumentStartEvent', 'StreamEndEvent', 'DocumentEndEvent')
+        ):
             continue
         if kind.endswith('EndEvent'):
             anchor, start, *_ = open_parts.pop()
             sizes[anchor] = count - start
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
-            raise DocumentError(f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
-                                code='yaml_alias')
+            raise DocumentError(
+                f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
+                code='yaml_alias',
+            )
         if open_parts and open_parts[-1][2] is not None:
             _check_key(event, open_parts[-1], what)
         count += sizes[event.anchor] if kind == 'AliasEvent' else 1
         if kind == 'ScalarEvent':
             sizes[event.anchor] = 1
-            if event.implicit[0] or event.tag:   # false for a quoted text
+            if event.implicit[0] or event.tag:  # false for a quoted text
                 _within_limits(len(event.value), MAX_SCALAR_CHARACTERS, what, 'characters in a row')
                 if NUMBER_START.fullmatch(event.value):
-                    _within_limits(len(event.value), MAX_NUMBER_CHARACTERS, what, 'characters in a number')
+                    _within_limits(
+                        len(event.value), MAX_NUMBER_CHARACTERS, what, 'characters in a number'
+                    )
         elif kind != 'AliasEvent':
-            open_parts.append([event.anchor, count, set() if kind == 'MappingStartEvent' else None, True])
+            open_parts.append(
+                [event.anchor, count, set() if kind == 'MappingStartEvent' else None, True]
+            )
         _within_limits(len(open_parts), MAX_DOCUMENT_DEPTH, what, 'levels')
         _within_limits(count, MOST_PARTS, what, 'parts')
 
@@ -169,24 +188,30 @@ def _look_through(events, what, aliases):
 def _check_key(event, mapping, what):
     """Refuse a key that the open mapping has already, and one that merges another mapping into it."""
     mapping[3] = not mapping[3]
-    if mapping[3]:   # this is a value
+    if mapping[3]:  # this is a value
         return
     key = getattr(event, 'value', None)
     if key in mapping[2] or (key == '<<' and event.implicit[0]):
-        raise DocumentError(f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
-                            f'{event.start_mark.line + 1}; remove it', code='key_repeated')
+        raise DocumentError(
+            f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
+            f'{event.start_mark.line + 1}; remove it',
+            code='key_repeated',
+        )
     mapping[2].update([key] if key is not None else [])
 
 
 def _within_limits(number, limit, what, unit):
     if number > limit:
-        raise DocumentError(f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
-                            code='document_limit')
+        raise DocumentError(
+            f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
+            code='document_limit',
+        )
 
 
 def version_of(text: str) -> str:
     """Return twelve characters that change whenever a document does: the beginning of its SHA-256."""
     from hashlib import sha256
+
     return sha256(text.encode()).hexdigest()[:12]
 
 
@@ -204,7 +229,9 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
         When it cannot be opened or is not a regular file.
 
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)   # opening a FIFO would wait for its writer
+    descriptor = os.open(
+        path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+    )  # opening a FIFO would wait for its writer
     if not S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(EINVAL, 'it is not a regular file', str(path))
@@ -222,7 +249,10 @@ def load_arrays(data: bytes) -> Any:
 
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        n_bytes, limit = sum(member.file_size for member in archive.infolist()), ARRAYS_BASE + ARRAYS_RATIO * len(data)
+        n_bytes, limit = (
+            sum(member.file_size for member in archive.infolist()),
+            ARRAYS_BASE + ARRAYS_RATIO * len(data),
+        )
     if n_bytes > limit:
         raise ValueError(f'its arrays need {n_bytes} bytes, at most {limit} are accepted')
     return np.load(io.BytesIO(data), allow_pickle=False)

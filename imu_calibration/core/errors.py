@@ -8,13 +8,37 @@ local name: an option of the command line, a parameter or topic of a node, an ar
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-ERROR_KEYS = ('allow_xacro', 'anyway', 'calibration', 'columns', 'diagnose', 'force', 'frame_id', 'gravity', 'imu_link', 'imu_topic',
-              'inspect', 'jobs', 'joint_topic', 'nominal', 'noise', 'scheduler', 'setting', 'table', 'target_frame', 'temperature_topic',
-              'up', 'urdf')
+ERROR_KEYS = (
+    'allow_xacro',
+    'anyway',
+    'calibration',
+    'columns',
+    'diagnose',
+    'force',
+    'frame_id',
+    'gravity',
+    'imu_link',
+    'imu_topic',
+    'inspect',
+    'jobs',
+    'joint_topic',
+    'nominal',
+    'noise',
+    'scheduler',
+    'setting',
+    'table',
+    'target_frame',
+    'temperature_topic',
+    'up',
+    'urdf',
+)
 """Inputs that an error may request, and programs that a remedy may need."""
 OFFERS = {'anyway': ', or give your consent', 'nominal': ', or give a nominal scaling'}
 """Key -> a second remedy, which is offered only where the key has a name."""
-REMEDY_VERBS = {'diagnose': "run 'imu_calibration diagnose' to {}", 'inspect': "run 'imu_calibration inspect' to {}"}
+REMEDY_VERBS = {
+    'diagnose': "run 'imu_calibration diagnose' to {}",
+    'inspect': "run 'imu_calibration inspect' to {}",
+}
 """Key -> the program for a remedy, unless the hints name another one."""
 
 
@@ -60,14 +84,20 @@ class DocumentError(InputError):
 
 def printable(text: str) -> str:
     """Return a text with a question mark for each line end, control character, change of direction and undecodable byte."""
-    return text if text.isprintable() and '\ufffd' not in text else \
-        ''.join(character if character.isprintable() and character != '\ufffd' else '?' for character in text)
+    return (
+        text
+        if text.isprintable() and '\ufffd' not in text
+        else ''.join(
+            character if character.isprintable() and character != '\ufffd' else '?'
+            for character in text
+        )
+    )
 
 
 def shortened(text: str, length: int = 60) -> str:
     """Return a text on one line without control characters, truncated at `length` characters: for received text, which may be anything."""
-    text = printable(' '.join(text[:length * 4].split()))
-    return text if len(text) <= length else f'{text[:length - 3]}...'
+    text = printable(' '.join(text[: length * 4].split()))
+    return text if len(text) <= length else f'{text[: length - 3]}...'
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

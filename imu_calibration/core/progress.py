@@ -52,6 +52,7 @@ def counter(phase: str, total: float) -> Callable[[float], None]:
         done += amount
         if total:
             report(phase, done, total)
+
     advance(0)
     return advance
 

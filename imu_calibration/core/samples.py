@@ -33,14 +33,24 @@ class AlignedArrays:
 
     def select(self, index: Any) -> Any:
         """Return the rows at `index` (slice, mask or integer array)."""
-        return type(self)(**{name: value[index] if isinstance(value, np.ndarray) else
-                             value.select(index) if isinstance(value, AlignedArrays) else value for name, value in vars(self).items()})
+        return type(self)(
+            **{
+                name: value[index]
+                if isinstance(value, np.ndarray)
+                else value.select(index)
+                if isinstance(value, AlignedArrays)
+                else value
+                for name, value in vars(self).items()
+            }
+        )
 
     @classmethod
     def concatenate(cls, parts: Iterable[Any]) -> Any:
         """Join `parts` in order; a field that one of them lacks is None, and fields that are not arrays are those of the first part."""
         parts = list(parts)
-        return cls(**{name: _joined([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+        return cls(
+            **{name: _joined([getattr(part, name) for part in parts]) for name in vars(parts[0])}
+        )
 
 
 def _joined(values):
@@ -69,12 +79,16 @@ class JoinedParts:
         """Append samples of one kind."""
         if self._first is None:
             self._first = part.select(slice(0))
-            self._columns = {name: values.copy() for name, values in vars(self._first).items() if isinstance(values, np.ndarray)}
+            self._columns = {
+                name: values.copy()
+                for name, values in vars(self._first).items()
+                if isinstance(values, np.ndarray)
+            }
         stop = self._count + len(part)
         for name, column in self._columns.items():
             if len(column) < stop:
                 self._resize(name, max(stop, len(column) + len(column) // self.SPARE))
-            column[self._count:stop] = getattr(part, name)
+            column[self._count : stop] = getattr(part, name)
         self._count = stop
 
     def samples(self) -> Any:
@@ -84,7 +98,9 @@ class JoinedParts:
         return replace(self._first, **self._columns)
 
     def _resize(self, name, count):
-        self._columns[name].resize((count, *self._columns[name].shape[1:]), refcheck=False)   # in place: no view exists
+        self._columns[name].resize(
+            (count, *self._columns[name].shape[1:]), refcheck=False
+        )  # in place: no view exists
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +167,15 @@ class SampleBlock:
     """Messages that were changed before use, such as messages without a stamp: reason -> count."""
 
     @classmethod
-    def from_arrays(cls, time: ArrayLike, force: ArrayLike, rate: ArrayLike, *, joints: dict[str, ArrayLike] | None = None,
-                    temperature_c: ArrayLike | None = None) -> 'SampleBlock':
+    def from_arrays(
+        cls,
+        time: ArrayLike,
+        force: ArrayLike,
+        rate: ArrayLike,
+        *,
+        joints: dict[str, ArrayLike] | None = None,
+        temperature_c: ArrayLike | None = None,
+    ) -> 'SampleBlock':
         """
         Return a recording from arrays.
 
@@ -179,17 +202,31 @@ class SampleBlock:
         angles = {name: np.asarray(values, float) for name, values in (joints or {}).items()}
         heat = None if temperature_c is None else np.asarray(temperature_c, float)
         n = len(time) if time.ndim == 1 else -1
-        given = {'time': time, 'force': force, 'rate': rate, **angles, **({} if heat is None else {'temperature_c': heat})}
+        given = {
+            'time': time,
+            'force': force,
+            'rate': rate,
+            **angles,
+            **({} if heat is None else {'temperature_c': heat}),
+        }
         for name, values in given.items():
             wanted = (n, 3) if name in ('force', 'rate') else (n,)
             if values.shape != wanted or n < 1:
-                raise InputError(f'{name} must have shape {str(wanted).replace("-1", "n")} with at least one row, got {values.shape}; '
-                                 'correct the array', code='array_shape')
+                raise InputError(
+                    f'{name} must have shape {str(wanted).replace("-1", "n")} with at least one row, got {values.shape}; '
+                    'correct the array',
+                    code='array_shape',
+                )
         if not np.isfinite(time).all():
-            raise InputError(f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are not; remove these rows')
+            raise InputError(
+                f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are not; remove these rows'
+            )
         stamp_ns = stamps_of(time)
-        return cls(ImuSamples(stamp_ns, force, rate, 'imu_link'), JointSamples.of_angles(stamp_ns, angles) if angles else None,
-                   None if heat is None else TemperatureSamples(stamp_ns, heat))
+        return cls(
+            ImuSamples(stamp_ns, force, rate, 'imu_link'),
+            JointSamples.of_angles(stamp_ns, angles) if angles else None,
+            None if heat is None else TemperatureSamples(stamp_ns, heat),
+        )
 
 
 @dataclass(frozen=True)
@@ -207,8 +244,11 @@ class NominalScaling:
 
     def apply(self, imu: ImuSamples) -> ImuSamples:
         """Return the samples in SI."""
-        return replace(imu, force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
-                       rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale)
+        return replace(
+            imu,
+            force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
+            rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale,
+        )
 
 
 def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
@@ -222,13 +262,15 @@ def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
 def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
     """Return the smallest step from one reading to the next in each column, (n, k), above the share `least` of the largest, shape (k,)."""
     steps = []
-    for column in readings.T:   # one at a time: the temporary arrays of a long recording are large
+    for column in readings.T:  # one at a time: the temporary arrays of a long recording are large
         step = np.abs(np.diff(column))
-        steps.append(np.min(step, where=step > least * np.abs(column).max(initial=1e-12), initial=np.inf))
+        steps.append(
+            np.min(step, where=step > least * np.abs(column).max(initial=1e-12), initial=np.inf)
+        )
     return np.array(steps)
 
 
 def rounding_variance(readings: np.ndarray) -> np.ndarray:
     """Return the variance of rounding, ``step^2 / 12`` of the smallest step, of each column, shape (k,); 0 where none changes."""
     step = smallest_step(readings, 1e-12)
-    return np.where(np.isfinite(step), step, 0.0)**2 / 12
+    return np.where(np.isfinite(step), step, 0.0) ** 2 / 12

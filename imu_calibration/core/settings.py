@@ -60,7 +60,9 @@ def override(group: Any, values: Mapping[str, Any]) -> Any:
     checked = {}
     for name, value in values.items():
         if name not in known:
-            raise InputError(f"setting '{name}' is unknown; the settings here are {', '.join(sorted(known))}")
+            raise InputError(
+                f"setting '{name}' is unknown; the settings here are {', '.join(sorted(known))}"
+            )
         checked[name] = _checked(known[name], value)
     return replace(group, **checked)
 
@@ -70,11 +72,17 @@ def _checked(declared, value):
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if default is not None and not isinstance(value, type(default)):
-        raise InputError(f"setting '{declared.name}' must be {type(default).__name__}, got {value!r}; correct it")
+        raise InputError(
+            f"setting '{declared.name}' must be {type(default).__name__}, got {value!r}; correct it"
+        )
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         if (low is not None and value < low) or (high is not None and value > high):
-            raise InputError(f"setting '{declared.name}' must lie in [{low}, {high}], got {value!r}; choose a value inside")
+            raise InputError(
+                f"setting '{declared.name}' must lie in [{low}, {high}], got {value!r}; choose a value inside"
+            )
     if declared.choices and value not in declared.choices:
-        raise InputError(f"setting '{declared.name}' must be one of {', '.join(declared.choices)}, got '{value}'; choose one",
-                         code='choice_unknown')
+        raise InputError(
+            f"setting '{declared.name}' must be one of {', '.join(declared.choices)}, got '{value}'; choose one",
+            code='choice_unknown',
+        )
     return value

@@ -22,19 +22,48 @@ ARCMIN = DEG / 60
 NOISE_QUANTITY = 'noise'
 """The quantity of noise figures, which have the units of data sheets."""
 _SHOWN = {
-    '': {'m/s^2': (1e3 / STANDARD_GRAVITY, 'mg'), 'rad/s': (1 / DEG, 'deg/s'), 'm': (1e3, 'mm'), 'rad': (60 / DEG, 'arcmin'),
-         's': (1e3, 'ms'), '(rad/s)^-1': (1e2 * DEG, '% per deg/s'), '(rad/s)/(m/s^2)': (STANDARD_GRAVITY / DEG, '(deg/s)/g'),
-         'm/s^2/K': (1e3 / STANDARD_GRAVITY, 'mg/K'), 'rad/s/K': (1 / DEG, '(deg/s)/K'), '1/K': (1e6, 'ppm/K'),
-         'rad/turn': (1 / DEG, 'deg per turn'), 'rad per turn': (1 / DEG, 'deg per turn'), 'm/s^2/s': (60e3 / STANDARD_GRAVITY, 'mg/min'),
-         'rad/s/s': (60 / DEG, '(deg/s)/min'), 's/s': (1e6, 'ppm')},
-    'accelerometer': {'(m/s^2)^-1': (1e3 * STANDARD_GRAVITY, 'mg/g²'), '(m/s^2)^-2': (1e3 * STANDARD_GRAVITY**2, 'mg/g³')},
-    'gyroscope': {'(m/s^2)^-1': (1e2 * STANDARD_GRAVITY, '% per g'), '(m/s^2)^-2': (1e2 * STANDARD_GRAVITY**2, '% per g²')},
-    NOISE_QUANTITY: {'m/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'), 'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
-                     'm/s^2': (1e6 / STANDARD_GRAVITY, 'µg'), 'm/s': (1e6, 'µm/s'), 'm/s^2/K': (1e6 / STANDARD_GRAVITY, 'µg/K'),
-                     'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'), 'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'),
-                     'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'), 'rad/s': (3600 / DEG, 'deg/h'), 'rad': (3600 / DEG, 'arcsec'),
-                     'rad/s/K': (3600 / DEG, '(deg/h)/K'), 'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'), 's': (1.0, 's')},
-    'time_constant': {'s': (1.0, 's')}, 'time': {'s': (1.0, 's')},
+    '': {
+        'm/s^2': (1e3 / STANDARD_GRAVITY, 'mg'),
+        'rad/s': (1 / DEG, 'deg/s'),
+        'm': (1e3, 'mm'),
+        'rad': (60 / DEG, 'arcmin'),
+        's': (1e3, 'ms'),
+        '(rad/s)^-1': (1e2 * DEG, '% per deg/s'),
+        '(rad/s)/(m/s^2)': (STANDARD_GRAVITY / DEG, '(deg/s)/g'),
+        'm/s^2/K': (1e3 / STANDARD_GRAVITY, 'mg/K'),
+        'rad/s/K': (1 / DEG, '(deg/s)/K'),
+        '1/K': (1e6, 'ppm/K'),
+        'rad/turn': (1 / DEG, 'deg per turn'),
+        'rad per turn': (1 / DEG, 'deg per turn'),
+        'm/s^2/s': (60e3 / STANDARD_GRAVITY, 'mg/min'),
+        'rad/s/s': (60 / DEG, '(deg/s)/min'),
+        's/s': (1e6, 'ppm'),
+    },
+    'accelerometer': {
+        '(m/s^2)^-1': (1e3 * STANDARD_GRAVITY, 'mg/g²'),
+        '(m/s^2)^-2': (1e3 * STANDARD_GRAVITY**2, 'mg/g³'),
+    },
+    'gyroscope': {
+        '(m/s^2)^-1': (1e2 * STANDARD_GRAVITY, '% per g'),
+        '(m/s^2)^-2': (1e2 * STANDARD_GRAVITY**2, '% per g²'),
+    },
+    NOISE_QUANTITY: {
+        'm/s^2/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√Hz'),
+        'm/s^3/sqrt(Hz)': (1e6 / STANDARD_GRAVITY, 'µg/√s'),
+        'm/s^2': (1e6 / STANDARD_GRAVITY, 'µg'),
+        'm/s': (1e6, 'µm/s'),
+        'm/s^2/K': (1e6 / STANDARD_GRAVITY, 'µg/K'),
+        'm/s^3': (3600e6 / STANDARD_GRAVITY, 'µg/h'),
+        'rad/s/sqrt(Hz)': (60 / DEG, 'deg/√h'),
+        'rad/s^2/sqrt(Hz)': (60 * 3600 / DEG, 'deg/h/√h'),
+        'rad/s': (3600 / DEG, 'deg/h'),
+        'rad': (3600 / DEG, 'arcsec'),
+        'rad/s/K': (3600 / DEG, '(deg/h)/K'),
+        'rad/s^2': (3600 * 3600 / DEG, '(deg/h)/h'),
+        's': (1.0, 's'),
+    },
+    'time_constant': {'s': (1.0, 's')},
+    'time': {'s': (1.0, 's')},
 }
 """Quantity ('' for all), component or sensor -> SI unit -> (factor, customary unit)."""
 
@@ -45,7 +74,14 @@ OTHER_UNITS = {'g': 1 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
 
 def unit_of_rest(length: float) -> str:
     """Return the unit other than m/s^2 in which a specific force at rest has this length, within a fifth; '' for none."""
-    return next((unit for unit, scale in OTHER_UNITS.items() if 0.8 < length / (scale * STANDARD_GRAVITY) < 1.25), '')
+    return next(
+        (
+            unit
+            for unit, scale in OTHER_UNITS.items()
+            if 0.8 < length / (scale * STANDARD_GRAVITY) < 1.25
+        ),
+        '',
+    )
 
 
 def for_people(unit: str, quantity: str = '') -> tuple[float, str]:

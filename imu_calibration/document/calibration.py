@@ -11,10 +11,24 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, significant, with_sd
-from imu_calibration.document.decision import BY_DEFINITION, SensorDecision, Verdict, decide, decisions_text, most_cautious
+from imu_calibration.document.decision import (
+    BY_DEFINITION,
+    SensorDecision,
+    Verdict,
+    decide,
+    decisions_text,
+    most_cautious,
+)
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, FIXED, GRAVITY, HELD, Status
+from imu_calibration.estimation.solution import (
+    COMMON_SCALE,
+    DETERMINED,
+    FIXED,
+    GRAVITY,
+    HELD,
+    Status,
+)
 
 UNKNOWN_SD = 'unknown'
 """Entry of the provenance for the uncertainty of imported values."""
@@ -116,7 +130,9 @@ class Calibration:
         white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
         if period is not None and 'noise_density' in found:
             white = np.asarray(found['noise_density'], float) / np.sqrt(period)
-        return white, np.hypot(float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0)))
+        return white, np.hypot(
+            float(found.get('between_window_sd', 0.0)), float(found.get('wander_sd', 0.0))
+        )
 
     @property
     def uncertainty_known(self) -> bool:
@@ -129,17 +145,31 @@ class Calibration:
         found = {}
         for sensor in SENSORS:
             known = [SensorDecision(self.decision[sensor])] if sensor in self.decision else []
-            found[sensor] = most_cautious([*known, decide(self.proof.get(sensor))] if self.proof.get(sensor) or not known else known)
+            found[sensor] = most_cautious(
+                [*known, decide(self.proof.get(sensor))]
+                if self.proof.get(sensor) or not known
+                else known
+            )
         return found
 
     @property
     def requested(self) -> dict[str, str]:
         """Status of the requested parameters and of the common scale, by name; table, clock and the common arm are nuisances."""
         nuisances = set(np.array(self.param_names)[~self.model.requested])
-        return {name: status for name, status in self.status_by_name.items() if name not in nuisances and status != FIXED}
+        return {
+            name: status
+            for name, status in self.status_by_name.items()
+            if name not in nuisances and status != FIXED
+        }
 
-    def compensate(self, samples: ImuSamples | np.ndarray, rate_s: np.ndarray | None = None, *, time: np.ndarray | None = None,
-                   temperature_c: Any = None) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
+    def compensate(
+        self,
+        samples: ImuSamples | np.ndarray,
+        rate_s: np.ndarray | None = None,
+        *,
+        time: np.ndarray | None = None,
+        temperature_c: Any = None,
+    ) -> ImuSamples | tuple[np.ndarray, np.ndarray]:
         """
         Return readings with the calibrated errors removed; see `compensate_readings`.
 
@@ -161,24 +191,43 @@ class Calibration:
 
         """
         from imu_calibration.compensation.stream import compensate_readings
+
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
     def __repr__(self):
         known = list(self.status_by_name.values())
-        counts = ', '.join(f'{known.count(status)} {status}' for status in Status if status in known)
+        counts = ', '.join(
+            f'{known.count(status)} {status}' for status in Status if status in known
+        )
         return f'<Calibration of {self.frame_id or "an IMU"}: {decisions_text(self.decisions)}, {counts}>'
 
     def __str__(self):
         rows = [PARAMETER_HEADINGS, *parameter_rows(self)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        aligned = ('  '.join(cell.rjust(width) if heading in NUMBER_COLUMNS else cell.ljust(width)
-                             for cell, width, heading in zip(row, widths, PARAMETER_HEADINGS)) for row in rows)
+        aligned = (
+            '  '.join(
+                cell.rjust(width) if heading in NUMBER_COLUMNS else cell.ljust(width)
+                for cell, width, heading in zip(row, widths, PARAMETER_HEADINGS)
+            )
+            for row in rows
+        )
         return '\n'.join([repr(self), *map(str.rstrip, aligned)])
 
     def _repr_html_(self):
         def row(cells: tuple[str, ...], tag: str) -> str:
-            style = [f' style="text-align:{"right" if heading in NUMBER_COLUMNS else "left"}"' for heading in PARAMETER_HEADINGS]
-            return '<tr>' + ''.join(f'<{tag}{s}>{escape(cell)}</{tag}>' for cell, s in zip(cells, style, strict=True)) + '</tr>'
+            style = [
+                f' style="text-align:{"right" if heading in NUMBER_COLUMNS else "left"}"'
+                for heading in PARAMETER_HEADINGS
+            ]
+            return (
+                '<tr>'
+                + ''.join(
+                    f'<{tag}{s}>{escape(cell)}</{tag}>'
+                    for cell, s in zip(cells, style, strict=True)
+                )
+                + '</tr>'
+            )
+
         body = ''.join(row(cells, 'td') for cells in parameter_rows(self))
         return f'<table><caption>{escape(repr(self))}</caption>{row(PARAMETER_HEADINGS, "th")}{body}</table>'
 
@@ -194,7 +243,9 @@ def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
         part = calibration.model.slices[effect.key]
         for k, index in enumerate(range(part.start, part.stop)):
             factor, unit = for_people(effect.unit_of(k), calibration.param_names[index])
-            value, sd = with_sd(calibration.values[index] * factor, calibration.own_sd[index] * factor)
+            value, sd = with_sd(
+                calibration.values[index] * factor, calibration.own_sd[index] * factor
+            )
             yield calibration.param_names[index], value, sd, unit, str(calibration.status[index])
     if common := calibration.common_scale:
         yield COMMON_SCALE, *with_sd(1.0, common['sd']), '1', str(common['status'])
@@ -213,10 +264,23 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     readings: a g-sensitivity by the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
     """
     model = calibration.model
-    names = {section: tuple(effect.name for effect in model.effects if effect.sensor == section and _stays(effect, sensors))
-             for section in SECTIONS}
-    small = replace(model, accelerometer=names['accelerometer'], gyroscope=names['gyroscope'], reference=names['reference'])
-    places = np.concatenate([np.arange(part.start, part.stop) for part in map(model.slices.__getitem__, small.slices)])
+    names = {
+        section: tuple(
+            effect.name
+            for effect in model.effects
+            if effect.sensor == section and _stays(effect, sensors)
+        )
+        for section in SECTIONS
+    }
+    small = replace(
+        model,
+        accelerometer=names['accelerometer'],
+        gyroscope=names['gyroscope'],
+        reference=names['reference'],
+    )
+    places = np.concatenate(
+        [np.arange(part.start, part.stop) for part in map(model.slices.__getitem__, small.slices)]
+    )
     values, covariance = calibration.values[places], calibration.covariance[np.ix_(places, places)]
     status = [calibration.status[place] for place in places]
     for effect in small.effects:
@@ -224,15 +288,24 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
             part = small.slices[effect.key]
             values[part], status[part] = effect.prior_values(), [HELD] * effect.size
             covariance[part, :] = covariance[:, part] = 0.0
-            covariance[part, part] = np.diag(effect.prior_sds()**2)
-    return replace(calibration, model=small, values=values, covariance=covariance, status=tuple(status), covariance_terms={},
-                   held_reason={})
+            covariance[part, part] = np.diag(effect.prior_sds() ** 2)
+    return replace(
+        calibration,
+        model=small,
+        values=values,
+        covariance=covariance,
+        status=tuple(status),
+        covariance_terms={},
+        held_reason={},
+    )
 
 
 def _stays(effect, sensors):
     if effect.sensor in sensors:
         return effect.role in (Role.OFFSET, Role.LINEAR, Role.LIMIT)
-    return effect.sensor == 'reference' or not any(group.uses & READINGS[sensor] for sensor in sensors for group in effect.groups)
+    return effect.sensor == 'reference' or not any(
+        group.uses & READINGS[sensor] for sensor in sensors for group in effect.groups
+    )
 
 
 SHOWN_NAMES = 6
@@ -248,7 +321,9 @@ def listed(names: Sequence[str]) -> str:
     groups = {}
     for name in names:
         groups.setdefault(name.rpartition('.')[0], []).append(name.rpartition('.')[2])
-    return ', '.join(f'{group} ({len(members)}: {", ".join(members)})' for group, members in groups.items())
+    return ', '.join(
+        f'{group} ({len(members)}: {", ".join(members)})' for group, members in groups.items()
+    )
 
 
 MIN_COEFFICIENT_SDS = 3.0
@@ -282,16 +357,29 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
     return ''
 
 
-def true_calibration(model: SensorModel, values: np.ndarray, frame_id: str, *, simulated: dict[str, Any]) -> Calibration:
+def true_calibration(
+    model: SensorModel, values: np.ndarray, frame_id: str, *, simulated: dict[str, Any]
+) -> Calibration:
     """Return the exact calibration of a simulated IMU; `simulated` describes the simulation in its provenance."""
-    return Calibration(model.at(values), values, np.zeros((len(values),) * 2), (DETERMINED,) * len(values), frame_id,
-                       {'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, provenance={'simulated': simulated}, **BY_DEFINITION)
+    return Calibration(
+        model.at(values),
+        values,
+        np.zeros((len(values),) * 2),
+        (DETERMINED,) * len(values),
+        frame_id,
+        {'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
+        provenance={'simulated': simulated},
+        **BY_DEFINITION,
+    )
 
 
 def beyond_known(share: float, section: str) -> str:
     """Return the message for an effect that explains a share of the excess variance with a size that no known instrument has."""
-    of_what = ('of tables: check the description of the table, the mount, the stamps' if section == 'reference' else
-               'of such sensors: check saturation, the mount, the scale')
+    of_what = (
+        'of tables: check the description of the table, the mount, the stamps'
+        if section == 'reference'
+        else 'of such sensors: check saturation, the mount, the scale'
+    )
     return f'explains {100 * share:.0f} % of the residual, but its size exceeds the literature values {of_what}'
 
 
@@ -305,6 +393,8 @@ def implausible(calibration: Calibration, sensor: str | None = None) -> list[str
         if effect.surpasses(amplitudes):
             grade, largest, source = effect.plausible
             size = max(map(abs, amplitudes))
-            lines.append(f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, '
-                         f'more than ten times the known values of {grade} instruments ({largest:.3g}; {source}): check units and axes')
+            lines.append(
+                f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, '
+                f'more than ten times the known values of {grade} instruments ({largest:.3g}; {source}): check units and axes'
+            )
     return lines

@@ -17,7 +17,9 @@ REST_SHARE = 0.7
 """An error at rest of at least this share of the total is attributed to the bias."""
 DELAY_SHARE = 0.1
 """A delay is named as a cause where it explains this share of the residual."""
-OTHER_ATTITUDES = '; unproven for other attitudes, because all held-out windows have the same attitude'
+OTHER_ATTITUDES = (
+    '; unproven for other attitudes, because all held-out windows have the same attitude'
+)
 NO_PROOF = 'its error on held-out data was not measured'
 
 
@@ -33,8 +35,10 @@ class SensorDecision(StrEnum):
 
 
 HELPS, UNPROVEN, HARMS = SensorDecision
-BY_DEFINITION: dict[str, Any] = {'decision': dict.fromkeys(SENSORS, str(HELPS)),
-                                 'decision_reasons': dict.fromkeys(SENSORS, 'the true parameters of a simulation')}
+BY_DEFINITION: dict[str, Any] = {
+    'decision': dict.fromkeys(SENSORS, str(HELPS)),
+    'decision_reasons': dict.fromkeys(SENSORS, 'the true parameters of a simulation'),
+}
 """Fields of the Calibration with which a session was simulated."""
 
 
@@ -54,7 +58,11 @@ def most_cautious(decisions: Iterable[SensorDecision]) -> SensorDecision:
 def decisions_text(decisions: Mapping[str, SensorDecision]) -> str:
     """Return the decisions on the sensors in one phrase; '' without any."""
     words = set(decisions.values())
-    return str(*words) if len(words) == 1 else ', '.join(f'{sensor} {word}' for sensor, word in decisions.items())
+    return (
+        str(*words)
+        if len(words) == 1
+        else ', '.join(f'{sensor} {word}' for sensor, word in decisions.items())
+    )
 
 
 def reason_of(entry: Mapping | None) -> str:
@@ -62,22 +70,39 @@ def reason_of(entry: Mapping | None) -> str:
     if not entry or not entry['windows']:
         return NO_PROOF
     earlier = entry.get('earlier')
-    more = f', {error_text(earlier["after"], entry["unit"])} with the earlier calibration' if earlier else ''
-    cause = OTHER_ATTITUDES if entry.get('one_attitude') else '' if decide(entry) is HELPS else _cause(entry)
-    return (f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, after / before {ratio_text(entry)})'
-            f'{more}{cause}')
+    more = (
+        f', {error_text(earlier["after"], entry["unit"])} with the earlier calibration'
+        if earlier
+        else ''
+    )
+    cause = (
+        OTHER_ATTITUDES
+        if entry.get('one_attitude')
+        else ''
+        if decide(entry) is HELPS
+        else _cause(entry)
+    )
+    return (
+        f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, after / before {ratio_text(entry)})'
+        f'{more}{cause}'
+    )
 
 
 def worse_regimes(entry: Mapping) -> list[str]:
     """Return a line for each regime in which the error grows."""
-    return [f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name} (after / before {ratio_text(part)})'
-            for name, part in harmed(entry).items()]
+    return [
+        f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name} (after / before {ratio_text(part)})'
+        for name, part in harmed(entry).items()
+    ]
 
 
 def harmed(entry: Mapping) -> dict[str, Any]:
     """Return {regime: entry} of the regimes of a proof in which the error grows."""
-    return {name: part for name, part in (entry.get('regimes') or {}).items() if part['after'] > HARM * part['before']
-            and part['ci95'][0] > 1.0}
+    return {
+        name: part
+        for name, part in (entry.get('regimes') or {}).items()
+        if part['after'] > HARM * part['before'] and part['ci95'][0] > 1.0
+    }
 
 
 def _errors(entry, unit):
@@ -98,7 +123,11 @@ def _cause(entry):
         return f'; likely cause: the readings are {abs(late) * 1e3:.0f} ms {side}, which the model does not include'
     regimes = entry.get('regimes') or {}
     rest = regimes.get('rest', {'after': 0.0})
-    if 'rest' in harmed(entry) or rest['after'] > REST_SHARE * entry['after'] > 0.0 and rest.get('unit', entry['unit']) == entry['unit']:
+    if (
+        'rest' in harmed(entry)
+        or rest['after'] > REST_SHARE * entry['after'] > 0.0
+        and rest.get('unit', entry['unit']) == entry['unit']
+    ):
         return '; likely cause: the bias has changed'
     if regimes and set(harmed(entry)) == {'angular acceleration'}:
         return '; likely cause: the error correlates with angular acceleration: a lever arm, a varying lag, a loose mount'
@@ -182,6 +211,8 @@ def lines_of(reasons: Iterable[Reason], hints: dict[str, str] | None = None) -> 
     """Return statements and next steps, a line each; `hints` as for `errors.with_hint`."""
     lines = []
     for reason in reasons:
-        lines.append(f'{reason.word}: {reason.what}' if reason.word in (WARNING, NOTE) else reason.what)
+        lines.append(
+            f'{reason.word}: {reason.what}' if reason.word in (WARNING, NOTE) else reason.what
+        )
         lines += [f'next: {reason.advice(hints)}'] if reason.next else []
     return list(dict.fromkeys(lines))

@@ -41,7 +41,9 @@ def user_path(text: str) -> Path:
     try:
         return Path(os.path.abspath(Path(text).expanduser()))
     except (RuntimeError, ValueError) as error:
-        raise InputError(f'{text!r} must be a path: {error}; correct it', code='not_a_path') from error
+        raise InputError(
+            f'{text!r} must be a path: {error}; correct it', code='not_a_path'
+        ) from error
 
 
 def read_text(path: str | PathLike[str], what: str) -> str:
@@ -50,8 +52,10 @@ def read_text(path: str | PathLike[str], what: str) -> str:
         with io.TextIOWrapper(open_regular(path), encoding='utf-8') as stream:
             text = stream.read(documents.MAX_DOCUMENT_CHARACTERS + 1)
     except (OSError, ValueError) as error:
-        raise InputError(f'the {what} {path} must be a readable text file: {_why(error)}; correct the path',
-                         code='file_unreadable') from error
+        raise InputError(
+            f'the {what} {path} must be a readable text file: {_why(error)}; correct the path',
+            code='file_unreadable',
+        ) from error
     return text
 
 
@@ -61,7 +65,9 @@ def read_bytes(path: str | PathLike[str], what: str) -> bytes:
         with open_regular(path) as stream:
             return stream.read()
     except (OSError, ValueError) as error:
-        raise InputError(f'the {what} {path} must be readable: {_why(error)}; correct the path') from error
+        raise InputError(
+            f'the {what} {path} must be readable: {_why(error)}; correct the path'
+        ) from error
 
 
 def _why(error):
@@ -83,7 +89,9 @@ def read_table(path: str | PathLike[str]) -> Table:
 
 def read_tolerances(path: Path, catalogue: Catalogue = CATALOGUE) -> dict[str, dict[str, float]]:
     """Return the tolerances in a YAML file: {section: {effect: tolerance}}."""
-    return read_mapping(path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue))
+    return read_mapping(
+        path, 'tolerance file', lambda mapping: checked_tolerances(mapping, catalogue)
+    )
 
 
 def read_effects(path: str | PathLike[str]) -> Catalogue:
@@ -111,19 +119,27 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
     if Path(path).suffix != '.xacro':
         return text
     if not allow_xacro:
-        raise InputError(f'a .xacro file is a program and needs explicit permission to run, got {path}; expand it to a .urdf, or allow it '
-                         'if you trust its author', key='allow_xacro')
+        raise InputError(
+            f'a .xacro file is a program and needs explicit permission to run, got {path}; expand it to a .urdf, or allow it '
+            'if you trust its author',
+            key='allow_xacro',
+        )
     try:
         import xacro
     except ImportError as error:
-        raise InputError("a .xacro file needs the package xacro, it is not installed; install 'imu_calibration[arm]'",
-                         code='package_missing') from error
+        raise InputError(
+            "a .xacro file needs the package xacro, it is not installed; install 'imu_calibration[arm]'",
+            code='package_missing',
+        ) from error
     try:
         return xacro.process_file(str(path)).toxml()
-    except Exception as error:   # expressions in macros may raise any exception
+    except Exception as error:  # expressions in macros may raise any exception
         reason = shortened(str(error), 200) or type(error).__name__
-        raise InputError(f'the robot description {path} must be one that xacro can expand, it says: {reason}; correct it, or expand it '
-                         'yourself to a .urdf', code='xacro_fails') from error
+        raise InputError(
+            f'the robot description {path} must be one that xacro can expand, it says: {reason}; correct it, or expand it '
+            'yourself to a .urdf',
+            code='xacro_fails',
+        ) from error
 
 
 def read_calibration(path: str | PathLike[str]) -> Calibration:
@@ -138,7 +154,10 @@ def given_calibration(chosen: Calibration | str | PathLike[str]) -> Calibration:
 
 def read_noise(path: str | os.PathLike) -> 'NoiseFigures':
     """Return the noise in a file that the verb `noise` wrote; an error names the file."""
-    from imu_calibration.allan.document import noise_from_text  # here, because its import takes 1 MB of the compensator node
+    from imu_calibration.allan.document import (
+        noise_from_text,
+    )  # here, because its import takes 1 MB of the compensator node
+
     try:
         return noise_from_text(read_text(path, 'noise document'))
     except InputError as error:
@@ -153,7 +172,9 @@ def make_folder(path: str | PathLike[str]) -> Path:
         with TemporaryFile(dir=folder):
             pass
     except (OSError, ValueError) as error:
-        raise InputError(f'the output folder {folder} must be writable: {_why(error)}; choose another one') from error
+        raise InputError(
+            f'the output folder {folder} must be writable: {_why(error)}; choose another one'
+        ) from error
     return folder
 
 
@@ -164,7 +185,7 @@ def output_folder(path: str) -> Iterator[Path]:
     try:
         yield make_folder(path)
     except BaseException:
-        with suppress(OSError):   # a folder with content is not removed
+        with suppress(OSError):  # a folder with content is not removed
             for made in missing:
                 made.rmdir()
         raise
@@ -185,8 +206,17 @@ def write_texts(folder: str | PathLike[str], texts: Mapping[str, str]) -> None:
 def hash_of(path: str | PathLike[str]) -> str:
     """Return the SHA-256 of a file, or of the data files of a bag in order of name, as hexadecimal digits."""
     path = Path(path)
-    files = sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml') if path.is_dir() else [path]
-    return _hash_of_unchanged(tuple((file, (state := file.stat()).st_size, state.st_mtime_ns, state.st_ino) for file in files))
+    files = (
+        sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml')
+        if path.is_dir()
+        else [path]
+    )
+    return _hash_of_unchanged(
+        tuple(
+            (file, (state := file.stat()).st_size, state.st_mtime_ns, state.st_ino)
+            for file in files
+        )
+    )
 
 
 @lru_cache
@@ -256,11 +286,17 @@ def put_aside(path: str | PathLike[str]) -> Path:
 
     """
     path = Path(path)
-    free = next(path.with_name(f'{path.name}.{number}') for number in count(1) if not path.with_name(f'{path.name}.{number}').exists())
+    free = next(
+        path.with_name(f'{path.name}.{number}')
+        for number in count(1)
+        if not path.with_name(f'{path.name}.{number}').exists()
+    )
     try:
         os.rename(path, free)
     except OSError as error:
-        raise InputError(f'{path} must be movable to {free.name}: {_why(error)}; move it away') from error
+        raise InputError(
+            f'{path} must be movable to {free.name}: {_why(error)}; move it away'
+        ) from error
     return free
 
 
@@ -278,7 +314,7 @@ def _is_running(process: int) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:   # of another user
+    except OSError:  # of another user
         pass
     return True
 
@@ -296,7 +332,9 @@ def _beside(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         yield beside
     except (OSError, ValueError) as error:
-        raise InputError(f'{path} must be writable: {_why(error)}; choose another place', code='not_writable') from error
+        raise InputError(
+            f'{path} must be writable: {_why(error)}; choose another place', code='not_writable'
+        ) from error
     finally:
-        with suppress(OSError, ValueError):   # in a read-only folder removal fails too
+        with suppress(OSError, ValueError):  # in a read-only folder removal fails too
             beside.unlink(missing_ok=True)

@@ -8,7 +8,13 @@ import numpy as np
 
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import error_text
-from imu_calibration.document.calibration import HAND_AXES, Calibration, beyond_instruments, listed, with_nominal
+from imu_calibration.document.calibration import (
+    HAND_AXES,
+    Calibration,
+    beyond_instruments,
+    listed,
+    with_nominal,
+)
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, reason_of
 from imu_calibration.effects.base import SENSORS, UNITS, Effect
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
@@ -17,11 +23,13 @@ from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.rotations import Reference
 
-if TYPE_CHECKING:   # the import takes 1 MB of the compensator node
+if TYPE_CHECKING:  # the import takes 1 MB of the compensator node
     from imu_calibration.allan.figures import NoiseFigures
 
 END, MEAN = 'end of the recording', 'mean of the recording'
-AGAIN = '; it is proven for its last third only, and the error returns where the effect starts again'
+AGAIN = (
+    '; it is proven for its last third only, and the error returns where the effect starts again'
+)
 LAST_SHARE = 2.0 / 3.0
 """Effects that have settled are proven on the windows after this share of the recording: the value at its end is applied."""
 SETTLED = 0.1
@@ -42,7 +50,9 @@ class Uncorrected:
         return {'uncorrected': [dict(entry) for entry in self.sizes]} if self.sizes else {}
 
 
-def uncorrected_on_table(model: SensorModel, values: np.ndarray, accumulator: Accumulator, *, gathered: SensorModel) -> Uncorrected:
+def uncorrected_on_table(
+    model: SensorModel, values: np.ndarray, accumulator: Accumulator, *, gathered: SensorModel
+) -> Uncorrected:
     """
     Return the errors that remain uncorrected by a calibration on a table.
 
@@ -58,19 +68,35 @@ def uncorrected_on_table(model: SensorModel, values: np.ndarray, accumulator: Ac
     """
     counts, end = np.array([row.count for row in accumulator.rows], float), end_of(accumulator)
     centre, sizes = {}, []
-    at_columns = replace(model, point=model.point | {e.name: gathered.point_of(e) for e in model.effects if e.time_constant})
+    at_columns = replace(
+        model,
+        point=model.point
+        | {e.name: gathered.point_of(e) for e in model.effects if e.time_constant},
+    )
     for effect in not_applied(model):
         squares, at_end = np.zeros(3), has_settled(model, effect, end)
         for group in effect.groups:
-            rows, own = gathered.layout(effect.sensor).rows[group.name], model.layout(effect.sensor).rows[group.name]
+            rows, own = (
+                gathered.layout(effect.sensor).rows[group.name],
+                model.layout(effect.sensor).rows[group.name],
+            )
             means = np.array([row.sensors[effect.sensor].mean[rows] for row in accumulator.rows])
-            centre[group.name] = columns_at(model, effect, [end])[group.name][0] if at_end else _moved(
-                effect, counts @ means / counts.sum(), values[model.slices[effect.key]] - gathered.point_of(effect))
+            centre[group.name] = (
+                columns_at(model, effect, [end])[group.name][0]
+                if at_end
+                else _moved(
+                    effect,
+                    counts @ means / counts.sum(),
+                    values[model.slices[effect.key]] - gathered.point_of(effect),
+                )
+            )
             applied = centre[group.name] @ coefficients(model, effect.sensor, values)[own]
             value = coefficients(at_columns, effect.sensor, values)[own]
-            squares += counts @ (means @ value - applied)**2
+            squares += counts @ (means @ value - applied) ** 2
             for (sensor, _), factor in accumulator.within.items():
-                squares += ((factor[:, rows] @ value)**2).sum(axis=0) if sensor == effect.sensor else 0.0
+                squares += (
+                    ((factor[:, rows] @ value) ** 2).sum(axis=0) if sensor == effect.sensor else 0.0
+                )
         sizes.append(_size(effect, np.sqrt(squares / counts.sum()), at_end))
     return Uncorrected(centre, tuple(sizes))
 
@@ -83,8 +109,9 @@ def _moved(effect, columns, change):
     return np.concatenate([plain + change[-1] * slopes, slopes])
 
 
-def uncorrected_in_time(model: SensorModel, values: np.ndarray, times: Sequence[float] | np.ndarray, *,
-                        end: float) -> Uncorrected:
+def uncorrected_in_time(
+    model: SensorModel, values: np.ndarray, times: Sequence[float] | np.ndarray, *, end: float
+) -> Uncorrected:
     """Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`."""
     centre, sizes = {}, []
     for effect in not_applied(model):
@@ -92,7 +119,10 @@ def uncorrected_in_time(model: SensorModel, values: np.ndarray, times: Sequence[
         applied = columns_at(model, effect, [end]) if at_end else at_times
         centre |= {name: columns.mean(axis=0) for name, columns in applied.items()}
         rows = model.layout(effect.sensor).rows
-        rest = sum((at_times[name] - centre[name]) @ coefficients(model, effect.sensor, values)[rows[name]] for name in at_times)
+        rest = sum(
+            (at_times[name] - centre[name]) @ coefficients(model, effect.sensor, values)[rows[name]]
+            for name in at_times
+        )
         sizes.append(_size(effect, np.sqrt(np.mean(np.square(rest), axis=0)), at_end))
     return Uncorrected(centre, tuple(sizes))
 
@@ -104,7 +134,11 @@ def end_of(accumulator: Accumulator) -> float:
 
 def judged_from_of(model: SensorModel, end: float) -> float:
     """Return the time from which windows are judged, s: the last third until `end` where an effect of the model has settled."""
-    return LAST_SHARE * end if any(has_settled(model, effect, end) for effect in not_applied(model)) else 0.0
+    return (
+        LAST_SHARE * end
+        if any(has_settled(model, effect, end) for effect in not_applied(model))
+        else 0.0
+    )
 
 
 def has_settled(model: SensorModel, effect: Effect, end: float) -> bool:
@@ -117,20 +151,33 @@ def has_settled(model: SensorModel, effect: Effect, end: float) -> bool:
     if not in_time(effect):
         return False
     columns = [*columns_at(model, effect, [0.0, end, 2.0 * end]).values()]
-    start, at_end, later = np.split(columns[0], 2, axis=1)[0] if effect.time_constant else np.concatenate(columns, axis=1)
+    start, at_end, later = (
+        np.split(columns[0], 2, axis=1)[0]
+        if effect.time_constant
+        else np.concatenate(columns, axis=1)
+    )
     return bool(np.all(np.abs(later - at_end) <= SETTLED * np.abs(at_end - start)))
 
 
-def columns_at(model: SensorModel, effect: Effect, times: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
+def columns_at(
+    model: SensorModel, effect: Effect, times: Sequence[float] | np.ndarray
+) -> dict[str, np.ndarray]:
     """Return the columns of an effect in time at some times, s: group -> shape (n, width)."""
     nothing = np.zeros((len(times), 3))
-    ref = Reference(np.asarray(times, float), np.zeros((len(times), 3, 3)), nothing, nothing, nothing, 0.0)
+    ref = Reference(
+        np.asarray(times, float), np.zeros((len(times), 3, 3)), nothing, nothing, nothing, 0.0
+    )
     return {group.name: group.columns(ref, model.full_point()) for group in effect.groups}
 
 
 def _size(effect, rms, at_end):
-    return {'effect': effect.name, 'sensor': effect.sensor, 'applied': END if at_end else MEAN, 'rms': rms.tolist(),
-            'unit': UNITS[effect.sensor]}
+    return {
+        'effect': effect.name,
+        'sensor': effect.sensor,
+        'applied': END if at_end else MEAN,
+        'rms': rms.tolist(),
+        'unit': UNITS[effect.sensor],
+    }
 
 
 def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:
@@ -138,8 +185,10 @@ def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:
     lines = []
     for entry in statistics.get('uncorrected') or ():
         size = error_text(max(entry['rms']), entry['unit'])
-        lines.append(f'{entry["effect"]} is not corrected: the {entry["sensor"]} bias has its value at the {entry["applied"]}, '
-                     f'with an error of {size} rms during the recording{AGAIN if entry["applied"] == END else ""}')
+        lines.append(
+            f'{entry["effect"]} is not corrected: the {entry["sensor"]} bias has its value at the {entry["applied"]}, '
+            f'with an error of {size} rms during the recording{AGAIN if entry["applied"] == END else ""}'
+        )
     return lines
 
 
@@ -157,7 +206,10 @@ class Usable:
     @property
     def lines(self) -> list[str]:
         """Sensors that are not corrected, or corrected with caution, a line each."""
-        return [*(f'the {sensor} is not corrected: {why}' for sensor, why in self.refused.items()), *self.cautions]
+        return [
+            *(f'the {sensor} is not corrected: {why}' for sensor, why in self.refused.items()),
+            *self.cautions,
+        ]
 
 
 def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False) -> Usable:
@@ -187,20 +239,39 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     if refused.keys() == set(SENSORS):
         first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
         consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(SENSORS)
-        text = ('a calibration must help a sensor on held-out data to be applied, this one does not: '
-                f'{first} {refused[first]}; calibrate again')
+        text = (
+            'a calibration must help a sensor on held-out data to be applied, this one does not: '
+            f'{first} {refused[first]}; calibrate again'
+        )
         raise DocumentError(text, key='anyway' if consent else None, code='no_sensor_helps')
-    cautions = tuple(f'{sensor} {_text(calibration, sensor)}' for sensor in SENSORS
-                     if sensor not in refused and words[sensor] is not HELPS)
-    return Usable(with_nominal(calibration, list(refused)) if refused else calibration, refused, cautions)
+    cautions = tuple(
+        f'{sensor} {_text(calibration, sensor)}'
+        for sensor in SENSORS
+        if sensor not in refused and words[sensor] is not HELPS
+    )
+    return Usable(
+        with_nominal(calibration, list(refused)) if refused else calibration, refused, cautions
+    )
 
 
-def refused_sensors(calibration: Calibration, *, anyway: bool = False, live: bool = False) -> dict[str, str]:
+def refused_sensors(
+    calibration: Calibration, *, anyway: bool = False, live: bool = False
+) -> dict[str, str]:
     """Return sensor -> why it is not corrected; arguments as in `usable`."""
-    accepted = {HELPS} | ({UNPROVEN} if anyway or not live else set()) | ({HARMS} if anyway and not live else set())
-    refused = {sensor: _text(calibration, sensor) for sensor in SENSORS if calibration.decisions[sensor] not in accepted}
+    accepted = (
+        {HELPS}
+        | ({UNPROVEN} if anyway or not live else set())
+        | ({HARMS} if anyway and not live else set())
+    )
+    refused = {
+        sensor: _text(calibration, sensor)
+        for sensor in SENSORS
+        if calibration.decisions[sensor] not in accepted
+    }
     for sensor in SENSORS:
-        if why := beyond_instruments(calibration, sensor) or (live and _mostly_undetermined(calibration, sensor)):
+        if why := beyond_instruments(calibration, sensor) or (
+            live and _mostly_undetermined(calibration, sensor)
+        ):
             refused[sensor] = why
     if 'accelerometer' in refused and calibration.gauge.get('axes') == HAND_AXES:
         refused.setdefault('gyroscope', 'its axes depend on the accelerometer')
@@ -209,11 +280,18 @@ def refused_sensors(calibration: Calibration, *, anyway: bool = False, live: boo
 
 def _mostly_undetermined(calibration, sensor):
     """Return why an unproven sensor is not applied even with consent; '' where it may be."""
-    status = [known for effect in calibration.model.effects if effect.sensor == sensor
-              for known in calibration.status[calibration.model.slices[effect.key]]]
+    status = [
+        known
+        for effect in calibration.model.effects
+        if effect.sensor == sensor
+        for known in calibration.status[calibration.model.slices[effect.key]]
+    ]
     missing = sum(each in LACKING for each in status)
-    return f'unproven, and {missing} of {len(status)} parameters are not determined' \
-        if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status) else ''
+    return (
+        f'unproven, and {missing} of {len(status)} parameters are not determined'
+        if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status)
+        else ''
+    )
 
 
 def _text(calibration, sensor):
@@ -232,14 +310,18 @@ def usage(calibration: Calibration) -> str:
 
 def caveats(calibration: Calibration) -> list[str]:
     """Return the caveats for a user of the calibration in addition to the decisions, a line each."""
-    return uncorrected_lines(calibration.statistics) + ([text] if (text := missing(calibration)) else [])
+    return uncorrected_lines(calibration.statistics) + (
+        [text] if (text := missing(calibration)) else []
+    )
 
 
 def missing(calibration: Calibration) -> str:
     """Return which parameters are not determined, as text; '' when all are."""
     known = calibration.status_by_name
     names = [name for name, status in known.items() if status in LACKING]
-    return f'{len(names)} of {len(known)} parameters not determined ({listed(names)})' if names else ''
+    return (
+        f'{len(names)} of {len(known)} parameters not determined ({listed(names)})' if names else ''
+    )
 
 
 def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Calibration:
@@ -253,5 +335,7 @@ def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Ca
     for sensor in SENSORS:
         density = np.array([axis.white for axis in figures.sensor(sensor)])
         statistics[sensor] = dict(statistics.get(sensor, {})) | {
-            'noise_sd': (density * np.sqrt(figures.rate)).tolist(), 'noise_density': density.tolist()}
+            'noise_sd': (density * np.sqrt(figures.rate)).tolist(),
+            'noise_density': density.tolist(),
+        }
     return replace(calibration, statistics=statistics)

@@ -6,7 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.core.units import error_text, for_people, significant
-from imu_calibration.document.calibration import HAND_AXES, SHOWN_NAMES, Calibration, beyond_known, implausible, listed
+from imu_calibration.document.calibration import (
+    HAND_AXES,
+    SHOWN_NAMES,
+    Calibration,
+    beyond_known,
+    implausible,
+    listed,
+)
 from imu_calibration.document.decision import (
     DECISION,
     HELPS,
@@ -36,31 +43,61 @@ LOST_SHARE = 0.05
 
 
 def _worse(calibration):
-    return [Reason(WARNING, f'{sensor}: {line}', 'find the cause', key='diagnose', sensors=(sensor,))
-            for sensor, entry in calibration.proof.items() for line in worse_regimes(entry)]
+    return [
+        Reason(WARNING, f'{sensor}: {line}', 'find the cause', key='diagnose', sensors=(sensor,))
+        for sensor, entry in calibration.proof.items()
+        for line in worse_regimes(entry)
+    ]
 
 
 def _unused_rests(calibration):
     """Return a warning about rests without any static window: noise and sds are then estimated only from motion."""
     counts = calibration.statistics.get('stream') or {}
-    unused = {reason: counts.get(reason, 0) for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET)}
-    total, used = sum(unused.values()), sum((calibration.statistics.get('samples_used') or {}).values())
+    unused = {
+        reason: counts.get(reason, 0)
+        for reason in (UnusedReason.REST_TOO_SHORT, UnusedReason.NOT_QUIET)
+    }
+    total, used = (
+        sum(unused.values()),
+        sum((calibration.statistics.get('samples_used') or {}).values()),
+    )
     if rested(calibration) or total <= LOST_SHARE * used:
         return []
-    return [Reason(WARNING, f'the recording has {total} samples at rest, but no static window is used '
-                   f'({", ".join(f"{count} {reason}" for reason, count in unused.items() if count)}): noise and bias changes '
-                   'come from motion only, and the standard deviations of the biases may be too small',
-                   'reduce static_minimum, or increase quiet_ratio', key='setting')]
+    return [
+        Reason(
+            WARNING,
+            f'the recording has {total} samples at rest, but no static window is used '
+            f'({", ".join(f"{count} {reason}" for reason, count in unused.items() if count)}): noise and bias changes '
+            'come from motion only, and the standard deviations of the biases may be too small',
+            'reduce static_minimum, or increase quiet_ratio',
+            key='setting',
+        )
+    ]
 
 
 CHANGES = {
-    'added': ('added to the model, because the recording demands it: {}', 'see the evidence; the requested model omits it', 'diagnose'),
-    'denied': ('not added to the model, because parts of the recording disagree, no coefficient is significant or the size is implausible: '
-               '{}; the standard deviations allow for it', 'see the evidence', 'diagnose'),
-    'lacking': ('the motion demands {}, which cannot join the model, since not all of it is kept: the standard deviations allow for it',
-                'calibrate the recording offline', None),
-    'not_believed': ('held, because only the misfit of the model determines them, at an implausible value: {}',
-                     'move the table so that gravity or the rate of turn act along their axes', None)}
+    'added': (
+        'added to the model, because the recording demands it: {}',
+        'see the evidence; the requested model omits it',
+        'diagnose',
+    ),
+    'denied': (
+        'not added to the model, because parts of the recording disagree, no coefficient is significant or the size is implausible: '
+        '{}; the standard deviations allow for it',
+        'see the evidence',
+        'diagnose',
+    ),
+    'lacking': (
+        'the motion demands {}, which cannot join the model, since not all of it is kept: the standard deviations allow for it',
+        'calibrate the recording offline',
+        None,
+    ),
+    'not_believed': (
+        'held, because only the misfit of the model determines them, at an implausible value: {}',
+        'move the table so that gravity or the rate of turn act along their axes',
+        None,
+    ),
+}
 """Entry of the statistics -> (note with the names, next step, its key) on a change of the model by the recording."""
 
 
@@ -69,28 +106,47 @@ def _adopted(calibration):
     names = {change: calibration.statistics.get(change) or [] for change in CHANGES}
     names['added'] = [_with_size(calibration, name) for name in names['added']]
     if held := names['not_believed']:
-        names['not_believed'] = [f'{name} ({value:.3g})' for name, value in held.items()][:SHOWN_NAMES]
+        names['not_believed'] = [f'{name} ({value:.3g})' for name, value in held.items()][
+            :SHOWN_NAMES
+        ]
         names['not_believed'] += ['...'] * (len(held) > SHOWN_NAMES)
-    return [Reason(NOTE, text.format(', '.join(names[change])), step, key=key)
-            for change, (text, step, key) in CHANGES.items() if names[change]]
+    return [
+        Reason(NOTE, text.format(', '.join(names[change])), step, key=key)
+        for change, (text, step, key) in CHANGES.items()
+        if names[change]
+    ]
 
 
 def _unexplained(calibration):
     """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
-    return [Reason(NOTE, unexplained_text(sensor, rest['rms'], rest.get('unit')) + f' ({", ".join(rest["axes"])})' * bool(rest['axes']),
-                   'find the cause', key='diagnose', sensors=(sensor,))
-            for sensor, rest in (calibration.statistics.get('unexplained') or {}).items()]
+    return [
+        Reason(
+            NOTE,
+            unexplained_text(sensor, rest['rms'], rest.get('unit'))
+            + f' ({", ".join(rest["axes"])})' * bool(rest['axes']),
+            'find the cause',
+            key='diagnose',
+            sensors=(sensor,),
+        )
+        for sensor, rest in (calibration.statistics.get('unexplained') or {}).items()
+    ]
 
 
 def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
     """Return the statement of an unexplained residual; `unit` where it is not the sensor's."""
-    return f'{error_text(rms, unit or UNITS[sensor], 2)} rms of the {sensor} residual are unexplained'
+    return (
+        f'{error_text(rms, unit or UNITS[sensor], 2)} rms of the {sensor} residual are unexplained'
+    )
 
 
 def _jitter(calibration):
     """Return a note on independent errors of the stamps."""
     found = calibration.statistics.get('stamp_jitter')
-    return [Reason(NOTE, jitter_text(found['sd_s']), "use stamps of the sensor's own clock")] if found else []
+    return (
+        [Reason(NOTE, jitter_text(found['sd_s']), "use stamps of the sensor's own clock")]
+        if found
+        else []
+    )
 
 
 def _with_size(calibration, name):
@@ -99,7 +155,9 @@ def _with_size(calibration, name):
     if effect is None:
         return name
     part = calibration.model.slices[effect.key]
-    best = part.start + int(np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300)))
+    best = part.start + int(
+        np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300))
+    )
     factor, unit = for_people(effect.unit_of(best - part.start), calibration.param_names[best])
     return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
 
@@ -107,8 +165,12 @@ def _with_size(calibration, name):
 def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
     """Return kind of window -> ratio of the residual variance of the sensor to that of its noise and of errors of the stamps."""
     chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
-    by_stamps = (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
-    return {kind: ratio / by_stamps.get(kind, 1.0) for kind, ratio in chi2.items() if kind != 'means'}
+    by_stamps = (
+        (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
+    )
+    return {
+        kind: ratio / by_stamps.get(kind, 1.0) for kind, ratio in chi2.items() if kind != 'means'
+    }
 
 
 def rested(calibration: Calibration) -> bool:
@@ -121,7 +183,10 @@ def helps_everywhere(entry: Mapping | None) -> bool:
     """Return whether an entry of a proof shows a smaller error in total and in each regime."""
     if decide(entry) is not HELPS or entry is None:
         return False
-    return not any(part['after'] >= part['before'] or part['ci95'][1] >= 1.0 for part in (entry.get('regimes') or {}).values())
+    return not any(
+        part['after'] >= part['before'] or part['ci95'][1] >= 1.0
+        for part in (entry.get('regimes') or {}).values()
+    )
 
 
 def misfits(calibration: Calibration) -> list[Reason]:
@@ -131,14 +196,28 @@ def misfits(calibration: Calibration) -> list[Reason]:
     Without a rest they are compared with their slow part; lags are visible in the fast part.
     """
     at_rest = rested(calibration)
-    reference = 'the noise at rest' if at_rest else 'their slow part (as after a lag or a late clock)'
+    reference = (
+        'the noise at rest' if at_rest else 'their slow part (as after a lag or a late clock)'
+    )
     reasons = []
     for sensor in SENSORS:
-        more = ', although the calibration helps in each regime' if at_rest and helps_everywhere(calibration.proof.get(sensor)) else ''
-        reasons += [Reason(WARNING if ratio > MAX_MISFIT_RATIO else NOTE, f'the {sensor} residuals of {kind} windows are '
-                           f'{np.sqrt(ratio):.1f} times {reference}: the model is incomplete{more}', 'find the cause', key='diagnose',
-                           sensors=(sensor,))
-                    for kind, ratio in misfit_ratios(calibration, sensor).items() if ratio > NOTED_MISFIT]
+        more = (
+            ', although the calibration helps in each regime'
+            if at_rest and helps_everywhere(calibration.proof.get(sensor))
+            else ''
+        )
+        reasons += [
+            Reason(
+                WARNING if ratio > MAX_MISFIT_RATIO else NOTE,
+                f'the {sensor} residuals of {kind} windows are '
+                f'{np.sqrt(ratio):.1f} times {reference}: the model is incomplete{more}',
+                'find the cause',
+                key='diagnose',
+                sensors=(sensor,),
+            )
+            for kind, ratio in misfit_ratios(calibration, sensor).items()
+            if ratio > NOTED_MISFIT
+        ]
     return reasons
 
 
@@ -150,11 +229,16 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
         scatter = float(np.max(calibration.noise(sensor)[1]))
         if scatter > tolerances[part][0]:
             factor, unit = for_people(UNITS[sensor])
-            reasons.append(Reason(NOTE, f'the {sensor} reads the same motion differently from window to window by '
-                                        f'{significant(scatter * factor, 2)} {unit}, more than '
-                                        'the tolerance on its bias: the mean is well determined, the present bias is not',
-                                  f'record after warm-up{"" if by_hand else ", on a rigid table"}, or estimate the bias in use',
-                                  sensors=(sensor,)))
+            reasons.append(
+                Reason(
+                    NOTE,
+                    f'the {sensor} reads the same motion differently from window to window by '
+                    f'{significant(scatter * factor, 2)} {unit}, more than '
+                    'the tolerance on its bias: the mean is well determined, the present bias is not',
+                    f'record after warm-up{"" if by_hand else ", on a rigid table"}, or estimate the bias in use',
+                    sensors=(sensor,),
+                )
+            )
     return reasons
 
 
@@ -164,11 +248,20 @@ def _left_out(calibration):
     for sensor in SENSORS:
         times = (calibration.statistics.get(sensor) or {}).get('left_out_s') or []
         if times:
-            windows = ('a window, whose mean is an outlier' if len(times) == 1
-                       else f'{len(times)} windows, whose means are outliers')
-            notes.append(Reason(NOTE, f'left out of the {sensor}: {windows}, '
-                                f'at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
-                                      + (' ...' if len(times) > SHOWN_NAMES else ''), 'the table or the IMU may have been touched'))
+            windows = (
+                'a window, whose mean is an outlier'
+                if len(times) == 1
+                else f'{len(times)} windows, whose means are outliers'
+            )
+            notes.append(
+                Reason(
+                    NOTE,
+                    f'left out of the {sensor}: {windows}, '
+                    f'at {", ".join(f"{time:.0f} s" for time in times[:SHOWN_NAMES])}'
+                    + (' ...' if len(times) > SHOWN_NAMES else ''),
+                    'the table or the IMU may have been touched',
+                )
+            )
     return notes
 
 
@@ -176,7 +269,10 @@ def _lost(calibration):
     dropped = calibration.statistics.get('dropped')
     if not dropped:
         return []
-    total, used = sum(dropped.values()), sum((calibration.statistics.get('samples_used') or {}).values())
+    total, used = (
+        sum(dropped.values()),
+        sum((calibration.statistics.get('samples_used') or {}).values()),
+    )
     text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
     many = total > LOST_SHARE * max(used, 1)
     return [Reason(NOTE, text, 'find the cause' if many else '', key='inspect')]
@@ -203,26 +299,59 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     worst = int(np.argmax(share))
     limiting = (calibration.param_names[worst], float(share[worst])) if found else ('', 0.0)
     if common := calibration.common_scale:
-        limiting = max(limiting, (COMMON_SCALE, common['sd'] / common['tolerance']), key=lambda pair: pair[1])
+        limiting = max(
+            limiting, (COMMON_SCALE, common['sd'] / common['tolerance']), key=lambda pair: pair[1]
+        )
     within = found.count(DETERMINED)
     reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
-    reasons.append(_parameters(calibration, within, limiting, complete=within == len(found) and set(decisions.values()) == {HELPS}))
-    reasons += _undetermined(calibration) + _blind(calibration) + _implausible(calibration) + misfits(calibration)
+    reasons.append(
+        _parameters(
+            calibration,
+            within,
+            limiting,
+            complete=within == len(found) and set(decisions.values()) == {HELPS},
+        )
+    )
+    reasons += (
+        _undetermined(calibration)
+        + _blind(calibration)
+        + _implausible(calibration)
+        + misfits(calibration)
+    )
     reasons += _strange_causes(calibration) + _worse(calibration) + _unused_rests(calibration)
     reasons += [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
-    reasons += _adopted(calibration) + _unexplained(calibration) + _jitter(calibration) + unsteady(calibration, tolerances)
-    return Verdict(decisions, (*reasons, *_left_out(calibration), *_lost(calibration)), within, len(found), limiting)
+    reasons += (
+        _adopted(calibration)
+        + _unexplained(calibration)
+        + _jitter(calibration)
+        + unsteady(calibration, tolerances)
+    )
+    return Verdict(
+        decisions,
+        (*reasons, *_left_out(calibration), *_lost(calibration)),
+        within,
+        len(found),
+        limiting,
+    )
 
 
 def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
     """Return the calibration with its verdict, which its document contains; arguments as in `judge`."""
     found = judge(calibration, tolerances)
-    counts = {'requested': found.requested, 'determined': found.within, 'limiting': found.limiting[0],
-              'sd_over_tolerance': found.limiting[1]}
-    return replace(calibration, decision={sensor: str(word) for sensor, word in found.decisions.items()},
-                   decision_reasons={sensor: _reason(calibration, sensor) for sensor in SENSORS},
-                   notes=tuple(lines_of(reason for reason in found.reasons if reason.word is not DECISION)),
-                   judgement=found, statistics=calibration.statistics | {'parameters': counts})
+    counts = {
+        'requested': found.requested,
+        'determined': found.within,
+        'limiting': found.limiting[0],
+        'sd_over_tolerance': found.limiting[1],
+    }
+    return replace(
+        calibration,
+        decision={sensor: str(word) for sensor, word in found.decisions.items()},
+        decision_reasons={sensor: _reason(calibration, sensor) for sensor in SENSORS},
+        notes=tuple(lines_of(reason for reason in found.reasons if reason.word is not DECISION)),
+        judgement=found,
+        statistics=calibration.statistics | {'parameters': counts},
+    )
 
 
 def _decided(calibration, sensor, word):
@@ -231,7 +360,13 @@ def _decided(calibration, sensor, word):
         step, key = 'find the cause', 'diagnose'
     elif word is not HELPS:
         step = 'record more windows, or hold it still in more attitudes'
-    return Reason(DECISION, f'{sensor} {word}: {_reason(calibration, sensor)}', step, key=key, sensors=(sensor,))
+    return Reason(
+        DECISION,
+        f'{sensor} {word}: {_reason(calibration, sensor)}',
+        step,
+        key=key,
+        sensors=(sensor,),
+    )
 
 
 def _decision(calibration, sensor):
@@ -246,63 +381,112 @@ def _reason(calibration, sensor):
 
 def _periodic(calibration, sensor):
     """Return whether held-out windows may repeat an error of the clock: no rests, and residuals far above the noise."""
-    return not rested(calibration) and any(ratio > MAX_MISFIT_RATIO for ratio in misfit_ratios(calibration, sensor).values())
+    return not rested(calibration) and any(
+        ratio > MAX_MISFIT_RATIO for ratio in misfit_ratios(calibration, sensor).values()
+    )
 
 
 def _parameters(calibration, within, limiting, *, complete):
     name, share = limiting
     limit = f'; limiting: {name}, its sd is {share:.2g} of its tolerance' if name else ''
-    return Reason(PARAMETERS, f'{within} of {len(calibration.requested)} parameters are within their tolerance{limit}',
-                  "compensate with it: 'imu_calibration compensate', or compensator_node" if complete else '')
+    return Reason(
+        PARAMETERS,
+        f'{within} of {len(calibration.requested)} parameters are within their tolerance{limit}',
+        "compensate with it: 'imu_calibration compensate', or compensator_node" if complete else '',
+    )
 
 
 def _implausible(calibration):
-    return [Reason(WARNING, line.partition(': check')[0], 'check the units of the recording and the axes in the table description',
-                   sensors=_whose([section]))
-            for section in SECTIONS for line in implausible(calibration, section)]
+    return [
+        Reason(
+            WARNING,
+            line.partition(': check')[0],
+            'check the units of the recording and the axes in the table description',
+            sensors=_whose([section]),
+        )
+        for section in SECTIONS
+        for line in implausible(calibration, section)
+    ]
 
 
 def _whose(sections):
     """Return the sensors that something of these sections concerns; table and clock concern both."""
     found = set(sections)
-    return tuple(sensor for sensor in SENSORS if sensor in found) if found <= set(SENSORS) else SENSORS
+    return (
+        tuple(sensor for sensor in SENSORS if sensor in found) if found <= set(SENSORS) else SENSORS
+    )
 
 
 def _strange_causes(calibration):
     """Return reasons why a known cause is not in the model."""
     found = calibration.statistics.get('implausible') or {}
-    catalogue = {effect.name: effect.sensor for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()}
-    return [Reason(WARNING, f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
-                   'it is not in the model, and the standard deviations allow for it',
-                   f'see the evidence; if {name} is expected, name it in the model',
-                   key='diagnose', sensors=_whose([catalogue.get(name, '')]))
-            for name, share in found.items()]
+    catalogue = {
+        effect.name: effect.sensor
+        for effect in calibration.model.catalogue.effects(calibration.model.joint_names).values()
+    }
+    return [
+        Reason(
+            WARNING,
+            f'{name} {beyond_known(share, catalogue.get(name, ""))}; '
+            'it is not in the model, and the standard deviations allow for it',
+            f'see the evidence; if {name} is expected, name it in the model',
+            key='diagnose',
+            sensors=_whose([catalogue.get(name, '')]),
+        )
+        for name, share in found.items()
+    ]
 
 
 def _blind(calibration):
     reasons = []
     for sensor in SENSORS:
         own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
-        matrix_held = all(status == HELD for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)])
+        matrix_held = all(
+            status == HELD
+            for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)]
+        )
         if own and matrix_held and DETERMINED not in own:
-            needs = [d['needs'] for d in calibration.undetermined if any(name.startswith(sensor) for name in d['parameters'])]
+            needs = [
+                d['needs']
+                for d in calibration.undetermined
+                if any(name.startswith(sensor) for name in d['parameters'])
+            ]
             step = needs[0] if needs else 'record static poses and turns about all three axes'
-            reasons.append(Reason(WARNING, f'the recording does not determine the {sensor}', step, sensors=(sensor,)))
+            reasons.append(
+                Reason(
+                    WARNING,
+                    f'the recording does not determine the {sensor}',
+                    step,
+                    sensors=(sensor,),
+                )
+            )
     return reasons
 
 
 def _undetermined(calibration):
     reasons = []
-    for status, text in ((Status.WEAK, 'sd above the tolerance'),
-                         (HELD, 'held at the prior value')):
+    for status, text in (
+        (Status.WEAK, 'sd above the tolerance'),
+        (HELD, 'held at the prior value'),
+    ):
         names = [name for name, found in calibration.requested.items() if found == status]
         if COMMON_SCALE in names:
             names.remove(COMMON_SCALE)
             what = f'{COMMON_SCALE}: sd {100 * calibration.common_scale["sd"]:.2g} %, that of gravity; it is not part of the other sds'
-            reasons.append(Reason(PARAMETERS, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]))
+            reasons.append(
+                Reason(
+                    PARAMETERS, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]
+                )
+            )
         for next_step, members in _by_need(calibration, names).items():
-            reasons.append(Reason(PARAMETERS, f'{listed(members)}: {text}', next_step,
-                                  sensors=_whose(name.partition('.')[0] for name in members)))
+            reasons.append(
+                Reason(
+                    PARAMETERS,
+                    f'{listed(members)}: {text}',
+                    next_step,
+                    sensors=_whose(name.partition('.')[0] for name in members),
+                )
+            )
     return reasons
 
 
@@ -310,11 +494,16 @@ def _by_need(calibration, names):
     """Return {motion: names}: each name with the motion of the weak direction in which it weighs most."""
     found = {}
     for name in names:
-        weights = [(abs(d['parameters'].get(name, 0.0)), d['needs']) for d in calibration.undetermined]
+        weights = [
+            (abs(d['parameters'].get(name, 0.0)), d['needs']) for d in calibration.undetermined
+        ]
         best = max(weights, default=(0.0, ''), key=lambda pair: pair[0])
         if best[0] == 0.0:
-            same = [d['needs']
-                    for d in calibration.undetermined if any(n.rpartition('.')[0] == name.rpartition('.')[0] for n in d['parameters'])]
+            same = [
+                d['needs']
+                for d in calibration.undetermined
+                if any(n.rpartition('.')[0] == name.rpartition('.')[0] for n in d['parameters'])
+            ]
             best = (1.0, same[0] if same else 'record the same motion for longer')
         found.setdefault(best[1], []).append(name)
     return found

@@ -69,7 +69,9 @@ class Lag:
 
     """
 
-    def __init__(self, pairs: Sequence[tuple[float, float]] = ((1.0, 1.0),), factor: Callable | None = None):
+    def __init__(
+        self, pairs: Sequence[tuple[float, float]] = ((1.0, 1.0),), factor: Callable | None = None
+    ):
         self.pairs, self.factor = pairs, factor
 
     @property
@@ -192,7 +194,11 @@ class Effect:
 
     def groups_of(self, sensor: str) -> tuple:
         """Return the groups that belong to a sensor."""
-        return tuple(group for group, own in zip(self.groups, self.group_sensors) if own == sensor) if self.group_sensors else self.groups
+        return (
+            tuple(group for group, own in zip(self.groups, self.group_sensors) if own == sensor)
+            if self.group_sensors
+            else self.groups
+        )
 
     @property
     def timed(self) -> bool:
@@ -233,7 +239,7 @@ class Effect:
 
     def amplitudes(self, values: Any) -> Any:
         """Return the values without the time constant or the time of a step."""
-        return values[:self.n_amplitudes]
+        return values[: self.n_amplitudes]
 
     def at_time_constant(self, constant: float) -> np.ndarray:
         """Return the prior values with another time constant, shape (size,): a point of linearisation of a bank."""
@@ -249,7 +255,18 @@ class Effect:
 
 
 PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
-TRIPLES = ((0, 0, 0), (1, 1, 1), (2, 2, 2), (0, 0, 1), (0, 0, 2), (1, 1, 0), (1, 1, 2), (2, 2, 0), (2, 2, 1), (0, 1, 2))
+TRIPLES = (
+    (0, 0, 0),
+    (1, 1, 1),
+    (2, 2, 2),
+    (0, 0, 1),
+    (0, 0, 2),
+    (1, 1, 0),
+    (1, 1, 2),
+    (2, 2, 0),
+    (2, 2, 1),
+    (0, 1, 2),
+)
 TEMPERATURE_RISE = 'temperature_c - temperature_ref_c'
 INPUT = {'accelerometer': 'force', 'gyroscope': 'rate'}
 _VECTOR = {'accelerometer': [f'f_{a}' for a in AXES], 'gyroscope': [f'w_{a}' for a in AXES]}
@@ -257,13 +274,18 @@ _VECTOR = {'accelerometer': [f'f_{a}' for a in AXES], 'gyroscope': [f'w_{a}' for
 
 def _of_input(ending, texts):
     """Return {sensor: ColumnGroup} made of the components of its true input."""
-    return {sensor: ColumnGroup(INPUT[sensor] + ending, tuple(texts(_VECTOR[sensor]))) for sensor in SENSORS}
+    return {
+        sensor: ColumnGroup(INPUT[sensor] + ending, tuple(texts(_VECTOR[sensor])))
+        for sensor in SENSORS
+    }
 
 
 CONSTANT = ColumnGroup('one', ('1',))
 TIME = ColumnGroup('time', ('time',))
 TRUE_INPUT = _of_input('', lambda v: v)
-SQUARES = _of_input('_squares', lambda v: [' * '.join(v[k] for k in product) for product in PRODUCT_PAIRS])
+SQUARES = _of_input(
+    '_squares', lambda v: [' * '.join(v[k] for k in product) for product in PRODUCT_PAIRS]
+)
 CUBES = _of_input('_cubes', lambda v: [' * '.join(v[k] for k in product) for product in TRIPLES])
 SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi in v for vj in v])
 """Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
@@ -272,19 +294,42 @@ TEMPERATURE = ColumnGroup('temperature', (TEMPERATURE_RISE,))
 TEMPERATURE_SQUARED = ColumnGroup('temperature_squared', (f'({TEMPERATURE_RISE}) ** 2',))
 VIBRATION = ColumnGroup('vibration', tuple(f'vibration_{a}' for a in AXES))
 BRANCH = ColumnGroup('thermal_branch', ('thermal_branch',))
-LEVER = ColumnGroup('lever', (
-    '-(w_y * w_y + w_z * w_z)', 'w_x * w_y - alpha_z', 'w_x * w_z + alpha_y',
-    'w_x * w_y + alpha_z', '-(w_x * w_x + w_z * w_z)', 'w_y * w_z - alpha_x',
-    'w_x * w_z - alpha_y', 'w_y * w_z + alpha_x', '-(w_x * w_x + w_y * w_y)'))
+LEVER = ColumnGroup(
+    'lever',
+    (
+        '-(w_y * w_y + w_z * w_z)',
+        'w_x * w_y - alpha_z',
+        'w_x * w_z + alpha_y',
+        'w_x * w_y + alpha_z',
+        '-(w_x * w_x + w_z * w_z)',
+        'w_y * w_z - alpha_x',
+        'w_x * w_z - alpha_y',
+        'w_y * w_z + alpha_x',
+        '-(w_x * w_x + w_y * w_y)',
+    ),
+)
 """Entries of ``[alpha x] + [omega x]^2`` by rows (Zhang 2017, eq. 11)."""
 ATTITUDE = ColumnGroup('attitude', tuple(f'c_{a}{b}' for a in AXES for b in AXES))
-LOAD = {'accelerometer': ColumnGroup('load_turns_force', tuple(f'f_{AXES[j]} * f_{AXES[k]}' for j, k in PRODUCT_PAIRS)),
-        'gyroscope': ColumnGroup('load_turns_rate', tuple(f'f_{a} * w_{b}' for a in AXES for b in AXES))}
+LOAD = {
+    'accelerometer': ColumnGroup(
+        'load_turns_force', tuple(f'f_{AXES[j]} * f_{AXES[k]}' for j, k in PRODUCT_PAIRS)
+    ),
+    'gyroscope': ColumnGroup(
+        'load_turns_rate', tuple(f'f_{a} * w_{b}' for a in AXES for b in AXES)
+    ),
+}
 """Columns of a mount that bends with load: force and rate are measured in a frame that rotates with the force."""
-CHANGE = {'accelerometer': ColumnGroup('force_change', ('f_y * w_z - f_z * w_y', 'f_z * w_x - f_x * w_z', 'f_x * w_y - f_y * w_x')),
-          'gyroscope': ColumnGroup('rate_change', tuple(f'alpha_{a}' for a in AXES))}
+CHANGE = {
+    'accelerometer': ColumnGroup(
+        'force_change', ('f_y * w_z - f_z * w_y', 'f_z * w_x - f_x * w_z', 'f_x * w_y - f_y * w_x')
+    ),
+    'gyroscope': ColumnGroup('rate_change', tuple(f'alpha_{a}' for a in AXES)),
+}
 """The true input's derivative in time, of the force as gravity gives it to a sensor that turns."""
-WARM_UP = {sensor: ColumnGroup(f'{short}_warm_up', ('-expm1(-time / tau)',), f'{short}_bias_drift') for sensor, short in PREFIXES.items()}
+WARM_UP = {
+    sensor: ColumnGroup(f'{short}_warm_up', ('-expm1(-time / tau)',), f'{short}_bias_drift')
+    for sensor, short in PREFIXES.items()
+}
 
 
 def power_coefficients(axes: np.ndarray, products: Sequence[tuple[int, ...]]) -> np.ndarray:
@@ -293,7 +338,12 @@ def power_coefficients(axes: np.ndarray, products: Sequence[tuple[int, ...]]) ->
 
     The coefficient of ``v_a v_b ...`` is ``u_a u_b ...`` times the number of orders of its factors (multinomial theorem).
     """
-    return np.stack([axes[:, list(product)].prod(axis=1) * len(set(permutations(product))) for product in products])
+    return np.stack(
+        [
+            axes[:, list(product)].prod(axis=1) * len(set(permutations(product)))
+            for product in products
+        ]
+    )
 
 
 def signed_coefficients(axes: np.ndarray) -> np.ndarray:
@@ -303,7 +353,9 @@ def signed_coefficients(axes: np.ndarray) -> np.ndarray:
     return block.reshape(9, 3)
 
 
-def amplitude_coefficients(effect: Effect, values: Values, point: dict[str, Any], *, own_axis: bool = False) -> Values:
+def amplitude_coefficients(
+    effect: Effect, values: Values, point: dict[str, Any], *, own_axis: bool = False
+) -> Values:
     """
     Return values straight before the columns: ``output_i = sum_k value_ik column_k``.
 
@@ -318,7 +370,9 @@ def amplitude_coefficients(effect: Effect, values: Values, point: dict[str, Any]
     return {effect.groups[0].name: block}
 
 
-def along_axis_coefficients(effect: Effect, values: Values, point: dict[str, Any], *, function: Callable) -> Values:
+def along_axis_coefficients(
+    effect: Effect, values: Values, point: dict[str, Any], *, function: Callable
+) -> Values:
     """Return values before a function of the input along each element's own axis; ``function(input axes)`` gives one of each."""
     matrix = values['matrix'].reshape(3, 3)
     input_axes = matrix / np.sqrt((matrix**2).sum(axis=1))[:, None]
@@ -341,10 +395,17 @@ def cross_axis_coefficients(effect: Effect, values: Values, point: dict[str, Any
 def matrix_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
     """Return the sensor's matrix, or its rows times one value per axis."""
     matrix = values['matrix'].reshape(3, 3)
-    return {effect.groups[0].name: matrix.T if effect.name == 'matrix' else (matrix * values[effect.name][:, None]).T}
+    return {
+        effect.groups[0].name: matrix.T
+        if effect.name == 'matrix'
+        else (matrix * values[effect.name][:, None]).T
+    }
 
 
 def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
     """Return the coefficients of the lever matrix W_jk for output i: m_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse)."""
-    matrix, arms = values['matrix'].reshape(3, 3), np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3))   # one arm for all three
+    matrix, arms = (
+        values['matrix'].reshape(3, 3),
+        np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3)),
+    )  # one arm for all three
     return {LEVER.name: (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T}

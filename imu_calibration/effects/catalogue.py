@@ -8,7 +8,14 @@ from functools import lru_cache, partial
 from typing import Any
 
 from imu_calibration.core.errors import InputError, did_you_mean, shortened
-from imu_calibration.effects.base import AXES, SECTIONS, SENSORS, VECTOR, Effect, amplitude_coefficients
+from imu_calibration.effects.base import (
+    AXES,
+    SECTIONS,
+    SENSORS,
+    VECTOR,
+    Effect,
+    amplitude_coefficients,
+)
 from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.effects.reference_effects import reference_effects
 from imu_calibration.effects.sensor_effects import ACCELEROMETER, GYROSCOPE
@@ -16,22 +23,45 @@ from imu_calibration.kinematics.joint import JointNames
 
 JOINT_INPUTS = {'joint angle', 'joint rate'}
 """Quantities that exist only with a table."""
-QUANTITY_MOTIONS = (('joint angle', ('static_dense', 'slow_turn')), ('joint rate', ('three_speeds',)),
-                    ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')), ('thermal branch', ('warm_and_cool',)),
-                    ('vibration', ('shake',)),
-                    ('temperature', ('warm_up',)), ('time', ('warm_up',)),
-                    ('rate', ('two_axis', 'three_speeds')), ('force', ('static_dense', 'centrifuge')))
+QUANTITY_MOTIONS = (
+    ('joint angle', ('static_dense', 'slow_turn')),
+    ('joint rate', ('three_speeds',)),
+    ('angular acceleration', ('oscillate_x', 'oscillate_y', 'oscillate_z')),
+    ('thermal branch', ('warm_and_cool',)),
+    ('vibration', ('shake',)),
+    ('temperature', ('warm_up',)),
+    ('time', ('warm_up',)),
+    ('rate', ('two_axis', 'three_speeds')),
+    ('force', ('static_dense', 'centrifuge')),
+)
 """Standard motions that show a quantity; the first that a column uses applies."""
-DRAWN_AGAINST = {'joint angle': 'angle', 'joint rate': 'angle', 'temperature': 'temperature', 'thermal branch': 'temperature',
-                 'time': 'time', 'force': 'force', 'rate': 'rate'}
+DRAWN_AGAINST = {
+    'joint angle': 'angle',
+    'joint rate': 'angle',
+    'temperature': 'temperature',
+    'thermal branch': 'temperature',
+    'time': 'time',
+    'force': 'force',
+    'rate': 'rate',
+}
 """Quantity -> abscissa of the residual plot of a column that uses it; the first applies."""
 PRIOR_TOLERANCES = 100.0
 """Tolerances in the default standard deviation of the prior."""
 
 
-def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tolerance: float, text: str,
-         tolerance_reason: str = '', prior_sd: float | None = None, largest: float | None = None,
-         time_constant: float = 300.0) -> Effect:
+def term(
+    name: str,
+    *,
+    sensor: str,
+    column: Sequence[str] | str,
+    unit: str,
+    tolerance: float,
+    text: str,
+    tolerance_reason: str = '',
+    prior_sd: float | None = None,
+    largest: float | None = None,
+    time_constant: float = 300.0,
+) -> Effect:
     """
     Return an effect ``output_i += value_i column``, with one value for each axis.
 
@@ -68,46 +98,100 @@ def term(name: str, *, sensor: str, column: Sequence[str] | str, unit: str, tole
 
     """
     if sensor not in SENSORS:
-        raise InputError(f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it", code='sensor_unknown')
-    numbers: dict[str, Any] = {'tolerance': tolerance, 'prior_sd': prior_sd, 'largest': largest, 'time_constant': time_constant}
+        raise InputError(
+            f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it",
+            code='sensor_unknown',
+        )
+    numbers: dict[str, Any] = {
+        'tolerance': tolerance,
+        'prior_sd': prior_sd,
+        'largest': largest,
+        'time_constant': time_constant,
+    }
     for key, value in numbers.items():
-        if value is not None and (isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf):
-            raise InputError(f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60}; correct it",
-                             code='tolerance_value')
+        if value is not None and (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or not 0 < value < math.inf
+        ):
+            raise InputError(
+                f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60}; correct it",
+                code='tolerance_value',
+            )
     for key, value in {'unit': unit, 'text': text, 'tolerance_reason': tolerance_reason}.items():
         if not isinstance(value, str):
-            raise InputError(f"the {key} of effect '{name}' must be a text, got {value!r:.60}; correct it", code='not_a_text')
+            raise InputError(
+                f"the {key} of effect '{name}' must be a text, got {value!r:.60}; correct it",
+                code='not_a_text',
+            )
     columns = (column,) if isinstance(column, str) else tuple(column)
     if len(columns) not in (1, 3):
-        raise InputError(f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it", code='column_count')
+        raise InputError(
+            f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it",
+            code='column_count',
+        )
     group = ColumnGroup(name, columns, name)
     try:
-        settles, thermal, turns = (quantity in group.uses for quantity in ('time constant', 'temperature', 'thermal branch'))
+        settles, thermal, turns = (
+            quantity in group.uses
+            for quantity in ('time constant', 'temperature', 'thermal branch')
+        )
     except InputError as error:
         raise error.named(f"effect '{name}'") from error
-    definition = {'sensor': sensor, 'column': column if isinstance(column, str) else list(columns), 'unit': unit, 'text': text,
-                  'tolerance_reason': tolerance_reason or None, **numbers}
+    definition = {
+        'sensor': sensor,
+        'column': column if isinstance(column, str) else list(columns),
+        'unit': unit,
+        'text': text,
+        'tolerance_reason': tolerance_reason or None,
+        **numbers,
+    }
     if not settles:
         del definition['time_constant']
     spread = PRIOR_TOLERANCES * tolerance if prior_sd is None else prior_sd
     needs = ('temperature',) * (thermal or turns) + ('cooling',) * turns
     needs += ('vibration',) * ('vibration' in group.uses)
     needs += ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
-    shape: dict[str, Any] = {'components': VECTOR, 'shape': (3,), 'unit': unit, 'prior': 0.0, 'prior_sd': spread}
+    shape: dict[str, Any] = {
+        'components': VECTOR,
+        'shape': (3,),
+        'unit': unit,
+        'prior': 0.0,
+        'prior_sd': spread,
+    }
     if settles:
-        shape = {'components': (*VECTOR, 'time_constant'), 'shape': (4,), 'unit': (*[unit] * len(AXES), 's'), 'time_constant': True,
-                 'prior': (0.0, 0.0, 0.0, time_constant), 'prior_sd': (spread, spread, spread, 10 * time_constant / 3)}
+        shape = {
+            'components': (*VECTOR, 'time_constant'),
+            'shape': (4,),
+            'unit': (*[unit] * len(AXES), 's'),
+            'time_constant': True,
+            'prior': (0.0, 0.0, 0.0, time_constant),
+            'prior_sd': (spread, spread, spread, 10 * time_constant / 3),
+        }
     text = text.strip() or f'The {sensor} output follows {", ".join(columns)}'
     return Effect(
-        name=name, sensor=sensor, **shape, tolerance=tolerance, tolerance_reason=tolerance_reason,
-        explanation=text if text.endswith(('.', '!', '?')) else f'{text}.', needs=needs,
-        motion=next((motions for quantity, motions in QUANTITY_MOTIONS if quantity in group.uses), ('static_poses',)),
-        compensation='none' if group.uses & {'time', 'attitude', *JOINT_INPUTS} else 'exact', groups=(group,),
+        name=name,
+        sensor=sensor,
+        **shape,
+        tolerance=tolerance,
+        tolerance_reason=tolerance_reason,
+        explanation=text if text.endswith(('.', '!', '?')) else f'{text}.',
+        needs=needs,
+        motion=next(
+            (motions for quantity, motions in QUANTITY_MOTIONS if quantity in group.uses),
+            ('static_poses',),
+        ),
+        compensation='none' if group.uses & {'time', 'attitude', *JOINT_INPUTS} else 'exact',
+        groups=(group,),
         coefficients=partial(amplitude_coefficients, own_axis=len(columns) == 3),
-        smooth=not group.uses - {'time', 'temperature', 'thermal branch', 'reference temperature', 'time constant'},
+        smooth=not group.uses
+        - {'time', 'temperature', 'thermal branch', 'reference temperature', 'time constant'},
         plausible=('such', largest, 'its definition') if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
-        against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[:1])
+        against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[
+            :1
+        ],
+    )
 
 
 def from_definition(name: str, definition: dict[str, Any]) -> Effect:
@@ -123,13 +207,20 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
     try:
         return term(name, **definition)
     except TypeError as error:
-        raise InputError(f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); "
-                         "correct it", code='definition_keys') from error
+        raise InputError(
+            f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); "
+            'correct it',
+            code='definition_keys',
+        ) from error
 
 
 def _reduced(effect):
     """Return how an effect is sent to other processes: by its definition if there is one, because `coefficients` hold functions."""
-    return object.__reduce_ex__(effect, 2) if effect.definition is None else (from_definition, (effect.name, effect.definition))
+    return (
+        object.__reduce_ex__(effect, 2)
+        if effect.definition is None
+        else (from_definition, (effect.name, effect.definition))
+    )
 
 
 copyreg.pickle(Effect, _reduced)
@@ -139,8 +230,15 @@ JOINTS = ('outer', 'middle', 'inner')
 """Default joint names."""
 MOST_ADDED = 50
 """Effects that a document may add at most."""
-UNDONE_WITH = {'force', 'rate', 'angular acceleration', 'temperature', 'thermal branch', 'vibration',
-               'reference temperature'}
+UNDONE_WITH = {
+    'force',
+    'rate',
+    'angular acceleration',
+    'temperature',
+    'thermal branch',
+    'vibration',
+    'reference temperature',
+}
 """Quantities of a sample that compensation has."""
 
 
@@ -167,15 +265,28 @@ class Catalogue:
 
     def effects(self, joint_names: Sequence[str] = JOINTS) -> dict[tuple[str, str], Effect]:
         """Return every effect by (sensor, name) for a table with these joints."""
-        return _own_effects(JointNames.of(joint_names)) | {effect.key: effect for effect in self.added}
+        return _own_effects(JointNames.of(joint_names)) | {
+            effect.key: effect for effect in self.added
+        }
 
-    def find(self, sensor: str, name: str, joint_names: Sequence[str] = JOINTS, *, models: Iterable[str] = ()) -> Effect:
+    def find(
+        self,
+        sensor: str,
+        name: str,
+        joint_names: Sequence[str] = JOINTS,
+        *,
+        models: Iterable[str] = (),
+    ) -> Effect:
         """Return the effect `name` of `sensor`, or raise `InputError` with the closest name; `models` are suggested too."""
         effects = self.effects(joint_names)
         if (sensor, name) not in effects:
-            known = sorted(known_name for known_sensor, known_name in effects if known_sensor == sensor)
-            raise InputError(f"the {sensor} has no effect '{name}'{did_you_mean(name, [*models, *known])}; choose from {', '.join(known)}",
-                             code='effect_unknown')
+            known = sorted(
+                known_name for known_sensor, known_name in effects if known_sensor == sensor
+            )
+            raise InputError(
+                f"the {sensor} has no effect '{name}'{did_you_mean(name, [*models, *known])}; choose from {', '.join(known)}",
+                code='effect_unknown',
+            )
         return effects[sensor, name]
 
     def owner_of(self, name: str, joint_names: Sequence[str] = JOINTS) -> str:
@@ -183,8 +294,10 @@ class Catalogue:
         names = [known for _, known in self.effects(joint_names)]
         if names.count(name) != 1:
             known = sorted(n for n in names if names.count(n) == 1)
-            raise InputError(f"effect '{name}' is unknown or ambiguous{did_you_mean(name, known)}; choose from {', '.join(known)}",
-                             code='effect_unknown')
+            raise InputError(
+                f"effect '{name}' is unknown or ambiguous{did_you_mean(name, known)}; choose from {', '.join(known)}",
+                code='effect_unknown',
+            )
         return next(sensor for sensor, known in self.effects(joint_names) if known == name)
 
     def with_effects(self, *effects: Effect) -> 'Catalogue':
@@ -208,8 +321,11 @@ class Catalogue:
         added = [effect for effect in self.added if effect.name in names]
         for effect in added:
             if effect.definition is None:
-                raise InputError(f"effect '{effect.name}' must be made of text to be written into a document, it is made of code; "
-                                 "make it with `effects.catalogue.term`", code='made_of_code')
+                raise InputError(
+                    f"effect '{effect.name}' must be made of text to be written into a document, it is made of code; "
+                    'make it with `effects.catalogue.term`',
+                    code='made_of_code',
+                )
         return {effect.name: effect.definition for effect in added}
 
     def with_definitions(self, definitions: dict[str, Any]) -> 'Catalogue':
@@ -223,10 +339,14 @@ class Catalogue:
 
         """
         if not isinstance(definitions, dict) or len(definitions) > MOST_ADDED:
-            raise InputError(f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit, tolerance, text}}, got '
-                             f'{len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))}; correct it',
-                             code='effects_count')
-        return self.with_effects(*(from_definition(name, definition) for name, definition in definitions.items()))
+            raise InputError(
+                f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit, tolerance, text}}, got '
+                f'{len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))}; correct it',
+                code='effects_count',
+            )
+        return self.with_effects(
+            *(from_definition(name, definition) for name, definition in definitions.items())
+        )
 
     def with_document(self, document: dict[str, Any]) -> 'Catalogue':
         """
@@ -238,11 +358,15 @@ class Catalogue:
             When there is no such part, or when a file of effects has other parts.
 
         """
-        strange = [] if 'format' in document else sorted(str(key) for key in document if key != 'effects')
+        strange = (
+            [] if 'format' in document else sorted(str(key) for key in document if key != 'effects')
+        )
         if strange or 'effects' not in document:
-            raise InputError('a file of effects must hold effects: NAME: {sensor, column, unit, tolerance, text}, it holds '
-                             f'{", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"}; correct it',
-                             code='effects_file')
+            raise InputError(
+                'a file of effects must hold effects: NAME: {sensor, column, unit, tolerance, text}, it holds '
+                f'{", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"}; correct it',
+                code='effects_file',
+            )
         return self.with_definitions(document['effects'] or {})
 
 
@@ -251,12 +375,22 @@ CATALOGUE = Catalogue()
 
 
 def _check(effect, taken):
-    if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken | {'effects'}:
-        raise InputError(f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; "
-                         "choose another one", code='effect_name')
+    if not (isinstance(effect.name, str) and effect.name.isidentifier()) or effect.name in taken | {
+        'effects'
+    }:
+        raise InputError(
+            f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; "
+            'choose another one',
+            code='effect_name',
+        )
     if effect.sensor not in SECTIONS:
-        raise InputError(f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it")
+        raise InputError(
+            f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it"
+        )
     strange = {quantity for group in effect.groups for quantity in group.uses} - UNDONE_WITH
     if effect.compensation == 'exact' and strange:
-        raise InputError(f"effect '{effect.name}' must not use {', '.join(sorted(strange))}, which are unknown during compensation; "
-                         "declare it with compensation 'none'", code='time_unavailable')
+        raise InputError(
+            f"effect '{effect.name}' must not use {', '.join(sorted(strange))}, which are unknown during compensation; "
+            "declare it with compensation 'none'",
+            code='time_unavailable',
+        )

@@ -19,7 +19,9 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
     'force': {f'f_{a}': ('force_s', k) for k, a in enumerate('xyz')},
     'rate': {f'w_{a}': ('rate_s', k) for k, a in enumerate('xyz')},
     'angular acceleration': {f'alpha_{a}': ('alpha_s', k) for k, a in enumerate('xyz')},
-    'attitude': {f'c_{a}{b}': ('mat_sn', i, j) for i, a in enumerate('xyz') for j, b in enumerate('xyz')},
+    'attitude': {
+        f'c_{a}{b}': ('mat_sn', i, j) for i, a in enumerate('xyz') for j, b in enumerate('xyz')
+    },
     'joint angle': {f'angle_{k + 1}': ('joint_angle', k) for k in range(MAX_COLUMN_JOINTS)},
     'joint rate': {f'joint_rate_{k + 1}': ('joint_rate', k) for k in range(MAX_COLUMN_JOINTS)},
     'time': {'time': ('time',)},
@@ -33,13 +35,21 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
 Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s, joints
 from the base outwards.
 """
-VOCABULARY = ('f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
-         'vibration_x .. z, temperature_ref_c, tau')
+VOCABULARY = (
+    'f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
+    'vibration_x .. z, temperature_ref_c, tau'
+)
 """The names, for messages."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
 QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
-MAX_CHARACTERS, MAX_COLUMN_DEPTH, MAX_EXPONENT, MAX_PRODUCTS, MAX_COLUMN_NUMBER = 400, 30, 9, 200, 1e30
+MAX_CHARACTERS, MAX_COLUMN_DEPTH, MAX_EXPONENT, MAX_PRODUCTS, MAX_COLUMN_NUMBER = (
+    400,
+    30,
+    9,
+    200,
+    1e30,
+)
 """Characters, depth, exponents, products and size of numbers at most, so that no document costs more than arithmetic should."""
 LONGEST_EXPANDED = 5000
 """Characters of a column at most when it is multiplied out: nested powers of a function multiply its text by nine at each level."""
@@ -69,7 +79,10 @@ def read(text: str) -> ast.expr:
         if len(text) > MAX_CHARACTERS:
             raise _Refused(MAX_CHARACTERS, 'too long')
         if not text.isascii():
-            raise _Refused(next(k for k, letter in enumerate(text) if not letter.isascii()), 'a letter that is not ASCII')
+            raise _Refused(
+                next(k for k, letter in enumerate(text) if not letter.isascii()),
+                'a letter that is not ASCII',
+            )
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', SyntaxWarning)
             tree = ast.parse(text, mode='eval').body
@@ -91,9 +104,12 @@ class _Refused(Exception):
 
 
 def _refusal(text, place, why):
-    shown = ' '.join(str(text)[place:place + 30].split())
-    return InputError(f'a column must be arithmetic of at most {MAX_CHARACTERS} characters in {VOCABULARY} with {", ".join(FUNCTIONS)} and '
-                      f'powers up to {MAX_EXPONENT}, got {why} at character {place + 1}: {shown!r}; correct it', code='not_arithmetic')
+    shown = ' '.join(str(text)[place : place + 30].split())
+    return InputError(
+        f'a column must be arithmetic of at most {MAX_CHARACTERS} characters in {VOCABULARY} with {", ".join(FUNCTIONS)} and '
+        f'powers up to {MAX_EXPONENT}, got {why} at character {place + 1}: {shown!r}; correct it',
+        code='not_arithmetic',
+    )
 
 
 def _checked(node, text, depth):
@@ -103,11 +119,18 @@ def _checked(node, text, depth):
 
     def inner(part):
         return _checked(part, text, depth + 1)
+
     match node:
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, OPERATORS):
             if isinstance(op, ast.Pow):
-                if not (isinstance(right, ast.Constant) and type(right.value) is int and 0 <= right.value <= MAX_EXPONENT):
-                    raise _Refused(right.col_offset, f'a power that is not an integer up to {MAX_EXPONENT}')
+                if not (
+                    isinstance(right, ast.Constant)
+                    and type(right.value) is int
+                    and 0 <= right.value <= MAX_EXPONENT
+                ):
+                    raise _Refused(
+                        right.col_offset, f'a power that is not an integer up to {MAX_EXPONENT}'
+                    )
                 return _folded(ast.BinOp(inner(left), op, right), node)
             return _folded(ast.BinOp(inner(left), op, inner(right)), node)
         case ast.UnaryOp(op=op, operand=operand) if isinstance(op, SIGNS):
@@ -118,15 +141,28 @@ def _checked(node, text, depth):
             return ast.copy_location(ast.Name(name, ast.Load()), node)
         case ast.Name(id=name):
             raise _Refused(node.col_offset, f"the unknown name '{name[:30]}'")
-        case ast.Constant(value=value) if type(value) in (int, float) and abs(value) < MAX_COLUMN_NUMBER:
+        case ast.Constant(value=value) if (
+            type(value) in (int, float) and abs(value) < MAX_COLUMN_NUMBER
+        ):
             return ast.copy_location(ast.Constant(float(value)), node)
     raise _Refused(node.col_offset, 'an operation that is not arithmetic')
 
 
 def _folded(node, source):
     """Return the node, or the number that it is."""
-    parts = [node.left, node.right] if isinstance(node, ast.BinOp) else [node.operand] if isinstance(node, ast.UnaryOp) else node.args
-    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div) and isinstance(node.right, ast.Constant) and node.right.value == 0.0:
+    parts = (
+        [node.left, node.right]
+        if isinstance(node, ast.BinOp)
+        else [node.operand]
+        if isinstance(node, ast.UnaryOp)
+        else node.args
+    )
+    if (
+        isinstance(node, ast.BinOp)
+        and isinstance(node.op, ast.Div)
+        and isinstance(node.right, ast.Constant)
+        and node.right.value == 0.0
+    ):
         raise _Refused(source.col_offset, 'a division by zero')
     if not all(isinstance(part, ast.Constant) for part in parts):
         return ast.copy_location(node, source)
@@ -144,9 +180,14 @@ def names_in(tree: ast.expr) -> set[str]:
 
 def may_fail(tree: ast.expr) -> bool:
     """Return whether a column may be without a finite value somewhere: it divides, or calls a function that is not defined everywhere."""
-    divides = any(isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant)
-                  for node in ast.walk(tree) if isinstance(node, ast.BinOp))
-    return divides or any(called(node) in UNBOUNDED_FUNCTIONS for node in ast.walk(tree) if isinstance(node, ast.Call))
+    divides = any(
+        isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.BinOp)
+    )
+    return divides or any(
+        called(node) in UNBOUNDED_FUNCTIONS for node in ast.walk(tree) if isinstance(node, ast.Call)
+    )
 
 
 def called(node: ast.Call) -> str:
@@ -158,8 +199,13 @@ def array_function(trees: Sequence[ast.expr]) -> Callable:
     """Return ``function({name: array or number}) -> tuple of arrays``, one for each tree."""
     source = ast.Expression(ast.Tuple(list(trees), ast.Load()))
     code = compile(ast.fix_missing_locations(source), '<columns>', 'eval')
-    known = {'__builtins__': {}, **{name: getattr(np, name) for name in FUNCTIONS}, 'abs': _abs, 'sign': _sign}
-    return lambda values: eval(code, known, values)   # the trees contain only arithmetic: see `read`
+    known = {
+        '__builtins__': {},
+        **{name: getattr(np, name) for name in FUNCTIONS},
+        'abs': _abs,
+        'sign': _sign,
+    }
+    return lambda values: eval(code, known, values)  # the trees contain only arithmetic: see `read`
 
 
 def _sign(x):
@@ -188,21 +234,34 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
     """
     match node := tree:
         case ast.Constant():
-            return {(): float(node.value)}   # type: ignore[arg-type]   # `read` accepts no other
+            return {(): float(node.value)}  # type: ignore[arg-type]   # `read` accepts no other
         case ast.Name():
             if node.id not in known:
-                raise InputError(f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), "
-                                 "which is not known there; declare the effect with compensation 'none'", code='variable_unavailable')
+                raise InputError(
+                    f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), "
+                    "which is not known there; declare the effect with compensation 'none'",
+                    code='variable_unavailable',
+                )
             return known[node.id]
         case ast.UnaryOp():
-            return scaled(products(node.operand, known), -1.0 if isinstance(node.op, ast.USub) else 1.0)
+            return scaled(
+                products(node.operand, known), -1.0 if isinstance(node.op, ast.USub) else 1.0
+            )
         case ast.Call():
             argument = as_text(products(node.args[0], known))
-            inline = called(node) == 'sign' and argument.isidentifier()   # a call costs more than all the arithmetic
-            return {(f'(({argument} > 0) - ({argument} < 0))' if inline else f'{called(node)}({argument})',): 1.0}
+            inline = (
+                called(node) == 'sign' and argument.isidentifier()
+            )  # a call costs more than all the arithmetic
+            return {
+                (
+                    f'(({argument} > 0) - ({argument} < 0))'
+                    if inline
+                    else f'{called(node)}({argument})',
+                ): 1.0
+            }
         case ast.BinOp():
             return _of_two(node, known)
-    raise TypeError(f'{ast.dump(tree):.60} is no arithmetic')   # `read` accepts none
+    raise TypeError(f'{ast.dump(tree):.60} is no arithmetic')  # `read` accepts none
 
 
 def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
@@ -210,7 +269,7 @@ def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
     left = products(node.left, known)
     if isinstance(node.op, ast.Pow):
         result: Sum = {(): 1.0}
-        for _ in range(cast(ast.Constant, node.right).value):   # type: ignore[arg-type]   # `read` accepts integer powers
+        for _ in range(cast(ast.Constant, node.right).value):  # type: ignore[arg-type]   # `read` accepts integer powers
             result = _multiplied(result, left)
         return result
     right = products(node.right, known)
@@ -218,7 +277,11 @@ def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
         return _multiplied(left, right)
     if isinstance(node.op, ast.Div):
         divisor = right[()] if right.keys() == {()} else 0.0
-        return scaled(left, 1.0 / divisor) if divisor else {(f'divided({as_text(left)}, {as_text(right)})',): 1.0}
+        return (
+            scaled(left, 1.0 / divisor)
+            if divisor
+            else {(f'divided({as_text(left)}, {as_text(right)})',): 1.0}
+        )
     return added(left, right if isinstance(node.op, ast.Add) else scaled(right, -1.0))
 
 
@@ -233,24 +296,40 @@ def added(*sums: dict[tuple[str, ...], float]) -> dict[tuple[str, ...], float]:
 
 def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str, ...], float]:
     """Return a multiple of a sum of products."""
-    return {factors: factor * coefficient for factors, coefficient in terms.items() if factor * coefficient != 0.0}
+    return {
+        factors: factor * coefficient
+        for factors, coefficient in terms.items()
+        if factor * coefficient != 0.0
+    }
 
 
 def _multiplied(left, right):
     if len(left) * len(right) > MAX_PRODUCTS:
-        raise InputError(f'a column must have at most {MAX_PRODUCTS} products when it is multiplied out, this one has more; '
-                         'write it shorter', code='column_expands')
-    result = added(*({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items()))
+        raise InputError(
+            f'a column must have at most {MAX_PRODUCTS} products when it is multiplied out, this one has more; '
+            'write it shorter',
+            code='column_expands',
+        )
+    result = added(
+        *({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items())
+    )
     if sum(len(factor) for factors in result for factor in factors) > LONGEST_EXPANDED:
-        raise InputError(f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out, this one has more; '
-                         'write it without powers inside of powers', code='column_expands')
+        raise InputError(
+            f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out, this one has more; '
+            'write it without powers inside of powers',
+            code='column_expands',
+        )
     return result
 
 
 def as_text(terms: dict[tuple[str, ...], float]) -> str:
     """Return a sum of products as a Python expression, coefficients of one left out."""
-    texts = [' * '.join([*([repr(float(coefficient))] if coefficient != 1.0 or not factors else []), *factors]) for factors,
-             coefficient in terms.items()]
+    texts = [
+        ' * '.join(
+            [*([repr(float(coefficient))] if coefficient != 1.0 or not factors else []), *factors]
+        )
+        for factors, coefficient in terms.items()
+    ]
     return ' + '.join(texts) or '0.0'
 
 
@@ -260,11 +339,16 @@ def _or_nan(function):
             return function(*arguments)
         except (ValueError, OverflowError, ZeroDivisionError):
             return math.nan
+
     return careful
 
 
-SCALAR_FUNCTIONS = {'abs': abs, 'sign': lambda x: (x > 0) - (x < 0), 'divided': _or_nan(lambda a, b: a / b),
-                    **{name: _or_nan(getattr(math, name)) for name in FUNCTIONS if hasattr(math, name)}}
+SCALAR_FUNCTIONS = {
+    'abs': abs,
+    'sign': lambda x: (x > 0) - (x < 0),
+    'divided': _or_nan(lambda a, b: a / b),
+    **{name: _or_nan(getattr(math, name)) for name in FUNCTIONS if hasattr(math, name)},
+}
 """Functions in the expressions of `products`: of plain floats, NaN where undefined."""
 
 
@@ -321,7 +405,12 @@ class ColumnGroup:
 
     @cached_property
     def _places(self):
-        return [(name, field, (slice(None), *index)) for name in sorted(self.names) for field, *index in [PLACES[name]] if field]
+        return [
+            (name, field, (slice(None), *index))
+            for name in sorted(self.names)
+            for field, *index in [PLACES[name]]
+            if field
+        ]
 
     def columns(self, ref: Reference, point: dict[str, Any]) -> np.ndarray:
         """
@@ -344,8 +433,10 @@ class ColumnGroup:
         try:
             values = {name: getattr(ref, field)[index] for name, field, index in self._places}
         except IndexError as error:
-            raise InputError(f"the columns of '{self.name}' refer to more joints than exist: {', '.join(self.text)}; "
-                             "correct them") from error
+            raise InputError(
+                f"the columns of '{self.name}' refer to more joints than exist: {', '.join(self.text)}; "
+                'correct them'
+            ) from error
         values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
         result, count = np.empty((len(ref), self.width)), len(self.text)
         if 'tau' in self.names:
@@ -358,9 +449,12 @@ class ColumnGroup:
         if self.name in point.get('centre', ()):
             result -= point['centre'][self.name]
         if self._may_fail and not np.all(np.isfinite(result)):
-            raise InputError(f"the columns of '{self.name}' must be finite in the whole recording, {', '.join(self.text)} is not; "
-                             "do not divide by a quantity that "
-                             'passes through zero, and use no root or logarithm of a negative quantity', code='column_not_finite')
+            raise InputError(
+                f"the columns of '{self.name}' must be finite in the whole recording, {', '.join(self.text)} is not; "
+                'do not divide by a quantity that '
+                'passes through zero, and use no root or logarithm of a negative quantity',
+                code='column_not_finite',
+            )
         return result
 
     def products(self, known: dict[str, Sum]) -> list[Sum]:

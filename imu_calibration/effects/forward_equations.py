@@ -29,8 +29,10 @@ def _mean_reference(weighted, motion):
     if len(weighted) == 1:
         return weighted[0][1]
     total = sum(weight for weight, _ in weighted)
-    mean: dict[str, Any] = {name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total
-                            for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn')}
+    mean: dict[str, Any] = {
+        name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total
+        for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn')
+    }
     return replace(weighted[0][1], motion=motion, **mean)
 
 
@@ -40,14 +42,39 @@ INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
 class References:
     """The motions that a model's sensors are thought to have felt, each worked out once for both sensors where both feel the same."""
 
-    def __init__(self, model: SensorModel, table: Table, motion: JointMotion, *, temperature_c: np.ndarray | None = None):
-        self.model, self.table, self.motion, self.temperature_c = model, table, motion, temperature_c
-        self._warps = {sensor: [(each, model.point_of(each)) for each in model.concerning(sensor) if each.warp is not None]
-                       for sensor in SENSORS}
+    def __init__(
+        self,
+        model: SensorModel,
+        table: Table,
+        motion: JointMotion,
+        *,
+        temperature_c: np.ndarray | None = None,
+    ):
+        self.model, self.table, self.motion, self.temperature_c = (
+            model,
+            table,
+            motion,
+            temperature_c,
+        )
+        self._warps = {
+            sensor: [
+                (each, model.point_of(each))
+                for each in model.concerning(sensor)
+                if each.warp is not None
+            ]
+            for sensor in SENSORS
+        }
         self._known: dict[tuple, Reference] = {}
         self._shifts: dict[tuple, list] = {}
 
-    def at(self, sensor: str, effect: Effect | None = None, values: np.ndarray | None = None, *, roughly: bool = False) -> Reference:
+    def at(
+        self,
+        sensor: str,
+        effect: Effect | None = None,
+        values: np.ndarray | None = None,
+        *,
+        roughly: bool = False,
+    ) -> Reference:
         """
         Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
 
@@ -64,7 +91,11 @@ class References:
         """
         acting: list[tuple[str, Any, Any]] = []
         moved = None
-        if effect is not None and values is not None and np.any(values != self.model.point_of(effect)):
+        if (
+            effect is not None
+            and values is not None
+            and np.any(values != self.model.point_of(effect))
+        ):
             moved = effect.key
         for each, point in self._warps[sensor]:
             at = values if each.key == moved else point
@@ -86,7 +117,9 @@ class References:
             for _, warp, at in acting:
                 if not isinstance(warp, Lag):
                     table, felt = warp(table, felt, at)
-            references.append((weight, reference_motion(table, felt, self.temperature_c, attitude=attitude)))
+            references.append(
+                (weight, reference_motion(table, felt, self.temperature_c, attitude=attitude))
+            )
         return _mean_reference(references, self.motion)
 
 
@@ -99,8 +132,12 @@ def columns(references: References, sensor: str) -> np.ndarray:
     """
     model, ref, parts = references.model, references.at(sensor), []
     layout = model.layout(sensor)
-    if ref.temperature_c is None and any('temperature' in group.uses for group in layout.groups.values()):
-        raise InputError('a thermal effect needs temperatures, none were received; record imu/temperature or omit the effect')
+    if ref.temperature_c is None and any(
+        'temperature' in group.uses for group in layout.groups.values()
+    ):
+        raise InputError(
+            'a thermal effect needs temperatures, none were received; record imu/temperature or omit the effect'
+        )
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     for name in layout.rows:
         if name in warps:
@@ -121,16 +158,25 @@ def _warp_columns(references, effect, sensor):
         return [effect.derivative(references.at(sensor))]
     clock = model.find('reference', Role.DELAY)
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
-        effect = clock   # a lag of zero is a delay to first order
+        effect = clock  # a lag of zero is a delay to first order
     inputs, levers = [], []
     # A search folds the arms and needs many warps: forward differences halve the references, with an error of the curvature over a step.
     # Candidate effects are evaluated with a delay in place of a filter.
     asking = model.folded_arms is not None
     for above, below, width in _steps(effect, model.point_of(effect), forward=asking):
-        ends = [references.at(sensor, effect, at, roughly=asking and not np.any(model.point_of(effect))) for at in (above, below)]
+        ends = [
+            references.at(sensor, effect, at, roughly=asking and not np.any(model.point_of(effect)))
+            for at in (above, below)
+        ]
         change = getattr(ends[0], INPUT_OF[sensor]) - getattr(ends[1], INPUT_OF[sensor])
-        if sensor == 'accelerometer' and model.arms and (model.folded_arms is None or model.folded_arms.any()):
-            turned = lever_matrix(ends[0].rate_s, ends[0].alpha_s) - lever_matrix(ends[1].rate_s, ends[1].alpha_s)
+        if (
+            sensor == 'accelerometer'
+            and model.arms
+            and (model.folded_arms is None or model.folded_arms.any())
+        ):
+            turned = lever_matrix(ends[0].rate_s, ends[0].alpha_s) - lever_matrix(
+                ends[1].rate_s, ends[1].alpha_s
+            )
             if model.folded_arms is None:
                 levers.append(turned.reshape(-1, 9) / width)
             else:
@@ -148,7 +194,7 @@ def _steps(effect, at, forward):
     for index in range(effect.size):
         step = np.zeros(effect.size)
         if index == effect.n_amplitudes and effect.located:
-            yield at, at, 1.0   # least squares does not move the time of a step
+            yield at, at, 1.0  # least squares does not move the time of a step
             continue
         step[index] = effect.step
         below = at if forward else at - step
@@ -161,7 +207,9 @@ def _steps(effect, at, forward):
 def columns_at_point(model: SensorModel, sensor: str, ref: Reference) -> np.ndarray:
     """Return the columns without the warps' derivatives, which have zero coefficients at the point itself."""
     layout = model.layout(sensor)
-    return np.concatenate([group.columns(ref, layout.point) for group in layout.groups.values()], axis=1)
+    return np.concatenate(
+        [group.columns(ref, layout.point) for group in layout.groups.values()], axis=1
+    )
 
 
 def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
@@ -178,14 +226,18 @@ def _add_coefficients(total, model, effect, of_sensor, layout):
     if effect.warp is not None:
         change = of_sensor[effect.name] - model.point_of(effect)
         matrix = of_sensor['matrix'].reshape(3, 3)
-        total[layout.rows[WARP + effect.name]] += (change[:, None, None] * matrix.T[None]).reshape(-1, 3)
+        total[layout.rows[WARP + effect.name]] += (change[:, None, None] * matrix.T[None]).reshape(
+            -1, 3
+        )
         if WARP_LEVER + effect.name in layout.rows:
             arms = sum((of_sensor[e.name].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
             products = (matrix[:, :, None] * arms[:, None, :]).reshape(3, 9).T
-            total[layout.rows[WARP_LEVER + effect.name]] += (change[:, None, None] * products[None]).reshape(-1, 3)
+            total[layout.rows[WARP_LEVER + effect.name]] += (
+                change[:, None, None] * products[None]
+            ).reshape(-1, 3)
     elif effect.coefficients is not None:
         for group, block in effect.coefficients(effect, of_sensor, layout.point).items():
-            if group in layout.rows:   # an effect on both sensors has groups of each
+            if group in layout.rows:  # an effect on both sensors has groups of each
                 total[layout.rows[group]] += block
 
 
@@ -215,8 +267,9 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     return jacobian
 
 
-def effect_slopes(effect: Effect, of_sensor: dict[str, np.ndarray],
-                  point: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def effect_slopes(
+    effect: Effect, of_sensor: dict[str, np.ndarray], point: dict[str, Any]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return {group: coefficients (w, 3)} of one effect and {group: derivative by its own values (w, 3, size)}, by complex steps."""
     coefficients = effect.coefficients
     if coefficients is None:
@@ -231,8 +284,14 @@ def effect_slopes(effect: Effect, of_sensor: dict[str, np.ndarray],
     return found, slopes
 
 
-def predict(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion,
-            temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def predict(
+    model: SensorModel,
+    values: np.ndarray,
+    table: Table,
+    *,
+    motion: JointMotion,
+    temperature_c: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the readings of this model, (force, rate), each shape (n, 3): the forward equations.
 
@@ -240,7 +299,10 @@ def predict(model: SensorModel, values: np.ndarray, table: Table, *, motion: Joi
     """
     exact = model.at(values)
     references = References(exact, table, motion, temperature_c=temperature_c)
-    outputs = {sensor: sensor_output(exact, sensor, values, ref=references.at(sensor)) for sensor in SENSORS}
+    outputs = {
+        sensor: sensor_output(exact, sensor, values, ref=references.at(sensor))
+        for sensor in SENSORS
+    }
     force, rate = (clip(exact, sensor, values, output=output) for sensor, output in outputs.items())
     return force, rate
 
@@ -257,7 +319,9 @@ def clip(model: SensorModel, sensor: str, values: np.ndarray, *, output: np.ndar
     return output if level is None else np.clip(output, -level, level)
 
 
-def sensor_output(model: SensorModel, sensor: str, values: np.ndarray, *, ref: Reference) -> np.ndarray:
+def sensor_output(
+    model: SensorModel, sensor: str, values: np.ndarray, *, ref: Reference
+) -> np.ndarray:
     """
     Return the output for a given true motion, without warps, shape (n, 3); compensation inverts it.
 
@@ -276,8 +340,15 @@ Centre = Mapping[str, np.ndarray]
 
 def not_applied(model: SensorModel) -> list[Effect]:
     """Return the effects of the sensors that compensation cannot undo: drifts, formulas in joint angles or time."""
-    return [effect for effect in model.effects if effect.sensor in SENSORS and effect.compensation == 'none'
-            and not effect.in_reference and effect.warp is None and effect.groups]
+    return [
+        effect
+        for effect in model.effects
+        if effect.sensor in SENSORS
+        and effect.compensation == 'none'
+        and not effect.in_reference
+        and effect.warp is None
+        and effect.groups
+    ]
 
 
 def in_time(effect: Effect) -> bool:
@@ -285,7 +356,9 @@ def in_time(effect: Effect) -> bool:
     return all(group.uses <= {'time', 'time constant'} for group in effect.groups)
 
 
-def centred(model: SensorModel, values: np.ndarray, centre: Centre) -> tuple[np.ndarray, np.ndarray]:
+def centred(
+    model: SensorModel, values: np.ndarray, centre: Centre
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (values, their derivative by the given ones) with columns that are measured from `centre`.
 
@@ -299,14 +372,23 @@ def centred(model: SensorModel, values: np.ndarray, centre: Centre) -> tuple[np.
 
     """
     moved, slope = values.copy(), np.eye(len(values))
-    for sensor, group in ((effect.sensor, group) for effect in not_applied(model) for group in effect.groups if group.name in centre):
+    for sensor, group in (
+        (effect.sensor, group)
+        for effect in not_applied(model)
+        for group in effect.groups
+        if group.name in centre
+    ):
         bias, rows = model.part(sensor, Role.OFFSET), model.layout(sensor).rows[group.name]
         moved[bias] += centre[group.name] @ coefficients(model, sensor, values)[rows]
-        slope[bias] += np.einsum('q,qan->an', centre[group.name], coefficient_jacobian(model, sensor, values)[rows])
+        slope[bias] += np.einsum(
+            'q,qan->an', centre[group.name], coefficient_jacobian(model, sensor, values)[rows]
+        )
     return moved, slope
 
 
-def applied_values(model: SensorModel, values: np.ndarray, centre: Centre | None = None) -> np.ndarray:
+def applied_values(
+    model: SensorModel, values: np.ndarray, centre: Centre | None = None
+) -> np.ndarray:
     """Return the values with effects that compensation cannot undo at their value in the centre, which the bias contains."""
     applied = centred(model, values, centre or {})[0]
     for effect in not_applied(model):

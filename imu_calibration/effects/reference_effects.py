@@ -8,8 +8,25 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.effects.base import ATTITUDE, LOAD, MATRIX, PREFIXES, PRODUCT_PAIRS, SENSORS, Effect, Lag, Role
-from imu_calibration.kinematics.chain import WOBBLES, tilt, with_axis_angles, with_axis_places, with_sag, with_wobble
+from imu_calibration.effects.base import (
+    ATTITUDE,
+    LOAD,
+    MATRIX,
+    PREFIXES,
+    PRODUCT_PAIRS,
+    SENSORS,
+    Effect,
+    Lag,
+    Role,
+)
+from imu_calibration.kinematics.chain import (
+    WOBBLES,
+    tilt,
+    with_axis_angles,
+    with_axis_places,
+    with_sag,
+    with_wobble,
+)
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.joint_motion import with_encoder_harmonics
 
@@ -34,11 +51,23 @@ def _second_order():
 
 SECOND_ORDER = _second_order()
 _LAG_FORMS = {
-    'bandwidth': ('time_constant', FIRST_ORDER, 'has a first-order low-pass filter: '
-                  'its output has a lag and a smaller amplitude at high frequency'),
-    'delay': ('delay', ((1.0, 1.0),), 'sends its output late, and the other sensor does not: a pure delay of its own'),
-    'filter': ('delay', SECOND_ORDER, 'has a second-order (Butterworth) low-pass filter: its output has a lag, '
-               'and an unchanged amplitude up to near its edge'),
+    'bandwidth': (
+        'time_constant',
+        FIRST_ORDER,
+        'has a first-order low-pass filter: '
+        'its output has a lag and a smaller amplitude at high frequency',
+    ),
+    'delay': (
+        'delay',
+        ((1.0, 1.0),),
+        'sends its output late, and the other sensor does not: a pure delay of its own',
+    ),
+    'filter': (
+        'delay',
+        SECOND_ORDER,
+        'has a second-order (Butterworth) low-pass filter: its output has a lag, '
+        'and an unchanged amplitude up to near its edge',
+    ),
 }
 """Ending of the name -> (component, (weight, delay) pairs, description). All have the same first derivative."""
 
@@ -46,11 +75,29 @@ _LAG_FORMS = {
 def _lag_effect(sensor, ending):
     component, pairs, does = _LAG_FORMS[ending]
     return Effect(
-        name=lag_name(sensor, ending), sensor=sensor, components=(component,), shape=(), unit='s', nonnegative=True, in_reference=True,
-        explanation=f'The {sensor} {does}.', tolerance=1e-4, prior_sd=0.1, plausible=('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),
-        tolerance_reason=('1 mg while the specific force changes by 100 m/s^3' if sensor == 'accelerometer'
-                          else '0.1 deg/s while the rate changes by 1000 deg/s^2'),
-        motion=('oscillate_fast',), compensation='none', warp=Lag(pairs), acts_on=(sensor,), needs=('joints', 'dynamic'), step=2e-4)
+        name=lag_name(sensor, ending),
+        sensor=sensor,
+        components=(component,),
+        shape=(),
+        unit='s',
+        nonnegative=True,
+        in_reference=True,
+        explanation=f'The {sensor} {does}.',
+        tolerance=1e-4,
+        prior_sd=0.1,
+        plausible=('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),
+        tolerance_reason=(
+            '1 mg while the specific force changes by 100 m/s^3'
+            if sensor == 'accelerometer'
+            else '0.1 deg/s while the rate changes by 1000 deg/s^2'
+        ),
+        motion=('oscillate_fast',),
+        compensation='none',
+        warp=Lag(pairs),
+        acts_on=(sensor,),
+        needs=('joints', 'dynamic'),
+        step=2e-4,
+    )
 
 
 def lag_name(sensor: str, ending: str) -> str:
@@ -71,7 +118,9 @@ FAMILY = frozenset({CLOCK, *(effect.name for effect in LAGS)})
 """Effects with one first derivative."""
 
 
-def total_lags(names: Sequence[str], values: np.ndarray, covariance: np.ndarray) -> dict[str, tuple[float, float]]:
+def total_lags(
+    names: Sequence[str], values: np.ndarray, covariance: np.ndarray
+) -> dict[str, tuple[float, float]]:
     """
     Return sensor -> (total lag of its output, standard deviation), s, of sensors with a lag.
 
@@ -86,13 +135,25 @@ def total_lags(names: Sequence[str], values: np.ndarray, covariance: np.ndarray)
     """
     found = {}
     for sensor in SENSORS:
-        own = np.array([part[1] in FAMILY and part[0] in (sensor, 'reference') for part in (name.split('.') for name in names)], float)
+        own = np.array(
+            [
+                part[1] in FAMILY and part[0] in (sensor, 'reference')
+                for part in (name.split('.') for name in names)
+            ],
+            float,
+        )
         if own.any():
             found[sensor] = (float(own @ values), float(np.sqrt(own @ covariance @ own)))
     return found
 
 
-EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i in range(3) for j in range(3) for k in range(3) if len({i, j, k}) == 3]
+EVEN_AND_ODD = [
+    (i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0)
+    for i in range(3)
+    for j in range(3)
+    for k in range(3)
+    if len({i, j, k}) == 3
+]
 """Axes i, j, k of a cross product with their sign."""
 _PAIR = {pair: place for place, pair in enumerate(PRODUCT_PAIRS)}
 ENCODER_ORDERS = (1, 2)
@@ -128,9 +189,13 @@ def _columns(table, names):
 
 def _harmonics(table, motion, values):
     amplitudes = np.zeros((motion.position.shape[1], len(ENCODER_ORDERS), 2))
-    amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(values, (-1, len(ENCODER_ORDERS), 2))
+    amplitudes[_columns(table, table.joint_names.turning)] = np.reshape(
+        values, (-1, len(ENCODER_ORDERS), 2)
+    )
     for index, order in enumerate(ENCODER_ORDERS):
-        motion = with_encoder_harmonics(motion, order, amplitudes[:, index, 0], sin_amplitude=amplitudes[:, index, 1])
+        motion = with_encoder_harmonics(
+            motion, order, amplitudes[:, index, 0], sin_amplitude=amplitudes[:, index, 1]
+        )
     return table, motion
 
 
@@ -145,18 +210,24 @@ def _after(time, values):
 def _earth(effect, values, point):
     """Coefficients of the attitude columns: matrix_ij C_jk earth_k."""
     matrix = values['matrix'].reshape(3, 3)
-    return {ATTITUDE.name: (matrix[:, :, None] * values['earth_rate'][None, None, :]).reshape(3, 9).T}
+    return {
+        ATTITUDE.name: (matrix[:, :, None] * values['earth_rate'][None, None, :]).reshape(3, 9).T
+    }
 
 
 def _earth_known(table):
     """Return why the Earth's rate cannot be tested: the table's location is unknown, or the reference includes it."""
     if table.latitude is None:
-        return ('the table gives no latitude, so the rotation of the Earth is not modelled',
-                'give latitude and height in the table description')
+        return (
+            'the table gives no latitude, so the rotation of the Earth is not modelled',
+            'give latitude and height in the table description',
+        )
     if table.azimuth_deg is None:
         return None
-    return ('the reference holds the rotation of the Earth already, from latitude and azimuth',
-            'omit the azimuth in the table description')
+    return (
+        'the reference holds the rotation of the Earth already, from latitude and azimuth',
+        'omit the azimuth in the table description',
+    )
 
 
 def _bent(effect, values, point):
@@ -170,96 +241,235 @@ def _bent(effect, values, point):
     force, rate = np.zeros((6, 3), turn.dtype), np.zeros((9, 3), turn.dtype)
     for i, j, k, sign in EVEN_AND_ODD:
         for m in range(3):
-            force[_PAIR[min(j, m), max(j, m)], i] += sign * turn[k, m]   # (f x theta)_i = f_j theta_k
-            rate[3 * m + j, i] += sign * turn[k, m]                       # (w x theta)_i = w_j theta_k
-            rate[3 * j + k, m] += sign * turn[m, i]                       # K (f x w): (f x w)_i = f_j w_k
+            force[_PAIR[min(j, m), max(j, m)], i] += (
+                sign * turn[k, m]
+            )  # (f x theta)_i = f_j theta_k
+            rate[3 * m + j, i] += sign * turn[k, m]  # (w x theta)_i = w_j theta_k
+            rate[3 * j + k, m] += sign * turn[m, i]  # K (f x w): (f x w)_i = f_j w_k
     return {LOAD['accelerometer'].name: force @ matrix.T, LOAD['gyroscope'].name: rate @ matrix.T}
 
 
 def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
     """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
     names = JointNames.of(joint_names)
-    of_table: dict[str, Any] = {'sensor': 'reference', 'unit': 'rad', 'tolerance': 1e-4, 'compensation': 'none', 'nuisance': True,
-                                'against': ('angle',)}
+    of_table: dict[str, Any] = {
+        'sensor': 'reference',
+        'unit': 'rad',
+        'tolerance': 1e-4,
+        'compensation': 'none',
+        'nuisance': True,
+        'against': ('angle',),
+    }
     return (
         Effect(
-            **of_table, name='table_tilt', sudden=True, role=Role.TILT, components=('x', 'y'), shape=(2,),
+            **of_table,
+            name='table_tilt',
+            sudden=True,
+            role=Role.TILT,
+            components=('x', 'y'),
+            shape=(2,),
             explanation='The table is not level: its vertical is rotated by a small angle about the base axes.',
-            tolerance_reason='0.1 mg at 1 g, a tenth of the accelerometer bias', prior_sd=2e-3,
-            plausible=('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'), motion=('turn_about_vertical',),
-            warp=partial(_of_table, tilt), derivative=_tilt_derivative, acts_on=('accelerometer',), needs=('joints',)),
+            tolerance_reason='0.1 mg at 1 g, a tenth of the accelerometer bias',
+            prior_sd=2e-3,
+            plausible=('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),
+            motion=('turn_about_vertical',),
+            warp=partial(_of_table, tilt),
+            derivative=_tilt_derivative,
+            acts_on=('accelerometer',),
+            needs=('joints',),
+        ),
         Effect(
-            **of_table, name='axis_non_orthogonality', components=names.angles, shape=(len(names.angles),),
+            **of_table,
+            name='axis_non_orthogonality',
+            components=names.angles,
+            shape=(len(names.angles),),
             explanation='The angles between the axes of the table differ from its description.',
-            tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01,
+            tolerance_reason='as the tilt',
+            prior_sd=names.angle_sd or 0.01,
             plausible=('bench', 0.01, 'field catalogue 6.3: 3 arcsec to arcmin'),
-            motion=('two_axis', 'static_dense'), warp=partial(_of_table, with_axis_angles), needs=('joints', 'two_joints')),
+            motion=('two_axis', 'static_dense'),
+            warp=partial(_of_table, with_axis_angles),
+            needs=('joints', 'two_joints'),
+        ),
         Effect(
-            **of_table, name='encoder_zero', sudden=True, components=names.zeros, shape=(len(names.zeros),),
+            **of_table,
+            name='encoder_zero',
+            sudden=True,
+            components=names.zeros,
+            shape=(len(names.zeros),),
             explanation='The zero of an inner joint angle differs from the table description.',
-            tolerance_reason='as the tilt', prior_sd=names.angle_sd or 0.01,
+            tolerance_reason='as the tilt',
+            prior_sd=names.angle_sd or 0.01,
             plausible=('bench', 0.02, 'field catalogue 6.3: encoder zero, up to degrees'),
-            motion=('static_dense',), warp=_zero, needs=('joints', 'three_joints')),
+            motion=('static_dense',),
+            warp=_zero,
+            needs=('joints', 'three_joints'),
+        ),
         Effect(
-            **of_table | {'unit': 'm'}, name='axis_offset', components=names.places, shape=(len(names.places),),
+            **of_table | {'unit': 'm'},
+            name='axis_offset',
+            components=names.places,
+            shape=(len(names.places),),
             explanation='The axes do not pass through the points of the description.',
-            tolerance_reason='0.1 mm, 0.01 m/s^2 at 10 rad/s', prior_sd=names.place_sd or 1e-3,
-            plausible=('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'), motion=('two_axis', 'three_speeds'),
-            warp=partial(_of_table, with_axis_places), acts_on=('accelerometer',), needs=('joints', 'two_joints', 'dynamic')),
+            tolerance_reason='0.1 mm, 0.01 m/s^2 at 10 rad/s',
+            prior_sd=names.place_sd or 1e-3,
+            plausible=('arm', 0.01, 'lengths of arms: 0.1-1 mm after a calibration of their own'),
+            motion=('two_axis', 'three_speeds'),
+            warp=partial(_of_table, with_axis_places),
+            acts_on=('accelerometer',),
+            needs=('joints', 'two_joints', 'dynamic'),
+        ),
         Effect(
-            **of_table, name='encoder_harmonic', shape=(len(names.turning), len(ENCODER_ORDERS), 2),
-            components=tuple(f'{name}_{kind}{order}' for name in names.turning for order in ENCODER_ORDERS for kind in ('cos', 'sin')),
+            **of_table,
+            name='encoder_harmonic',
+            shape=(len(names.turning), len(ENCODER_ORDERS), 2),
+            components=tuple(
+                f'{name}_{kind}{order}'
+                for name in names.turning
+                for order in ENCODER_ORDERS
+                for kind in ('cos', 'sin')
+            ),
             explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).',
-            tolerance_reason='as the tilt', prior_sd=0.01, plausible=('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),
-            motion=('slow_turn',), warp=_harmonics, needs=('joints',)),
+            tolerance_reason='as the tilt',
+            prior_sd=0.01,
+            plausible=('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),
+            motion=('slow_turn',),
+            warp=_harmonics,
+            needs=('joints',),
+        ),
         Effect(
-            **of_table, name='axis_sag', components=names.turning[1:], shape=(len(names.turning[1:]),),
+            **of_table,
+            name='axis_sag',
+            components=names.turning[1:],
+            shape=(len(names.turning[1:]),),
             explanation='The axes sag: each bends towards the ground by an angle proportional to its horizontal component, '
             'like a loaded shaft.',
-            tolerance_reason='as the tilt', prior_sd=2e-3,
-            plausible=('bench', 3e-3, 'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft'),
-            motion=('static_dense', 'two_axis'), warp=partial(_of_table, with_sag), needs=('joints', 'two_joints')),
+            tolerance_reason='as the tilt',
+            prior_sd=2e-3,
+            plausible=(
+                'bench',
+                3e-3,
+                'field catalogue 6.3: arcsec to 10 arcmin of a slender shaft',
+            ),
+            motion=('static_dense', 'two_axis'),
+            warp=partial(_of_table, with_sag),
+            needs=('joints', 'two_joints'),
+        ),
         Effect(
-            **of_table, name='axis_wobble', shape=(len(names.turning), len(WOBBLES), 2),
-            components=tuple(f'{name}_{kind}{order:+d}' for name in names.turning for order in WOBBLES for kind in ('cos', 'sin')),
+            **of_table,
+            name='axis_wobble',
+            shape=(len(names.turning), len(WOBBLES), 2),
+            components=tuple(
+                f'{name}_{kind}{order:+d}'
+                for name in names.turning
+                for order in WOBBLES
+                for kind in ('cos', 'sin')
+            ),
             explanation='An axis wobbles: it leans another way at every angle of its turn, as a bearing out of round makes it.',
-            tolerance_reason='as the tilt', prior_sd=2e-3,
+            tolerance_reason='as the tilt',
+            prior_sd=2e-3,
             plausible=('bench', 3e-3, 'field catalogue 6.3: arcsec; 10 arcmin of a worn bearing'),
-            motion=('slow_turn', 'two_axis'), warp=partial(_of_table, with_wobble), needs=('joints',)),
+            motion=('slow_turn', 'two_axis'),
+            warp=partial(_of_table, with_wobble),
+            needs=('joints',),
+        ),
         Effect(
-            **of_table | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY}, name='load_compliance',
-            components=MATRIX, shape=(3, 3),
+            **of_table
+            | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY},
+            name='load_compliance',
+            components=MATRIX,
+            shape=(3, 3),
             explanation='The mount bends with the load: the sensor turns a little with the force that it carries, which both sensors see.',
-            tolerance_reason='0.1 mrad at 1 g', prior_sd=1e-3 / STANDARD_GRAVITY,
+            tolerance_reason='0.1 mrad at 1 g',
+            prior_sd=1e-3 / STANDARD_GRAVITY,
             plausible=('bench', 3e-3 / STANDARD_GRAVITY, '10 arcmin per g of a slender bracket'),
-            motion=('static_dense', 'two_axis'), groups=tuple(LOAD.values()), group_sensors=tuple(LOAD), coefficients=_bent,
-            needs=('joints',)),
+            motion=('static_dense', 'two_axis'),
+            groups=tuple(LOAD.values()),
+            group_sensors=tuple(LOAD),
+            coefficients=_bent,
+            needs=('joints',),
+        ),
         Effect(
-            name='time_offset', sudden=True, sensor='reference', role=Role.DELAY, components=('offset',), shape=(), unit='s', nuisance=True,
+            name='time_offset',
+            sudden=True,
+            sensor='reference',
+            role=Role.DELAY,
+            components=('offset',),
+            shape=(),
+            unit='s',
+            nuisance=True,
             explanation='The IMU stamps are late against the joint stamps.',
-            tolerance=1e-4, tolerance_reason='0.1 mrad at 1 rad/s', prior_sd=0.1,
+            tolerance=1e-4,
+            tolerance_reason='0.1 mrad at 1 rad/s',
+            prior_sd=0.1,
             plausible=('bench', 0.05, 'field catalogue 6.3: 1-20 ms on serial paths'),
-            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=Lag(), needs=('joints', 'dynamic'), step=2e-4),
+            motion=('oscillate_fast', 'two_axis'),
+            compensation='none',
+            warp=Lag(),
+            needs=('joints', 'dynamic'),
+            step=2e-4,
+        ),
         Effect(
-            name='clock_rate', sensor='reference', components=('rate',), shape=(), unit='s/s', nuisance=True, against=('time',),
+            name='clock_rate',
+            sensor='reference',
+            components=('rate',),
+            shape=(),
+            unit='s/s',
+            nuisance=True,
+            against=('time',),
             explanation='The clock of the IMU stamps runs at another rate than that of the joint stamps: the lag grows linearly with time.',
-            tolerance=1e-6, tolerance_reason='0.6 ms in 10 min', prior_sd=1e-3,
+            tolerance=1e-6,
+            tolerance_reason='0.6 ms in 10 min',
+            prior_sd=1e-3,
             plausible=('bench', 5e-4, 'crystal oscillators: 10-100 ppm over temperature'),
-            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=Lag(factor=_elapsed), needs=('joints', 'dynamic'), step=1e-6),
+            motion=('oscillate_fast', 'two_axis'),
+            compensation='none',
+            warp=Lag(factor=_elapsed),
+            needs=('joints', 'dynamic'),
+            step=1e-6,
+        ),
         Effect(
-            name='clock_step', sensor='reference', components=('step', 'time'), shape=(2,), unit='s', nuisance=True, against=('time',),
+            name='clock_step',
+            sensor='reference',
+            components=('step', 'time'),
+            shape=(2,),
+            unit='s',
+            nuisance=True,
+            against=('time',),
             explanation='The clock of the IMU stamps is set at one moment: the lag changes by a step.',
-            tolerance=1e-4, tolerance_reason='as the time offset', prior=(0.0, 60.0), prior_sd=(0.1, 1.0),
-            plausible=('bench', 0.05, 'as the time offset'), located=True,
-            motion=('oscillate_fast', 'two_axis'), compensation='none', warp=Lag(factor=_after), needs=('joints', 'dynamic'), step=2e-4),
+            tolerance=1e-4,
+            tolerance_reason='as the time offset',
+            prior=(0.0, 60.0),
+            prior_sd=(0.1, 1.0),
+            plausible=('bench', 0.05, 'as the time offset'),
+            located=True,
+            motion=('oscillate_fast', 'two_axis'),
+            compensation='none',
+            warp=Lag(factor=_after),
+            needs=('joints', 'dynamic'),
+            step=2e-4,
+        ),
         Effect(
-            name='earth_rate', sensor='reference', components=('x', 'y', 'z'), shape=(3,), unit='rad/s', nuisance=True,
-            title='Earth rate in the level frame', known_size=True, moot=_earth_known,
+            name='earth_rate',
+            sensor='reference',
+            components=('x', 'y', 'z'),
+            shape=(3,),
+            unit='rad/s',
+            nuisance=True,
+            title='Earth rate in the level frame',
+            known_size=True,
+            moot=_earth_known,
             explanation="The gyroscopes measure the Earth's rotation, which the model omits.",
-            tolerance=2e-6, tolerance_reason="3 % of the Earth's rotation", prior_sd=1e-4,
+            tolerance=2e-6,
+            tolerance_reason="3 % of the Earth's rotation",
+            prior_sd=1e-4,
             plausible=('Earth', 7.3e-5, 'WGS 84: 7.292115e-5 rad/s'),
-            motion=('turn_about_vertical', 'static_poses'), compensation='none', groups=(ATTITUDE,), coefficients=_earth,
+            motion=('turn_about_vertical', 'static_poses'),
+            compensation='none',
+            groups=(ATTITUDE,),
+            coefficients=_earth,
             acts_on=('gyroscope',),
-            needs=('joints',)),
+            needs=('joints',),
+        ),
         *LAGS,
     )

@@ -31,7 +31,9 @@ DEFAULT_MODEL = {'accelerometer': 'size_effect', 'gyroscope': 'rate'}
 """Default model of a recording on a table."""
 
 
-def parse_effects(sensor: str, text: str, joint_names: Sequence[str] = JOINTS, *, catalogue: Catalogue = CATALOGUE) -> tuple[str, ...]:
+def parse_effects(
+    sensor: str, text: str, joint_names: Sequence[str] = JOINTS, *, catalogue: Catalogue = CATALOGUE
+) -> tuple[str, ...]:
     """
     Return effect names from a named model or names joined by '+'.
 
@@ -45,7 +47,9 @@ def parse_effects(sensor: str, text: str, joint_names: Sequence[str] = JOINTS, *
     for name in names:
         catalogue.find(sensor, name, joint_names, models=NAMED_MODELS if name == text else ())
     if not set(BASE) <= set(names):
-        raise InputError(f"the {sensor} model must contain bias and matrix, got '{text}'; write bias+matrix+...")
+        raise InputError(
+            f"the {sensor} model must contain bias and matrix, got '{text}'; write bias+matrix+..."
+        )
     return names
 
 
@@ -58,9 +62,16 @@ def parse_reference(text: str | None, table: Table) -> tuple[str, ...]:
     if text is not None:
         return tuple(name for name in text.split('+') if name not in ('', 'none'))
     names = table.joint_names
-    said = {'axis_non_orthogonality': names.angle_sd and names.angles, 'encoder_zero': names.angle_sd and names.zeros,
-            'axis_offset': names.place_sd and names.places}
-    return tuple(name for name in ('table_tilt', *said, 'earth_rate') if said.get(name, True) and not _is_moot(name, table))
+    said = {
+        'axis_non_orthogonality': names.angle_sd and names.angles,
+        'encoder_zero': names.angle_sd and names.zeros,
+        'axis_offset': names.place_sd and names.places,
+    }
+    return tuple(
+        name
+        for name in ('table_tilt', *said, 'earth_rate')
+        if said.get(name, True) and not _is_moot(name, table)
+    )
 
 
 def _is_moot(name: str, table: Table) -> bool:
@@ -109,7 +120,7 @@ class SensorModel:
     """Names of the gyroscope's effects."""
     reference: tuple = ()
     """Names of the effects of table and clock."""
-    joint_names: JointNames = JOINTS   # type: ignore[assignment]   # made one at once
+    joint_names: JointNames = JOINTS  # type: ignore[assignment]   # made one at once
     """Joints of the table; a plain sequence of names means turning joints without parallel neighbours."""
     temperature_ref_c: float = 25.0
     """Temperature at which thermal effects vanish, degrees Celsius."""
@@ -135,7 +146,11 @@ class SensorModel:
     @cached_property
     def effects(self) -> list[Effect]:
         """Effects in parameter order."""
-        return [self.catalogue.find(sensor, name, self.joint_names) for sensor in SECTIONS for name in getattr(self, sensor)]
+        return [
+            self.catalogue.find(sensor, name, self.joint_names)
+            for sensor in SECTIONS
+            for name in getattr(self, sensor)
+        ]
 
     @cached_property
     def param_names(self) -> list[str]:
@@ -150,10 +165,17 @@ class SensorModel:
 
     def has_columns_of(self, other: 'SensorModel') -> bool:
         """Return whether another model makes the very same columns: the same effects, linearised at the same point."""
-        same = all(tuple(getattr(self, name)) == tuple(getattr(other, name)) for name in SECTIONS) \
-            and all(getattr(self, name) == getattr(other, name) for name in ('joint_names', 'temperature_ref_c', 'definitions'))
-        return (same and self.point.keys() == other.point.keys()
-                and all(np.array_equal(self.point[name], other.point[name]) for name in self.point))
+        same = all(
+            tuple(getattr(self, name)) == tuple(getattr(other, name)) for name in SECTIONS
+        ) and all(
+            getattr(self, name) == getattr(other, name)
+            for name in ('joint_names', 'temperature_ref_c', 'definitions')
+        )
+        return (
+            same
+            and self.point.keys() == other.point.keys()
+            and all(np.array_equal(self.point[name], other.point[name]) for name in self.point)
+        )
 
     def find(self, sensor: str, role: Role) -> Effect | None:
         """Return the effect of a sensor in a place of its equation, or None."""
@@ -195,7 +217,12 @@ class SensorModel:
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
         """Return prior values and prior standard deviations, both shape (n_params,); the prior time of a step is that of its columns."""
-        values = [np.append(e.prior_values()[:-1], self.point_of(e)[-1]) if e.located else e.prior_values() for e in self.effects]
+        values = [
+            np.append(e.prior_values()[:-1], self.point_of(e)[-1])
+            if e.located
+            else e.prior_values()
+            for e in self.effects
+        ]
         return np.concatenate(values), np.concatenate([e.prior_sds() for e in self.effects])
 
     def start(self) -> np.ndarray:
@@ -212,13 +239,19 @@ class SensorModel:
 
     def values_of(self, sensor: str, values: np.ndarray) -> dict[str, np.ndarray]:
         """Return {effect name: values} that concern `sensor`, its own and the reference's."""
-        return {e.name: values[self.slices[e.key]] for e in self.effects if e.sensor in (sensor, 'reference')}
+        return {
+            e.name: values[self.slices[e.key]]
+            for e in self.effects
+            if e.sensor in (sensor, 'reference')
+        }
 
     def with_effect(self, sensor: str, name: str) -> 'SensorModel':
         """Return the model extended by one effect."""
         return replace(self, **{sensor: getattr(self, sensor) + (name,)})
 
-    def with_sized_effect(self, values: np.ndarray, sensor: str, name: str, *, size: np.ndarray) -> tuple['SensorModel', np.ndarray]:
+    def with_sized_effect(
+        self, values: np.ndarray, sensor: str, name: str, *, size: np.ndarray
+    ) -> tuple['SensorModel', np.ndarray]:
         """Return (the model extended by one effect, its parameters): `values` of this model, and the parameters `size` of the effect."""
         model = self.with_effect(sensor, name)
         extended = model.start_from(self, values)
@@ -228,7 +261,9 @@ class SensorModel:
     def with_role(self, sensor: str, role: Role) -> 'SensorModel':
         """Return the model extended by the catalogue's effect for a place of a sensor's equation."""
         effects = self.catalogue.effects(self.joint_names).values()
-        return self.with_effect(sensor, next(e.name for e in effects if e.sensor == sensor and e.role is role))
+        return self.with_effect(
+            sensor, next(e.name for e in effects if e.sensor == sensor and e.role is role)
+        )
 
     def with_reference_temperature(self, temperature_c: float) -> 'SensorModel':
         """Return the model whose thermal effects vanish at the whole degree nearest to a temperature."""
@@ -236,7 +271,9 @@ class SensorModel:
 
     def without(self, sensor: str, *names: str) -> 'SensorModel':
         """Return the model without some effects of a sensor."""
-        left: dict[str, Any] = {sensor: tuple(known for known in getattr(self, sensor) if known not in names)}
+        left: dict[str, Any] = {
+            sensor: tuple(known for known in getattr(self, sensor) if known not in names)
+        }
         return replace(self, **left)
 
     def without_arms(self) -> 'SensorModel':
@@ -250,7 +287,11 @@ class SensorModel:
 
     def concerning(self, sensor: str) -> list[Effect]:
         """Return the effects that contribute columns to `sensor`."""
-        return [e for e in self.effects if e.sensor == sensor or (e.sensor == 'reference' and sensor in e.acts_on)]
+        return [
+            e
+            for e in self.effects
+            if e.sensor == sensor or (e.sensor == 'reference' and sensor in e.acts_on)
+        ]
 
     def groups(self, sensor: str) -> list[tuple[str, int]]:
         """Return the columns of `sensor` in order: (group name, width)."""
@@ -271,16 +312,26 @@ class SensorModel:
             for effect in self.concerning(sensor):
                 for group in effect.groups_of(sensor):
                     if groups.setdefault(group.name, group) != group:
-                        raise InputError(f"effect '{effect.name}' must call its columns otherwise than '{group.name}', "
-                                         "which other columns are called; rename it", code='column_name_taken')
+                        raise InputError(
+                            f"effect '{effect.name}' must call its columns otherwise than '{group.name}', "
+                            'which other columns are called; rename it',
+                            code='column_name_taken',
+                        )
                     widths[group.name] = group.width
                 if effect.warp is not None:
                     widths[WARP + effect.name] = 3 * effect.size
-                    if sensor == SENSORS[0] and effect.derivative is None and self.arms and self.folded_arms is None:
+                    if (
+                        sensor == SENSORS[0]
+                        and effect.derivative is None
+                        and self.arms
+                        and self.folded_arms is None
+                    ):
                         widths[WARP_LEVER + effect.name] = 9 * effect.size
             ends = np.cumsum([0, *widths.values()])
             rows = {name: slice(int(a), int(b)) for name, a, b in zip(widths, ends, ends[1:])}
-            self._layouts[sensor] = ColumnLayout(tuple(self.concerning(sensor)), groups, rows, int(ends[-1]), self.full_point())
+            self._layouts[sensor] = ColumnLayout(
+                tuple(self.concerning(sensor)), groups, rows, int(ends[-1]), self.full_point()
+            )
         return self._layouts[sensor]
 
     @cached_property

@@ -125,13 +125,22 @@ class Accumulator(_CentredRows):
 
     def copy(self) -> 'Accumulator':
         """Return an independent copy; rows and factors are never changed in place."""
-        maps: dict[str, Any] = {name: getattr(self, name).copy() for name in ('within', 'slow', 'slow_rows', 'samples', 'windows')}
-        return replace(self, rows=list(self.rows), blocks=[block.copy() for block in self.blocks], **maps)
+        maps: dict[str, Any] = {
+            name: getattr(self, name).copy()
+            for name in ('within', 'slow', 'slow_rows', 'samples', 'windows')
+        }
+        return replace(
+            self, rows=list(self.rows), blocks=[block.copy() for block in self.blocks], **maps
+        )
 
     def merge(self, other: 'Accumulator') -> None:
         """Add another accumulator with the same columns; its recordings follow the ones of this accumulator."""
         self._stack_all_of(other)
-        for mine, its in ((self.slow_rows, other.slow_rows), (self.samples, other.samples), (self.windows, other.windows)):
+        for mine, its in (
+            (self.slow_rows, other.slow_rows),
+            (self.samples, other.samples),
+            (self.windows, other.windows),
+        ):
             mine.update(its)
         self.rows.extend(other.rows)
         self.blocks.extend(block.copy() for block in other.blocks if self.in_blocks)
@@ -155,7 +164,7 @@ class Accumulator(_CentredRows):
 
     def _join_blocks(self):
         while len(self.blocks) > MAX_ACCUMULATOR_BLOCKS:
-            pairs = [self.blocks[at:at + 2] for at in range(0, len(self.blocks), 2)]
+            pairs = [self.blocks[at : at + 2] for at in range(0, len(self.blocks), 2)]
             self.blocks = [pair[0].joined(pair[1]) if len(pair) == 2 else pair[0] for pair in pairs]
             self.block_length *= 2
 
@@ -165,13 +174,21 @@ class Accumulator(_CentredRows):
         while index < len(self.rows):
             first = self.rows[index]
             second = self.rows[index + 1] if index + 1 < len(self.rows) else None
-            if second is None or (first.kind, first.session) != (second.kind, second.session) or index > len(self.rows) // 2:
+            if (
+                second is None
+                or (first.kind, first.session) != (second.kind, second.session)
+                or index > len(self.rows) // 2
+            ):
                 thinned.append(first)
                 index += 1
                 continue
             parts = [self.within]
             if self.blocks:
-                parts.append(self.blocks[int(self.block_of(np.array([first.session]), np.array([first.time]))[0])].within)
+                parts.append(
+                    self.blocks[
+                        int(self.block_of(np.array([first.session]), np.array([first.time]))[0])
+                    ].within
+                )
             for sensor in SENSORS:
                 for factors in parts:
                     stack(factors, (sensor, first.kind), _difference(first, second, sensor))
@@ -185,7 +202,13 @@ class Accumulator(_CentredRows):
 def stack(factors: dict, key: tuple, factor: np.ndarray) -> None:
     """Add rows to the triangular factor under `key`."""
     known = factors.get(key)
-    factors[key] = factor if known is None or not len(known) else triangular(np.concatenate([known, factor])) if len(factor) else known
+    factors[key] = (
+        factor
+        if known is None or not len(known)
+        else triangular(np.concatenate([known, factor]))
+        if len(factor)
+        else known
+    )
 
 
 def _difference(first, second, sensor):
@@ -204,14 +227,26 @@ def _joined(first, second):
         means = [share[0] * x + share[1] * y for x, y in pairs]
         sensors[sensor] = SensorStatistics(means[0], a.within[:0], means[1], means[2])
     time = share[0] * first.time + share[1] * second.time
-    return WindowStatistics(first.kind, float(time), first.duration + second.duration, total, sensors, first.session,
-                            max(first.encoder_step, second.encoder_step))
+    return WindowStatistics(
+        first.kind,
+        float(time),
+        first.duration + second.duration,
+        total,
+        sensors,
+        first.session,
+        max(first.encoder_step, second.encoder_step),
+    )
 
 
 def _without_within(window):
-    if not window.pieces and all(len(s.within) == 0 and s.slow is None for s in window.sensors.values()):
+    if not window.pieces and all(
+        len(s.within) == 0 and s.slow is None for s in window.sensors.values()
+    ):
         return window
-    sensors = {name: replace(s, within=s.within[:0].copy(), slow=None, slow_rows=0) for name, s in window.sensors.items()}
+    sensors = {
+        name: replace(s, within=s.within[:0].copy(), slow=None, slow_rows=0)
+        for name, s in window.sensors.items()
+    }
     return replace(window, sensors=sensors, pieces={})
 
 
@@ -230,12 +265,17 @@ def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -
     chosen = selected_columns(wide, narrow)
     blocks = [replace(block, **_chosen_factors(block, chosen)) for block in accumulator.blocks]
     rows = [restricted_window(row, chosen) for row in accumulator.rows]
-    return replace(accumulator.copy(), rows=rows, blocks=blocks, **_chosen_factors(accumulator, chosen))
+    return replace(
+        accumulator.copy(), rows=rows, blocks=blocks, **_chosen_factors(accumulator, chosen)
+    )
 
 
 def _chosen_factors(part, chosen):
     """Return the `CENTRED_FACTORS` of an accumulator or block with the columns `chosen` only."""
-    return {name: {key: factor[:, chosen[key[0]]] for key, factor in getattr(part, name).items()} for name in CENTRED_FACTORS}
+    return {
+        name: {key: factor[:, chosen[key[0]]] for key, factor in getattr(part, name).items()}
+        for name in CENTRED_FACTORS
+    }
 
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:
@@ -243,7 +283,12 @@ def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -
     sensors = {}
     for name, own in window.sensors.items():
         at = chosen[name]
-        sensors[name] = replace(own, mean=own.mean[at], within=own.within[:, at], slow=None if own.slow is None else own.slow[:, at])
+        sensors[name] = replace(
+            own,
+            mean=own.mean[at],
+            within=own.within[:, at],
+            slow=None if own.slow is None else own.slow[:, at],
+        )
     return replace(window, sensors=sensors)
 
 

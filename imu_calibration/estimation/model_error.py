@@ -53,10 +53,15 @@ class ModelError:
     def terms(self, covariance: np.ndarray) -> dict[str, np.ndarray]:
         """Return the terms to add to the covariance from noise and fixed parameters."""
         scaled = covariance * (np.outer(self.factor, self.factor) - 1.0)
-        return {MODEL_ERROR: scaled + np.diag(self.scatter_variance), DRIFT: np.diag(self.drift_variance)}
+        return {
+            MODEL_ERROR: scaled + np.diag(self.scatter_variance),
+            DRIFT: np.diag(self.drift_variance),
+        }
 
 
-def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray) -> ModelError:
+def model_error(
+    system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel], *, free: np.ndarray
+) -> ModelError:
     """
     Return the model error from the scatter of parameters between blocks, beyond noise.
 
@@ -75,15 +80,21 @@ def model_error(system: WeightedSystem, values: np.ndarray, noises: dict[str, No
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
     waves = _waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free)
     found, misfits = errors_of_waves(waves, system.model)
-    if 'accelerometer' in misfits:   # an error that depends on the attitude has a mean as large as its scatter, absorbed by the bias
+    if (
+        'accelerometer' in misfits
+    ):  # an error that depends on the attitude has a mean as large as its scatter, absorbed by the bias
         offset = system.model.part('accelerometer', Role.OFFSET)
-        found.scatter_variance[offset] += COMMON_MEAN_FACTOR * _scatter_of_means(noises['accelerometer'])
+        found.scatter_variance[offset] += COMMON_MEAN_FACTOR * _scatter_of_means(
+            noises['accelerometer']
+        )
     return found
 
 
 def _scatter_of_means(noise):
     """Return the variance of the means between windows, from offsets and from bias processes too fast for a bias."""
-    return noise.offset_sd**2 + sum(process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS)
+    return noise.offset_sd**2 + sum(
+        process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS
+    )
 
 
 def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelError, set[str]]:
@@ -100,7 +111,11 @@ def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelErr
     size, misfits = len(model.param_names), set()
     factor, more = np.ones(size), np.zeros(size)
     for sensor in {effect.sensor for effect in model.effects}:
-        shown = [group for effect in model.effects if effect.sensor == sensor and len(group := waves.group(model.slices[effect.key]))]
+        shown = [
+            group
+            for effect in model.effects
+            if effect.sensor == sensor and len(group := waves.group(model.slices[effect.key]))
+        ]
         if shown and _fisher([waves.drift(group)[0] for group in shown]) < CHANCE:
             for group in shown:
                 more[waves.places[group]] = waves.drift(group)[1]
@@ -116,26 +131,44 @@ def _fisher(p_values):
     return float(chi2_sf(-2 * np.log(np.maximum(p_values, 1e-300)).sum(), 2 * len(p_values)))
 
 
-def _block_scores(system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
+def _block_scores(
+    system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the information of each block of windows, shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params)."""
     blocks = system.accumulator.blocks
-    information, gradient = np.zeros((len(blocks),) + (len(values),) * 2), np.zeros((len(blocks), len(values)))
-    block = system.accumulator.block_of(np.array([row.session for row in system.accumulator.rows]), system.times)
+    information, gradient = (
+        np.zeros((len(blocks),) + (len(values),) * 2),
+        np.zeros((len(blocks), len(values))),
+    )
+    block = system.accumulator.block_of(
+        np.array([row.session for row in system.accumulator.rows]), system.times
+    )
     for sensor in SENSORS:
-        own, slope, noise = coefficients(system.model, sensor, values), coefficient_jacobian(system.model, sensor, values), noises[sensor]
+        own, slope, noise = (
+            coefficients(system.model, sensor, values),
+            coefficient_jacobian(system.model, sensor, values),
+            noises[sensor],
+        )
         white = system.whitened_means(sensor, noise)
         for number, part in enumerate(blocks):
             weighed = list(system.weighed_rows(sensor, noise, part))
             for axis in range(3):
                 at = system.columns_and(sensor, axis)
-                rows = np.concatenate([white[block == number, axis], *(rows[:, at] * weight[axis] for rows, weight in weighed)])
+                rows = np.concatenate(
+                    [
+                        white[block == number, axis],
+                        *(rows[:, at] * weight[axis] for rows, weight in weighed),
+                    ]
+                )
                 design = rows[:, :-1] @ slope[:, axis]
                 information[number] += design.T @ design
                 gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ own[:, axis])
     return information, gradient
 
 
-def model_error_of_rows(rows: RowSet, found: RowEstimate, model: SensorModel, *, block: np.ndarray) -> ModelError:
+def model_error_of_rows(
+    rows: RowSet, found: RowEstimate, model: SensorModel, *, block: np.ndarray
+) -> ModelError:
     """
     Return the model error from the scatter of parameters between blocks of rows, beyond noise and known scatter.
 
@@ -154,19 +187,31 @@ def model_error_of_rows(rows: RowSet, found: RowEstimate, model: SensorModel, *,
 
     """
     root = np.sqrt(found.scatter.total(rows.noise, rows.component))[:, None]
-    fitted, rest = scipy.linalg.qr(rows.nuisance / root, mode='economic')[0], rows.residual / root[:, 0]
+    fitted, rest = (
+        scipy.linalg.qr(rows.nuisance / root, mode='economic')[0],
+        rows.residual / root[:, 0],
+    )
     main = rows.main / root
     main -= fitted @ (fitted.T @ main)
-    parts = [(main[own], rest[own], fitted[own]) for own in block == np.arange(block.max() + 1)[:, None]]
-    waves = _waves_of_blocks(np.array([part.T @ part for part, *_ in parts]), np.array([part.T @ error for part, error, _ in parts]),
-                             np.zeros((0, len(found.free))), found.free, shared=np.array([along.T @ part for part, _, along in parts]))
+    parts = [
+        (main[own], rest[own], fitted[own]) for own in block == np.arange(block.max() + 1)[:, None]
+    ]
+    waves = _waves_of_blocks(
+        np.array([part.T @ part for part, *_ in parts]),
+        np.array([part.T @ error for part, error, _ in parts]),
+        np.zeros((0, len(found.free))),
+        found.free,
+        shared=np.array([along.T @ part for part, _, along in parts]),
+    )
     return errors_of_waves(waves, model)[0]
 
 
 def _waves_of_blocks(information, gradient, prior_root, free, shared=None):
     """Return the Waves of parts with their own information and gradient; `shared`: products of their fitted nuisances with the design."""
     information, gradient = information[:, free][:, :, free], gradient[:, free]
-    covariance = inverse_normal(information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free])
+    covariance = inverse_normal(
+        information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free]
+    )
     # Weights of the blocks in each cosine, the slowest first.
     count = len(information)
     number = np.arange(1, min(MOST_WAVES, count - 1) + 1)
@@ -178,7 +223,9 @@ def _waves_of_blocks(information, gradient, prior_root, free, shared=None):
         along = np.einsum('kc,cdi->kdi', weights, shared[:, :, free])
         expected -= along.transpose(0, 2, 1) @ along
     expected = covariance @ expected @ covariance
-    return CosineScores(np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance=covariance)
+    return CosineScores(
+        np.flatnonzero(free), weights @ gradient @ covariance, expected, covariance=covariance
+    )
 
 
 class CosineScores:
@@ -198,11 +245,15 @@ class CosineScores:
 
     """
 
-    def __init__(self, places: np.ndarray, moved: np.ndarray, expected: np.ndarray, *, covariance: np.ndarray):
+    def __init__(
+        self, places: np.ndarray, moved: np.ndarray, expected: np.ndarray, *, covariance: np.ndarray
+    ):
         self.places, self.moved, self.expected = places, moved, expected
-        self.walk = 1 / (np.pi * np.arange(1, len(moved) + 1))**2
+        self.walk = 1 / (np.pi * np.arange(1, len(moved) + 1)) ** 2
         """Variance of each cosine of a random walk that has unit variance after the whole recording."""
-        self._seen = np.all(np.einsum('kii->ki', expected) > LEAST_SHARE_OF_DATA * np.diag(covariance), axis=0)
+        self._seen = np.all(
+            np.einsum('kii->ki', expected) > LEAST_SHARE_OF_DATA * np.diag(covariance), axis=0
+        )
 
     def group(self, part: slice) -> np.ndarray:
         """Return the indices among the free parameters of one effect with information from the recording."""
@@ -217,7 +268,12 @@ class CosineScores:
         """
         p_value, common = self._walked(group)
         own = [self._walked(at) for at in group[:, None]]
-        return p_value, np.array([max(common, variance if chance < CHANCE / len(group) else 0.0) for chance, variance in own])
+        return p_value, np.array(
+            [
+                max(common, variance if chance < CHANCE / len(group) else 0.0)
+                for chance, variance in own
+            ]
+        )
 
     def _walked(self, group):
         """
@@ -230,7 +286,7 @@ class CosineScores:
         fast = np.einsum('ki,kij,kj->k', moved, inverse, moved)[SLOW_WAVES:]
         fast_dof = fast.size * len(group)
         inverse, moved = inverse[:SLOW_WAVES], moved[:SLOW_WAVES]
-        score = walk @ (np.einsum('kij,kj->ki', inverse, moved)**2).sum(axis=1)
+        score = walk @ (np.einsum('kij,kj->ki', inverse, moved) ** 2).sum(axis=1)
         mean = walk @ np.einsum('kii->k', inverse)
         spread = walk**2 @ np.einsum('kij,kij->k', inverse, inverse)
         dof = mean**2 / spread
@@ -246,7 +302,11 @@ class CosineScores:
         moved = self.moved[:, group]
         ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size
         single = (moved**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)
-        return float(chi2_sf(ratio * moved.size, moved.size)), 1.0 + COMMON_ERROR_FACTOR * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
+        return float(
+            chi2_sf(ratio * moved.size, moved.size)
+        ), 1.0 + COMMON_ERROR_FACTOR * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
 
     def _inverse(self, group):
-        return np.array([inverse_normal(expected) for expected in self.expected[:, group][:, :, group]])
+        return np.array(
+            [inverse_normal(expected) for expected in self.expected[:, group][:, :, group]]
+        )

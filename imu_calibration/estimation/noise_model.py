@@ -31,7 +31,11 @@ class BiasProcess:
         ``sd^2 (1 - 2 r (1 - r (1 - exp(-1 / r))))`` with r the correlation time over the duration.
         """
         ratio = self.time / duration
-        return self.sd * float(np.sqrt(1 + 2 * ratio * (ratio * -np.expm1(-1 / ratio) - 1))) if ratio > 1e-6 else self.sd
+        return (
+            self.sd * float(np.sqrt(1 + 2 * ratio * (ratio * -np.expm1(-1 / ratio) - 1)))
+            if ratio > 1e-6
+            else self.sd
+        )
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,16 @@ class ReferenceNoise:
         The error of a reading is ``step / sqrt(12)``, of a turn ``step / sqrt(6)``. An error of the attitude about one axis affects two
         of the three components of gravity.
         """
-        return cls(turn=step / np.sqrt(6)) if sensor == 'gyroscope' else cls(level=STANDARD_GRAVITY * step / np.sqrt(12) * np.sqrt(2 / 3))
+        return (
+            cls(turn=step / np.sqrt(6))
+            if sensor == 'gyroscope'
+            else cls(level=STANDARD_GRAVITY * step / np.sqrt(12) * np.sqrt(2 / 3))
+        )
 
     def variance(self, kinds: Sequence[str] | np.ndarray, durations: np.ndarray) -> np.ndarray:
         """Return the variance of the means of windows of these kinds and lengths, s, shape (k,)."""
         still = np.array([kind == 'static' for kind in kinds])
-        return np.where(still, self.level**2, (self.turn / np.maximum(durations, 1e-3))**2)
+        return np.where(still, self.level**2, (self.turn / np.maximum(durations, 1e-3)) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,35 +134,72 @@ class NoiseModel:
     @property
     def bias_time(self) -> float | None:
         """Correlation time of the largest bias process, s; None when there is none."""
-        return max(self.bias_processes, key=lambda process: process.sd).time if self.bias_processes else None
+        return (
+            max(self.bias_processes, key=lambda process: process.sd).time
+            if self.bias_processes
+            else None
+        )
 
-    def mean_variance(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray | None = None, *,
-                      keys: Sequence[tuple[int, float]] = ()) -> np.ndarray:
+    def mean_variance(
+        self,
+        kinds: Sequence[str] | np.ndarray,
+        counts: np.ndarray,
+        durations: np.ndarray | None = None,
+        *,
+        keys: Sequence[tuple[int, float]] = (),
+    ) -> np.ndarray:
         """
         Return the variance of means of windows of these kinds and lengths (samples; s) by the noise within and the reference, (k, 3).
 
         The variance of vibrating windows with `keys` (recording, middle in s) is at least the one estimated from their samples.
         """
         factors = {kind: moving.means for kind, moving in self.moving.items()}
-        white = self.low_variance * np.stack([factors.get(kind, np.ones(3)) for kind in kinds]) / np.asarray(counts, float)[:, None]
+        white = (
+            self.low_variance
+            * np.stack([factors.get(kind, np.ones(3)) for kind in kinds])
+            / np.asarray(counts, float)[:, None]
+        )
         if self.shaken and keys:
             white = np.maximum(white, [self.shaken.get(key, np.zeros(3)) for key in keys])
-        return white if durations is None else white + self.reference.variance(kinds, durations)[:, None]
+        return (
+            white
+            if durations is None
+            else white + self.reference.variance(kinds, durations)[:, None]
+        )
 
-    def variance_beside_bias(self, kinds: Sequence[str] | np.ndarray, counts: np.ndarray, durations: np.ndarray, *,
-                             keys: Sequence[tuple[int, float]] = ()) -> np.ndarray:
+    def variance_beside_bias(
+        self,
+        kinds: Sequence[str] | np.ndarray,
+        counts: np.ndarray,
+        durations: np.ndarray,
+        *,
+        keys: Sequence[tuple[int, float]] = (),
+    ) -> np.ndarray:
         """Return the same relative to the bias in the middle of each window: with its change within the window, shape (k, 3)."""
-        return self.mean_variance(kinds, counts, durations, keys=keys) + means_beside_middles(self.bias_processes, durations)[:, None]
+        return (
+            self.mean_variance(kinds, counts, durations, keys=keys)
+            + means_beside_middles(self.bias_processes, durations)[:, None]
+        )
 
     def wander_within(self, offsets: np.ndarray) -> np.ndarray:
         """Return the covariance of the bias at instants about the middle of a window, s, given its value there, shape (n, n)."""
         away, apart = np.abs(offsets), np.abs(np.subtract.outer(offsets, offsets))
-        return sum((process.sd**2 * (np.exp(-apart / process.time) - np.exp(-np.add.outer(away, away) / process.time))
-                    for process in self.bias_processes), np.zeros(apart.shape))
+        return sum(
+            (
+                process.sd**2
+                * (np.exp(-apart / process.time) - np.exp(-np.add.outer(away, away) / process.time))
+                for process in self.bias_processes
+            ),
+            np.zeros(apart.shape),
+        )
 
     def row_variance(self, kind: str) -> np.ndarray:
         """Return the variance per centred row of windows of `kind`, shape (3,)."""
-        return self.low_variance * self.moving[kind].every if kind in self.moving else self.low_variance
+        return (
+            self.low_variance * self.moving[kind].every
+            if kind in self.moving
+            else self.low_variance
+        )
 
     def slow_weight(self, kind: str) -> np.ndarray:
         """
@@ -169,9 +214,14 @@ class NoiseModel:
 
     def at_rest_only(self, *processes: BiasProcess) -> 'NoiseModel':
         """Return the model of noise only: no offsets, no misfit along the columns, and only the given bias processes."""
-        moving = {kind: replace(factors, every=factors.every / factors.along) for kind, factors in self.moving.items()}
-        moving = {kind: replace(factors, means=np.minimum(factors.means, np.maximum(factors.every, 1.0))) for kind,
-                  factors in moving.items()}
+        moving = {
+            kind: replace(factors, every=factors.every / factors.along)
+            for kind, factors in self.moving.items()
+        }
+        moving = {
+            kind: replace(factors, means=np.minimum(factors.means, np.maximum(factors.every, 1.0)))
+            for kind, factors in moving.items()
+        }
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
 
     def weighs_alike(self, other: 'NoiseModel') -> bool:
@@ -182,12 +232,17 @@ class NoiseModel:
             if kind not in other.moving:
                 return False
             its, unit = other.moving[kind], self.low_variance / other.low_variance
-            if any(np.any(np.abs(unit * a / b - 1) > SAME_VARIANCE) for a, b in ((mine.every, its.every), (mine.slow, its.slow))):
+            if any(
+                np.any(np.abs(unit * a / b - 1) > SAME_VARIANCE)
+                for a, b in ((mine.every, its.every), (mine.slow, its.slow))
+            ):
                 return False
         return True
 
 
-def means_beside_middles(processes: Sequence[BiasProcess], durations: np.ndarray | float) -> np.ndarray:
+def means_beside_middles(
+    processes: Sequence[BiasProcess], durations: np.ndarray | float
+) -> np.ndarray:
     """
     Return the variance of the mean of a bias process over windows of these lengths (s) relative to its value in their middles.
 
@@ -197,7 +252,7 @@ def means_beside_middles(processes: Sequence[BiasProcess], durations: np.ndarray
     total = np.zeros(np.shape(durations))
     for process in processes:
         step = np.asarray(durations, float) / (6 * process.time)
-        total = total + process.sd**2 * step / (1 + (3 * step)**2)
+        total = total + process.sd**2 * step / (1 + (3 * step) ** 2)
     return total
 
 
@@ -210,4 +265,7 @@ def sessions_of(rows: Sequence) -> list[np.ndarray]:
     """Return the index arrays of the rows of each recording, in order of time."""
     numbers = np.array([row.session for row in rows])
     times = np.array([row.time for row in rows])
-    return [np.flatnonzero(numbers == number)[np.argsort(times[numbers == number], kind='stable')] for number in np.unique(numbers)]
+    return [
+        np.flatnonzero(numbers == number)[np.argsort(times[numbers == number], kind='stable')]
+        for number in np.unique(numbers)
+    ]

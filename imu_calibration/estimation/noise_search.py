@@ -51,8 +51,15 @@ class GroupVariances:
         return noise + np.append(self.upper if inflated else self.variance, 0.0)[group]
 
 
-def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np.ndarray, *, group: np.ndarray, start: np.ndarray,
-                             fallback: np.ndarray) -> GroupVariances:
+def estimate_group_variances(
+    design: np.ndarray,
+    residual: np.ndarray,
+    noise: np.ndarray,
+    *,
+    group: np.ndarray,
+    start: np.ndarray,
+    fallback: np.ndarray,
+) -> GroupVariances:
     """
     Estimate the additional variance of each group of rows.
 
@@ -72,9 +79,17 @@ def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np
 
     """
     rows = np.column_stack([design, residual])[:, None]
-    problem = _Groups(RestrictedLikelihood(rows, np.zeros(len(rows)), [np.arange(len(rows))]), noise, group, len(start))
+    problem = _Groups(
+        RestrictedLikelihood(rows, np.zeros(len(rows)), [np.arange(len(rows))]),
+        noise,
+        group,
+        len(start),
+    )
     # at a large variance the degrees of freedom depend on the layout of the rows only
-    none, large = np.zeros(len(start), bool), 100 * (np.asarray(fallback, float) + problem.typical(np.zeros(len(start))))
+    none, large = (
+        np.zeros(len(start), bool),
+        100 * (np.asarray(fallback, float) + problem.typical(np.zeros(len(start)))),
+    )
     spare = problem.step(large, none)[1]
     free = spare >= DOF_LEAST
     current = np.where(free, start, fallback)
@@ -93,7 +108,7 @@ def estimate_group_variances(design: np.ndarray, residual: np.ndarray, noise: np
 
 def student_factor(dof: np.ndarray) -> np.ndarray:
     """Return the squared ratio of the 97.5 % quantiles of Student's t with `dof` (at least 1) degrees of freedom and of the normal law."""
-    return (stdtrit(np.maximum(dof, 1.0), WIDENING_PROBABILITY) / ndtri(WIDENING_PROBABILITY))**2
+    return (stdtrit(np.maximum(dof, 1.0), WIDENING_PROBABILITY) / ndtri(WIDENING_PROBABILITY)) ** 2
 
 
 def _attributed(problem, alone, fallback):
@@ -124,10 +139,16 @@ class _Groups:
     def step(self, extra, free):
         """Return the next variances, a scoring step over the free groups that are not pinned at zero, and each one's degrees of freedom."""
         score, information = self.likelihood.scoring(self.variance(extra)[:, None], self.members)
-        index, step, typical = np.flatnonzero(free & ~((extra <= 0) & (score < 0))), np.zeros(len(extra)), self.typical(extra)
+        index, step, typical = (
+            np.flatnonzero(free & ~((extra <= 0) & (score < 0))),
+            np.zeros(len(extra)),
+            self.typical(extra),
+        )
         if len(index):
             step[index] = np.linalg.solve(information[np.ix_(index, index)], score[index])
-        return np.clip(extra + step, 0.0, extra + 100 * typical), 2 * np.diag(information) * typical**2
+        return np.clip(extra + step, 0.0, extra + 100 * typical), 2 * np.diag(
+            information
+        ) * typical**2
 
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
@@ -169,24 +190,42 @@ class NoiseLikelihood:
 
     """
 
-    def __init__(self, rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray],
-                 information: np.ndarray | None = None, known: tuple[BiasProcess, ...] = (), durations: np.ndarray | float = 0.0,
-                 common: int = 0):
+    def __init__(
+        self,
+        rows: np.ndarray,
+        white: np.ndarray,
+        times: np.ndarray,
+        *,
+        sessions: list[np.ndarray],
+        information: np.ndarray | None = None,
+        known: tuple[BiasProcess, ...] = (),
+        durations: np.ndarray | float = 0.0,
+        common: int = 0,
+    ):
         self._common, self._durations = common, np.broadcast_to(durations, len(rows))
         self.typical = float(np.sqrt(np.median(white)))
         self.many, self.known = len(rows) >= MIN_PROCESS_WINDOWS, known
         self._rows, self._white, self._times, self._sessions = rows, white, times, sessions
-        self._likelihood, self._losses = RestrictedLikelihood(rows, times, sessions, information=information), {}
+        self._likelihood, self._losses = (
+            RestrictedLikelihood(rows, times, sessions, information=information),
+            {},
+        )
         self._profiles = {}
 
-    def loss(self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, *, session: float = 0.0) -> float:
+    def loss(
+        self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, *, session: float = 0.0
+    ) -> float:
         """Return minus twice the restricted log likelihood with the parameters `used`, counted after the common ones, by default all."""
         key = (*map(float, shape), float(session))
         if key not in self._losses:
-            offset, bias, time, step = np.multiply(key, (self.typical, self.typical, 1.0, self.typical))
+            offset, bias, time, step = np.multiply(
+                key, (self.typical, self.typical, 1.0, self.typical)
+            )
             processes = self.processes(bias, time)
             within = means_beside_middles(processes, self._durations)[:, None]
-            logs, normal = self._likelihood.whitened(self._white + within + offset**2, processes, step**2)
+            logs, normal = self._likelihood.whitened(
+                self._white + within + offset**2, processes, step**2
+            )
             of_common, normal = eliminate(normal, self._common)
             self._losses[key] = logs + of_common, normal
         logs, normal = self._losses[key]
@@ -201,19 +240,43 @@ class NoiseLikelihood:
         offset, bias, time = np.multiply(shape, (self.typical, self.typical, 1.0))
         others = np.arange(self._white.shape[1]) != axis
         processes = self.processes(bias, time)
-        variance = self._white[:, others] + means_beside_middles(processes, self._durations)[:, None] + offset**2
+        variance = (
+            self._white[:, others]
+            + means_beside_middles(processes, self._durations)[:, None]
+            + offset**2
+        )
         information = self._likelihood.of_axes(others).whitened(variance, processes)[1]
-        return NoiseLikelihood(self._rows[:, [axis]], self._white[:, [axis]], self._times, sessions=self._sessions, information=information,
-                               known=self.known, durations=self._durations, common=self._common)
+        return NoiseLikelihood(
+            self._rows[:, [axis]],
+            self._white[:, [axis]],
+            self._times,
+            sessions=self._sessions,
+            information=information,
+            known=self.known,
+            durations=self._durations,
+            common=self._common,
+        )
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
         """Return the known processes plus one more (or the flicker processes) if its standard deviation is above zero."""
         times = FLICKER_TIMES if time == FLICKER_MARK else (time,)
-        return (*self.known, *(BiasProcess(sd / float(np.sqrt(len(times))), each) for each in times)) if sd > 0 else self.known
+        return (
+            (*self.known, *(BiasProcess(sd / float(np.sqrt(len(times))), each) for each in times))
+            if sd > 0
+            else self.known
+        )
 
 
-def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray], information: np.ndarray,
-                     known: tuple[BiasProcess, ...] = (), durations: np.ndarray | float = 0.0) -> dict:
+def estimate_offsets(
+    rows: np.ndarray,
+    white: np.ndarray,
+    times: np.ndarray,
+    *,
+    sessions: list[np.ndarray],
+    information: np.ndarray,
+    known: tuple[BiasProcess, ...] = (),
+    durations: np.ndarray | float = 0.0,
+) -> dict:
     """
     Return the fields of `NoiseModel` that concern offsets: offset_sd, bias_processes, session_sd, session_variance.
 
@@ -228,8 +291,17 @@ def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, 
         As in `NoiseLikelihood`.
 
     """
-    search = _Search(NoiseLikelihood(rows, white, times, sessions=sessions, information=information, known=known,
-                                     durations=durations))
+    search = _Search(
+        NoiseLikelihood(
+            rows,
+            white,
+            times,
+            sessions=sessions,
+            information=information,
+            known=known,
+            durations=durations,
+        )
+    )
     trials, costs = search.grid(0.0)
     session = search.best_session(trials[np.argmin(costs)]) if len(sessions) > 1 else 0.0
     if session > 0:
@@ -242,8 +314,12 @@ def estimate_offsets(rows: np.ndarray, white: np.ndarray, times: np.ndarray, *, 
     offset, bias, time = search.conclusion(trials, costs, session)
     dof = 3 * (len(sessions) - 1)
     factor = float(dof_factor(dof)) if dof else 1.0
-    return {'offset_sd': offset * typical, 'bias_processes': search.likelihood.processes(bias * typical, time),
-            'session_sd': session * typical, 'session_variance': (session * typical)**2 * factor}
+    return {
+        'offset_sd': offset * typical,
+        'bias_processes': search.likelihood.processes(bias * typical, time),
+        'session_sd': session * typical,
+        'session_variance': (session * typical) ** 2 * factor,
+    }
 
 
 class _Search:
@@ -255,15 +331,22 @@ class _Search:
 
     def cost(self, shape, session=0.0):
         """Return minus twice the log of likelihood times prior."""
-        return self.likelihood.loss(shape, session=session) + (np.log(shape[2] / TYPICAL_TIME) / TIME_SPREAD)**2
+        return (
+            self.likelihood.loss(shape, session=session)
+            + (np.log(shape[2] / TYPICAL_TIME) / TIME_SPREAD) ** 2
+        )
 
     def grid(self, session):
         """Return the shapes tried, shape (k, 3), and their costs; shapes without bias process are first."""
         trials = [(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID]
         alone = np.array([self.cost(trial, session) for trial in trials])
         offsets = np.unique(np.concatenate([[0.0], OFFSET_GRID[alone < alone.min() + 20.0]]))
-        moving = [(offset, bias, time) for bias in self.biases for time in TIME_GRID for offset in offsets]
-        return np.array(trials + moving), np.concatenate([alone, [self.cost(trial, session) for trial in moving]])
+        moving = [
+            (offset, bias, time) for bias in self.biases for time in TIME_GRID for offset in offsets
+        ]
+        return np.array(trials + moving), np.concatenate(
+            [alone, [self.cost(trial, session) for trial in moving]]
+        )
 
     def best_session(self, shape):
         """Return the likeliest sd between recordings, over the best offsets and process, the offsets without process, and neither."""
@@ -281,10 +364,10 @@ class _Search:
     def conclusion(self, trials, costs, session):
         """Return offset sd, sd of the bias process and its correlation time."""
         best = int(np.argmin(costs))
-        if costs[:len(OFFSET_GRID)].min() - costs[best] > CLEAR_GAIN:
+        if costs[: len(OFFSET_GRID)].min() - costs[best] > CLEAR_GAIN:
             return self._best(trials[best], session)
         if self.likelihood.known:
-            trials, costs = trials[:len(OFFSET_GRID)], costs[:len(OFFSET_GRID)]
+            trials, costs = trials[: len(OFFSET_GRID)], costs[: len(OFFSET_GRID)]
             best = int(np.argmin(costs))
         return _posterior_mean(trials, costs - costs[best])
 
@@ -297,8 +380,12 @@ class _Search:
         def shape(x):
             return np.exp(x[0]) / unit, np.exp(x[1]) / unit, np.exp(np.clip(x[2], 1.6, 8.0))
 
-        found = minimize(lambda x: self.cost(shape(x), session), np.log([max(start[0], 0.1) * unit, start[1] * unit, start[2]]),
-                         method='Nelder-Mead', options={'maxfev': 80, 'xatol': 0.03, 'fatol': 0.03})
+        found = minimize(
+            lambda x: self.cost(shape(x), session),
+            np.log([max(start[0], 0.1) * unit, start[1] * unit, start[2]]),
+            method='Nelder-Mead',
+            options={'maxfev': 80, 'xatol': 0.03, 'fatol': 0.03},
+        )
         return tuple(float(value) for value in shape(found.x))
 
 
@@ -306,8 +393,8 @@ def _posterior_mean(trials, costs):
     """Return the roots of the mean variances, and the mean logarithm of the correlation time, over the likelihood."""
     weight = np.exp(-0.5 * costs) * np.where(trials[:, 1] == 0, 1.0, 1.0 / len(TIME_GRID))
     weight /= weight.sum()
-    offset, bias = np.sqrt(weight @ trials[:, :2]**2)
-    moving = weight * trials[:, 1]**2
+    offset, bias = np.sqrt(weight @ trials[:, :2] ** 2)
+    moving = weight * trials[:, 1] ** 2
     if moving.sum() <= 0:
         return float(offset), 0.0, TYPICAL_TIME
     return float(offset), float(bias), float(np.exp(moving @ np.log(trials[:, 2]) / moving.sum()))
@@ -342,10 +429,15 @@ class BiasProcessSearch:
     """
 
     def __init__(self, likelihood: NoiseLikelihood, least: float = 0.0, usual: float = 0.0):
-        self.likelihood, self.least, self.usual = likelihood, least / likelihood.typical, max(least, usual) / likelihood.typical
+        self.likelihood, self.least, self.usual = (
+            likelihood,
+            least / likelihood.typical,
+            max(least, usual) / likelihood.typical,
+        )
 
     def best(self, used: Sequence[int]) -> tuple[tuple, float]:
         """Return (shape, loss) of the best noise given the parameters `used`, standard deviations in units of the typical noise."""
+
         def loss(shape):
             return self.likelihood.loss(shape, used) + self.price(*shape[:2])
 
@@ -361,23 +453,39 @@ class BiasProcessSearch:
 
     def price(self, offset: float, bias: float) -> float:
         """Return minus twice the log prior of offsets, relative to none, and of the sd of a bias, relative to the usual one."""
-        return OFFSET_PRICE * (offset > 0) + ((np.log(max(bias / self.usual, 1.0)) / BIAS_LOG_SD)**2 if self.least else 0.0)
+        return OFFSET_PRICE * (offset > 0) + (
+            (np.log(max(bias / self.usual, 1.0)) / BIAS_LOG_SD) ** 2 if self.least else 0.0
+        )
 
     def of_middle_axis(self, shape: tuple, used: Sequence[int]) -> float:
         """Return the median over the axes of the likeliest sd of the bias process of each, with `shape` for the other axes."""
+
         def likeliest(own):
             offset = shape[0] * self.likelihood.typical / own.typical
-            return own.typical * _descend(lambda x: own.loss((offset, x, shape[2]), used), SD_RATIOS)
+            return own.typical * _descend(
+                lambda x: own.loss((offset, x, shape[2]), used), SD_RATIOS
+            )
 
-        return float(np.median([likeliest(self.likelihood.of_axis(axis, shape)) for axis in range(3)]))
+        return float(
+            np.median([likeliest(self.likelihood.of_axis(axis, shape)) for axis in range(3)])
+        )
 
     def polished(self, shape: tuple, used: Sequence[int]) -> dict:
         """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""
         offset, bias, time = shape
         offset = _polish(lambda x: self.likelihood.loss((x, bias, time), used), offset)
-        bias = max(_polish(lambda x: self.likelihood.loss((offset, x, time), used) + self.price(offset, x), bias), self.least)
+        bias = max(
+            _polish(
+                lambda x: self.likelihood.loss((offset, x, time), used) + self.price(offset, x),
+                bias,
+            ),
+            self.least,
+        )
         unit = self.likelihood.typical
-        return {'offset_sd': offset * unit, 'bias_processes': self.likelihood.processes(bias * unit, time)}
+        return {
+            'offset_sd': offset * unit,
+            'bias_processes': self.likelihood.processes(bias * unit, time),
+        }
 
 
 def _near(ratio):
@@ -396,4 +504,8 @@ def _descend(loss: Callable, grid):
 
 
 def _polish(loss: Callable, value):
-    return value if value == 0.0 else min([value * factor for factor in (0.7, 0.85, 1.0, 1.2, 1.4)], key=loss)
+    return (
+        value
+        if value == 0.0
+        else min([value * factor for factor in (0.7, 0.85, 1.0, 1.2, 1.4)], key=loss)
+    )

@@ -43,20 +43,46 @@ class Motion:
     @property
     def seconds(self) -> float:
         """Duration: rests with the move to the next one, and moving pieces."""
-        return sum(REST + WAY if len(piece) == 1 else float(piece.time[-1] - piece.time[0]) + WAY for piece in self.make(STANDARD_GRAVITY))
+        return sum(
+            REST + WAY if len(piece) == 1 else float(piece.time[-1] - piece.time[0]) + WAY
+            for piece in self.make(STANDARD_GRAVITY)
+        )
 
 
-def _turn(axis, time, angle, rate, alpha, gravity, up, temperature_c=None, arm=None, branch=None,
-          shaking=None):
+def _turn(
+    axis,
+    time,
+    angle,
+    rate,
+    alpha,
+    gravity,
+    up,
+    temperature_c=None,
+    arm=None,
+    branch=None,
+    shaking=None,
+):
     """Return the reference of a sensor that turns about its own `axis`; `up` is the vertical in the sensor at angle zero."""
-    axis, up = np.asarray(axis, float) / np.linalg.norm(axis), np.asarray(up, float) / np.linalg.norm(up)
+    axis, up = (
+        np.asarray(axis, float) / np.linalg.norm(axis),
+        np.asarray(up, float) / np.linalg.norm(up),
+    )
     up_s = Rotation.from_rotvec(-angle[:, None] * axis).apply(up)
     rate_s, alpha_s = rate[:, None] * axis, alpha[:, None] * axis
     force = gravity * up_s
     if arm is not None:
         force = force + np.cross(alpha_s, arm) + np.cross(rate_s, np.cross(rate_s, arm))
-    return Reference(time, _attitudes(up_s), force, rate_s, alpha_s, gravity, temperature_c, branch,
-                     None if shaking is None else np.tile(shaking, (len(time), 1)))
+    return Reference(
+        time,
+        _attitudes(up_s),
+        force,
+        rate_s,
+        alpha_s,
+        gravity,
+        temperature_c,
+        branch,
+        None if shaking is None else np.tile(shaking, (len(time), 1)),
+    )
 
 
 def _attitudes(up_s):
@@ -68,7 +94,9 @@ def _attitudes(up_s):
 
 
 MOTION_TIME = np.arange(0.0, 30.0, 0.02)
-DIRECTIONS = np.array([np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)])
+DIRECTIONS = np.array(
+    [np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
+)
 """Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
 FACES_UP = [sign * row for row in np.eye(3) for sign in (1, -1)]
 """The six faces turned up, in the sensor frame."""
@@ -77,16 +105,38 @@ FACES_UP = [sign * row for row in np.eye(3) for sign in (1, -1)]
 def _spin(axis, speeds, up=None, arm=None):
     def make(gravity):
         across = np.roll(axis, 1) if up is None else up
-        return [_turn(axis, MOTION_TIME, s * DEG * MOTION_TIME, np.full(len(MOTION_TIME), s * DEG), np.zeros(len(MOTION_TIME)), gravity,
-                      across, arm=arm) for s in speeds]
+        return [
+            _turn(
+                axis,
+                MOTION_TIME,
+                s * DEG * MOTION_TIME,
+                np.full(len(MOTION_TIME), s * DEG),
+                np.zeros(len(MOTION_TIME)),
+                gravity,
+                across,
+                arm=arm,
+            )
+            for s in speeds
+        ]
+
     return make
 
 
 def _oscillation(axis, up=None):
     def make(gravity):
         w, a = 2 * np.pi, 30 * DEG
-        return [_turn(axis, MOTION_TIME, a * np.sin(w * MOTION_TIME), a * w * np.cos(w * MOTION_TIME), -a * w**2 * np.sin(w * MOTION_TIME),
-                      gravity, (0.3, 0.4, 1.0) if up is None else up)]
+        return [
+            _turn(
+                axis,
+                MOTION_TIME,
+                a * np.sin(w * MOTION_TIME),
+                a * w * np.cos(w * MOTION_TIME),
+                -a * w**2 * np.sin(w * MOTION_TIME),
+                gravity,
+                (0.3, 0.4, 1.0) if up is None else up,
+            )
+        ]
+
     return make
 
 
@@ -94,17 +144,28 @@ def _poses(directions, temperatures=(None,)):
     def make(gravity):
         one, way, pieces = np.zeros(1), ThermalBranch(), []
         for t in temperatures:
-            warmth = {} if t is None else {'temperature_c': np.full(1, t), 'branch': way.of(np.full(1, t))}
-            pieces += [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, **warmth) for k, up in enumerate(directions)]
+            warmth = (
+                {}
+                if t is None
+                else {'temperature_c': np.full(1, t), 'branch': way.of(np.full(1, t))}
+            )
+            pieces += [
+                _turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, **warmth)
+                for k, up in enumerate(directions)
+            ]
         return pieces
+
     return make
 
 
 def _shaken(gravity):
     """Rest in six faces, quiet and while the sensor is shaken along each axis."""
     one, shakes = np.zeros(1), (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3))
-    return [_turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, shaking=shaking)
-            for shaking in shakes for k, up in enumerate(FACES_UP)]
+    return [
+        _turn((0, 0, 1), one + 60.0 * k, one, one, one, gravity, up, shaking=shaking)
+        for shaking in shakes
+        for k, up in enumerate(FACES_UP)
+    ]
 
 
 def rest_with_up(up: np.ndarray) -> 'Motion':
@@ -121,7 +182,10 @@ def _two_axis(gravity):
         third = 3 - inner - outer
         rate[:, inner] = w
         rate[:, outer], rate[:, third] = w * np.cos(w * MOTION_TIME), -w * np.sin(w * MOTION_TIME)
-        alpha[:, outer], alpha[:, third] = -w * w * np.sin(w * MOTION_TIME), -w * w * np.cos(w * MOTION_TIME)
+        alpha[:, outer], alpha[:, third] = (
+            -w * w * np.sin(w * MOTION_TIME),
+            -w * w * np.cos(w * MOTION_TIME),
+        )
         up = np.zeros((len(MOTION_TIME), 3))
         up[:, outer], up[:, third] = np.cos(w * MOTION_TIME), -np.sin(w * MOTION_TIME)
         pieces.append(Reference(MOTION_TIME, _attitudes(up), gravity * up, rate, alpha, gravity))
@@ -130,7 +194,12 @@ def _two_axis(gravity):
 
 def _fine_poses():
     angle = np.arange(0, 2 * np.pi, np.pi / 12)
-    return np.concatenate([np.roll(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), k, axis=1) for k in range(3)])
+    return np.concatenate(
+        [
+            np.roll(np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), k, axis=1)
+            for k in range(3)
+        ]
+    )
 
 
 SPINS = (-200, -100, 100, 200)
@@ -140,30 +209,65 @@ AXIS_DIRECTIONS = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 def _spins_about(axis, up=None):
     name = 'xyz'[axis.index(1)]
-    return Motion(f'spin_{name}', f"spin about the sensor's {name} axis at 100 and 200 deg/s in both senses", _spin(axis, SPINS, up), axis)
+    return Motion(
+        f'spin_{name}',
+        f"spin about the sensor's {name} axis at 100 and 200 deg/s in both senses",
+        _spin(axis, SPINS, up),
+        axis,
+    )
 
 
 def _oscillates_about(axis, up=None):
     name = 'xyz'[axis.index(1)]
-    return Motion(f'oscillate_{name}', f"oscillate about the sensor's {name} axis, 30 deg at 1 Hz", _oscillation(axis, up), axis)
+    return Motion(
+        f'oscillate_{name}',
+        f"oscillate about the sensor's {name} axis, 30 deg at 1 Hz",
+        _oscillation(axis, up),
+        axis,
+    )
 
 
 MOTIONS = (
-    Motion('static_poses', 'rest in six faces and twelve edge positions, at several headings', _poses(DIRECTIONS)),
+    Motion(
+        'static_poses',
+        'rest in six faces and twelve edge positions, at several headings',
+        _poses(DIRECTIONS),
+    ),
     Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_fine_poses())),
     *(_spins_about(axis) for axis in AXIS_DIRECTIONS),
-    Motion('three_speeds', 'spin about skewed axes at 50, 100 and 200 deg/s in both senses', lambda g: [
-        piece for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
-        for piece in _spin(axis, (-200, -100, -50, 50, 100, 200))(g)]),
+    Motion(
+        'three_speeds',
+        'spin about skewed axes at 50, 100 and 200 deg/s in both senses',
+        lambda g: [
+            piece
+            for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+            for piece in _spin(axis, (-200, -100, -50, 50, 100, 200))(g)
+        ],
+    ),
     *(_oscillates_about(axis) for axis in AXIS_DIRECTIONS),
-    Motion('two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis),
-    Motion('centrifuge', 'spin at 300 deg/s on an arm of 0.3 m, about each axis', lambda g: [
-        piece for k in range(3) for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)]),
-    Motion('warm_up', 'rest in six faces, cold and warm',
-           _poses(FACES_UP, (15.0, 25.0, 35.0))),
-    Motion('warm_and_cool', 'rest in six faces while it warms up by ten kelvins, and again while it cools',
-           _poses(FACES_UP, (20.0, 25.0, 30.0, 25.0, 20.0))),
-    Motion('shake', 'rest in six faces, quiet and while a machine shakes the sensor along each axis', _shaken),
+    Motion(
+        'two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis
+    ),
+    Motion(
+        'centrifuge',
+        'spin at 300 deg/s on an arm of 0.3 m, about each axis',
+        lambda g: [
+            piece
+            for k in range(3)
+            for piece in _spin(np.eye(3)[k], (-300, 300), arm=0.3 * np.roll(np.eye(3)[k], 1))(g)
+        ],
+    ),
+    Motion('warm_up', 'rest in six faces, cold and warm', _poses(FACES_UP, (15.0, 25.0, 35.0))),
+    Motion(
+        'warm_and_cool',
+        'rest in six faces while it warms up by ten kelvins, and again while it cools',
+        _poses(FACES_UP, (20.0, 25.0, 30.0, 25.0, 20.0)),
+    ),
+    Motion(
+        'shake',
+        'rest in six faces, quiet and while a machine shakes the sensor along each axis',
+        _shaken,
+    ),
 )
 """Standard motions of the sensor; motions of table joints are named by the effects that need them."""
 
@@ -208,8 +312,14 @@ ONE_JOINT = {
 """The motions that a table of one joint can do; the other ones require a remounted IMU."""
 
 
-def added_information(model: SensorModel, values: np.ndarray, noise: dict[str, NoiseModel], *, motion: Motion,
-                      gravity: float) -> np.ndarray:
+def added_information(
+    model: SensorModel,
+    values: np.ndarray,
+    noise: dict[str, NoiseModel],
+    *,
+    motion: Motion,
+    gravity: float,
+) -> np.ndarray:
     """
     Return the information matrix that one minute of a standard motion would add, shape (n_params, n_params).
 
@@ -224,7 +334,9 @@ def added_information(model: SensorModel, values: np.ndarray, noise: dict[str, N
 
 
 def _piece_information(layout, dc, noise, piece):
-    design = np.concatenate([_columns(layout, name, rows, piece) for name, rows in layout.rows.items()], axis=1)
+    design = np.concatenate(
+        [_columns(layout, name, rows, piece) for name, rows in layout.rows.items()], axis=1
+    )
     static = len(piece) == 1
     count = 500.0 if static else 2.0 * len(piece)
     mean = design.mean(axis=0)
@@ -233,7 +345,9 @@ def _piece_information(layout, dc, noise, piece):
     for axis in range(3):
         rows = mean @ dc[:, axis]
         variance = noise.low_variance[axis]
-        information += np.outer(rows, rows) / (variance / count + noise.offset_sd**2 + noise.bias_variance)
+        information += np.outer(rows, rows) / (
+            variance / count + noise.offset_sd**2 + noise.bias_variance
+        )
         information += dc[:, axis].T @ within @ dc[:, axis] / variance
     return information
 
@@ -241,9 +355,16 @@ def _piece_information(layout, dc, noise, piece):
 def _columns(layout, name, rows, piece):
     """Return the columns of a group; zeros where the motion has no temperature or no joints, and for columns of a warp."""
     group = layout.groups.get(name)
-    unknown = group is None or (piece.temperature_c is None and 'temperature' in group.uses) or (
-        piece.motion is None and bool(group.uses & {'joint angle', 'joint rate'}))
-    return np.zeros((len(piece), rows.stop - rows.start)) if unknown else group.columns(piece, layout.point)
+    unknown = (
+        group is None
+        or (piece.temperature_c is None and 'temperature' in group.uses)
+        or (piece.motion is None and bool(group.uses & {'joint angle', 'joint rate'}))
+    )
+    return (
+        np.zeros((len(piece), rows.stop - rows.start))
+        if unknown
+        else group.columns(piece, layout.point)
+    )
 
 
 def tolerance_scaled_singular_values(information: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
@@ -256,7 +377,9 @@ def tolerance_scaled_singular_values(information: np.ndarray, tolerances: np.nda
     return np.sqrt(np.clip(scipy.linalg.eigvalsh((scaled + scaled.T) / 2)[::-1], 0, None))
 
 
-def weak_directions(covariance: np.ndarray, tolerances: np.ndarray, names: Sequence[str], *, limit: int = 6) -> list[dict[str, float]]:
+def weak_directions(
+    covariance: np.ndarray, tolerances: np.ndarray, names: Sequence[str], *, limit: int = 6
+) -> list[dict[str, float]]:
     """
     Return the directions in which the standard deviation exceeds the tolerance, worst first.
 
@@ -274,12 +397,20 @@ def weak_directions(covariance: np.ndarray, tolerances: np.ndarray, names: Seque
             break
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
         strong = np.abs(vector) >= 0.2 * np.max(np.abs(vector))
-        found.append({names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(strong).tolist()})
+        found.append(
+            {names[k]: round(float(vector[k]), 3) for k in np.flatnonzero(strong).tolist()}
+        )
     return found
 
 
-def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *, prior_sd: np.ndarray,
-                   possible: Sequence[Motion] | None = None) -> dict[str, tuple[str, float]]:
+def needed_motions(
+    solution: Solution,
+    tolerances: np.ndarray,
+    gravity: float,
+    *,
+    prior_sd: np.ndarray,
+    possible: Sequence[Motion] | None = None,
+) -> dict[str, tuple[str, float]]:
     """
     Return for each undetermined parameter the standard motion that reduces its standard deviation most.
 
@@ -299,9 +430,16 @@ def needed_motions(solution: Solution, tolerances: np.ndarray, gravity: float, *
     base = solution.information + np.diag(1 / prior_sd**2)
     before, predicted = _sd_of(base), {}
     for motion in MOTIONS if possible is None else possible:
-        total = base + added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=gravity)
-        predicted[motion] = _sd_of(total) * np.maximum(solution.sd / before, 1.0)   # the model error remains
-    return {solution.param_names[k]: _best(solution, k, predicted, one_joint=possible is not None) for k in lacking}
+        total = base + added_information(
+            solution.model, solution.values, solution.noise, motion=motion, gravity=gravity
+        )
+        predicted[motion] = _sd_of(total) * np.maximum(
+            solution.sd / before, 1.0
+        )  # the model error remains
+    return {
+        solution.param_names[k]: _best(solution, k, predicted, one_joint=possible is not None)
+        for k in lacking
+    }
 
 
 def _sd_of(information):
@@ -315,5 +453,7 @@ def _best(solution, index, predicted, one_joint):
         return motion.text, float(predicted[motion][index])
     if one_joint:
         return OTHER_MOUNT, float('nan')
-    owner = next(e for e in solution.model.effects if solution.param_names[index] in e.param_names())
+    owner = next(
+        e for e in solution.model.effects if solution.param_names[index] in e.param_names()
+    )
     return ALL_MOTIONS[owner.motion[0]], float('nan')

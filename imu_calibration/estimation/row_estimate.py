@@ -13,7 +13,11 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.noise_search import GroupVariances, estimate_group_variances
-from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, triangular_of_band
+from imu_calibration.estimation.scaled_solve import (
+    covariance_with_held,
+    inverse_gram,
+    triangular_of_band,
+)
 from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE
 
 MAX_NEWTON_STEPS = 15
@@ -91,12 +95,16 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
 
     """
     asked, priors = ~reference.fixed, reference.priors
-    state, scatter, steps = _iterate(reference, state, asked, priors, variance=fallback, fallback=fallback)
+    state, scatter, steps = _iterate(
+        reference, state, asked, priors, variance=fallback, fallback=fallback
+    )
     held = _choose_held(_factor(reference.linearise(state), scatter), priors, asked)
     free = asked & ~held
     state = replace(state, values=np.where(held, reference.nominal, state.values))
     start = np.maximum(scatter.variance, 0.01 * fallback)
-    state, scatter, more = _iterate(reference, state, free, FLAT_PRIOR_FACTOR * priors, variance=start, fallback=fallback)
+    state, scatter, more = _iterate(
+        reference, state, free, FLAT_PRIOR_FACTOR * priors, variance=start, fallback=fallback
+    )
     rows = reference.linearise(state)
     factor = _factor(rows, scatter)
     own, of_held = covariance_with_held(factor, free, held, prior_sd=priors)
@@ -115,8 +123,15 @@ def _choose_held(factor, priors, asked):
     while np.any(free := asked & ~held):
         ratio = np.zeros(len(priors))
         # the sds in units of the priors, nearly unlimited without information from the data
-        ratio[free] = np.sqrt(np.diag(inverse_gram(np.vstack([factor[:, free] * priors[free],
-                                                              np.eye(free.sum()) / FLAT_PRIOR_FACTOR]))))
+        ratio[free] = np.sqrt(
+            np.diag(
+                inverse_gram(
+                    np.vstack(
+                        [factor[:, free] * priors[free], np.eye(free.sum()) / FLAT_PRIOR_FACTOR]
+                    )
+                )
+            )
+        )
         worst = int(np.argmax(ratio))
         if ratio[worst] <= 0.5:
             break
@@ -126,17 +141,28 @@ def _choose_held(factor, priors, asked):
 
 def _iterate(reference, state, free, priors, *, variance, fallback):
     """Repeat steps and scatter estimates until both converge."""
-    scatter = GroupVariances(np.array(variance, float), np.full(len(fallback), np.inf), np.array(variance, float))
+    scatter = GroupVariances(
+        np.array(variance, float), np.full(len(fallback), np.inf), np.array(variance, float)
+    )
     for number in range(1, MAX_NEWTON_STEPS + 1):
         rows = reference.linearise(state)
         n_nuisances, n_free = rows.nuisance.shape[1], int(free.sum())
-        design = np.vstack([np.hstack([rows.nuisance, rows.main[:, free]]), np.eye(n_nuisances + n_free)[n_nuisances:]])
+        design = np.vstack(
+            [
+                np.hstack([rows.nuisance, rows.main[:, free]]),
+                np.eye(n_nuisances + n_free)[n_nuisances:],
+            ]
+        )
         residual = np.concatenate([rows.residual, (reference.nominal - state.values)[free]])
-        noise = np.concatenate([rows.noise, priors[free]**2])
+        noise = np.concatenate([rows.noise, priors[free] ** 2])
         group = np.concatenate([rows.component, np.full(n_free, -1)])
         before = scatter.variance
-        if number > 2:  # after the first steps there are errors of linearisation that are not scatter
-            scatter = estimate_group_variances(design, residual, noise, group=group, start=scatter.variance, fallback=fallback)
+        if (
+            number > 2
+        ):  # after the first steps there are errors of linearisation that are not scatter
+            scatter = estimate_group_variances(
+                design, residual, noise, group=group, start=scatter.variance, fallback=fallback
+            )
         root = np.sqrt(scatter.total(noise, group))
         factor = triangular_of_band(np.column_stack([design, residual]) / root[:, None])[:-1]
         reduced = scipy.linalg.solve_triangular(factor[:, :-1], factor[:, -1])
@@ -144,14 +170,19 @@ def _iterate(reference, state, free, priors, *, variance, fallback):
         step[np.append(np.ones(n_nuisances, bool), free)] = reduced
         state = reference.moved(state, step)
         settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
-        if number > 3 and settled and np.linalg.norm(factor[:, -1]) < 1e-3:  # in units of the joint sd
+        if (
+            number > 3 and settled and np.linalg.norm(factor[:, -1]) < 1e-3
+        ):  # in units of the joint sd
             break
     return state, scatter, number
 
 
 def _factor(rows, scatter):
     """Return the triangular factor of the parameters with the nuisances eliminated, at inflated variances."""
-    root, width = np.sqrt(scatter.total(rows.noise, rows.component, inflated=True)), rows.nuisance.shape[1]
+    root, width = (
+        np.sqrt(scatter.total(rows.noise, rows.component, inflated=True)),
+        rows.nuisance.shape[1],
+    )
     return triangular_of_band(np.hstack([rows.nuisance, rows.main]) / root[:, None])[width:, width:]
 
 
@@ -160,7 +191,9 @@ def _of_scatter(rows, scatter, free):
     variance = scatter.total(rows.noise, rows.component, inflated=True)
     design = np.hstack([rows.nuisance, rows.main[:, free]]) / np.sqrt(variance)[:, None]
     factor = triangular_of_band(design)
-    gain = scipy.linalg.cho_solve((factor, False), design.T)[rows.nuisance.shape[1]:] * np.sqrt(1 - rows.noise / variance)
+    gain = scipy.linalg.cho_solve((factor, False), design.T)[rows.nuisance.shape[1] :] * np.sqrt(
+        1 - rows.noise / variance
+    )
     found = np.zeros((len(free),) * 2)
     found[np.ix_(free, free)] = gain @ gain.T
     return found

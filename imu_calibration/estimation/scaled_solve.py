@@ -21,8 +21,10 @@ def triangular(rows: np.ndarray) -> np.ndarray:
     factor = np.zeros((width, width), order='F')
     for start in range(0, count, FACTORED_ROWS):
         # Each block is folded into the triangle, whose zeros are skipped.
-        block = np.array(rows[start:start + FACTORED_ROWS], order='F')
-        factor, _, _, info = lapack.dtpqrt(0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1)
+        block = np.array(rows[start : start + FACTORED_ROWS], order='F')
+        factor, _, _, info = lapack.dtpqrt(
+            0, min(PANEL, width), factor, block, overwrite_a=1, overwrite_b=1
+        )
         _require_finite(info, factor)
     return np.triu(factor)
 
@@ -37,14 +39,18 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
 
     With the elements near a diagonal, and dense columns last, the cost is proportional to the number of rows.
     """
-    band, factor, carried = np.argmax(rows != 0, axis=1) // BAND_COLUMNS, np.zeros((rows.shape[1],) * 2), rows[:0]
+    band, factor, carried = (
+        np.argmax(rows != 0, axis=1) // BAND_COLUMNS,
+        np.zeros((rows.shape[1],) * 2),
+        rows[:0],
+    )
     for number in range(-(-len(factor) // BAND_COLUMNS)):
         own = np.concatenate([carried, rows[band == number]])
         used = np.flatnonzero(own.any(axis=0))
         part, done = triangular(own[:, used]), np.searchsorted(used, (number + 1) * BAND_COLUMNS)
         carried = np.zeros((len(part), len(factor)))
         carried[:, used] = part
-        factor[used[:len(part[:done])]], carried = carried[:done], carried[done:]
+        factor[used[: len(part[:done])]], carried = carried[:done], carried[done:]
     return factor
 
 
@@ -59,7 +65,7 @@ def unpacked(factors: Sequence[np.ndarray], width: int) -> np.ndarray:
     rows = places[longest - 1] // width + 1 if longest else 0
     found = np.zeros((len(factors), rows * width))
     for row, factor in zip(found, factors):
-        row[places[:len(factor)]] = factor
+        row[places[: len(factor)]] = factor
     return found.reshape(len(factors), rows, width)
 
 
@@ -74,7 +80,7 @@ def _r_factor(stacked):
         return stacked
     raw, _, _, info = lapack.dgeqrf(stacked, overwrite_a=1)
     _require_finite(info, raw[:, 0])
-    return np.triu(raw[:min(raw.shape)])
+    return np.triu(raw[: min(raw.shape)])
 
 
 def _require_finite(info, values):
@@ -101,7 +107,7 @@ def scaled_lstsq(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 def inverse_gram(matrix: np.ndarray) -> np.ndarray:
     """Return ``(matrix' matrix)^-1`` through the triangular factor of the scaled columns."""
     scale = np.linalg.norm(matrix, axis=0)
-    r = scipy.linalg.qr(matrix / scale, mode='r')[0][:matrix.shape[1]]
+    r = scipy.linalg.qr(matrix / scale, mode='r')[0][: matrix.shape[1]]
     inverse = scipy.linalg.solve_triangular(r, np.eye(len(r)))
     return (inverse @ inverse.T) / np.outer(scale, scale)
 
@@ -110,18 +116,22 @@ def inverse_normal(information: np.ndarray) -> np.ndarray:
     """Return the inverse of an information matrix, scaled to a unit diagonal first."""
     scale = 1 / np.sqrt(np.diag(information))
     scaled = information * np.outer(scale, scale)
-    scaled.flat[::len(scaled) + 1] += JITTER
+    scaled.flat[:: len(scaled) + 1] += JITTER
     return np.linalg.inv(scaled) * np.outer(scale, scale)
 
 
 def solve_scaled(information: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the solutions of several systems, (k, n, n) and (k, n), each information matrix scaled to a unit diagonal first."""
     scale = 1 / np.sqrt(np.einsum('kii->ki', information))
-    scaled = information * scale[:, :, None] * scale[:, None, :] + JITTER * np.eye(information.shape[1])
+    scaled = information * scale[:, :, None] * scale[:, None, :] + JITTER * np.eye(
+        information.shape[1]
+    )
     return np.linalg.solve(scaled, (scale * right)[:, :, None])[:, :, 0] * scale
 
 
-def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, prior_mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve_normal(
+    normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, prior_mean: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (values, covariance) of the parameters `used` that minimise the quadratic form of a normal matrix plus a prior.
 
@@ -135,19 +145,24 @@ def solve_normal(normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, 
 
     """
     used = np.asarray(used)
-    information = normal[np.ix_(used, used)] + np.diag(1 / prior_sd[used]**2)
+    information = normal[np.ix_(used, used)] + np.diag(1 / prior_sd[used] ** 2)
     covariance = inverse_normal(information)
-    return covariance @ (normal[used, -1] + prior_mean[used] / prior_sd[used]**2), covariance
+    return covariance @ (normal[used, -1] + prior_mean[used] / prior_sd[used] ** 2), covariance
 
 
 def quadratic(normal: np.ndarray, used: Sequence[int] | np.ndarray, values: np.ndarray) -> float:
     """Return the residual sum of squares of `values` of the parameters `used` under a normal matrix."""
     used = np.asarray(used)
-    return float(normal[-1, -1] - 2 * values @ normal[used, -1] + values @ normal[np.ix_(used, used)] @ values)
+    return float(
+        normal[-1, -1]
+        - 2 * values @ normal[used, -1]
+        + values @ normal[np.ix_(used, used)] @ values
+    )
 
 
-def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, *,
-                         prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def covariance_with_held(
+    rows: np.ndarray, free: np.ndarray, held: np.ndarray, *, prior_sd: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (covariance of the free parameters, covariance due to those fixed at their prior), both shape (n, n); their sum is the total.
 
@@ -166,4 +181,4 @@ def covariance_with_held(rows: np.ndarray, free: np.ndarray, held: np.ndarray, *
         influence[free] = -scaled_lstsq(rows[:, free], rows[:, held])
     own = np.zeros((len(prior_sd),) * 2)
     own[np.ix_(free, free)] = inverse_gram(rows[:, free])
-    return own, influence @ np.diag(prior_sd[held]**2) @ influence.T
+    return own, influence @ np.diag(prior_sd[held] ** 2) @ influence.T

@@ -7,7 +7,12 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
-from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise
+from imu_calibration.estimation.noise_model import (
+    BiasProcess,
+    MovingFactors,
+    NoiseModel,
+    ReferenceNoise,
+)
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
 
@@ -39,9 +44,14 @@ class BandMisfit:
     def factors(self, noise: NoiseModel) -> MovingFactors:
         """Return the excess variance of moving windows with this residual over the noise at rest."""
         white, unit = noise.white_variance, noise.low_variance
-        samples, pieces = np.where(self.apart, self.fast, self.overall), np.where(self.apart, 0.0, self.slow)
+        samples, pieces = (
+            np.where(self.apart, self.fast, self.overall),
+            np.where(self.apart, 0.0, self.slow),
+        )
         every = np.maximum.reduce([samples / white, pieces / unit, np.ones(3)])
-        return MovingFactors(every, np.where(self.apart, np.minimum(np.maximum(self.slow / unit, 1.0), every), every))
+        return MovingFactors(
+            every, np.where(self.apart, np.minimum(np.maximum(self.slow / unit, 1.0), every), every)
+        )
 
     def without_fast(self) -> 'BandMisfit':
         """Return the same with a variance of the fast part so large that its weight is zero."""
@@ -53,7 +63,9 @@ class BandMisfit:
         return np.where(self.apart, self.slow, self.overall)
 
 
-def band_misfit(total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_slow: float) -> BandMisfit:
+def band_misfit(
+    total: np.ndarray, dof_total: float, slow: np.ndarray, *, dof_slow: float
+) -> BandMisfit:
     """
     Return the `BandMisfit` of centred rows.
 
@@ -83,7 +95,9 @@ def own_misfit(rows: np.ndarray) -> np.ndarray:
     columns, output = rows[:, :-3], rows[:, -3:]
     scale = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
-    return output - columns @ np.linalg.lstsq(columns, output, rcond=1e-10)[0] if len(rows) else output
+    return (
+        output - columns @ np.linalg.lstsq(columns, output, rcond=1e-10)[0] if len(rows) else output
+    )
 
 
 def misfit_along(products: np.ndarray) -> tuple[float, int]:
@@ -114,7 +128,9 @@ def least_misfit(products: np.ndarray) -> tuple[float, int]:
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
     seen = eigenvalues > RESIDUAL_EIGENVALUE_SHARE * max(eigenvalues[-1], 1e-300)
     along = (vectors.T @ scaled[:-1, -1])[seen]
-    return max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0) / scale[-1]**2, int(seen.sum())
+    return max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0) / scale[-1] ** 2, int(
+        seen.sum()
+    )
 
 
 def _scales(squares):
@@ -142,12 +158,23 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
     rows : sequence of WindowStatistics
 
     """
-    static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
+    static = [
+        row
+        for row in rows
+        if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))
+    ]
     if not static:
         return None
-    rounding = np.array([row.sensors[sensor].noise_variance for row in rows if row.kind != 'static']).reshape(-1, 3)
-    floor = np.min(np.where(rounding > 0, rounding, np.inf), axis=0, initial=np.inf)   # a code may be constant at rest
-    variances = np.maximum([row.sensors[sensor].noise_variance for row in static], np.where(np.isfinite(floor), floor, 0.0))
+    rounding = np.array(
+        [row.sensors[sensor].noise_variance for row in rows if row.kind != 'static']
+    ).reshape(-1, 3)
+    floor = np.min(
+        np.where(rounding > 0, rounding, np.inf), axis=0, initial=np.inf
+    )  # a code may be constant at rest
+    variances = np.maximum(
+        [row.sensors[sensor].noise_variance for row in static],
+        np.where(np.isfinite(floor), floor, 0.0),
+    )
     inflations = np.array([row.sensors[sensor].inflation for row in static])
     counts = np.array([row.count for row in static], float)
     pooled, factors = np.empty(3), np.empty(3)
@@ -159,7 +186,7 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
         weight = (counts >= 32) * near
         factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
         factors[axis] = max(factors[axis], MIN_SHAKEN_INFLATION if shaken else MIN_INFLATION)
-    return np.maximum(pooled, LEAST_NOISE[sensor]**2), factors
+    return np.maximum(pooled, LEAST_NOISE[sensor] ** 2), factors
 
 
 def _usual(variances, inflations):
@@ -167,35 +194,56 @@ def _usual(variances, inflations):
     median = float(np.median(variances))
     quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
     louder = variances > VIBRATES * quiet
-    shaken = 0.0 < VIBRATES * quiet < median and float(np.median(inflations[louder])) < MIN_INFLATION
+    shaken = (
+        0.0 < VIBRATES * quiet < median and float(np.median(inflations[louder])) < MIN_INFLATION
+    )
     return (quiet if shaken else median), shaken
 
 
 def shaken_means(rows: Sequence, sensor: str) -> dict[tuple[int, float], np.ndarray]:
     """Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level."""
-    static = [row for row in rows if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))]
+    static = [
+        row
+        for row in rows
+        if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))
+    ]
     if not static:
         return {}
-    variances, inflations = (np.array([getattr(row.sensors[sensor], name) for row in static]) for name in ('noise_variance', 'inflation'))
+    variances, inflations = (
+        np.array([getattr(row.sensors[sensor], name) for row in static])
+        for name in ('noise_variance', 'inflation')
+    )
     own = np.zeros(variances.shape)
     for axis in range(3):
         quiet, shaken = _usual(variances[:, axis], inflations[:, axis])
         loud = (variances[:, axis] > VIBRATES * quiet) & shaken
         own[loud, axis] = variances[loud, axis] * inflations[loud, axis]
-    return {(row.session, row.time): each / row.count for row, each in zip(static, own) if each.any()}
+    return {
+        (row.session, row.time): each / row.count for row, each in zip(static, own) if each.any()
+    }
 
 
-def first_noise(system: WeightedSystem, values: np.ndarray, known: dict[str, tuple[BiasProcess, ...]]) -> dict[str, NoiseModel]:
+def first_noise(
+    system: WeightedSystem, values: np.ndarray, known: dict[str, tuple[BiasProcess, ...]]
+) -> dict[str, NoiseModel]:
     """Return the initial noise without residuals; fast parts have weight zero where slow parts can be fitted better."""
-    return {sensor: _with_bands(system, sensor,
-                                replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))) for sensor in SENSORS}
+    return {
+        sensor: _with_bands(
+            system, sensor, replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))
+        )
+        for sensor in SENSORS
+    }
 
 
 def _at_rest(system, sensor, values):
     white = white_noise(system.accumulator.rows, sensor)
-    reference = ReferenceNoise.of_steps(max(row.encoder_step for row in system.accumulator.rows), sensor)
+    reference = ReferenceNoise.of_steps(
+        max(row.encoder_step for row in system.accumulator.rows), sensor
+    )
     if white is not None:
-        return NoiseModel(*white, reference=reference, shaken=shaken_means(system.accumulator.rows, sensor))
+        return NoiseModel(
+            *white, reference=reference, shaken=shaken_means(system.accumulator.rows, sensor)
+        )
     variance = np.full(3, 1e-30)
     for kind in system.within[sensor]:
         variance = np.maximum(variance, _misfit_of(system, sensor, kind, values).noise)
@@ -205,18 +253,45 @@ def _at_rest(system, sensor, values):
 def _with_bands(system, sensor, noise):
     """Return the noise with weight zero for the fast parts where slow parts, fitted separately, have a smaller residual variance."""
     misfits = {kind: _misfit_of(system, sensor, kind) for kind in system.within[sensor]}
-    return replace(noise, moving={kind: misfit.without_fast().factors(noise) for kind, misfit in misfits.items() if misfit.apart.any()})
+    return replace(
+        noise,
+        moving={
+            kind: misfit.without_fast().factors(noise)
+            for kind, misfit in misfits.items()
+            if misfit.apart.any()
+        },
+    )
 
 
-def updated_noise(system: WeightedSystem, sensor: str, values: np.ndarray, *, noise: NoiseModel) -> NoiseModel:
+def updated_noise(
+    system: WeightedSystem, sensor: str, values: np.ndarray, *, noise: NoiseModel
+) -> NoiseModel:
     """Return the noise of a sensor estimated from the residuals at `values`, starting from `noise`."""
     if white_noise(system.accumulator.rows, sensor) is None:
-        noise = replace(_at_rest(system, sensor, values), known=noise.known, left_out=noise.left_out)
-    noise = replace(noise, moving={kind: _judged(system, sensor, kind, values).factors(noise) for kind in system.within[sensor]})
+        noise = replace(
+            _at_rest(system, sensor, values), known=noise.known, left_out=noise.left_out
+        )
+    noise = replace(
+        noise,
+        moving={
+            kind: _judged(system, sensor, kind, values).factors(noise)
+            for kind in system.within[sensor]
+        },
+    )
     rows, information = system.linearised(sensor, values, noise)
     white = system.mean_variance(noise, beside_bias=False)
-    return replace(noise, **estimate_offsets(rows, white, system.times, sessions=system.sessions, information=information,
-                                             known=noise.known, durations=system.durations))
+    return replace(
+        noise,
+        **estimate_offsets(
+            rows,
+            white,
+            system.times,
+            sessions=system.sessions,
+            information=information,
+            known=noise.known,
+            durations=system.durations,
+        ),
+    )
 
 
 def _judged(system, sensor, kind, values) -> BandMisfit:
@@ -227,8 +302,12 @@ def _judged(system, sensor, kind, values) -> BandMisfit:
     dc = coefficient_jacobian(system.model, sensor, values)[:, :, ~fixed_parameters(system.model)]
     along = np.zeros(3)
     for axis in range(3):
-        every, slow = (np.column_stack([rows[:, :-3] @ dc[:, axis], system.misfit(sensor, rows, values)[:, axis]])
-                       for rows in (system.within[sensor][kind], system.accumulator.slow[sensor, kind]))
+        every, slow = (
+            np.column_stack(
+                [rows[:, :-3] @ dc[:, axis], system.misfit(sensor, rows, values)[:, axis]]
+            )
+            for rows in (system.within[sensor][kind], system.accumulator.slow[sensor, kind])
+        )
         squares, rank = misfit_along((every.T @ every - slow.T @ slow)[None])
         along[axis] = squares / max(rank, 1)
     return replace(misfit, fast=np.where(misfit.apart, np.maximum(misfit.fast, along), misfit.fast))
@@ -236,8 +315,14 @@ def _judged(system, sensor, kind, values) -> BandMisfit:
 
 def _misfit_of(system, sensor, kind, values=None) -> BandMisfit:
     """Return the misfit of the centred rows of a kind at `values`; without them, of each part at its own best fit."""
-    rows, n_slow = system.within[sensor][kind], system.accumulator.slow_rows.get(kind, 0) - system.accumulator.windows[kind]
+    rows, n_slow = (
+        system.within[sensor][kind],
+        system.accumulator.slow_rows.get(kind, 0) - system.accumulator.windows[kind],
+    )
     slow = system.accumulator.slow[sensor, kind] if n_slow > 0 else rows[:0]
-    misfits = [own_misfit(part) if values is None else system.misfit(sensor, part, values) for part in (rows, slow)]
+    misfits = [
+        own_misfit(part) if values is None else system.misfit(sensor, part, values)
+        for part in (rows, slow)
+    ]
     total, of_slow = ((misfit**2).sum(axis=0) for misfit in misfits)
     return band_misfit(total, system.dof_within[kind], of_slow, dof_slow=n_slow)

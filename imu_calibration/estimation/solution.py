@@ -47,8 +47,14 @@ def of_fit(terms: Terms) -> np.ndarray:
     return total({name: terms[name] for name in (SAMPLE_NOISE, BIAS_PROCESS) if name in terms})
 
 
-def replace_weak(values: np.ndarray, terms: Terms, prior: np.ndarray, *,
-                 weak: Sequence[int], limit: np.ndarray | float = 1.0) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
+def replace_weak(
+    values: np.ndarray,
+    terms: Terms,
+    prior: np.ndarray,
+    *,
+    weak: Sequence[int],
+    limit: np.ndarray | float = 1.0,
+) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     """
     Return (values, terms, mask of the replaced parameters) with weak values replaced by their prior where that lowers the expected error.
 
@@ -76,13 +82,16 @@ def replace_weak(values: np.ndarray, terms: Terms, prior: np.ndarray, *,
     replaced, smallest = np.zeros(len(values), bool), 1e-12 * np.diag(posterior)
     candidates = [k for k in weak if np.isfinite(prior[k])]
     while candidates := [k for k in candidates if posterior[k, k] > smallest[k]]:
-        ratio = [(moved[k] - prior[k])**2 / posterior[k, k] / limits[k] for k in candidates]
+        ratio = [(moved[k] - prior[k]) ** 2 / posterior[k, k] / limits[k] for k in candidates]
         least = int(np.argmin(ratio))
         if ratio[least] >= 1.0:
             break
         k = candidates.pop(least)
         slope = posterior[:, k] / posterior[k, k]
-        moved, posterior = moved + slope * (prior[k] - moved[k]), posterior - np.outer(slope, posterior[k])
+        moved, posterior = (
+            moved + slope * (prior[k] - moved[k]),
+            posterior - np.outer(slope, posterior[k]),
+        )
         replaced[k] = True
     moved[replaced] = prior[replaced]
     if not replaced.any():
@@ -115,7 +124,9 @@ expected error.
 """
 
 
-def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[float]) -> tuple[Status, ...]:
+def statuses(
+    sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[float]
+) -> tuple[Status, ...]:
     """
     Return the status of each parameter.
 
@@ -129,14 +140,29 @@ def statuses(sd: Iterable[float], held: Iterable[bool], tolerances: Iterable[flo
         Largest standard deviation of a determined parameter, SI.
 
     """
-    return tuple(HELD if h else FIXED if s == 0 else DETERMINED if s <= t else WEAK for h, s, t in zip(held, sd, tolerances, strict=True))
+    return tuple(
+        HELD if h else FIXED if s == 0 else DETERMINED if s <= t else WEAK
+        for h, s, t in zip(held, sd, tolerances, strict=True)
+    )
 
 
-def reasons_held(held: Iterable[bool], names: Iterable[str], replaced: Collection[str], *,
-                 tested: Collection[str] = ()) -> dict[str, str]:
+def reasons_held(
+    held: Iterable[bool],
+    names: Iterable[str],
+    replaced: Collection[str],
+    *,
+    tested: Collection[str] = (),
+) -> dict[str, str]:
     """Return held parameter -> the reason: `replaced` by its prior, for those `tested` by likelihood ratio, or too weak data."""
-    return {name: WEAK_DATA if name not in replaced else LIKELIHOOD_RATIO if name in tested else REPLACEMENT
-            for name, flag in zip(names, held, strict=True) if flag}
+    return {
+        name: WEAK_DATA
+        if name not in replaced
+        else LIKELIHOOD_RATIO
+        if name in tested
+        else REPLACEMENT
+        for name, flag in zip(names, held, strict=True)
+        if flag
+    }
 
 
 def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarray:
@@ -150,7 +176,12 @@ def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarr
 
     """
     overrides = overrides or {}
-    return np.concatenate([np.full(e.size, float(overrides.get(e.sensor, {}).get(e.name, e.tolerance))) for e in model.effects])
+    return np.concatenate(
+        [
+            np.full(e.size, float(overrides.get(e.sensor, {}).get(e.name, e.tolerance)))
+            for e in model.effects
+        ]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +240,17 @@ class Solution:
     @property
     def judged_sd(self) -> np.ndarray:
         """Standard deviations that are compared with the tolerances, shape (n_params,)."""
-        return np.sqrt(np.diag(total({name: term for name, term in self.terms.items() if name not in self.judged_without})))
+        return np.sqrt(
+            np.diag(
+                total(
+                    {
+                        name: term
+                        for name, term in self.terms.items()
+                        if name not in self.judged_without
+                    }
+                )
+            )
+        )
 
     @property
     def prior_mean(self) -> np.ndarray:
@@ -242,10 +283,20 @@ def with_weak_replaced(solution: AnySolution, tolerances: np.ndarray) -> AnySolu
     effects = solution.model.effects
     applied = np.repeat([e.compensation == 'exact' for e in effects], [e.size for e in effects])
     weak = np.flatnonzero(applied & ~solution.held & (solution.judged_sd > tolerances))
-    values, terms, replaced = replace_weak(solution.values, solution.terms, solution.prior_mean, weak=weak.tolist(),
-                                           limit=solution.replacement_limit)
-    return replace(solution, values=values, terms=terms, held=solution.held | replaced,
-                   replaced=tuple(np.array(solution.param_names)[replaced].tolist()))
+    values, terms, replaced = replace_weak(
+        solution.values,
+        solution.terms,
+        solution.prior_mean,
+        weak=weak.tolist(),
+        limit=solution.replacement_limit,
+    )
+    return replace(
+        solution,
+        values=values,
+        terms=terms,
+        held=solution.held | replaced,
+        replaced=tuple(np.array(solution.param_names)[replaced].tolist()),
+    )
 
 
 CONVENTION_SHARE = 1e-9
@@ -278,6 +329,10 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
         known = sizes > CONVENTION_SHARE * sizes[-1]
         far = directions[:, known].T @ ((values[at] - prior[at]) / sd)
         chi2 = float((far**2 / sizes[known]).sum())
-        step = directions[:, known] @ (far / sizes[known]) / sd   # inverse covariance times the distance
-        values -= min(1.0, known.sum() / max(chi2, 1e-300)) * np.where(solution.held, 0.0, covariance[:, at] @ step)
+        step = (
+            directions[:, known] @ (far / sizes[known]) / sd
+        )  # inverse covariance times the distance
+        values -= min(1.0, known.sum() / max(chi2, 1e-300)) * np.where(
+            solution.held, 0.0, covariance[:, at] @ step
+        )
     return solution.at(values)

@@ -12,7 +12,12 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, not_separable
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
-from imu_calibration.estimation.scaled_solve import covariance_with_held, inverse_gram, inverse_normal, scaled_lstsq
+from imu_calibration.estimation.scaled_solve import (
+    covariance_with_held,
+    inverse_gram,
+    inverse_normal,
+    scaled_lstsq,
+)
 from imu_calibration.estimation.session_noise import first_noise, updated_noise
 from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE, Solution
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
@@ -51,8 +56,14 @@ def _outlier_windows(system, values, noises):
     """
     found, kinds = {}, np.array(system.kinds)
     for sensor in SENSORS:
-        fit, out = _Fit.of(system, sensor, values, noises[sensor]), np.array([key in noises[sensor].left_out for key in system.keys])
-        worst = min((_of_kind(kinds == kind, out, fit) for kind in sorted(set(system.kinds))), key=lambda of_kind: of_kind[0])
+        fit, out = (
+            _Fit.of(system, sensor, values, noises[sensor]),
+            np.array([key in noises[sensor].left_out for key in system.keys]),
+        )
+        worst = min(
+            (_of_kind(kinds == kind, out, fit) for kind in sorted(set(system.kinds))),
+            key=lambda of_kind: of_kind[0],
+        )
         found[sensor] = frozenset(system.keys[at] for at in worst[1])
     return found
 
@@ -61,7 +72,11 @@ def _of_kind(own: np.ndarray, out: np.ndarray, fit: '_Fit') -> tuple[float, list
     """Return (the smallest p-value, the numbers of the outliers among the windows `own`), without the windows `out`."""
     count, kept = int(own.sum()), np.flatnonzero(own & ~out)
     allowed = max(1, int(MAX_WINDOW_OUTLIERS * count)) - (count - len(kept))
-    worst = kept[np.argsort(-(fit.rest[kept]**2).sum(axis=1), kind='stable')][:OUTLIER_CANDIDATES] if allowed > 0 else []
+    worst = (
+        kept[np.argsort(-(fit.rest[kept] ** 2).sum(axis=1), kind='stable')][:OUTLIER_CANDIDATES]
+        if allowed > 0
+        else []
+    )
     found = sorted((fit.p_value(at, kept) * len(kept), at) for at in worst)[:allowed]
     return found[0][0] if found else 1.0, [at for chance, at in found if chance < OUTLIER_P_VALUE]
 
@@ -80,12 +95,18 @@ class _Fit:
     """Function that whitens columns, shape (n_windows, 3, k)."""
 
     @classmethod
-    def of(cls, system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel) -> '_Fit':
+    def of(
+        cls, system: WeightedSystem, sensor: str, values: np.ndarray, noise: NoiseModel
+    ) -> '_Fit':
         rows, normal = system.linearised(sensor, values, noise)
         white = system.whitened(rows, noise)
         design, q = white[:, :, :-1], white.shape[2] - 1
-        return cls(white[:, :, -1], design, inverse_normal(normal[:q, :q] + np.einsum('kap,kaq->pq', design, design)),
-                   lambda columns: system.whitened(columns, noise))
+        return cls(
+            white[:, :, -1],
+            design,
+            inverse_normal(normal[:q, :q] + np.einsum('kap,kaq->pq', design, design)),
+            lambda columns: system.whitened(columns, noise),
+        )
 
     def p_value(self, at: int, own: np.ndarray) -> float:
         """Return the p-value of the improvement of the windows `own` by a separate offset for window `at`."""
@@ -97,12 +118,17 @@ class _Fit:
         if np.any(seen < LEAST_SEEN * (one**2).sum(axis=0)):
             return 1.0
         size = (one * self.rest).sum(axis=0) / seen
-        better = self.rest - (one - np.einsum('kap,pq,aq->ka', self.design, self.covariance, along)) * size
-        leverage = np.einsum('kap,pq,kaq->ka', self.design[own], self.covariance, self.design[own]).sum()
+        better = (
+            self.rest
+            - (one - np.einsum('kap,pq,aq->ka', self.design, self.covariance, along)) * size
+        )
+        leverage = np.einsum(
+            'kap,pq,kaq->ka', self.design[own], self.covariance, self.design[own]
+        ).sum()
         spare = 3 * len(own) - leverage - 3
         if spare < MIN_WINDOW_FREEDOM:
             return 1.0
-        total, others = ((part[own]**2).sum() for part in (self.rest, better))
+        total, others = ((part[own] ** 2).sum() for part in (self.rest, better))
         return chance_of_fall(total - others, 3, rest=others, spare=spare)
 
 
@@ -133,29 +159,42 @@ def _implausible_estimates(system, values, *, sd, noises, free):
         Parameters that were estimated.
 
     """
-    found, feigned = np.zeros(len(values), bool), {sensor: _feigned(system, sensor, values, noises[sensor]) for sensor in SENSORS}
+    found, feigned = (
+        np.zeros(len(values), bool),
+        {sensor: _feigned(system, sensor, values, noises[sensor]) for sensor in SENSORS},
+    )
     for effect in system.model.effects:
         part = system.model.slices[effect.key]
         if effect.role is Role.OFFSET or not np.isfinite(_limit(effect)):
             continue
         size = np.abs(values[part] - system.prior.mean[part])
         sensors = (effect.sensor,) if effect.sensor in SENSORS else effect.acts_on
-        strange = free[part] & (size > _limit(effect)) & (size < sd[part] * max(feigned[sensor] for sensor in sensors))
+        strange = (
+            free[part]
+            & (size > _limit(effect))
+            & (size < sd[part] * max(feigned[sensor] for sensor in sensors))
+        )
         found[part] = strange if effect.role is Role.LINEAR else free[part] & strange.any()
     return found
 
 
 def _limit(effect: Effect) -> float:
-    return MAX_PRIOR_SDS * float(np.max(effect.prior_sds())) if effect.role is Role.LINEAR else effect.largest
+    return (
+        MAX_PRIOR_SDS * float(np.max(effect.prior_sds()))
+        if effect.role is Role.LINEAR
+        else effect.largest
+    )
 
 
 def _feigned(system, sensor, values, noise):
     """Return the largest shift, in sds of noise, of a parameter of the worst axis by all excess misfit of moving windows."""
     rested = any(row.kind == 'static' for row in system.accumulator.rows)
-    rest = REST_NOISE_MARGIN * np.maximum(noise.low_variance, noise.white_variance) if rested else 0.0
+    rest = (
+        REST_NOISE_MARGIN * np.maximum(noise.low_variance, noise.white_variance) if rested else 0.0
+    )
     total = np.zeros(3)
     for kind, factor in system.within[sensor].items():
-        squares = (system.misfit(sensor, factor, values)**2).sum(axis=0)
+        squares = (system.misfit(sensor, factor, values) ** 2).sum(axis=0)
         weight = noise.low_variance * (noise.moving[kind].slow if kind in noise.moving else 1.0)
         total += np.maximum(squares - system.dof_within[kind] * rest, 0.0) / weight
     return float(np.sqrt(total.max()))
@@ -169,8 +208,14 @@ LEAVING_ROUNDS = 5
 """Largest number of rounds of outlier exclusion; one outlier may hide another."""
 
 
-def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool = True, noise: dict[str, NoiseModel] | None = None,
-          bias_processes: dict[str, tuple[BiasProcess, ...]] | None = None) -> Solution:
+def solve(
+    accumulator: Accumulator,
+    model: SensorModel,
+    *,
+    allow_holding: bool = True,
+    noise: dict[str, NoiseModel] | None = None,
+    bias_processes: dict[str, tuple[BiasProcess, ...]] | None = None,
+) -> Solution:
     """
     Estimate all parameters jointly from accumulated windows.
 
@@ -200,8 +245,11 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
 
     """
     if not accumulator.rows:
-        raise NotObservableError('at least one static window, spin or dynamic stretch must be found, none was; '
-                                 'rest the table between moves, or check the joint states', code='no_windows')
+        raise NotObservableError(
+            'at least one static window, spin or dynamic stretch must be found, none was; '
+            'rest the table between moves, or check the joint states',
+            code='no_windows',
+        )
     system = WeightedSystem(accumulator, model)
     prior, values, free = system.prior, start(system), ~fixed_parameters(model)
     noises = noise or first_noise(system, values, bias_processes or {})
@@ -211,7 +259,9 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
             more = _outlier_windows(system, values, noises)
             if not any(more.values()):
                 break
-            smaller = {s: replace(noises[s], left_out=noises[s].left_out | more[s]) for s in SENSORS}
+            smaller = {
+                s: replace(noises[s], left_out=noises[s].left_out | more[s]) for s in SENSORS
+            }
             values, noises = _with_noise(system, values, smaller, free)
     factors = _factors(system, noises)
     values = _minimised(system, values, factors, free)
@@ -222,17 +272,40 @@ def solve(accumulator: Accumulator, model: SensorModel, *, allow_holding: bool =
         if held.any():
             values = _minimised(system, np.where(held, prior.mean, values), factors, free & ~held)
         data = system.jacobian(values, factors)
-        own, of_held = covariance_with_held(np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd)
-        strange = _implausible_estimates(system, values, sd=np.sqrt(np.diag(own + of_held)), noises=noises, free=free & ~held)
+        own, of_held = covariance_with_held(
+            np.concatenate([data, prior.root]), free & ~held, held, prior_sd=prior.sd
+        )
+        strange = _implausible_estimates(
+            system, values, sd=np.sqrt(np.diag(own + of_held)), noises=noises, free=free & ~held
+        )
         if not allow_holding or not strange.any() or (held | strange | ~free).all():
             break
-        not_believed |= {name: float(value) for name, value, flag in zip(model.param_names, values, strange) if flag}
+        not_believed |= {
+            name: float(value)
+            for name, value, flag in zip(model.param_names, values, strange)
+            if flag
+        }
         held |= strange
     of_bias = own @ system.bias_information(values, noises) @ own
-    terms = {SAMPLE_NOISE: own - of_bias, BIAS_PROCESS: of_bias, HELD_PRIORS: of_held,
-             **model_error(system, values, noises, free=free & ~held).terms(own + of_held)}
+    terms = {
+        SAMPLE_NOISE: own - of_bias,
+        BIAS_PROCESS: of_bias,
+        HELD_PRIORS: of_held,
+        **model_error(system, values, noises, free=free & ~held).terms(own + of_held),
+    }
     chi2, rms = _fit_quality(system, values, noises)
-    return Solution(model, values, terms, held, noises, chi2, data.T @ data, rms, _session_biases(system, values, noises), not_believed)
+    return Solution(
+        model,
+        values,
+        terms,
+        held,
+        noises,
+        chi2,
+        data.T @ data,
+        rms,
+        _session_biases(system, values, noises),
+        not_believed,
+    )
 
 
 def _with_noise(system, values, noises, free):
@@ -244,7 +317,10 @@ def _with_noise(system, values, noises, free):
     """
     for _ in range(NOISE_ROUNDS):
         values = _minimised(system, values, _factors(system, noises), free, enough=0.01)
-        before, noises = noises, {s: updated_noise(system, s, values, noise=noises[s]) for s in SENSORS}
+        before, noises = (
+            noises,
+            {s: updated_noise(system, s, values, noise=noises[s]) for s in SENSORS},
+        )
         if all(noises[s].weighs_alike(before[s]) for s in SENSORS):
             break
     return values, noises
@@ -253,11 +329,16 @@ def _with_noise(system, values, noises, free):
 def _refuse(without, held, model, allow_holding):
     names = [name for name, flag in zip(model.param_names, held) if flag]
     if without.all():
-        raise NotObservableError('the recording must determine at least one parameter, it determines none; '
-                                 'record static positions in at least four different attitudes')
+        raise NotObservableError(
+            'the recording must determine at least one parameter, it determines none; '
+            'record static positions in at least four different attitudes'
+        )
     if held.any() and not allow_holding:
-        raise NotObservableError(f"every parameter must be determined, {len(names)} are not: {', '.join(names)}; "
-                                 'record more motion or allow holding', code='undetermined')
+        raise NotObservableError(
+            f'every parameter must be determined, {len(names)} are not: {", ".join(names)}; '
+            'record more motion or allow holding',
+            code='undetermined',
+        )
 
 
 def start(system: WeightedSystem) -> np.ndarray:
@@ -267,14 +348,21 @@ def start(system: WeightedSystem) -> np.ndarray:
     values = np.where(np.isfinite(values), values, 0.0)
     for sensor in SENSORS:
         every = np.arange(model.layout(sensor).width)
-        chosen = np.concatenate([every[model.columns_of(sensor, role)] for role in (Role.OFFSET, Role.LINEAR)])
+        chosen = np.concatenate(
+            [every[model.columns_of(sensor, role)] for role in (Role.OFFSET, Role.LINEAR)]
+        )
         means = system.means[sensor]
         weight = np.sqrt(system.counts / system.counts.max())[:, None]
         penalty = 1e-6 * np.eye(4)
         target = np.concatenate([np.zeros((1, 3)), np.eye(3)])
         design = np.concatenate([weight * means[:, chosen], penalty])
-        solution = np.linalg.lstsq(design, np.concatenate([weight * means[:, -3:], penalty @ target]), rcond=None)[0]
-        values[model.part(sensor, Role.OFFSET)], values[model.part(sensor, Role.LINEAR)] = solution[0], solution[1:].T.ravel()
+        solution = np.linalg.lstsq(
+            design, np.concatenate([weight * means[:, -3:], penalty @ target]), rcond=None
+        )[0]
+        values[model.part(sensor, Role.OFFSET)], values[model.part(sensor, Role.LINEAR)] = (
+            solution[0],
+            solution[1:].T.ravel(),
+        )
     return values
 
 
@@ -285,10 +373,13 @@ def _factors(system, noises):
 def _minimised(system, values, factors, free, enough=1e-7):
     """Gauss-Newton with step halving on the triangular factors, until steps are below `enough` standard deviations."""
     for _ in range(40):
-        residual, data = system.residuals(values, factors), system.jacobian(values, factors)[:, free]
+        residual, data = (
+            system.residuals(values, factors),
+            system.jacobian(values, factors)[:, free],
+        )
         step = scaled_lstsq(np.concatenate([data, system.prior.root[:, free]]), -residual)
         values, cost = _halved(system, values, step, free, factors, residual @ residual)
-        sd_steps = np.abs(step) * np.sqrt((data**2).sum(axis=0) + 1 / system.prior.sd[free]**2)
+        sd_steps = np.abs(step) * np.sqrt((data**2).sum(axis=0) + 1 / system.prior.sd[free] ** 2)
         if np.max(sd_steps, initial=0.0) < enough * max(1.0, 1e-7 * np.sqrt(cost)):
             break
     return values
@@ -333,11 +424,15 @@ def _fit_quality(system, values, noises):
         white = system.whitened(misfit[:, :, None], noise)
         quality['means'] = float((white**2).sum() / max(white.size - _used(system, sensor), 1))
         for kind, factor in system.within[sensor].items():
-            squares = (system.misfit(sensor, factor, values)**2).sum(axis=0)
-            quality[kind] = float(np.mean(squares / (system.dof_within[kind] * noise.white_variance)))
+            squares = (system.misfit(sensor, factor, values) ** 2).sum(axis=0)
+            quality[kind] = float(
+                np.mean(squares / (system.dof_within[kind] * noise.white_variance))
+            )
             moving, count = moving + squares.sum(), count + 3 * system.dof_within[kind]
         chi2[sensor] = quality
-        rms[sensor] = np.array([np.sqrt(moving / count) if count else np.nan, np.sqrt((misfit**2).mean())])
+        rms[sensor] = np.array(
+            [np.sqrt(moving / count) if count else np.nan, np.sqrt((misfit**2).mean())]
+        )
     return chi2, rms
 
 
@@ -348,8 +443,15 @@ def _session_biases(system, values, noises):
         noise = noises[sensor]
         if noise.session_variance > 0:
             misfit = system.misfit(sensor, system.means[sensor], values)
-            found[sensor] = values[system.model.part(sensor, Role.OFFSET)] + predict_session_offsets(
-                misfit, system.mean_variance(noise) + noise.offset_sd**2, system.times, sessions=system.sessions, noise=noise)
+            found[sensor] = values[
+                system.model.part(sensor, Role.OFFSET)
+            ] + predict_session_offsets(
+                misfit,
+                system.mean_variance(noise) + noise.offset_sd**2,
+                system.times,
+                sessions=system.sessions,
+                noise=noise,
+            )
     return found
 
 

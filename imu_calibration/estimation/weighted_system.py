@@ -56,7 +56,9 @@ def make_prior(model: SensorModel) -> Prior:
 
 def fixed_parameters(model: SensorModel) -> np.ndarray:
     """Return a mask of parameters that least squares does not estimate (saturation is censoring, not a column)."""
-    return np.concatenate([np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects])
+    return np.concatenate(
+        [np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects]
+    )
 
 
 EXCLUDED_MEAN_SD_FACTOR = 1e3
@@ -77,14 +79,28 @@ class WeightedSystem:
     def __init__(self, accumulator: Accumulator, model: SensorModel):
         self.model, self.prior, self.accumulator = model, make_prior(model), accumulator
         rows = accumulator.rows
-        self.dof_within = {k: max(accumulator.samples[k] - accumulator.windows[k], 1) for k in accumulator.samples}
+        self.dof_within = {
+            k: max(accumulator.samples[k] - accumulator.windows[k], 1) for k in accumulator.samples
+        }
         self.means = {s: np.array([row.sensors[s].mean for row in rows]) for s in SENSORS}
         """Sensor -> mean rows, shape (n_windows, p + 3)."""
-        self.within = {s: {k: f for (sensor, k), f in sorted(accumulator.within.items()) if sensor == s and len(f)} for s in SENSORS}
+        self.within = {
+            s: {
+                k: f
+                for (sensor, k), f in sorted(accumulator.within.items())
+                if sensor == s and len(f)
+            }
+            for s in SENSORS
+        }
         """Sensor -> kind -> factor of the centred rows."""
-        self.times, self.counts, self.durations = np.array([(row.time, row.count, row.duration) for row in rows]).T
+        self.times, self.counts, self.durations = np.array(
+            [(row.time, row.count, row.duration) for row in rows]
+        ).T
         """Middle (s), number of samples and length (s) of each window."""
-        self.kinds, self.keys = [row.kind for row in rows], [(row.session, row.time) for row in rows]
+        self.kinds, self.keys = (
+            [row.kind for row in rows],
+            [(row.session, row.time) for row in rows],
+        )
         """Kind, and (recording, middle in s), of each window."""
         self.sessions = sessions_of(rows)
         """Indices of each recording's windows in order of time."""
@@ -99,11 +115,14 @@ class WeightedSystem:
 
         Relative to the bias in the middle of each window, or of the noise within windows and of the reference only.
         """
-        variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(self.kinds, self.counts, self.durations,
-                                                                                            keys=self.keys)
+        variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(
+            self.kinds, self.counts, self.durations, keys=self.keys
+        )
         if noise.left_out:
             out = np.array([key in noise.left_out for key in self.keys])
-            variance[out] = EXCLUDED_MEAN_SD_FACTOR**2 * (variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance)
+            variance[out] = EXCLUDED_MEAN_SD_FACTOR**2 * (
+                variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance
+            )
         return variance
 
     def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:
@@ -112,7 +131,13 @@ class WeightedSystem:
 
     def _whitening(self, noise):
         variance = self.mean_variance(noise) + noise.offset_sd**2
-        return Whitening(variance, self.times, self.sessions, processes=noise.bias_processes, session_variance=noise.session_variance)
+        return Whitening(
+            variance,
+            self.times,
+            self.sessions,
+            processes=noise.bias_processes,
+            session_variance=noise.session_variance,
+        )
 
     def bias_information(self, values: np.ndarray, noises: dict[str, NoiseModel]) -> np.ndarray:
         """
@@ -123,7 +148,10 @@ class WeightedSystem:
         """
         total = np.zeros((len(values),) * 2)
         for sensor in SENSORS:
-            slope, whitening = coefficient_jacobian(self.model, sensor, values), self._whitening(noises[sensor])
+            slope, whitening = (
+                coefficient_jacobian(self.model, sensor, values),
+                self._whitening(noises[sensor]),
+            )
             white = whitening(np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope))
             information = np.einsum('kap,kaq->pq', white, white)
             weighed = whitening.adjoint(white)
@@ -133,7 +161,12 @@ class WeightedSystem:
 
     def whitened_means(self, sensor: str, noise: NoiseModel) -> np.ndarray:
         """Return the whitened mean rows ``[columns | output]`` of each axis, shape (n_windows, 3, p + 1)."""
-        return self.whitened(np.stack([self.means[sensor][:, self.columns_and(sensor, axis)] for axis in range(3)], axis=1), noise)
+        return self.whitened(
+            np.stack(
+                [self.means[sensor][:, self.columns_and(sensor, axis)] for axis in range(3)], axis=1
+            ),
+            noise,
+        )
 
     def columns_and(self, sensor: str, axis: int) -> list[int]:
         """Return the places of all columns and of the output of one axis in rows of a sensor."""
@@ -143,12 +176,24 @@ class WeightedSystem:
     def factors(self, sensor: str, noise: NoiseModel) -> list[np.ndarray]:
         """Return for each axis the triangular factor of all whitened rows ``[columns | output]``."""
         white, weighed = self.whitened_means(sensor, noise), list(self.weighed_rows(sensor, noise))
-        return [triangular(np.concatenate([white[:, axis],
-                                           *(rows[:, self.columns_and(sensor, axis)] * weight[axis] for rows, weight in weighed)]))
-                for axis in range(3)]
+        return [
+            triangular(
+                np.concatenate(
+                    [
+                        white[:, axis],
+                        *(
+                            rows[:, self.columns_and(sensor, axis)] * weight[axis]
+                            for rows, weight in weighed
+                        ),
+                    ]
+                )
+            )
+            for axis in range(3)
+        ]
 
-    def weighed_rows(self, sensor: str, noise: NoiseModel,
-                     part: Accumulator | WindowBlock | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def weighed_rows(
+        self, sensor: str, noise: NoiseModel, part: Accumulator | WindowBlock | None = None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
         Yield (centred rows, weight of each axis (3,)): all rows of each kind, and again the slow ones where these have more weight.
 
@@ -167,7 +212,10 @@ class WeightedSystem:
         parts = []
         for sensor in SENSORS:
             c = coefficients(self.model, sensor, values)
-            parts += [factor[:, :-1] @ c[:, axis] - factor[:, -1] for axis, factor in enumerate(factors[sensor])]
+            parts += [
+                factor[:, :-1] @ c[:, axis] - factor[:, -1]
+                for axis, factor in enumerate(factors[sensor])
+            ]
         return np.concatenate(parts + [self.prior.root @ (values - self.prior.mean)])
 
     def jacobian(self, values: np.ndarray, factors: dict) -> np.ndarray:
@@ -178,7 +226,9 @@ class WeightedSystem:
             parts += [factor[:, :-1] @ dc[:, axis] for axis, factor in enumerate(factors[sensor])]
         return np.concatenate(parts)
 
-    def linearised(self, sensor: str, values: np.ndarray, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
+    def linearised(
+        self, sensor: str, values: np.ndarray, noise: NoiseModel
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return mean rows in coordinates of the parameters of one sensor, and the normal matrix of centred rows and prior.
 
@@ -194,7 +244,7 @@ class WeightedSystem:
         own = np.flatnonzero(np.any(dc != 0, axis=(0, 1)))
         gauge = self.prior.gauge[:, own]
         basis = scipy.linalg.null_space(gauge) if gauge.any() else np.eye(len(own))
-        dc, root = dc[:, :, own] @ basis, self.prior.root[:-len(gauge) or None, own]
+        dc, root = dc[:, :, own] @ basis, self.prior.root[: -len(gauge) or None, own]
         means = self.means[sensor]
         design = np.einsum('kp,paq->kaq', means[:, :-3], dc)
         rows = np.concatenate([design, self.misfit(sensor, means, values)[:, :, None]], axis=2)
@@ -203,6 +253,10 @@ class WeightedSystem:
         parts = [np.concatenate([root[used] @ basis, offset[:, None]], axis=1)]
         for factor, weight in self.weighed_rows(sensor, noise):
             rest = self.misfit(sensor, factor, values)
-            parts += [np.concatenate([factor[:, :-3] @ dc[:, axis], rest[:, axis:axis + 1]], axis=1) * weight[axis] for axis in range(3)]
+            parts += [
+                np.concatenate([factor[:, :-3] @ dc[:, axis], rest[:, axis : axis + 1]], axis=1)
+                * weight[axis]
+                for axis in range(3)
+            ]
         stacked = np.concatenate(parts)
         return rows, stacked.T @ stacked

@@ -30,16 +30,31 @@ class Whitening:
 
     """
 
-    def __init__(self, variance: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], *, processes: Sequence[BiasProcess] = (),
-                 session_variance: float = 0.0):
-        self._variance, self._sessions, self._session_variance = variance, sessions, session_variance
+    def __init__(
+        self,
+        variance: np.ndarray,
+        times: np.ndarray,
+        sessions: list[np.ndarray],
+        *,
+        processes: Sequence[BiasProcess] = (),
+        session_variance: float = 0.0,
+    ):
+        self._variance, self._sessions, self._session_variance = (
+            variance,
+            sessions,
+            session_variance,
+        )
         self._filter, self._ones = None, None
         processes = [process for process in processes if process.sd > 0]
         if processes:
             self._order = np.concatenate(sessions)
             steps = np.diff(times[self._order], prepend=-np.inf)
             steps[np.cumsum([len(index) for index in sessions])[:-1]] = np.inf
-            self._filter = _Filter(self._chained(variance[:, :, None])[:, 0], np.tile(steps, variance.shape[1]), processes)
+            self._filter = _Filter(
+                self._chained(variance[:, :, None])[:, 0],
+                np.tile(steps, variance.shape[1]),
+                processes,
+            )
         if session_variance > 0:
             self._ones = self._filtered(np.ones(variance.shape + (1,)))[:, :, 0]
 
@@ -56,7 +71,10 @@ class Whitening:
         """Logarithm of the determinant of the covariance, all axes together."""
         logs = np.log(self._variance if self._filter is None else self._filter.total).sum()
         if self._ones is not None:
-            logs += sum(np.log1p(self._session_variance * (self._ones[index]**2).sum(axis=0)).sum() for index in self._sessions)
+            logs += sum(
+                np.log1p(self._session_variance * (self._ones[index] ** 2).sum(axis=0)).sum()
+                for index in self._sessions
+            )
         return float(logs)
 
     def _chained(self, values):
@@ -77,7 +95,9 @@ class Whitening:
             ones = self._ones[index]
             square = (ones**2).sum(axis=0)
             shrink = (1 - 1 / np.sqrt(1 + self._session_variance * square)) / square
-            white[index] -= (shrink * ones)[:, :, None] * np.einsum('ka,kaq->aq', ones, white[index])
+            white[index] -= (shrink * ones)[:, :, None] * np.einsum(
+                'ka,kaq->aq', ones, white[index]
+            )
         return white
 
 
@@ -86,8 +106,15 @@ class _Filter:
 
     def __init__(self, variance, steps, processes):
         power, times = np.array([(process.sd**2, process.time) for process in processes]).T
-        decay, fresh = np.exp(-steps[:, None] / times), -np.expm1(-2 * steps[:, None] / times) * power
-        self.total, gain = _gains_of_one(variance, decay[:, 0], fresh[:, 0]) if len(power) == 1 else _gains(variance, decay, fresh)
+        decay, fresh = (
+            np.exp(-steps[:, None] / times),
+            -np.expm1(-2 * steps[:, None] / times) * power,
+        )
+        self.total, gain = (
+            _gains_of_one(variance, decay[:, 0], fresh[:, 0])
+            if len(power) == 1
+            else _gains(variance, decay, fresh)
+        )
         self._width, self._driven_by = len(power), decay[1:] * gain[:-1]
         # the states follow s_k = F_k s_(k-1) + u_k with F_k = diag(decay) (I - gain 1'): a banded system for all of them at once
         width = self._width
@@ -95,13 +122,21 @@ class _Filter:
         self._bands[0] = 1.0
         for i in range(width):
             for j in range(width):
-                self._bands[width + i - j, j:-width:width] = -decay[2:, i] * ((i == j) - gain[1:-1, i])
+                self._bands[width + i - j, j:-width:width] = -decay[2:, i] * (
+                    (i == j) - gain[1:-1, i]
+                )
 
     def forward(self, values):
         if len(values) > 1:
-            driven = np.asfortranarray((self._driven_by[:, :, None] * values[:-1, None, :]).reshape(-1, values.shape[1]))
+            driven = np.asfortranarray(
+                (self._driven_by[:, :, None] * values[:-1, None, :]).reshape(-1, values.shape[1])
+            )
             states = lapack.dtbtrs(self._bands, driven, uplo='L', diag='U', overwrite_b=1)[0]
-            values[1:] -= states if self._width == 1 else states.reshape(len(values) - 1, self._width, -1).sum(axis=1)
+            values[1:] -= (
+                states
+                if self._width == 1
+                else states.reshape(len(values) - 1, self._width, -1).sum(axis=1)
+            )
         values /= np.sqrt(self.total)[:, None]
         return values
 
@@ -109,7 +144,9 @@ class _Filter:
         values /= np.sqrt(self.total)[:, None]
         if len(values) > 1:
             states = np.asfortranarray(np.repeat(values[1:], self._width, axis=0))
-            driven = lapack.dtbtrs(self._bands, states, uplo='L', trans='T', diag='U', overwrite_b=1)[0]
+            driven = lapack.dtbtrs(
+                self._bands, states, uplo='L', trans='T', diag='U', overwrite_b=1
+            )[0]
             driven = driven.reshape(len(values) - 1, self._width, -1)
             values[:-1] -= np.einsum('kj,kjq->kq', self._driven_by, driven)
         return values
@@ -117,7 +154,11 @@ class _Filter:
 
 def _gains(variance, decay, fresh):
     """Return (variances of the innovations, shape (n,), gains, shape (n, m)) of m processes."""
-    spread, total, gain = np.zeros((decay.shape[1],) * 2), np.empty(len(variance)), np.empty(decay.shape)
+    spread, total, gain = (
+        np.zeros((decay.shape[1],) * 2),
+        np.empty(len(variance)),
+        np.empty(decay.shape),
+    )
     for k, own in enumerate(variance):
         spread = decay[k][:, None] * spread * decay[k] + np.diag(fresh[k])
         reach = spread.sum(axis=1)
@@ -138,12 +179,20 @@ def _gains_of_one(variance, decay, fresh):
     diagonal[1:] += decay[1:] * carried
     total, _, info = lapack.dpttrf(diagonal, -carried)
     if info:
-        raise FloatingPointError('the covariance of the window means must be positive definite; variances are not finite')
+        raise FloatingPointError(
+            'the covariance of the window means must be positive definite; variances are not finite'
+        )
     return total, (1 - variance / total)[:, None]
 
 
-def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.ndarray, *, sessions: list[np.ndarray],
-                            noise: NoiseModel) -> np.ndarray:
+def predict_session_offsets(
+    misfit: np.ndarray,
+    variance: np.ndarray,
+    times: np.ndarray,
+    *,
+    sessions: list[np.ndarray],
+    noise: NoiseModel,
+) -> np.ndarray:
     """
     Return the offset of each session, shape (n_sessions, 3): the weighted mean of its residuals, drawn towards zero by its noise.
 
@@ -154,10 +203,17 @@ def predict_session_offsets(misfit: np.ndarray, variance: np.ndarray, times: np.
     noise : NoiseModel
 
     """
-    rows = Whitening(variance, times, sessions, processes=noise.bias_processes)(np.stack([np.ones_like(misfit), misfit], axis=2))
+    rows = Whitening(variance, times, sessions, processes=noise.bias_processes)(
+        np.stack([np.ones_like(misfit), misfit], axis=2)
+    )
     ones, rest = np.moveaxis(rows, 2, 0)
     parts = ((ones[index], rest[index]) for index in sessions)
-    return np.array([(one * left).sum(axis=0) / ((one**2).sum(axis=0) + 1 / noise.session_variance) for one, left in parts])
+    return np.array(
+        [
+            (one * left).sum(axis=0) / ((one**2).sum(axis=0) + 1 / noise.session_variance)
+            for one, left in parts
+        ]
+    )
 
 
 class RestrictedLikelihood:
@@ -177,23 +233,42 @@ class RestrictedLikelihood:
 
     """
 
-    def __init__(self, rows: np.ndarray, times: np.ndarray, sessions: list[np.ndarray], *, information: np.ndarray | None = None):
+    def __init__(
+        self,
+        rows: np.ndarray,
+        times: np.ndarray,
+        sessions: list[np.ndarray],
+        *,
+        information: np.ndarray | None = None,
+    ):
         self._rows, self._times, self._sessions = rows, times, sessions
         self._information = np.zeros((rows.shape[2],) * 2) if information is None else information
 
     def of_axes(self, axes: np.ndarray) -> 'RestrictedLikelihood':
         """Return the same of the rows of some axes only."""
-        return RestrictedLikelihood(self._rows[:, axes], self._times, self._sessions, information=self._information)
+        return RestrictedLikelihood(
+            self._rows[:, axes], self._times, self._sessions, information=self._information
+        )
 
-    def whitened(self, variance: np.ndarray, processes: Sequence[BiasProcess] = (), session_variance: float = 0.0) -> tuple[float,
-                                                                                                                            np.ndarray]:
+    def whitened(
+        self,
+        variance: np.ndarray,
+        processes: Sequence[BiasProcess] = (),
+        session_variance: float = 0.0,
+    ) -> tuple[float, np.ndarray]:
         """
         Return log|V| and the normal matrix of ``[design | residual]`` weighted with V^-1, `information` included.
 
         For independent variances of the rows, shape (n, n_axes), bias processes and an offset per session.
         Minus twice the log likelihood is log|V| plus the `profile` of the matrix.
         """
-        whitening = Whitening(variance, self._times, self._sessions, processes=processes, session_variance=session_variance)
+        whitening = Whitening(
+            variance,
+            self._times,
+            self._sessions,
+            processes=processes,
+            session_variance=session_variance,
+        )
         white = whitening(self._rows).reshape(-1, self._rows.shape[2])
         return whitening.log_determinant, self._information + white.T @ white
 
@@ -215,15 +290,20 @@ class RestrictedLikelihood:
             n_groups).
 
         """
-        white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(-1, self._rows.shape[2])
+        white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(
+            -1, self._rows.shape[2]
+        )
         some, factor = members.any(axis=0), triangular_of_band(white)
-        white, weighted = white[some], (members / variance.ravel())[:, some]   # the cost grows with the square of the rows
+        white, weighted = (
+            white[some],
+            (members / variance.ravel())[:, some],
+        )  # the cost grows with the square of the rows
         left = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
         rest = white[:, -1] - left @ factor[:-1, -1]
         redundancy = 1 - np.einsum('ij,ij->i', left, left)
         spread = left @ left.T
         spread[np.diag_indices_from(spread)] -= 1
-        np.square(spread, out=spread)   # in place: the square of the number of rows
+        np.square(spread, out=spread)  # in place: the square of the number of rows
         return 0.5 * weighted @ (rest**2 - redundancy), 0.5 * weighted @ spread @ weighted.T
 
 
@@ -233,7 +313,7 @@ def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
         return 0.0, normal
     scale = np.sqrt(np.maximum(np.diag(normal)[:count], 1e-300))
     scaled = normal[:count, :count] / np.outer(scale, scale)
-    scaled.flat[::count + 1] += JITTER
+    scaled.flat[:: count + 1] += JITTER
     factor = np.linalg.cholesky(scaled)
     solved = lapack.dtrtrs(factor, normal[:count, count:] / scale[:, None], lower=1)[0]
     logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum()

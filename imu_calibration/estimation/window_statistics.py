@@ -45,7 +45,9 @@ def count_pieces(duration: float) -> int:
     return max(round(duration / PIECE_TIME), 1)
 
 
-def moving_pieces(rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *, rate_s: np.ndarray) -> dict[str, np.ndarray]:
+def moving_pieces(
+    rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *, rate_s: np.ndarray
+) -> dict[str, np.ndarray]:
     """
     Return {regime: rows ``[columns | d(true input)/dt | output]``} of a moving window, a row for the mean over each piece.
 
@@ -66,9 +68,18 @@ def moving_pieces(rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *,
     edges = np.round(np.linspace(0, len(rows), count + 1)).astype(int)
     length = np.diff(edges)[:, None]
     means = np.add.reduceat(rows, edges[:-1], axis=0) / length
-    rate, change = np.linalg.norm(np.add.reduceat(rate_s, edges[:-1], axis=0) / length, axis=1), _slope(rate_s, time, edges)
-    pieces = np.concatenate([means[:, :-N_AXES], _slope(true_input, time, edges), means[:, -N_AXES:]], axis=1)
-    regime = np.select([np.linalg.norm(change, axis=1) > ACCELERATING, rate > MIN_FAST_RATE, rate > MAX_SLOW_RATE], [3, 2, 1], 0)
+    rate, change = (
+        np.linalg.norm(np.add.reduceat(rate_s, edges[:-1], axis=0) / length, axis=1),
+        _slope(rate_s, time, edges),
+    )
+    pieces = np.concatenate(
+        [means[:, :-N_AXES], _slope(true_input, time, edges), means[:, -N_AXES:]], axis=1
+    )
+    regime = np.select(
+        [np.linalg.norm(change, axis=1) > ACCELERATING, rate > MIN_FAST_RATE, rate > MAX_SLOW_RATE],
+        [3, 2, 1],
+        0,
+    )
     names = (Regime.SLOW, Regime.MEDIUM, Regime.FAST, Regime.ACCELERATING)
     return {name: pieces[regime == k] for k, name in enumerate(names) if np.any(regime == k)}
 
@@ -86,7 +97,7 @@ SLOW_TIME = 0.25
 """Length of the pieces whose means separate correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
 BATCHES = 16
 """Pieces of a window at rest whose means determine the noise at low frequency."""
-BATCH_DOF = 2 * (BATCHES - 1)**2 / (3 * BATCHES - 4)
+BATCH_DOF = 2 * (BATCHES - 1) ** 2 / (3 * BATCHES - 4)
 """Degrees of freedom of that estimate: differences of neighbours are correlated (von Neumann)."""
 
 
@@ -143,8 +154,14 @@ def references_of(windows: Sequence[Window], model: SensorModel, table: Table) -
     return References(model, table, motion, temperature_c=temperature)
 
 
-def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, *, session: int = 0,
-                   column_function: Callable = columns) -> list[WindowStatistics]:
+def reduce_windows(
+    windows: Sequence[Window],
+    model: SensorModel,
+    table: Table,
+    *,
+    session: int = 0,
+    column_function: Callable = columns,
+) -> list[WindowStatistics]:
     """
     Reduce windows to their statistics without pieces; the columns of all windows are computed in one call.
 
@@ -165,35 +182,68 @@ def reduce_windows(windows: Sequence[Window], model: SensorModel, table: Table, 
     references = references_of(windows, model, table)
     designs = {sensor: column_function(references, sensor) for sensor in SENSORS}
     edges = np.cumsum([0] + [len(window.motion) for window in windows])
-    return [_reduced(window, {s: designs[s][a:b] for s in SENSORS}, session) for window, a, b in zip(windows, edges, edges[1:])]
+    return [
+        _reduced(window, {s: designs[s][a:b] for s in SENSORS}, session)
+        for window, a, b in zip(windows, edges, edges[1:])
+    ]
 
 
-def reduce_window(window: Window, model: SensorModel, table: Table, *, session: int = 0) -> WindowStatistics:
+def reduce_window(
+    window: Window, model: SensorModel, table: Table, *, session: int = 0
+) -> WindowStatistics:
     """Reduce one window to its statistics, with the short pieces for held-out evaluation."""
     references = references_of([window], model, table)
-    return _reduced(window, {s: columns(references, s) for s in SENSORS}, session, {s: model.columns_of(s, Role.LINEAR) for s in SENSORS})
+    return _reduced(
+        window,
+        {s: columns(references, s) for s in SENSORS},
+        session,
+        {s: model.columns_of(s, Role.LINEAR) for s in SENSORS},
+    )
 
 
 def _reduced(window, designs, session, inputs=None):
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
     static, length = window.kind == 'static', _piece_length(window)
-    sensors = {s: _reduce_static(designs[s], outputs[s]) if static else _reduce_moving(designs[s], outputs[s], length) for s in SENSORS}
+    sensors = {
+        s: _reduce_static(designs[s], outputs[s])
+        if static
+        else _reduce_moving(designs[s], outputs[s], length)
+        for s in SENSORS
+    }
     duration = float(window.time[-1] - window.time[0])
     pieces = {}
     if inputs and static:
         pieces = {s: pieces_at_rest(sensors[s].mean, duration) for s in SENSORS}
     elif inputs:
         rate_s = designs['gyroscope'][:, inputs['gyroscope']]
-        pieces = {s: moving_pieces(np.concatenate([designs[s], outputs[s]], axis=1), window.time, designs[s][:, inputs[s]],
-                                   rate_s=rate_s) for s in SENSORS}
+        pieces = {
+            s: moving_pieces(
+                np.concatenate([designs[s], outputs[s]], axis=1),
+                window.time,
+                designs[s][:, inputs[s]],
+                rate_s=rate_s,
+            )
+            for s in SENSORS
+        }
     step = 0.0 if window.joint_step is None else float(np.max(window.joint_step, initial=0.0))
-    return WindowStatistics(window.kind, float(window.time.mean()), duration, len(window.time), sensors, session, step, pieces)
+    return WindowStatistics(
+        window.kind,
+        float(window.time.mean()),
+        duration,
+        len(window.time),
+        sensors,
+        session,
+        step,
+        pieces,
+    )
 
 
 def _reduce_static(design, output):
     mean = np.concatenate([design.mean(axis=0), output.mean(axis=0)])
     variance, inflation = batch_statistics(output)
-    return SensorStatistics(mean, np.zeros((0, len(mean))), np.maximum(variance, rounding_variance(output)), inflation)
+    return SensorStatistics(
+        mean, np.zeros((0, len(mean))), np.maximum(variance, rounding_variance(output)), inflation
+    )
 
 
 def _reduce_moving(design, output, length):
@@ -201,7 +251,9 @@ def _reduce_moving(design, output, length):
     mean = rows.mean(axis=0)
     rows -= mean
     unknown, slow = np.full(3, np.nan), slow_part(rows, length)
-    return SensorStatistics(mean, triangular(rows), rounding_variance(output), unknown, triangular(slow), len(slow))
+    return SensorStatistics(
+        mean, triangular(rows), rounding_variance(output), unknown, triangular(slow), len(slow)
+    )
 
 
 def _piece_length(window):
@@ -215,7 +267,11 @@ def _piece_length(window):
 def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
     """Return the means of pieces of `length` rows times the root of their length, none when a piece is a single row."""
     pieces = len(rows) // length if length > 1 else 0
-    return rows[:pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1)) if pieces else rows[:0]
+    return (
+        rows[: pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1))
+        if pieces
+        else rows[:0]
+    )
 
 
 def batch_statistics(output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -229,7 +285,7 @@ def batch_statistics(output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     length = len(output) // BATCHES
     if length < 2:
         return variance, np.ones(output.shape[1])
-    means = output[:length * BATCHES].reshape(BATCHES, length, -1).mean(axis=1)
+    means = output[: length * BATCHES].reshape(BATCHES, length, -1).mean(axis=1)
     with np.errstate(divide='ignore', invalid='ignore'):
         factor = np.diff(means, axis=0).var(axis=0, ddof=0) / 2 * length / variance
     return variance, np.where(np.isfinite(factor), factor, 1.0)

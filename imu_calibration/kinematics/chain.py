@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from imu_calibration.kinematics.rotations import Reference, align, cross, earth_rate_n, rotation
-from imu_calibration.kinematics.table import Table, axis_angles, axis_error_directions, base_heading_deg
+from imu_calibration.kinematics.table import (
+    Table,
+    axis_angles,
+    axis_error_directions,
+    base_heading_deg,
+)
 
 if TYPE_CHECKING:
     from imu_calibration.kinematics.joint import Joint
@@ -53,8 +58,12 @@ def with_axis_angles(table: Table, errors: np.ndarray) -> Table:
     vectors = np.zeros((len(table.joints), 3))
     for angle, error in zip(axis_angles(table.joints), errors, strict=True):
         vectors[angle.joint] += error * angle.direction
-    joints = [joint if not vector.any() else replace(joint, axis=tuple((rotation(vector) @ np.array(joint.axis)).tolist()))
-              for joint, vector in zip(table.joints, vectors, strict=True)]
+    joints = [
+        joint
+        if not vector.any()
+        else replace(joint, axis=tuple((rotation(vector) @ np.array(joint.axis)).tolist()))
+        for joint, vector in zip(table.joints, vectors, strict=True)
+    ]
     return replace(table, joints=tuple(joints))
 
 
@@ -72,7 +81,9 @@ def tilt(table: Table, angles: np.ndarray) -> Table:
     azimuth = np.radians(table.azimuth_n_deg)  # type: ignore[arg-type]
     north = tilted.mat_nb @ mat_bn @ np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     azimuth_n_deg = np.degrees(np.arctan2(north[1], north[0]))
-    return replace(tilted, azimuth_deg=float((azimuth_n_deg - base_heading_deg(tilted.mat_nb)) % 360.0))
+    return replace(
+        tilted, azimuth_deg=float((azimuth_n_deg - base_heading_deg(tilted.mat_nb)) % 360.0)
+    )
 
 
 WOBBLES = (-1, 2)
@@ -97,8 +108,15 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
 
     """
     of_joint = dict(zip(table.joint_names.turning[1:], angles, strict=True))
-    return replace(table, joints=tuple(replace(joint, sag=of_joint[joint.source]) if joint.turns and of_joint.get(joint.source) else joint
-                                       for joint in table.joints))
+    return replace(
+        table,
+        joints=tuple(
+            replace(joint, sag=of_joint[joint.source])
+            if joint.turns and of_joint.get(joint.source)
+            else joint
+            for joint in table.joints
+        ),
+    )
 
 
 def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
@@ -116,17 +134,39 @@ def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
 
     """
     parts = np.reshape(amplitudes, (len(table.joint_names.turning), len(WOBBLES), 2))
-    of_joint = {name: tuple((order, complex(*each)) for order, each in zip(WOBBLES, part, strict=True) if each.any())
-                for name, part in zip(table.joint_names.turning, parts, strict=True)}
-    return replace(table, joints=tuple(replace(joint, wobble=of_joint[joint.source]) if joint.turns else joint for joint in table.joints))
+    of_joint = {
+        name: tuple(
+            (order, complex(*each)) for order, each in zip(WOBBLES, part, strict=True) if each.any()
+        )
+        for name, part in zip(table.joint_names.turning, parts, strict=True)
+    }
+    return replace(
+        table,
+        joints=tuple(
+            replace(joint, wobble=of_joint[joint.source]) if joint.turns else joint
+            for joint in table.joints
+        ),
+    )
 
 
-def wobble_at(wobble: tuple[tuple[int, complex], ...], angle: np.ndarray, rate: np.ndarray, *, acceleration: np.ndarray) -> np.ndarray:
+def wobble_at(
+    wobble: tuple[tuple[int, complex], ...],
+    angle: np.ndarray,
+    rate: np.ndarray,
+    *,
+    acceleration: np.ndarray,
+) -> np.ndarray:
     """Return z of `with_wobble` and its first two derivatives in time, complex, shape (3, n)."""
     found = np.zeros((3, len(angle)), complex)
     for order, amplitude in wobble:
         turn = amplitude * np.exp(1j * order * angle)
-        found += np.stack([turn, 1j * order * rate * turn, (1j * order * acceleration - (order * rate) ** 2) * turn])
+        found += np.stack(
+            [
+                turn,
+                1j * order * rate * turn,
+                (1j * order * acceleration - (order * rate) ** 2) * turn,
+            ]
+        )
     return found
 
 
@@ -163,7 +203,13 @@ class _Step(NamedTuple):
     """Directions u, v of a lean in these coordinates, shape (2, 3)."""
 
 
-def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarray | None = None, *, attitude: bool = True) -> Reference:
+def reference_motion(
+    table: Table,
+    motion: JointMotion,
+    temperature_c: np.ndarray | None = None,
+    *,
+    attitude: bool = True,
+) -> Reference:
     """
     Return the readings of a perfect sensor at the reference point of the mount.
 
@@ -196,7 +242,11 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
     """
     n_samples = len(motion.time)
     mat_sn = np.empty((n_samples, 3, 3)) if attitude else np.broadcast_to(np.nan, (n_samples, 3, 3))
-    force_s, rate_s, alpha_s = np.empty((n_samples, 3)), np.empty((n_samples, 3)), np.empty((n_samples, 3))
+    force_s, rate_s, alpha_s = (
+        np.empty((n_samples, 3)),
+        np.empty((n_samples, 3)),
+        np.empty((n_samples, 3)),
+    )
     constants = _constants(table)
     steps = _chain_steps(constants, motion)
     # The last columns are up, which a sag needs, the rate, the angular acceleration and the force.
@@ -207,9 +257,23 @@ def reference_motion(table: Table, motion: JointMotion, temperature_c: np.ndarra
         columns = _run_chain(base, motion, steps, part)
         if attitude:
             mat_sn[part] = columns[:, :3].transpose(2, 0, 1)
-        rate_s[part], alpha_s[part], force_s[part] = columns[:, -3].T, columns[:, -2].T, columns[:, -1].T
-    return Reference(time=motion.time, mat_sn=mat_sn, force_s=force_s, rate_s=rate_s, alpha_s=alpha_s, gravity=constants.gravity,
-                     temperature_c=temperature_c, branch=motion.thermal_branch, shaking=motion.vibration, motion=motion)
+        rate_s[part], alpha_s[part], force_s[part] = (
+            columns[:, -3].T,
+            columns[:, -2].T,
+            columns[:, -1].T,
+        )
+    return Reference(
+        time=motion.time,
+        mat_sn=mat_sn,
+        force_s=force_s,
+        rate_s=rate_s,
+        alpha_s=alpha_s,
+        gravity=constants.gravity,
+        temperature_c=temperature_c,
+        branch=motion.thermal_branch,
+        shaking=motion.vibration,
+        motion=motion,
+    )
 
 
 def _chain_steps(constants, motion):
@@ -219,13 +283,17 @@ def _chain_steps(constants, motion):
         offset = offset + matrix.T @ link.xyz
         matrix = link.mat_in @ matrix
         if not link.joint.leans and not _moves(motion, link.column):
-            at = link.plus + (link.multiplier * motion.position[0, link.column] if len(motion.time) else 0.0)
+            at = link.plus + (
+                link.multiplier * motion.position[0, link.column] if len(motion.time) else 0.0
+            )
             if link.joint.turns:
                 matrix = rotation(-at * link.axis) @ matrix
             else:
                 offset = offset + matrix.T @ (at * link.axis)
             continue
-        before, sense, third = _to_coordinate_axis(link.axis) if link.joint.turns else (np.eye(3), 1.0, 2)
+        before, sense, third = (
+            _to_coordinate_axis(link.axis) if link.joint.turns else (np.eye(3), 1.0, 2)
+        )
         steps.append(_Step(offset, before @ matrix, link, sense, third, link.across @ before.T))
         matrix, offset = before.T, np.zeros(3)
     return [*steps, _Step(offset + matrix.T @ constants.mount_xyz, constants.mat_sl @ matrix, None)]
@@ -233,8 +301,11 @@ def _chain_steps(constants, motion):
 
 def _moves(motion, column):
     position = motion.position[:, column]
-    still = len(position) == 0 or (np.all(position == position[0]) and not motion.rate[:, column].any()
-                                   and not motion.acceleration[:, column].any())
+    still = len(position) == 0 or (
+        np.all(position == position[0])
+        and not motion.rate[:, column].any()
+        and not motion.acceleration[:, column].any()
+    )
     return not still
 
 
@@ -261,12 +332,28 @@ class _Constants(NamedTuple):
 def _constants(table):
     """Return the `_Constants`: thousands of short windows share one table."""
     columns = {name: column for column, name in enumerate(table.joint_names)}
-    links = tuple(_Link(joint, np.array(joint.axis), np.array(joint.xyz), joint.mat_before.T, columns[joint.source],
-                        *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)),
-                        axis_error_directions(np.array(joint.axis))) for joint in table.joints)
+    links = tuple(
+        _Link(
+            joint,
+            np.array(joint.axis),
+            np.array(joint.xyz),
+            joint.mat_before.T,
+            columns[joint.source],
+            *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)),
+            axis_error_directions(np.array(joint.axis)),
+        )
+        for joint in table.joints
+    )
     mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
-    constants = _Constants(_base_columns(table), links, mount_xyz, table.mat_sl, table.gravity_value)
-    for array in (constants.base, constants.mount_xyz, constants.mat_sl, *(part for link in links for part in (*link[1:4], link.across))):
+    constants = _Constants(
+        _base_columns(table), links, mount_xyz, table.mat_sl, table.gravity_value
+    )
+    for array in (
+        constants.base,
+        constants.mount_xyz,
+        constants.mat_sl,
+        *(part for link in links for part in (*link[1:4], link.across)),
+    ):
         array.flags.writeable = False
     return constants
 
@@ -299,11 +386,16 @@ def _move(columns, step, motion, part):
     """Bring `columns` past a joint that moves."""
     link = step.link
     factor = step.sense * link.multiplier
-    position, rate, acceleration = (factor * values[part, link.column] for values in (motion.position, motion.rate, motion.acceleration))
+    position, rate, acceleration = (
+        factor * values[part, link.column]
+        for values in (motion.position, motion.rate, motion.acceleration)
+    )
     position += step.sense * link.plus
     if link.joint.turns:
         if link.joint.leans:
-            columns = _lean(columns, step, *(step.sense * values for values in (position, rate, acceleration)))
+            columns = _lean(
+                columns, step, *(step.sense * values for values in (position, rate, acceleration))
+            )
         return _turn(columns, step.third, position, rate, acceleration)
     return _slide(columns, link.axis[:, None], position, rate, acceleration)
 
@@ -311,16 +403,22 @@ def _move(columns, step, motion, part):
 def _lean(columns, step, angle, rate, acceleration):
     """Bring `columns` into the frame of a joint whose axis sags and wobbles, by two small turns across it; the joint is at `angle`."""
     joint, first, second = step.link.joint, (step.third + 1) % 3, (step.third + 2) % 3
-    vector = np.zeros((3, 3, len(angle)))   # derivative, direction, sample
+    vector = np.zeros((3, 3, len(angle)))  # derivative, direction, sample
     if joint.wobble:
         lean = wobble_at(joint.wobble, angle, rate, acceleration=acceleration)
-        vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum('dn,k->dkn', lean.imag, step.across[1])
+        vector += np.einsum('dn,k->dkn', lean.real, step.across[0]) + np.einsum(
+            'dn,k->dkn', lean.imag, step.across[1]
+        )
     if joint.sag:
         up, spin, alpha = columns[:, -4], columns[:, -3], columns[:, -2]
-        moves = cross(up, spin)   # up is fixed in space; the rotation of the Earth is negligible relative to the sag
+        moves = cross(
+            up, spin
+        )  # up is fixed in space; the rotation of the Earth is negligible relative to the sag
         axis = np.zeros((3, 1))
         axis[step.third] = step.sense * joint.sag
-        vector += np.stack([cross(each, axis) for each in (up, moves, cross(moves, spin) + cross(up, alpha))])
+        vector += np.stack(
+            [cross(each, axis) for each in (up, moves, cross(moves, spin) + cross(up, alpha))]
+        )
     for which in (first, second):
         columns = _turn(columns, which, *vector[:, which])
     return columns
@@ -335,7 +433,11 @@ def _slide(columns, axis, position, rate, acceleration):
     """Bring `columns` into the link that slides along `axis`, shape (3, 1)."""
     slid = np.array(np.broadcast_to(columns, columns.shape[:2] + (len(position),)))
     spin, alpha = slid[:, -3], slid[:, -2]
-    slid[:, -1] += _arm_force(spin, alpha, axis * position) + 2 * rate * cross(spin, axis) + axis * acceleration
+    slid[:, -1] += (
+        _arm_force(spin, alpha, axis * position)
+        + 2 * rate * cross(spin, axis)
+        + axis * acceleration
+    )
     return slid
 
 

@@ -16,11 +16,16 @@ MAX_TABLE_NUMBER = 1e6
 def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
     """Refuse values that are not a mapping, and keys that are not `known`."""
     if not isinstance(mapping, Mapping):
-        raise InputError(f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the table description',
-                         code='not_a_mapping')
+        raise InputError(
+            f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the table description',
+            code='not_a_mapping',
+        )
     for key in mapping:
         if key not in known:
-            raise InputError(f"{what}: key '{key}' is unknown; the keys here are {', '.join(known)}", code='key_unknown')
+            raise InputError(
+                f"{what}: key '{key}' is unknown; the keys here are {', '.join(known)}",
+                code='key_unknown',
+            )
 
 
 def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
@@ -28,7 +33,10 @@ def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
     vector = np.array(several_numbers(value, what))
     norm = np.linalg.norm(vector)
     if norm < 1e-9:
-        raise InputError(f'table: {what} must not be zero, got {list(value)}; give a direction of three numbers', code='zero_vector')
+        raise InputError(
+            f'table: {what} must not be zero, got {list(value)}; give a direction of three numbers',
+            code='zero_vector',
+        )
     # Idempotent, so that a table written and read again is equal.
     return tuple((vector / norm if abs(norm - 1) > 4e-16 else vector).tolist())
 
@@ -37,12 +45,21 @@ def several_numbers(value: Any, what: str, count: int = 3) -> tuple[float, ...]:
     """Return `count` finite numbers."""
     words = {2: 'two', 3: 'three'}[count]
     if isinstance(value, (str, bytes)) or not hasattr(value, '__len__') or len(value) != count:
-        raise InputError(f'table: {what} must be {words} numbers, got {value!r}; correct it', code='three_numbers')
+        raise InputError(
+            f'table: {what} must be {words} numbers, got {value!r}; correct it',
+            code='three_numbers',
+        )
     return tuple(finite_number(item, what, advice=f'give {words} numbers') for item in value)
 
 
-def finite_number(value: Any, what: str, *, low: float = -MAX_TABLE_NUMBER, high: float = MAX_TABLE_NUMBER,
-                  advice: str = 'give a number') -> float:
+def finite_number(
+    value: Any,
+    what: str,
+    *,
+    low: float = -MAX_TABLE_NUMBER,
+    high: float = MAX_TABLE_NUMBER,
+    advice: str = 'give a number',
+) -> float:
     """Return one finite number within [low, high], by default the limits of any number of a table."""
     # YAML 1.1 reads 1e-5, without a point, as text.
     try:
@@ -50,9 +67,14 @@ def finite_number(value: Any, what: str, *, low: float = -MAX_TABLE_NUMBER, high
     except (TypeError, ValueError, OverflowError):
         number = float('nan')
     if not np.isfinite(number):
-        raise InputError(f'table: {what} must be a finite number, got {value!r}; {advice}', code='not_finite')
+        raise InputError(
+            f'table: {what} must be a finite number, got {value!r}; {advice}', code='not_finite'
+        )
     if not low <= number <= high:
-        raise InputError(f'table: {what} must lie in [{low:g}, {high:g}], got {value!r}; {advice}', code='out_of_range')
+        raise InputError(
+            f'table: {what} must lie in [{low:g}, {high:g}], got {value!r}; {advice}',
+            code='out_of_range',
+        )
     return number
 
 
@@ -115,9 +137,13 @@ class Joint:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'axis', unit_vector(self.axis, f"axis of joint '{self.name}'"))
         object.__setattr__(self, 'xyz', several_numbers(self.xyz, f"xyz of joint '{self.name}'"))
-        object.__setattr__(self, 'rpy_deg', several_numbers(self.rpy_deg, f"rpy_deg of joint '{self.name}'"))
+        object.__setattr__(
+            self, 'rpy_deg', several_numbers(self.rpy_deg, f"rpy_deg of joint '{self.name}'")
+        )
         if self.type not in TYPES:
-            raise InputError(f"table: the type of joint '{self.name}' must be {' or '.join(TYPES)}, got {self.type!r}; correct it")
+            raise InputError(
+                f"table: the type of joint '{self.name}' must be {' or '.join(TYPES)}, got {self.type!r}; correct it"
+            )
         _require_limits(self.limits, f"joint '{self.name}'")
 
     @property
@@ -167,9 +193,18 @@ class JointNames(Sequence):
             return names
         names = tuple(names)
         if errors is not None:
-            known: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in errors.items()}
+            known: dict[str, Any] = {
+                key: tuple(value) if isinstance(value, list) else value
+                for key, value in errors.items()
+            }
             return cls(names, **known)
-        return cls(names, names, names[1:-1], tuple(f'{a}_{b}' for a, b in zip(names, names[1:], strict=False)), place_names(names))
+        return cls(
+            names,
+            names,
+            names[1:-1],
+            tuple(f'{a}_{b}' for a, b in zip(names, names[1:], strict=False)),
+            place_names(names),
+        )
 
     @property
     def errors(self) -> dict[str, Any] | None:
@@ -177,7 +212,10 @@ class JointNames(Sequence):
         if self == self.of(self.read):
             return None
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'read'}
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in values.items()
+        }
 
     @property
     def taken_as_described(self) -> tuple[str, ...]:
@@ -196,8 +234,10 @@ def place_names(turning: Sequence[str]) -> tuple[str, ...]:
     return tuple(f'{name}_{letter}' for name in turning[1:] for letter in 'uv')
 
 
-LIMIT_KEYS = {'revolute': ('range_deg', 'speed_deg_s', 'acceleration_deg_s2', 'endless'),
-              'prismatic': ('range_m', 'speed_m_s', 'acceleration_m_s2')}
+LIMIT_KEYS = {
+    'revolute': ('range_deg', 'speed_deg_s', 'acceleration_deg_s2', 'endless'),
+    'prismatic': ('range_m', 'speed_m_s', 'acceleration_m_s2'),
+}
 """Keys of the limits in a table description, by type."""
 _KEYS = ('name', 'axis', 'xyz', 'rpy_deg', 'type', 'mimic')
 
@@ -208,7 +248,10 @@ def joint_from_mapping(item: Any) -> Joint:
     require_keys(item, (*_KEYS, *LIMIT_KEYS.get(kind, ())), 'table joint')
     for key in ('name', 'axis'):
         if item.get(key) is None:
-            raise InputError(f'table: every joint must have name and axis, got {item!r}; add {key}', code='keys_missing')
+            raise InputError(
+                f'table: every joint must have name and axis, got {item!r}; add {key}',
+                code='keys_missing',
+            )
     values = {key: item[key] for key in _KEYS if item.get(key) is not None}
     if 'mimic' in values:
         values['mimic'] = _mimic(values['mimic'], item['name'])
@@ -220,33 +263,56 @@ def limits_from_mapping(item: Mapping, kind: str) -> JointLimits:
     what = f"of joint '{item.get('name')}'"
     range_key, *others = LIMIT_KEYS.get(kind, LIMIT_KEYS['revolute'])[:3]
     unit = np.radians(1.0) if range_key.endswith('_deg') else 1.0
-    lower, upper = (None, None) if item.get(range_key) is None else (
-        unit * end for end in several_numbers(item[range_key], f'{range_key} {what}', 2))
+    lower, upper = (
+        (None, None)
+        if item.get(range_key) is None
+        else (unit * end for end in several_numbers(item[range_key], f'{range_key} {what}', 2))
+    )
     endless = item.get('endless') or False
     if not isinstance(endless, bool):
-        raise InputError(f'table: endless {what} must be true or false, got {endless!r}; correct it', code='not_true_or_false')
-    speed, acceleration = (None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}') for key in others)
+        raise InputError(
+            f'table: endless {what} must be true or false, got {endless!r}; correct it',
+            code='not_true_or_false',
+        )
+    speed, acceleration = (
+        None if item.get(key) is None else unit * finite_number(item[key], f'{key} {what}')
+        for key in others
+    )
     return JointLimits(lower, upper, speed, acceleration, endless)
 
 
 def _require_limits(limits: JointLimits, what: str) -> None:
     lower, upper = limits.lower, limits.upper
-    if (lower is None) != (upper is None) or (lower is not None and upper is not None and lower > upper):
-        raise InputError(f'table: the range of {what} must be a smaller and a larger number, got [{lower}, {upper}]; correct it')
+    if (lower is None) != (upper is None) or (
+        lower is not None and upper is not None and lower > upper
+    ):
+        raise InputError(
+            f'table: the range of {what} must be a smaller and a larger number, got [{lower}, {upper}]; correct it'
+        )
     if limits.endless and lower is not None:
-        raise InputError(f'table: {what} must have a range or be endless, got both; omit one', code='range_and_endless')
+        raise InputError(
+            f'table: {what} must have a range or be endless, got both; omit one',
+            code='range_and_endless',
+        )
     for name in ('speed', 'acceleration'):
         value = getattr(limits, name)
         if value is not None and not value > 0:
-            raise InputError(f'table: the largest {name} of {what} must be above zero, got {value:g}; correct or omit it')
+            raise InputError(
+                f'table: the largest {name} of {what} must be above zero, got {value:g}; correct or omit it'
+            )
 
 
 def _mimic(item: Any, name: str) -> Mimic:
     require_keys(item, ('joint', 'multiplier', 'offset'), f"mimic of joint '{name}'")
-    numbers = {key: finite_number(item[key], f"mimic {key} of joint '{name}'") for key in ('multiplier', 'offset')
-               if item.get(key) is not None}
+    numbers = {
+        key: finite_number(item[key], f"mimic {key} of joint '{name}'")
+        for key in ('multiplier', 'offset')
+        if item.get(key) is not None
+    }
     if not isinstance(item.get('joint'), str):
-        raise InputError(f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add joint: NAME")
+        raise InputError(
+            f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add joint: NAME"
+        )
     return Mimic(item['joint'], **numbers)
 
 
@@ -258,12 +324,18 @@ def joint_to_mapping(joint: Joint) -> dict[str, Any]:
     if not joint.turns:
         item['type'] = joint.type
     if joint.mimic is not None:
-        item['mimic'] = {'joint': joint.mimic.joint, 'multiplier': joint.mimic.multiplier, 'offset': joint.mimic.offset}
+        item['mimic'] = {
+            'joint': joint.mimic.joint,
+            'multiplier': joint.mimic.multiplier,
+            'offset': joint.mimic.offset,
+        }
     limits, unit = joint.limits, np.radians(1.0) if joint.turns else 1.0
     ends = None if limits.lower is None else [limits.lower, limits.upper]
     if limits.endless:
         item['endless'] = True
-    for key, value in zip(LIMIT_KEYS[joint.type][:3], (ends, limits.speed, limits.acceleration), strict=True):
+    for key, value in zip(
+        LIMIT_KEYS[joint.type][:3], (ends, limits.speed, limits.acceleration), strict=True
+    ):
         if value is not None:
             # Twelve decimals of a degree, so that values survive reading and writing.
             item[key] = np.round(np.asarray(value) / unit, 10).tolist()

@@ -34,11 +34,17 @@ def _with_velocity(spline, fit, position, velocity, *, knots, time, trend):
     if not trusted or fit.noise_sd * fit.bandwidth / knots.step < 0.3 * velocity_sd:
         return fit
     weight = np.where(np.isfinite(velocity), fit.noise_sd / velocity_sd, 0.0)
-    rest = position - trend.at(time)[:, 0], weight * (np.nan_to_num(velocity) - trend.at(time, 1)[:, 0])
+    rest = (
+        position - trend.at(time)[:, 0],
+        weight * (np.nan_to_num(velocity) - trend.at(time, 1)[:, 0]),
+    )
     interval, values = design_values(knots, time, 1)
-    both = PenalisedSpline(vstack([spline.design, design_matrix(knots, interval, values * weight)], format='csr'),
-                           spline.bands + normal_bands(knots, interval, values * weight), n_kinds=2)
-    better, = smooth(both, np.concatenate(rest)[:, None], [fit.noise_sd])
+    both = PenalisedSpline(
+        vstack([spline.design, design_matrix(knots, interval, values * weight)], format='csr'),
+        spline.bands + normal_bands(knots, interval, values * weight),
+        n_kinds=2,
+    )
+    (better,) = smooth(both, np.concatenate(rest)[:, None], [fit.noise_sd])
     return better
 
 
@@ -59,13 +65,15 @@ class Trend:
         scale = max(time[-1] - centre, 1e-9) ** np.arange(degree + 1)
         powers = np.vander(time - centre, degree + 1, increasing=True) / scale
         factors = np.zeros((3, position.shape[1]))
-        factors[:degree + 1] = np.linalg.solve(powers.T @ powers, powers.T @ position) / scale[:, None]
+        factors[: degree + 1] = (
+            np.linalg.solve(powers.T @ powers, powers.T @ position) / scale[:, None]
+        )
         factors[:, still] = np.array([[1.0], [0.0], [0.0]]) * position[0, still]
         return cls(centre, factors)
 
     def column(self, joint: int) -> 'Trend':
         """Return the parabola of one joint."""
-        return Trend(self.centre, self.factors[:, joint:joint + 1])
+        return Trend(self.centre, self.factors[:, joint : joint + 1])
 
     def at(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Return values or rates, shape (n, n_joints)."""
@@ -79,10 +87,12 @@ class Trend:
         starts = knots.start + knots.step * np.arange(knots.n_intervals)
         pieces[0] += self.at(starts)
         pieces[1] += knots.step * self.at(starts, 1)
-        pieces[2] += knots.step ** 2 * self.factors[2]
+        pieces[2] += knots.step**2 * self.factors[2]
 
 
-def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float) -> tuple[bool, float]:
+def check_velocity(
+    velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float
+) -> tuple[bool, float]:
     """
     Compare a joint's velocities with the derivative of its positions, ``velocity = offset + scale rate - lag acceleration + noise``.
 
@@ -107,7 +117,7 @@ def check_velocity(velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndar
     if good.mean() < 0.9 or not np.any(velocity[good]):
         return False, np.inf
     columns = np.stack([np.ones(good.sum()), rate[good], -acceleration[good]], axis=1)
-    size = np.sqrt(np.mean(columns ** 2, axis=0))
+    size = np.sqrt(np.mean(columns**2, axis=0))
     if size.min() < 1e-12:
         return False, np.inf
     normal = np.linalg.pinv((columns / size).T @ (columns / size))
@@ -144,15 +154,24 @@ class JointCurve:
         """
         time = np.asarray(time, float)
         values = np.zeros((4, len(time), self.pieces.shape[2]))
-        values[:derivatives + 1] = evaluate_pieces(self.knots, self.pieces, time, derivatives=derivatives)
-        outside = (time < self.knots.start) | (time > self.knots.start + self.knots.step * self.knots.n_intervals)
+        values[: derivatives + 1] = evaluate_pieces(
+            self.knots, self.pieces, time, derivatives=derivatives
+        )
+        outside = (time < self.knots.start) | (
+            time > self.knots.start + self.knots.step * self.knots.n_intervals
+        )
         if outside.any():
             values[:, outside] = np.nan
         return JointMotion(time, *values)
 
 
-def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray | None = None, *,
-                    noise_sd: np.ndarray | float | None = None) -> JointCurve:
+def fit_joint_curve(
+    time: np.ndarray,
+    position: np.ndarray,
+    velocity: np.ndarray | None = None,
+    *,
+    noise_sd: np.ndarray | float | None = None,
+) -> JointCurve:
     """
     Return the smooth curve through readings of the joints.
 
@@ -183,7 +202,11 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     """
     time, position = np.asarray(time, float), np.asarray(position, float)
     _check(time, position)
-    position = np.unwrap(position, axis=0) if np.any(np.abs(np.diff(position, axis=0)) > np.pi) else position
+    position = (
+        np.unwrap(position, axis=0)
+        if np.any(np.abs(np.diff(position, axis=0)) > np.pi)
+        else position
+    )
     stamps = time[np.concatenate([[True], np.diff(time) > 0])]
     knots = _place_knots(stamps)
     still = np.all(position == position[0], axis=0)
@@ -194,14 +217,26 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
     moving = np.flatnonzero(~still).tolist()
     if len(stamps) >= _MINIMUM_SAMPLES and len(moving):
         interval, values = design_values(knots, time)
-        spline = PenalisedSpline(design_matrix(knots, interval, values), normal_bands(knots, interval, values))
+        spline = PenalisedSpline(
+            design_matrix(knots, interval, values), normal_bands(knots, interval, values)
+        )
         fits = smooth(spline, position[:, moving] - trend.at(time)[:, moving], floor[moving])
         for joint, fit in zip(moving, fits, strict=True):
             noise[joint] = max(floor[joint], fit.noise_sd)
             if velocity is not None:
-                fit = _with_velocity(spline, fit, position[:, joint], velocity[:, joint], knots=knots, time=time,
-                                     trend=trend.column(joint))
-            coefficients[:, joint], bandwidth[joint] = fit.coefficients, fit.bandwidth / (2 * np.pi * knots.step)
+                fit = _with_velocity(
+                    spline,
+                    fit,
+                    position[:, joint],
+                    velocity[:, joint],
+                    knots=knots,
+                    time=time,
+                    trend=trend.column(joint),
+                )
+            coefficients[:, joint], bandwidth[joint] = (
+                fit.coefficients,
+                fit.bandwidth / (2 * np.pi * knots.step),
+            )
     pieces = piece_coefficients(coefficients)
     trend.add_to(pieces, knots)
     return JointCurve(knots, pieces, noise, bandwidth)
@@ -209,11 +244,15 @@ def fit_joint_curve(time: np.ndarray, position: np.ndarray, velocity: np.ndarray
 
 def _check(time, position):
     if not len(time) or not np.isfinite(position).all():
-        raise InputError(f'joint positions must be finite, got {len(time)} readings with gaps or none; remove non-finite values',
-                         code='not_finite')
+        raise InputError(
+            f'joint positions must be finite, got {len(time)} readings with gaps or none; remove non-finite values',
+            code='not_finite',
+        )
     if np.any(np.diff(time) < 0):
-        raise InputError('joint stamps must not run backwards, got a backward step; sort the readings or drop those',
-                         code='stamps_backwards')
+        raise InputError(
+            'joint stamps must not run backwards, got a backward step; sort the readings or drop those',
+            code='stamps_backwards',
+        )
 
 
 def _place_knots(time):
@@ -222,13 +261,26 @@ def _place_knots(time):
     step = float(np.median(time[stride:] - time[:-stride]) / stride) if stride else 1e-6
     hole = np.max(np.diff(time), initial=0.0)
     if hole > _LONGEST_HOLE * step:
-        raise InputError(f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; '
-                         'split them there', code='gap')
-    return Knots(float(time[0] - _MARGIN * step), step, int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN)
+        raise InputError(
+            f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; '
+            'split them there',
+            code='gap',
+        )
+    return Knots(
+        float(time[0] - _MARGIN * step),
+        step,
+        int(np.ceil((time[-1] - time[0]) / step)) + 2 * _MARGIN,
+    )
 
 
 def _noise_floor(position, noise_sd):
     """Return the lower limit of the noise of the readings: the given value, rounding, coarse steps."""
     floor = 4 * np.finfo(float).eps * np.abs(position).max(axis=0)
     steps = np.array([encoder_step(column) for column in position.T])
-    return np.maximum.reduce([floor, steps / np.sqrt(12), np.broadcast_to(0.0 if noise_sd is None else noise_sd, floor.shape)])
+    return np.maximum.reduce(
+        [
+            floor,
+            steps / np.sqrt(12),
+            np.broadcast_to(0.0 if noise_sd is None else noise_sd, floor.shape),
+        ]
+    )

@@ -28,7 +28,9 @@ class JointMotion(AlignedArrays):
     """Variance of vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
 
 
-def with_encoder_harmonics(motion: JointMotion, order: int, cos_amplitude: np.ndarray, *, sin_amplitude: np.ndarray) -> JointMotion:
+def with_encoder_harmonics(
+    motion: JointMotion, order: int, cos_amplitude: np.ndarray, *, sin_amplitude: np.ndarray
+) -> JointMotion:
     """
     Return the true motion behind encoders with a harmonic error, ``q_true = q + c cos(k q) + s sin(k q)``.
 
@@ -44,21 +46,31 @@ def with_encoder_harmonics(motion: JointMotion, order: int, cos_amplitude: np.nd
         Amplitudes c and s, rad.
 
     """
-    cos_amplitude, sin_amplitude = (np.broadcast_to(np.asarray(a, float), motion.position.shape[1:]) for a in (cos_amplitude,
-                                                                                                               sin_amplitude))
+    cos_amplitude, sin_amplitude = (
+        np.broadcast_to(np.asarray(a, float), motion.position.shape[1:])
+        for a in (cos_amplitude, sin_amplitude)
+    )
     wrong = np.flatnonzero((cos_amplitude != 0) | (sin_amplitude != 0))
     if not len(wrong):
         return motion
-    phase, rate, acceleration = order * motion.position[:, wrong], motion.rate[:, wrong], motion.acceleration[:, wrong]
+    phase, rate, acceleration = (
+        order * motion.position[:, wrong],
+        motion.rate[:, wrong],
+        motion.acceleration[:, wrong],
+    )
     cos, sin = np.cos(phase), np.sin(phase)
     error = cos_amplitude[wrong] * cos + sin_amplitude[wrong] * sin
     slope = order * (sin_amplitude[wrong] * cos - cos_amplitude[wrong] * sin)
-    curvature, third = -order ** 2 * error, -order ** 2 * slope
-    moved = {name: getattr(motion, name).copy() for name in ('position', 'rate', 'acceleration', 'jerk')}
+    curvature, third = -(order**2) * error, -(order**2) * slope
+    moved = {
+        name: getattr(motion, name).copy() for name in ('position', 'rate', 'acceleration', 'jerk')
+    }
     moved['position'][:, wrong] += error
     moved['rate'][:, wrong] *= 1 + slope
-    moved['acceleration'][:, wrong] = acceleration * (1 + slope) + curvature * rate ** 2
-    moved['jerk'][:, wrong] = motion.jerk[:, wrong] * (1 + slope) + 3 * curvature * rate * acceleration + third * rate ** 3
+    moved['acceleration'][:, wrong] = acceleration * (1 + slope) + curvature * rate**2
+    moved['jerk'][:, wrong] = (
+        motion.jerk[:, wrong] * (1 + slope) + 3 * curvature * rate * acceleration + third * rate**3
+    )
     return replace(motion, **moved)
 
 
@@ -113,8 +125,12 @@ def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
         target, moved = motion.time - delay, np.empty_like(derivatives)
         for first in range(0, len(target), DERIVATIVE_BLOCK_ROWS):
             rows = slice(first, first + DERIVATIVE_BLOCK_ROWS)
-            moved[:, :, rows] = _interpolated(motion.time, step, derivatives, target[rows], delay[rows] > 0)
-    return replace(motion, position=moved[0].T, rate=moved[1].T, acceleration=moved[2].T, jerk=moved[3].T)
+            moved[:, :, rows] = _interpolated(
+                motion.time, step, derivatives, target[rows], delay[rows] > 0
+            )
+    return replace(
+        motion, position=moved[0].T, rate=moved[1].T, acceleration=moved[2].T, jerk=moved[3].T
+    )
 
 
 def _interpolated(time, step, derivatives, target, backwards):
@@ -138,11 +154,19 @@ def _interpolated(time, step, derivatives, target, backwards):
 def _taylor(derivatives, by):
     """Return value and first three derivatives at a distance `by`."""
     position, rate, acceleration, jerk = derivatives
-    return np.stack([position + by * (rate + by / 2 * (acceleration + by / 3 * jerk)), rate + by * (acceleration + by / 2 * jerk),
-                     acceleration + by * jerk, jerk])
+    return np.stack(
+        [
+            position + by * (rate + by / 2 * (acceleration + by / 3 * jerk)),
+            rate + by * (acceleration + by / 2 * jerk),
+            acceleration + by * jerk,
+            jerk,
+        ]
+    )
 
 
-_POWERS = np.array([[factorial(power) / factorial(power - order) for power in range(4, 8)] for order in range(4)])
+_POWERS = np.array(
+    [[factorial(power) / factorial(power - order) for power in range(4, 8)] for order in range(4)]
+)
 """Derivatives of u^4 ... u^7 at u = 1."""
 _FROM_ENDS = np.linalg.inv(_POWERS)
 
@@ -161,7 +185,9 @@ def _hermite(left, right, step, by):
         for power in range(6, order - 1, -1):
             total *= u
             total += coefficients[power]
-        coefficients = [coefficients[0]] * (order + 1) + [(power - order) * coefficients[power] for power in range(order + 1, 8)]
+        coefficients = [coefficients[0]] * (order + 1) + [
+            (power - order) * coefficients[power] for power in range(order + 1, 8)
+        ]
     return found / scale
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG
 
-if TYPE_CHECKING:   # the help of verbs reads the layout of messages, hence this module; the table imports scipy
+if (
+    TYPE_CHECKING
+):  # the help of verbs reads the layout of messages, hence this module; the table imports scipy
     from imu_calibration.kinematics.joint import Joint
     from imu_calibration.kinematics.table import Table
 
@@ -43,18 +45,31 @@ class TrajectoryPoints:
         shape = (len(self.time), len(self.joint_names))
         for name, values in self.columns().items():
             if values.shape != shape:
-                raise InputError(f'each point of a trajectory must have {shape[1]} {_WORDS[name]}, one for each joint, got shape '
-                                 f'{values.shape}; give all or none', code='position_count')
+                raise InputError(
+                    f'each point of a trajectory must have {shape[1]} {_WORDS[name]}, one for each joint, got shape '
+                    f'{values.shape}; give all or none',
+                    code='position_count',
+                )
             if not np.all(np.isfinite(values)):
-                raise InputError(f'every number of a trajectory must be finite, some {_WORDS[name]} are not; correct the points',
-                                 code='not_finite')
+                raise InputError(
+                    f'every number of a trajectory must be finite, some {_WORDS[name]} are not; correct the points',
+                    code='not_finite',
+                )
         if not np.all(np.diff(self.time, prepend=0.0) > 0):
-            raise InputError('the times of a trajectory must rise from above zero, they do not; correct time_from_start',
-                             code='times_not_rising')
+            raise InputError(
+                'the times of a trajectory must rise from above zero, they do not; correct time_from_start',
+                code='times_not_rising',
+            )
         if self.acceleration is not None and self.rate is None:
-            raise InputError('a trajectory with accelerations must have velocities, it has none; give both', code='velocities_missing')
+            raise InputError(
+                'a trajectory with accelerations must have velocities, it has none; give both',
+                code='velocities_missing',
+            )
         if self.rate is not None and len(self) and np.any(self.rate[-1]):
-            raise InputError('a trajectory must end at rest, its last point has a velocity; let it be zero', code='not_at_rest')
+            raise InputError(
+                'a trajectory must end at rest, its last point has a velocity; let it be zero',
+                code='not_at_rest',
+            )
 
     @classmethod
     def stop(cls, joint_names: Sequence[str]) -> TrajectoryPoints:
@@ -86,15 +101,23 @@ class TrajectoryPoints:
         """
         own, wanted = list(self.joint_names), list(joint_names)
         if sorted(own) != sorted(wanted):
-            raise InputError(f'a trajectory must name exactly the joints {", ".join(wanted)}, got {", ".join(own) or "none"}; '
-                             'name every joint once', code='joint_names')
+            raise InputError(
+                f'a trajectory must name exactly the joints {", ".join(wanted)}, got {", ".join(own) or "none"}; '
+                'name every joint once',
+                code='joint_names',
+            )
         order = [own.index(name) for name in wanted]
-        columns: dict[str, Any] = {name: values[:, order] for name, values in self.columns().items()}
+        columns: dict[str, Any] = {
+            name: values[:, order] for name, values in self.columns().items()
+        }
         return replace(self, joint_names=tuple(wanted), **columns)
 
     def slowed(self, factor: float) -> TrajectoryPoints:
         """Return the same path at `factor` of its speed, 0 < factor <= 1."""
-        slower: dict[str, Any] = {name: values * factor**order for order, (name, values) in enumerate(self.columns().items())}
+        slower: dict[str, Any] = {
+            name: values * factor**order
+            for order, (name, values) in enumerate(self.columns().items())
+        }
         return replace(self, time=self.time / factor, **slower)
 
 
@@ -140,7 +163,11 @@ class MotionLimits:
 
     def wound(self, position: np.ndarray, turns: float) -> 'MotionLimits':
         """Return the limits with endless joints restricted to so many turns to either side of a position; zero turns: unrestricted."""
-        return self.around(position, np.where(self.endless, 2 * np.pi * turns, np.inf)) if turns else self
+        return (
+            self.around(position, np.where(self.endless, 2 * np.pi * turns, np.inf))
+            if turns
+            else self
+        )
 
     def around(self, position: np.ndarray, reach: np.ndarray) -> 'MotionLimits':
         """
@@ -157,10 +184,15 @@ class MotionLimits:
             When the position is outside the limits.
 
         """
-        lower, upper = np.maximum(self.lower, position - reach), np.minimum(self.upper, position + reach)
+        lower, upper = (
+            np.maximum(self.lower, position - reach),
+            np.minimum(self.upper, position + reach),
+        )
         if np.any(lower > upper):
-            raise InputError(f'the pose must lie within the range of every joint, joint number {int(np.argmax(lower - upper)) + 1} is '
-                             'outside; choose another pose')
+            raise InputError(
+                f'the pose must lie within the range of every joint, joint number {int(np.argmax(lower - upper)) + 1} is '
+                'outside; choose another pose'
+            )
         return replace(self, lower=lower, upper=upper)
 
     def reached(self, position: np.ndarray, reach_deg: float) -> 'MotionLimits':
@@ -171,7 +203,13 @@ class MotionLimits:
 def free_limits(n_joints: int) -> MotionLimits:
     """Return the limits of joints that turn without end at the usual speed."""
     whole, (speed, acceleration) = np.full(n_joints, np.inf), USUAL[True]
-    return MotionLimits(-whole, whole, np.full(n_joints, speed), np.full(n_joints, acceleration), np.ones(n_joints, bool))
+    return MotionLimits(
+        -whole,
+        whole,
+        np.full(n_joints, speed),
+        np.full(n_joints, acceleration),
+        np.ones(n_joints, bool),
+    )
 
 
 def limits_of(table: Table) -> MotionLimits:
@@ -183,13 +221,19 @@ def limits_of(table: Table) -> MotionLimits:
     """
     names = table.joint_names
     turns = np.ones(len(names), bool)
-    lower, upper, fastest = np.full(len(names), -np.inf), np.full(len(names), np.inf), np.full((2, len(names)), np.inf)
+    lower, upper, fastest = (
+        np.full(len(names), -np.inf),
+        np.full(len(names), np.inf),
+        np.full((2, len(names)), np.inf),
+    )
     origins = [[DEFAULT_ORIGIN] * 3 for _ in names]
     # A joint's own entry is last, so that a follower does not determine its type.
     for joint in sorted(table.joints, key=lambda joint: joint.mimic is None):
         column, limits = names.index(joint.source), joint.limits
         turns[column] = joint.turns
-        factor, offset = (1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)
+        factor, offset = (
+            (1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)
+        )
         if factor and limits.lower is not None and limits.upper is not None:
             ends = sorted(((limits.lower - offset) / factor, (limits.upper - offset) / factor))
             if ends[0] > lower[column] or ends[1] < upper[column]:
@@ -197,7 +241,10 @@ def limits_of(table: Table) -> MotionLimits:
             lower[column], upper[column] = max(lower[column], ends[0]), min(upper[column], ends[1])
         elif limits.endless and joint.mimic is None and not np.isfinite(lower[column]):
             origins[column][0] = _origin(joint, 'endless')
-        given = [np.inf if value is None or not factor else value / abs(factor) for value in (limits.speed, limits.acceleration)]
+        given = [
+            np.inf if value is None or not factor else value / abs(factor)
+            for value in (limits.speed, limits.acceleration)
+        ]
         for row, (value, key) in enumerate(zip(given, ('speed', 'acceleration'), strict=True)):
             if value < fastest[row, column]:
                 fastest[row, column], origins[column][row + 1] = value, _origin(joint, key)
@@ -205,7 +252,9 @@ def limits_of(table: Table) -> MotionLimits:
     stuck = ~turns & ~np.isfinite(lower)
     lower[stuck] = upper[stuck] = 0.0
     speed, acceleration = np.where(np.isfinite(fastest), fastest, usual)
-    return MotionLimits(lower, upper, speed, acceleration, turns, tuple((a, b, c) for a, b, c in origins))
+    return MotionLimits(
+        lower, upper, speed, acceleration, turns, tuple((a, b, c) for a, b, c in origins)
+    )
 
 
 def _origin(joint: Joint, name: str) -> str:
@@ -216,35 +265,61 @@ def _origin(joint: Joint, name: str) -> str:
 def missing_ranges(table: Table) -> tuple[str, ...]:
     """Return the joints whose range is unknown or implausibly wide: neither a plausible range nor declared endless."""
     limits = limits_of(table)
-    wide = limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > MAX_RADIAN_RANGE)
-    return tuple(name for name, origin, is_wide in zip(table.joint_names, limits.origins, wide, strict=True)
-                 if origin[0] == DEFAULT_ORIGIN or (is_wide and origin[0].startswith(ROBOT_ORIGIN)))
+    wide = (
+        limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > MAX_RADIAN_RANGE)
+    )
+    return tuple(
+        name
+        for name, origin, is_wide in zip(table.joint_names, limits.origins, wide, strict=True)
+        if origin[0] == DEFAULT_ORIGIN or (is_wide and origin[0].startswith(ROBOT_ORIGIN))
+    )
 
 
 def range_warnings(table: Table) -> list[str]:
     """Return one line on joints without a range, and one per range whose unit is doubtful."""
     lines, missing = [], missing_ranges(table)
     if missing:
-        lines.append(f'every joint must have a range to be moved, {", ".join(missing)}: none, or over ten turns; add range_deg: [a, b] '
-                     '(range_m where it slides) or endless: true to the table file')
+        lines.append(
+            f'every joint must have a range to be moved, {", ".join(missing)}: none, or over ten turns; add range_deg: [a, b] '
+            '(range_m where it slides) or endless: true to the table file'
+        )
     for joint in table.joints:
         lower, upper = joint.limits.lower, joint.limits.upper
-        if joint.turns and lower is not None and upper is not None and 'lower' not in joint.limits.described:
+        if (
+            joint.turns
+            and lower is not None
+            and upper is not None
+            and 'lower' not in joint.limits.described
+        ):
             ends = np.degrees((lower, upper))
             if 0 < np.max(np.abs(ends)) <= RADIANS:
-                lines.append(f"range_deg of joint '{joint.name}' must be in degrees, [{ends[0]:g}, {ends[1]:g}] looks like radians; "
-                             f'write [{np.degrees(ends[0]):.1f}, {np.degrees(ends[1]):.1f}] if it is')
+                lines.append(
+                    f"range_deg of joint '{joint.name}' must be in degrees, [{ends[0]:g}, {ends[1]:g}] looks like radians; "
+                    f'write [{np.degrees(ends[0]):.1f}, {np.degrees(ends[1]):.1f}] if it is'
+                )
     return lines
 
 
 def limit_words(table: Table, limits: MotionLimits) -> list[str]:
     """Return range, speed and acceleration of each joint with the origin of each limit, a line per joint."""
     lines, described = [], limits_of(table)
-    for k, (name, (of_range, of_speed, of_acceleration)) in enumerate(zip(table.joint_names, limits.origins, strict=True)):
+    for k, (name, (of_range, of_speed, of_acceleration)) in enumerate(
+        zip(table.joint_names, limits.origins, strict=True)
+    ):
         factor, unit = (180 / np.pi, 'deg') if limits.turns[k] else (1.0, 'm')
         declared = 'endless' if described.endless[k] else ''
-        ends = f'{factor * limits.lower[k]:.4g} to {factor * limits.upper[k]:.4g} {unit}' if np.isfinite(limits.lower[k]) else ''
-        text = 'no range' if of_range == DEFAULT_ORIGIN else f'{", here ".join(filter(None, (declared, ends)))} ({of_range})'
-        lines.append(f'{name}: {text}, {factor * limits.speed[k]:.4g} {unit}/s ({of_speed}), '
-                     f'{factor * limits.acceleration[k]:.4g} {unit}/s^2 ({of_acceleration})')
+        ends = (
+            f'{factor * limits.lower[k]:.4g} to {factor * limits.upper[k]:.4g} {unit}'
+            if np.isfinite(limits.lower[k])
+            else ''
+        )
+        text = (
+            'no range'
+            if of_range == DEFAULT_ORIGIN
+            else f'{", here ".join(filter(None, (declared, ends)))} ({of_range})'
+        )
+        lines.append(
+            f'{name}: {text}, {factor * limits.speed[k]:.4g} {unit}/s ({of_speed}), '
+            f'{factor * limits.acceleration[k]:.4g} {unit}/s^2 ({of_acceleration})'
+        )
     return lines

@@ -59,7 +59,9 @@ class Reference(AlignedArrays):
     @property
     def _joints(self):
         if self.motion is None:
-            raise InputError('an effect that depends on joints needs a table or an arm, there is none; omit the effect')
+            raise InputError(
+                'an effect that depends on joints needs a table or an arm, there is none; omit the effect'
+            )
         return self.motion
 
 
@@ -120,7 +122,15 @@ def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
     roll = np.arctan2(matrix[2, 1], matrix[2, 2])
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
     sin, cos = np.sin(roll), np.cos(roll)
-    return np.array([roll, pitch, np.arctan2(sin * matrix[0, 2] - cos * matrix[0, 1], cos * matrix[1, 1] - sin * matrix[1, 2])])
+    return np.array(
+        [
+            roll,
+            pitch,
+            np.arctan2(
+                sin * matrix[0, 2] - cos * matrix[0, 1], cos * matrix[1, 1] - sin * matrix[1, 2]
+            ),
+        ]
+    )
 
 
 def align(direction: np.ndarray) -> np.ndarray:
@@ -164,13 +174,19 @@ def normal_gravity(latitude_deg: float, height: float = 0.0) -> float:
 
     """
     sin2 = np.sin(np.radians(latitude_deg)) ** 2
-    surface = _GRAVITY_EQUATOR * (1 + _SOMIGLIANA * sin2) / np.sqrt(1 - _ECCENTRICITY_SQUARED * sin2)
+    surface = (
+        _GRAVITY_EQUATOR * (1 + _SOMIGLIANA * sin2) / np.sqrt(1 - _ECCENTRICITY_SQUARED * sin2)
+    )
     ratio = np.asarray(height, float) / _SEMI_MAJOR_AXIS
-    value = surface * (1 - 2 * (1 + _FLATTENING + _ROTATION_RATIO - 2 * _FLATTENING * sin2) * ratio + 3 * ratio ** 2)
+    value = surface * (
+        1 - 2 * (1 + _FLATTENING + _ROTATION_RATIO - 2 * _FLATTENING * sin2) * ratio + 3 * ratio**2
+    )
     return value if np.ndim(value) else float(value)
 
 
-def local_gravity(gravity: float | None, latitude_deg: float | None = None, height: float | None = None) -> tuple[float | None, float]:
+def local_gravity(
+    gravity: float | None, latitude_deg: float | None = None, height: float | None = None
+) -> tuple[float | None, float]:
     """
     Return (gravity, its standard deviation), m/s^2: as given, else the normal gravity of the place; (None, 0.0) without either.
 
@@ -191,15 +207,25 @@ def local_gravity(gravity: float | None, latitude_deg: float | None = None, heig
     """
     if latitude_deg is None:
         if height is not None:
-            raise InputError(f'height must come with a latitude, got height {height:g} m alone; give both, or gravity in m/s^2',
-                             key='latitude', code='latitude_missing')
+            raise InputError(
+                f'height must come with a latitude, got height {height:g} m alone; give both, or gravity in m/s^2',
+                key='latitude',
+                code='latitude_missing',
+            )
         return gravity, 0.0
     if gravity is not None:
-        raise InputError(f'the place or gravity must be given, got latitude {latitude_deg:g} deg and gravity {gravity:g} m/s^2; omit one',
-                         key='latitude', code='gravity_twice')
+        raise InputError(
+            f'the place or gravity must be given, got latitude {latitude_deg:g} deg and gravity {gravity:g} m/s^2; omit one',
+            key='latitude',
+            code='gravity_twice',
+        )
     if not (abs(latitude_deg) <= 90 and -500 <= (height or 0.0) <= 9000):
-        raise InputError(f'the place must have a latitude of -90 to 90 deg and a height of -500 to 9000 m, got {latitude_deg:g} deg and '
-                         f'{height or 0.0:g} m; correct them', key='latitude', code='place_impossible')
+        raise InputError(
+            f'the place must have a latitude of -90 to 90 deg and a height of -500 to 9000 m, got {latitude_deg:g} deg and '
+            f'{height or 0.0:g} m; correct them',
+            key='latitude',
+            code='place_impossible',
+        )
     value = normal_gravity(latitude_deg, height or 0.0)
     return value, NORMAL_GRAVITY_ACCURACY * value
 
@@ -219,4 +245,6 @@ def earth_rate_n(latitude_deg: float, azimuth_deg: float) -> np.ndarray:
 
     """
     latitude, azimuth = np.radians(latitude_deg), np.radians(azimuth_deg)
-    return EARTH_RATE * np.array([np.cos(latitude) * np.cos(azimuth), np.cos(latitude) * np.sin(azimuth), np.sin(latitude)])
+    return EARTH_RATE * np.array(
+        [np.cos(latitude) * np.cos(azimuth), np.cos(latitude) * np.sin(azimuth), np.sin(latitude)]
+    )

@@ -25,7 +25,9 @@ def _piece_matrix():
         for shift in range(piece + 1):
             scale = (-1) ** shift * comb(SPLINE_ORDER, shift) / 120
             for power in range(SPLINE_ORDER):
-                matrix[power, basis] += scale * comb(DEGREE, power) * float(piece - shift) ** (DEGREE - power)
+                matrix[power, basis] += (
+                    scale * comb(DEGREE, power) * float(piece - shift) ** (DEGREE - power)
+                )
     return matrix
 
 
@@ -56,7 +58,9 @@ class Knots:
         return interval, scaled - interval
 
 
-def design_values(knots: Knots, time: np.ndarray, derivative: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def design_values(
+    knots: Knots, time: np.ndarray, derivative: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (interval, values): the six basis functions that are not zero at each instant, shape (6, n), or their derivative."""
     interval, place = knots.locate(time)
     matrix = PIECES
@@ -71,8 +75,14 @@ def design_values(knots: Knots, time: np.ndarray, derivative: int = 0) -> tuple[
 def design_matrix(knots: Knots, interval: np.ndarray, values: np.ndarray) -> Any:
     """Return the sparse design, shape (n, n_coefficients)."""
     columns = interval[:, None] + np.arange(SPLINE_ORDER)
-    return csr_matrix((np.ascontiguousarray(values.T).ravel(), columns.ravel(), np.arange(0, columns.size + 1, SPLINE_ORDER)),
-                      shape=(len(interval), knots.n_coefficients))
+    return csr_matrix(
+        (
+            np.ascontiguousarray(values.T).ravel(),
+            columns.ravel(),
+            np.arange(0, columns.size + 1, SPLINE_ORDER),
+        ),
+        shape=(len(interval), knots.n_coefficients),
+    )
 
 
 def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -81,7 +91,9 @@ def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.n
     bands = np.zeros((SPLINE_ORDER, size))
     for first in range(SPLINE_ORDER):
         for second in range(first, SPLINE_ORDER):
-            bands[second - first] += np.bincount(interval + first, values[first] * values[second], size)
+            bands[second - first] += np.bincount(
+                interval + first, values[first] * values[second], size
+            )
     return bands
 
 
@@ -90,7 +102,9 @@ def penalty_bands(weights: np.ndarray) -> np.ndarray:
     bands = np.zeros((SPLINE_ORDER, len(weights) + 3))
     for first in range(4):
         for second in range(first, 4):
-            bands[second - first, first:first + len(weights)] += _THIRD_DIFFERENCE[first] * _THIRD_DIFFERENCE[second] * weights
+            bands[second - first, first : first + len(weights)] += (
+                _THIRD_DIFFERENCE[first] * _THIRD_DIFFERENCE[second] * weights
+            )
     return bands
 
 
@@ -100,7 +114,9 @@ def piece_coefficients(coefficients: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(windows @ PIECES.T, -1, 0))
 
 
-def evaluate_pieces(knots: Knots, pieces: np.ndarray, time: np.ndarray, *, derivatives: int) -> np.ndarray:
+def evaluate_pieces(
+    knots: Knots, pieces: np.ndarray, time: np.ndarray, *, derivatives: int
+) -> np.ndarray:
     """Return the values and the first `derivatives` derivatives at `time`, shape (derivatives + 1, n, n_joints)."""
     n_joints = pieces.shape[2]
     result = np.zeros((derivatives + 1, len(time), n_joints))
@@ -109,7 +125,7 @@ def evaluate_pieces(knots: Knots, pieces: np.ndarray, time: np.ndarray, *, deriv
         interval, place = knots.locate(time[part])
         _horner(pieces, interval, np.repeat(place, n_joints).reshape(-1, n_joints), result[:, part])
     for order in range(1, derivatives + 1):
-        result[order] *= factorial(order) / knots.step ** order
+        result[order] *= factorial(order) / knots.step**order
     return result
 
 
@@ -165,13 +181,21 @@ class PenalisedSpline:
     """
 
     def __init__(self, design: Any, bands: np.ndarray, n_kinds: int = 1):
-        self.design, self.bands, self.penalty = design, bands, penalty_bands(np.ones(design.shape[1] - 3))
+        self.design, self.bands, self.penalty = (
+            design,
+            bands,
+            penalty_bands(np.ones(design.shape[1] - 3)),
+        )
         self.n_rows, self.n_coefficients = design.shape
         # Splines are worst at the ends, which callers keep out: the ends have weight zero in the noise and the penalty.
         interior = np.tile(_taper(self.n_rows // n_kinds) ** 2, n_kinds)
         self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
-        self._mean_bands = bands.sum(axis=1) / self.n_coefficients * np.where(np.arange(SPLINE_ORDER) == 0, 1.0, 2.0)
+        self._mean_bands = (
+            bands.sum(axis=1)
+            / self.n_coefficients
+            * np.where(np.arange(SPLINE_ORDER) == 0, 1.0, 2.0)
+        )
         # The smallest penalty for which the factor exists: holes of m knots give it eigenvalues of about (pi / m)^6.
         empty = self.bands[0] < 1e-9 * self.density
         hole = np.max(np.diff(runs_of(empty)), initial=0) + SPLINE_ORDER
@@ -185,11 +209,19 @@ class PenalisedSpline:
         normal = np.cos(theta[:, None] * np.arange(SPLINE_ORDER)) @ self._mean_bands
         return np.maximum(normal, 1e-6 * self.density), (2 - 2 * np.cos(theta)) ** 3
 
-    def fit(self, values: np.ndarray, penalty: float, with_ends: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    def fit(
+        self, values: np.ndarray, penalty: float, with_ends: bool = False
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the coefficients for columns of `values`, and the mean squared residuals away from the ends."""
         unit = penalty_bands(self._end_weights(penalty)) if with_ends else self.penalty
-        coefficients = solveh_banded(self.bands + penalty * unit, self.design.T @ values, lower=True, overwrite_ab=True,
-                                     overwrite_b=True, check_finite=False)
+        coefficients = solveh_banded(
+            self.bands + penalty * unit,
+            self.design.T @ values,
+            lower=True,
+            overwrite_ab=True,
+            overwrite_b=True,
+            check_finite=False,
+        )
         residual = values - self.design @ coefficients
         return coefficients, np.einsum('i,ij,ij->j', self._interior, residual, residual)
 
@@ -201,7 +233,10 @@ class PenalisedSpline:
         distance, over a period of the bandwidth, remove this bias for some more noise: the error of the
         acceleration in the last hundredths of a second falls to a third and less.
         """
-        distance = np.minimum(np.arange(self.n_coefficients - 3), np.arange(self.n_coefficients - 3)[::-1]) - 2
+        distance = (
+            np.minimum(np.arange(self.n_coefficients - 3), np.arange(self.n_coefficients - 3)[::-1])
+            - 2
+        )
         return np.clip(distance * self.bandwidth(penalty) / 6, 0.1, 1.0) ** 3
 
     def gains(self, penalty: float) -> tuple[float, float]:
@@ -210,7 +245,10 @@ class PenalisedSpline:
             normal, damping = self._symbols
             gain = normal / (normal + penalty * damping)
             least = 3 / self.n_rows
-            self._gains[penalty] = least + (1 - least) * np.mean(gain), least + (1 - least) * np.mean(gain ** 2)
+            self._gains[penalty] = (
+                least + (1 - least) * np.mean(gain),
+                least + (1 - least) * np.mean(gain**2),
+            )
         return self._gains[penalty]
 
     def bandwidth(self, penalty: float) -> float:
@@ -219,7 +257,9 @@ class PenalisedSpline:
         return self._theta[np.searchsorted(penalty * damping / normal, 1.0) - 1]
 
 
-def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[float] | np.ndarray) -> list[Smooth]:
+def smooth(
+    spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[float] | np.ndarray
+) -> list[Smooth]:
     """
     Return a `Smooth` per column of `values`, with the penalty that predicts best.
 
@@ -237,9 +277,15 @@ def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[fl
 
     """
     squares = (_squares_by_spectrum if spline.n_rows >= _LONG else _squares_by_fits)(spline, values)
-    decades = [_best_decade((lambda decade, c=column: _cross_validation(spline, decade, squares(decade)[c]),
-                             lambda decade, c=column, f=floor: _mallows(spline, decade, squares(decade)[c], f)))
-               for column, floor in enumerate(noise_floor)]
+    decades = [
+        _best_decade(
+            (
+                lambda decade, c=column: _cross_validation(spline, decade, squares(decade)[c]),
+                lambda decade, c=column, f=floor: _mallows(spline, decade, squares(decade)[c], f),
+            )
+        )
+        for column, floor in enumerate(noise_floor)
+    ]
     results = {}
     for decade in set(decades):
         columns = np.flatnonzero(np.array(decades) == decade)
@@ -248,8 +294,12 @@ def smooth(spline: PenalisedSpline, values: np.ndarray, noise_floor: Sequence[fl
         gain, _ = spline.gains(penalty)
         noise = np.sqrt(residual / (1 - gain))
         for place, column in enumerate(columns.tolist()):
-            results[column] = Smooth(coefficients[:, place], gain * spline.n_rows, spline.bandwidth(penalty),
-                                     float(noise[place]))
+            results[column] = Smooth(
+                coefficients[:, place],
+                gain * spline.n_rows,
+                spline.bandwidth(penalty),
+                float(noise[place]),
+            )
     return [results[column] for column in range(len(decades))]
 
 
@@ -267,12 +317,18 @@ def _squares_by_spectrum(spline, values):
     pilot = _penalty(spline, _PILOT)
     coefficients, floor = spline.fit(values, pilot)
     taper = _taper(len(coefficients) - 3)[:, None]
-    power = np.abs(np.fft.rfft(taper * np.diff(coefficients, 3, axis=0), axis=0)) ** 2 / np.sum(taper ** 2)
+    power = np.abs(np.fft.rfft(taper * np.diff(coefficients, 3, axis=0), axis=0)) ** 2 / np.sum(
+        taper**2
+    )
     theta = np.arange(len(power)) * 2 * np.pi / len(taper)
     normal, damping = spline.symbols(theta)
     # Third differences of the rough fit lack the part removed by its own penalty.
     power *= ((1 + pilot * damping / normal) ** 2 * normal * damping)[:, None]
-    power[1:] *= 2.0 if len(taper) % 2 else np.where(np.arange(1, len(power)) == len(power) - 1, 1.0, 2.0)[:, None]
+    power[1:] *= (
+        2.0
+        if len(taper) % 2
+        else np.where(np.arange(1, len(power)) == len(power) - 1, 1.0, 2.0)[:, None]
+    )
     power /= len(taper) * spline.density
 
     @lru_cache(None)
@@ -286,7 +342,9 @@ def _squares_by_spectrum(spline, values):
 
 def _taper(size):
     """Return a window with raised-cosine edges (Tukey's; the import of scipy.signal is slow)."""
-    inside = np.minimum(np.arange(size), np.arange(size)[::-1]) / max(0.5 * _TAPER * (size - 1), 1.0)
+    inside = np.minimum(np.arange(size), np.arange(size)[::-1]) / max(
+        0.5 * _TAPER * (size - 1), 1.0
+    )
     return 0.5 - 0.5 * np.cos(np.pi * np.minimum(inside, 1.0))
 
 
@@ -302,13 +360,17 @@ def _cross_validation(spline, decade, squares):
 def _mallows(spline, decade, squares, noise_sd):
     gain, _ = spline.gains(_penalty(spline, decade))
     # The guard of the robust criterion, to first order in the gain.
-    return squares + (1 + 1 / ROBUSTNESS) * noise_sd ** 2 * gain
+    return squares + (1 + 1 / ROBUSTNESS) * noise_sd**2 * gain
 
 
 def _best_decade(scores):
     """Return the largest of the scores' minima: in coarse steps, then one decade, then half a one."""
     coarse = [min(_COARSE, key=score) for score in scores]
-    return max(_refine(score, start) for score, start in zip(scores, coarse, strict=True) if start == max(coarse))
+    return max(
+        _refine(score, start)
+        for score, start in zip(scores, coarse, strict=True)
+        if start == max(coarse)
+    )
 
 
 def _refine(score, decade):

@@ -37,8 +37,14 @@ class Turn:
     """Seconds from first to last sample."""
 
 
-def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndarray, matrix: np.ndarray,
-                   further: tuple[np.ndarray, np.ndarray] | None = None) -> Turn:
+def integrate_turn(
+    time: np.ndarray,
+    rate_measured: np.ndarray,
+    *,
+    bias: np.ndarray,
+    matrix: np.ndarray,
+    further: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Turn:
     """
     Integrate ``rate = matrix^-1 (measured - bias - further effects)`` over one stretch of samples.
 
@@ -63,7 +69,9 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
 
     """
     inverse = np.linalg.inv(matrix)
-    centred = (rate_measured - bias if further is None else rate_measured - bias - further[0]).T.copy()
+    centred = (
+        rate_measured - bias if further is None else rate_measured - bias - further[0]
+    ).T.copy()
     rate, step, slopes = inverse @ centred, np.diff(time), _slope_weights(time)
     vectors = _rotation_vectors(rate, step, slopes)
     mat_ik = Rotation.from_quat(_prefix_product(vectors).T).as_matrix()
@@ -73,10 +81,22 @@ def integrate_turn(time: np.ndarray, rate_measured: np.ndarray, *, bias: np.ndar
     by_inverse = (weight.reshape(9, -1) @ centred.T).reshape(3, 3, 3)
     by_matrix = -np.einsum('irc,rp,qc->ipq', by_inverse, inverse, inverse)
     by_reading = inverse.T @ weight
-    by_further = np.zeros((3, 0)) if further is None else -np.tensordot(by_reading, further[1], ((1, 2), (1, 0)))
+    by_further = (
+        np.zeros((3, 0))
+        if further is None
+        else -np.tensordot(by_reading, further[1], ((1, 2), (1, 0)))
+    )
     path = float(np.sum(0.5 * step * np.linalg.norm(rate[:, :-1] + rate[:, 1:], axis=0)))
     integral = 0.5 * (centred[:, :-1] + centred[:, 1:]) @ step
-    return Turn(mat_ji, -by_reading.sum(axis=2), by_matrix, by_further, integral, path, float(time[-1] - time[0]))
+    return Turn(
+        mat_ji,
+        -by_reading.sum(axis=2),
+        by_matrix,
+        by_further,
+        integral,
+        path,
+        float(time[-1] - time[0]),
+    )
 
 
 def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
@@ -91,7 +111,9 @@ def _rotation_vectors(rate, step, slopes):
     slope = slopes[1] * rate
     slope[:, 1:] += slopes[0][1:] * first
     slope[:, :-1] += slopes[2][:-1] * second
-    return 0.5 * step * (first + second) + MAGNUS_SECOND * step**2 * (cross(first, second) - np.diff(slope))
+    return 0.5 * step * (first + second) + MAGNUS_SECOND * step**2 * (
+        cross(first, second) - np.diff(slope)
+    )
 
 
 def small_rotation(vector: np.ndarray) -> np.ndarray:
@@ -105,7 +127,10 @@ def _slope_weights(time):
     step = np.diff(time)
     before, after = step[:-1], step[1:]
     weights = np.zeros((3, len(time)))
-    weights[0, 1:-1], weights[2, 1:-1] = -after / (before * (before + after)), before / (after * (before + after))
+    weights[0, 1:-1], weights[2, 1:-1] = (
+        -after / (before * (before + after)),
+        before / (after * (before + after)),
+    )
     weights[0, -1], weights[2, 0] = -1 / step[-1], 1 / step[0]
     weights[1] = -weights[0] - weights[2]
     return weights
@@ -132,8 +157,14 @@ def _per_sample(gain, step, rate, slopes):
 
 def _multiply(left, right):
     (b, c, d, a), (x, y, z, w) = left, right
-    return np.stack([a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
-                     a * w - b * x - c * y - d * z])
+    return np.stack(
+        [
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+            a * w - b * x - c * y - d * z,
+        ]
+    )
 
 
 def _prefix_product(vectors):
@@ -148,7 +179,7 @@ def _running_quaternion(factors):
     pairs = _running_quaternion(_multiply(factors[:, :-1:2], factors[:, 1::2]))
     product = factors.copy()
     product[:, 1::2] = pairs
-    product[:, 2::2] = _multiply(pairs[:, :(factors.shape[1] - 1) // 2], factors[:, 2::2])
+    product[:, 2::2] = _multiply(pairs[:, : (factors.shape[1] - 1) // 2], factors[:, 2::2])
     return product
 
 
@@ -163,7 +194,9 @@ def _times_jacobian(rows, vectors):
     return rows - one * across + two * cross(across, vectors)
 
 
-def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray | None = None) -> np.ndarray:
+def integrate_attitude(
+    time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray | None = None
+) -> np.ndarray:
     """
     Integrate the rate into the attitude, sensor frame to level frame, shape (n, 3, 3).
 
@@ -181,12 +214,18 @@ def integrate_attitude(time: np.ndarray, rate_s: np.ndarray, mat_ns0: np.ndarray
     """
     time, rate_s = _checked(time, rate_s)
     step = np.diff(time)[:, None]
-    turns = 0.5 * (rate_s[1:] + rate_s[:-1]) * step + np.cross(rate_s[:-1], rate_s[1:]) * step**2 / 12
+    turns = (
+        0.5 * (rate_s[1:] + rate_s[:-1]) * step + np.cross(rate_s[:-1], rate_s[1:]) * step**2 / 12
+    )
     start = np.eye(3) if mat_ns0 is None else mat_ns0
-    return np.concatenate([start[None], start @ Rotation.from_quat(_prefix_product(turns.T).T).as_matrix()])
+    return np.concatenate(
+        [start[None], start @ Rotation.from_quat(_prefix_product(turns.T).T).as_matrix()]
+    )
 
 
-def dead_reckon(time: np.ndarray, force_n: np.ndarray, gravity: float) -> tuple[np.ndarray, np.ndarray]:
+def dead_reckon(
+    time: np.ndarray, force_n: np.ndarray, gravity: float
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Integrate specific force in the level frame (z up) twice by the trapezoid rule.
 
@@ -201,8 +240,14 @@ def dead_reckon(time: np.ndarray, force_n: np.ndarray, gravity: float) -> tuple[
     return velocity, _running_integral(time, velocity)
 
 
-def strapdown(time: np.ndarray, force_s: np.ndarray, rate_s: np.ndarray, *, gravity: float,
-              mat_ns0: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def strapdown(
+    time: np.ndarray,
+    force_s: np.ndarray,
+    rate_s: np.ndarray,
+    *,
+    gravity: float,
+    mat_ns0: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return velocity and position in n, m/s and m, each shape (n, 3), by accelerometers and gyroscopes only, from rest at the origin.
 
@@ -222,7 +267,9 @@ def strapdown(time: np.ndarray, force_s: np.ndarray, rate_s: np.ndarray, *, grav
     return dead_reckon(time, np.einsum('nij,nj->ni', mat_ns, force_s), gravity)
 
 
-def error_growth(time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def error_growth(
+    time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return velocity and position errors that a specific-force error causes, attitude being known, each of shape (n, 3).
 
@@ -236,7 +283,9 @@ def error_growth(time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray
     return dead_reckon(time, force_error, 0.0)
 
 
-def constant_error_growth(force_error: np.ndarray | float, seconds: float) -> tuple[np.ndarray | float, np.ndarray | float]:
+def constant_error_growth(
+    force_error: np.ndarray | float, seconds: float
+) -> tuple[np.ndarray | float, np.ndarray | float]:
     """Return the velocity and position error, m/s and m, of a constant error in m/s^2 along one axis of a body that does not turn."""
     return force_error * seconds, force_error * seconds**2 / 2
 
@@ -246,7 +295,9 @@ def largest(vectors: np.ndarray) -> np.ndarray | float:
     return np.max(np.linalg.norm(vectors, axis=-1), axis=-1)
 
 
-def dead_reckoning_errors(reference: Reference, force_s: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def dead_reckoning_errors(
+    reference: Reference, force_s: np.ndarray, rate_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the errors of velocity and position in n of measured or compensated samples, m/s and m, each shape (n, 3).
 
@@ -261,16 +312,22 @@ def dead_reckoning_errors(reference: Reference, force_s: np.ndarray, rate_s: np.
         Measured or compensated samples, m/s^2 and rad/s.
 
     """
-    measured, true = (strapdown(reference.time, force, rate, gravity=reference.gravity, mat_ns0=reference.mat_sn[0].T)
-                      for force, rate in ((force_s, rate_s), (reference.force_s, reference.rate_s)))
+    measured, true = (
+        strapdown(
+            reference.time, force, rate, gravity=reference.gravity, mat_ns0=reference.mat_sn[0].T
+        )
+        for force, rate in ((force_s, rate_s), (reference.force_s, reference.rate_s))
+    )
     return measured[0] - true[0], measured[1] - true[1]
 
 
 def _checked(time, rate_s):
     time, rate_s = np.asarray(time, float), np.asarray(rate_s, float)
     if rate_s.shape != (len(time), 3) or np.any(np.diff(time) <= 0):
-        raise InputError(f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort the samples',
-                         code='shape_and_times')
+        raise InputError(
+            f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort the samples',
+            code='shape_and_times',
+        )
     return time, rate_s
 
 

@@ -21,7 +21,12 @@ from imu_calibration.kinematics.joint import (
     several_numbers,
     unit_vector,
 )
-from imu_calibration.kinematics.rotations import NORMAL_GRAVITY_ACCURACY, align, normal_gravity, rotation_from_rpy
+from imu_calibration.kinematics.rotations import (
+    NORMAL_GRAVITY_ACCURACY,
+    align,
+    normal_gravity,
+    rotation_from_rpy,
+)
 
 PARALLEL = 0.02
 """Sine of the angle up to which two axes count as parallel: their common perpendicular is undefined there."""
@@ -65,7 +70,10 @@ def _between(name, index, before, axis):
     sine = np.linalg.norm(normal)
     if sine > PARALLEL:
         return [AxisAngle(name, index, normal / sine)]
-    return [AxisAngle(f'{name}_{letter}', index, direction) for letter, direction in zip('uv', axis_error_directions(axis), strict=True)]
+    return [
+        AxisAngle(f'{name}_{letter}', index, direction)
+        for letter, direction in zip('uv', axis_error_directions(axis), strict=True)
+    ]
 
 
 def axis_error_directions(axis: np.ndarray) -> np.ndarray:
@@ -121,18 +129,28 @@ class Table:
     def __post_init__(self) -> None:
         joints = tuple(self.joints)
         _require_joints(joints)
-        checked: dict[str, Any] = {'joints': joints, 'up': unit_vector(self.up, 'up'),
-                                   'mount_rpy_deg': several_numbers(self.mount_rpy_deg, 'mount rpy_deg')}
+        checked: dict[str, Any] = {
+            'joints': joints,
+            'up': unit_vector(self.up, 'up'),
+            'mount_rpy_deg': several_numbers(self.mount_rpy_deg, 'mount rpy_deg'),
+        }
         if self.mount_xyz is not None:
             checked['mount_xyz'] = several_numbers(self.mount_xyz, 'mount xyz')
         for name, (low, high, advice) in _NUMBERS.items():
             value = getattr(self, name)
-            checked[name] = None if value is None else finite_number(value, name, low=low, high=high, advice=advice)
+            checked[name] = (
+                None
+                if value is None
+                else finite_number(value, name, low=low, high=high, advice=advice)
+            )
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.gravity is None and self.latitude is None:
-            raise InputError('table: gravity or latitude must be given, got neither; '
-                             'add gravity in m/s^2, or latitude in degrees (and height)', code='gravity_missing')
+            raise InputError(
+                'table: gravity or latitude must be given, got neither; '
+                'add gravity in m/s^2, or latitude in degrees (and height)',
+                code='gravity_missing',
+            )
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> 'Table':
@@ -145,14 +163,22 @@ class Table:
             When a key is unknown, a joint is missing or a value does not fit.
 
         """
-        return cls(joints=tuple(joint_from_mapping(item) for item in joint_entries(mapping)), **site_from_mapping(mapping))
+        return cls(
+            joints=tuple(joint_from_mapping(item) for item in joint_entries(mapping)),
+            **site_from_mapping(mapping),
+        )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the mapping that `from_mapping` turns into an equal table."""
-        mapping = {f.name: getattr(self, f.name) for f in fields(self) if not f.name.startswith('mount_')}
+        mapping = {
+            f.name: getattr(self, f.name) for f in fields(self) if not f.name.startswith('mount_')
+        }
         mapping['joints'] = [joint_to_mapping(joint) for joint in self.joints]
         mapping['up'] = list(self.up)
-        mapping['mount'] = {'rpy_deg': list(self.mount_rpy_deg), 'xyz': None if self.mount_xyz is None else list(self.mount_xyz)}
+        mapping['mount'] = {
+            'rpy_deg': list(self.mount_rpy_deg),
+            'xyz': None if self.mount_xyz is None else list(self.mount_xyz),
+        }
         return mapping
 
     @cached_property
@@ -161,16 +187,30 @@ class Table:
         turning = [joint.source for joint in self.joints if joint.turns]
         # A zero that affects only the first or the last axis is the azimuth, or belongs to the mount.
         apart = [name for name in (turning[:1] + turning[-1:]) if turning.count(name) == 1]
-        read, turning = (tuple(dict.fromkeys(names)) for names in ((joint.source for joint in self.joints), turning))
+        read, turning = (
+            tuple(dict.fromkeys(names))
+            for names in ((joint.source for joint in self.joints), turning)
+        )
         angles = tuple(angle.name for angle in axis_angles(self.joints))
         places = place_names([joint.name for joint in self.joints if joint.turns])
-        return JointNames(read, turning, tuple(name for name in turning if name not in apart), angles, places,
-                          self.joint_error_rad or None, self.joint_error_m or None)
+        return JointNames(
+            read,
+            turning,
+            tuple(name for name in turning if name not in apart),
+            angles,
+            places,
+            self.joint_error_rad or None,
+            self.joint_error_m or None,
+        )
 
     @property
     def gravity_value(self) -> float:
         """Local gravity, m/s^2: as given, otherwise normal gravity."""
-        return self.gravity if self.gravity is not None else normal_gravity(self.latitude, self.height or 0.0)  # type: ignore[arg-type]
+        return (
+            self.gravity
+            if self.gravity is not None
+            else normal_gravity(self.latitude, self.height or 0.0)
+        )  # type: ignore[arg-type]
 
     @property
     def gravity_sd_value(self) -> float:
@@ -192,7 +232,9 @@ class Table:
     @property
     def azimuth_n_deg(self) -> float | None:
         """Heading of the x axis of n, degrees clockwise from true north, or None."""
-        return None if self.azimuth_deg is None else self.azimuth_deg + base_heading_deg(self.mat_nb)
+        return (
+            None if self.azimuth_deg is None else self.azimuth_deg + base_heading_deg(self.mat_nb)
+        )
 
 
 _NUMBERS = {
@@ -215,8 +257,16 @@ def joint_entries(mapping: Any) -> tuple:
 
 def site_from_mapping(mapping: Any) -> dict[str, Any]:
     """Return the entries of a table description except the joints, as arguments of `Table`."""
-    require_keys(mapping, [f.name for f in fields(Table) if not f.name.startswith('mount_')] + ['mount'], 'table')
-    values = {name: value for name, value in mapping.items() if value is not None and name not in ('mount', 'joints')}
+    require_keys(
+        mapping,
+        [f.name for f in fields(Table) if not f.name.startswith('mount_')] + ['mount'],
+        'table',
+    )
+    values = {
+        name: value
+        for name, value in mapping.items()
+        if value is not None and name not in ('mount', 'joints')
+    }
     mount = mapping.get('mount') or {}
     require_keys(mount, _MOUNT_KEYS, 'table mount')
     return values | {f'mount_{name}': value for name, value in mount.items() if value is not None}
@@ -230,14 +280,21 @@ def base_heading_deg(mat_nb: np.ndarray) -> float:
 
 def _require_joints(joints):
     if not joints:
-        raise InputError('table: joints must list at least one joint, got none; describe them from the base outwards', code='no_joint')
+        raise InputError(
+            'table: joints must list at least one joint, got none; describe them from the base outwards',
+            code='no_joint',
+        )
     names = [joint.name for joint in joints]
     for name in names:
         if not isinstance(name, str) or not name or names.count(name) > 1:
-            raise InputError(f'table: joint names must be different and not empty, got {names}; use the names of the joint states',
-                             code='joint_names')
+            raise InputError(
+                f'table: joint names must be different and not empty, got {names}; use the names of the joint states',
+                code='joint_names',
+            )
     followers = {joint.name for joint in joints if joint.mimic is not None}
     for joint in joints:
         if joint.source in followers:
-            raise InputError(f"table: joint '{joint.name}' must follow a joint that moves by itself, '{joint.source}' follows another one; "
-                             'name that one')
+            raise InputError(
+                f"table: joint '{joint.name}' must follow a joint that moves by itself, '{joint.source}' follows another one; "
+                'name that one'
+            )

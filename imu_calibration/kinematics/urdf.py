@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.core.documents import MAX_DOCUMENT_CHARACTERS
 from imu_calibration.core.errors import InputError, printable, shortened
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
-from imu_calibration.kinematics.joint import LIMIT_KEYS, Joint, JointLimits, Mimic, limits_from_mapping, require_keys, several_numbers
+from imu_calibration.kinematics.joint import (
+    LIMIT_KEYS,
+    Joint,
+    JointLimits,
+    Mimic,
+    limits_from_mapping,
+    require_keys,
+    several_numbers,
+)
 from imu_calibration.kinematics.rotations import rotation_from_rpy, rpy_from_rotation
 from imu_calibration.kinematics.table import Table, joint_entries, site_from_mapping
 
@@ -27,7 +35,14 @@ class StaticTransforms:
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, np.ndarray, np.ndarray]] = {}
 
-    def add(self, parent: str, child: str, *, xyz: Sequence[float], quaternion: Sequence[float] | np.ndarray) -> bool:
+    def add(
+        self,
+        parent: str,
+        child: str,
+        *,
+        xyz: Sequence[float],
+        quaternion: Sequence[float] | np.ndarray,
+    ) -> bool:
         """
         Add the pose of a child frame in its parent: translation in m, quaternion (x, y, z, w).
 
@@ -38,7 +53,14 @@ class StaticTransforms:
 
         """
         xyz, quaternion = np.array(xyz, float), np.array(quaternion, float)
-        if not (np.isfinite(xyz).all() and np.isfinite(quaternion).all() and np.linalg.norm(quaternion) > 0.5) or parent == child:
+        if (
+            not (
+                np.isfinite(xyz).all()
+                and np.isfinite(quaternion).all()
+                and np.linalg.norm(quaternion) > 0.5
+            )
+            or parent == child
+        ):
             return False
         self._parents[child] = (parent, xyz, Rotation.from_quat(quaternion).as_matrix())
         return True
@@ -68,9 +90,12 @@ class StaticTransforms:
             return 'no static transform has come'
         absent = [f"'{name}'" for name in (target, source) if name not in known]
         names = ', '.join(sorted(known)[:NAMED]) + (', ...' if len(known) > NAMED else '')
-        return f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came (frames: {names})' if absent else \
-            f"'{target}' and '{source}' are in trees without a static connection (roots: {self._to_root(target)[-1][0]}, " \
+        return (
+            f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came (frames: {names})'
+            if absent
+            else f"'{target}' and '{source}' are in trees without a static connection (roots: {self._to_root(target)[-1][0]}, "
             f'{self._to_root(source)[-1][0]})'
+        )
 
     def _to_root(self, frame):
         """Return (ancestor, origin of `frame` in it, matrix from `frame` to it) from the frame up to its root; a ring ends once closed."""
@@ -83,7 +108,9 @@ class StaticTransforms:
         return steps
 
 
-def up_of(root: str, transforms: Iterable[tuple[str, str, np.ndarray]]) -> tuple[float, float, float]:
+def up_of(
+    root: str, transforms: Iterable[tuple[str, str, np.ndarray]]
+) -> tuple[float, float, float]:
     """
     Return the z axis of the outermost frame in the frame `root`: up, where that frame is the world or a map.
 
@@ -105,8 +132,11 @@ def up_of(root: str, transforms: Iterable[tuple[str, str, np.ndarray]]) -> tuple
         tree.add(parent, child, xyz=(0.0, 0.0, 0.0), quaternion=quaternion)
     frame, _, mat = tree._to_root(root)[-1]
     if frame in tree._parents:
-        raise InputError(f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or give `up`",
-                         key='up', code='frame_circle')
+        raise InputError(
+            f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or give `up`",
+            key='up',
+            code='frame_circle',
+        )
     return tuple(mat[2].tolist())
 
 
@@ -145,12 +175,20 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
     robot = _read(text)
     values = site_from_mapping(site or {})
     if values.get('gravity') is None and values.get('latitude') is None:
-        values |= {'gravity': STANDARD_GRAVITY, 'gravity_sd': values.get('gravity_sd') or STANDARD_GRAVITY_SD}
+        values |= {
+            'gravity': STANDARD_GRAVITY,
+            'gravity_sd': values.get('gravity_sd') or STANDARD_GRAVITY_SD,
+        }
     joints, rest = _chain(robot, link)
-    xyz, rpy_deg = (several_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}') for name in ('xyz', 'rpy_deg'))
+    xyz, rpy_deg = (
+        several_numbers(values.get(f'mount_{name}', (0.0, 0.0, 0.0)), f'mount {name}')
+        for name in ('xyz', 'rpy_deg')
+    )
     mount = rest.then(np.array(xyz), rotation_from_rpy(np.radians(rpy_deg)))
     values |= {f'mount_{name}': value for name, value in mount.fields.items()}
-    return Table(**JOINT_ERRORS | values | {'joints': _with_limits(joints, joint_entries(site or {}), link)})
+    return Table(
+        **JOINT_ERRORS | values | {'joints': _with_limits(joints, joint_entries(site or {}), link)}
+    )
 
 
 def root_of(text: str | bytes) -> str:
@@ -158,7 +196,9 @@ def root_of(text: str | bytes) -> str:
     robot = _read(text)
     roots = [link for link in robot.link_map if link not in robot.parent_map]
     if len(roots) != 1:
-        raise InputError(f'a robot description must have one root link, it has {_listed(roots) or "none"}; correct it')
+        raise InputError(
+            f'a robot description must have one root link, it has {_listed(roots) or "none"}; correct it'
+        )
     return roots[0]
 
 
@@ -176,7 +216,10 @@ class _Placement:
     @property
     def fields(self):
         """As fields of a `Joint`."""
-        return {'xyz': tuple(self.xyz.tolist()), 'rpy_deg': tuple(np.degrees(rpy_from_rotation(self.matrix)).tolist())}
+        return {
+            'xyz': tuple(self.xyz.tolist()),
+            'rpy_deg': tuple(np.degrees(rpy_from_rotation(self.matrix)).tolist()),
+        }
 
 
 def _read(text):
@@ -186,11 +229,15 @@ def _read(text):
     try:
         from urdf_parser_py.urdf import Robot
     except ImportError as error:
-        raise InputError("a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'",
-                         code='package_missing') from error
+        raise InputError(
+            "a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'",
+            code='package_missing',
+        ) from error
     try:
         if len(text) > MAX_DOCUMENT_CHARACTERS:
-            raise ValueError(f'it has {len(text)} characters, at most {MAX_DOCUMENT_CHARACTERS} are accepted')
+            raise ValueError(
+                f'it has {len(text)} characters, at most {MAX_DOCUMENT_CHARACTERS} are accepted'
+            )
         root = ElementTree.fromstring(text)
         for element in root.iter():
             element.attrib.update((key, printable(value)) for key, value in element.items())
@@ -198,44 +245,71 @@ def _read(text):
             raise ValueError(f'its outermost element is <{root.tag}>')
         bare = ElementTree.Element('robot', root.attrib)
         for element in (child for child in root if child.tag in _READ):
-            ElementTree.SubElement(bare, element.tag, element.attrib).extend(child for child in element if child.tag in _READ[element.tag])
+            ElementTree.SubElement(bare, element.tag, element.attrib).extend(
+                child for child in element if child.tag in _READ[element.tag]
+            )
         return Robot.from_xml_string(ElementTree.tostring(bare))
-    except Exception as error:   # the parsers raise many kinds
-        raise InputError(f'a robot description must be a URDF, this is not: {shortened(str(error), 200)}; give the .urdf or .xacro of '
-                         'the robot') from error
+    except Exception as error:  # the parsers raise many kinds
+        raise InputError(
+            f'a robot description must be a URDF, this is not: {shortened(str(error), 200)}; give the .urdf or .xacro of '
+            'the robot'
+        ) from error
 
 
 def _chain(robot, link):
     """Return the moving joints from the root to `link`, and the placement of the link after the last of them."""
     if link not in robot.link_map:
-        raise InputError(f"the robot description must hold the link '{link}' that carries the IMU, it holds {_listed(robot.link_map)}; "
-                         'name one of these', key='imu_link', code='link_unknown')
+        raise InputError(
+            f"the robot description must hold the link '{link}' that carries the IMU, it holds {_listed(robot.link_map)}; "
+            'name one of these',
+            key='imu_link',
+            code='link_unknown',
+        )
     on_the_way = []
     while link in robot.parent_map:
         name, link = robot.parent_map[link]
         on_the_way.append(robot.joint_map[name])
         if len(on_the_way) > len(robot.joint_map):
-            raise InputError(f"the links of a robot description must form a tree, those around '{link}' form a circle; correct it")
+            raise InputError(
+                f"the links of a robot description must form a tree, those around '{link}' form a circle; correct it"
+            )
     joints, placement = [], _Placement(np.zeros(3), np.eye(3))
     for joint in reversed(on_the_way):
         placement = placement.then(*_origin(joint))
         if joint.type == 'fixed':
             continue
         if joint.type not in _MOVING:
-            raise InputError(f"joints on the way to the IMU must be revolute, continuous, prismatic or fixed, '{joint.name}' is "
-                             f'{joint.type}; use a description that begins after it')
-        joints.append(Joint(joint.name, tuple(joint.axis or (1.0, 0.0, 0.0)), type=_MOVING[joint.type], mimic=_mimic(robot, joint),
-                            limits=_limits(joint), **placement.fields))
+            raise InputError(
+                f"joints on the way to the IMU must be revolute, continuous, prismatic or fixed, '{joint.name}' is "
+                f'{joint.type}; use a description that begins after it'
+            )
+        joints.append(
+            Joint(
+                joint.name,
+                tuple(joint.axis or (1.0, 0.0, 0.0)),
+                type=_MOVING[joint.type],
+                mimic=_mimic(robot, joint),
+                limits=_limits(joint),
+                **placement.fields,
+            )
+        )
         placement = _Placement(np.zeros(3), np.eye(3))
     if not joints:
-        raise InputError(f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least one joint, it is fixed to "
-                         f"the root '{link}'; name the link that carries the IMU, or calibrate by hand")
+        raise InputError(
+            f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least one joint, it is fixed to "
+            f"the root '{link}'; name the link that carries the IMU, or calibrate by hand"
+        )
     return joints, placement
 
 
 def _origin(joint):
-    xyz, rpy = (several_numbers((joint.origin and getattr(joint.origin, name)) or (0, 0, 0), f'origin {name} of joint {joint.name}')
-                for name in ('xyz', 'rpy'))
+    xyz, rpy = (
+        several_numbers(
+            (joint.origin and getattr(joint.origin, name)) or (0, 0, 0),
+            f'origin {name} of joint {joint.name}',
+        )
+        for name in ('xyz', 'rpy')
+    )
     return np.array(xyz), rotation_from_rpy(rpy)
 
 
@@ -249,7 +323,9 @@ def _mimic(robot, joint):
         seen.append(name)
         name = mimic.joint
         if name not in robot.joint_map or name in seen:
-            raise InputError(f"joint '{joint.name}' must mimic another joint of the robot, it mimics '{name}'; correct the description")
+            raise InputError(
+                f"joint '{joint.name}' must mimic another joint of the robot, it mimics '{name}'; correct the description"
+            )
     return None if name == joint.name else Mimic(name, multiplier, offset)
 
 
@@ -257,9 +333,17 @@ def _limits(joint):
     """Return the limits in the description: a continuous joint is endless, placeholders (zero, infinite) count as not given."""
     limit, endless = joint.limit, joint.type == 'continuous'
     ends = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
-    ends = (None, None) if endless or ends == (0.0, 0.0) or not all(map(math.isfinite, ends)) else ends
-    speed = limit.velocity if limit is not None and limit.velocity and math.isfinite(limit.velocity) else None
-    return JointLimits(*ends, speed, endless=endless, described=frozenset(('lower', 'upper', 'speed', 'endless')))
+    ends = (
+        (None, None) if endless or ends == (0.0, 0.0) or not all(map(math.isfinite, ends)) else ends
+    )
+    speed = (
+        limit.velocity
+        if limit is not None and limit.velocity and math.isfinite(limit.velocity)
+        else None
+    )
+    return JointLimits(
+        *ends, speed, endless=endless, described=frozenset(('lower', 'upper', 'speed', 'endless'))
+    )
 
 
 def _with_limits(joints, entries, link):
@@ -268,12 +352,19 @@ def _with_limits(joints, entries, link):
     for entry in entries:
         name = entry.get('name') if isinstance(entry, Mapping) else None
         if name not in by_name:
-            raise InputError(f"joints of the site must be on the way to '{link}': {_listed(by_name)}; got {name!r}", code='joint_unknown')
+            raise InputError(
+                f"joints of the site must be on the way to '{link}': {_listed(by_name)}; got {name!r}",
+                code='joint_unknown',
+            )
         known = by_name[name]
         require_keys(entry, ('name', *LIMIT_KEYS[known.type]), f"limits of joint '{name}'")
         given = limits_from_mapping(entry, known.type)
-        better = {key: value for key, value in vars(given).items() if key != 'described' and value is not None and value is not False}
-        if given.endless or given.lower is not None:   # a range and endless exclude each other
+        better = {
+            key: value
+            for key, value in vars(given).items()
+            if key != 'described' and value is not None and value is not False
+        }
+        if given.endless or given.lower is not None:  # a range and endless exclude each other
             better = {'lower': None, 'upper': None, 'endless': False} | better
         better['described'] = known.limits.described - set(better)
         by_name[name] = replace(known, limits=replace(known.limits, **better))

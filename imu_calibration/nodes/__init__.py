@@ -10,7 +10,13 @@ import signal
 import sys
 from importlib.util import find_spec
 
-NODE_NAMES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
+NODE_NAMES = (
+    'calibration_node',
+    'compensator_node',
+    'simulator_node',
+    'bag_player_node',
+    'planner_node',
+)
 """Executables of this package; the nodes of other packages that import it keep their own interrupt."""
 
 
@@ -24,8 +30,11 @@ def end_quietly_while_importing() -> None:
 def require_rclpy() -> None:
     """End a node's process with one line and exit code 1 where ROS is not installed; no effect in other programs."""
     if is_node_process() and find_spec('rclpy') is None:
-        print('a node needs ROS 2 (rclpy), it is not installed; source a ROS 2 Jazzy workspace, or use the command line imu_calibration, '
-              'which needs no ROS', file=sys.stderr)
+        print(
+            'a node needs ROS 2 (rclpy), it is not installed; source a ROS 2 Jazzy workspace, or use the command line imu_calibration, '
+            'which needs no ROS',
+            file=sys.stderr,
+        )
         raise SystemExit(1)
 
 
@@ -36,6 +45,8 @@ def is_node_process() -> bool:
     return bool(sys.argv) and os.path.basename(sys.argv[0]) in NODE_NAMES
 
 
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')   # as the command line does, before numpy is imported
+os.environ.setdefault(
+    'OPENBLAS_NUM_THREADS', '1'
+)  # as the command line does, before numpy is imported
 end_quietly_while_importing()
 require_rclpy()

@@ -30,57 +30,150 @@ another session to replace it, and without a file the node has no other source.
 class CompensatorSettings:
     """Calibration, target frame and options of the compensation."""
 
-    calibration_file: str = setting('', '', 'calibration.yaml to correct with, read again on ~/reload; empty: wait for imu/calibration',
-                                    symptom='no messages are published, see diagnostics', session=True, path=True)
-    wait_for_file: bool = setting(False, '', 'wait for calibration_file while it does not exist', symptom='the node ends at its start')
-    adopt: str = setting(FILE_THEN_TOPIC, '', 'source of calibrations; file: calibration_file only, for the field; '
-                         'topic: imu/calibration, which replaces the file; '
-                         'file_then_topic: imu/calibration only while no calibration_file is named',
-                         symptom='a calibration on the topic is not adopted, or replaces the file', live=True,
-                         choices=(FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC))
-    anyway: bool = setting(False, '', 'also correct a sensor whose decision is unproven; one whose decision is harms is never corrected',
-                           symptom='the correction may increase the error of the readings', live=True)
-    passthrough: bool = setting(False, '', 'publish the messages unchanged until there is a calibration',
-                                symptom='uncorrected messages on the corrected topic', live=True)
-    target_frame: str = setting('', '', 'frame of the same rigid body to move the readings to, by target_xyz and target_rpy, '
-                                'or where both are zero by the transforms on /tf_static; empty: the frame of the sensor',
-                                symptom='subscribers expect a different frame_id', live=True, session=True)
-    target_xyz: tuple = setting((0.0, 0.0, 0.0), 'm', 'place of the sensor in the target frame; with target_rpy zero too: from /tf_static',
-                                symptom='specific force is wrong while the body turns, right at rest', live=True, session=True)
-    target_rpy: tuple = setting((0.0, 0.0, 0.0), 'rad', 'roll, pitch and yaw of the sensor in the target frame; '
-                                'with target_xyz zero too: from /tf_static',
-                                symptom='gravity points along the wrong axis', live=True, session=True)
-    check_frame_id: bool = setting(True, '', 'correct only messages that carry the frame_id of the calibration',
-                                   symptom='no messages are published, diagnostics name both frames; '
-                                   'if false, messages of a different sensor are corrected',
-                                   live=True)
-    correct_stamps: bool = setting(False, '', 'move the stamps back by the time_offset of the calibration',
-                                   symptom='stamps differ from those of the driver', live=True)
-    parameter_covariance: bool = setting(True, '', 'add the uncertainty of the calibration to the covariances',
-                                         symptom='covariances are too small, filters trust the readings too much', live=True)
-    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: '
-                              'covariances follow from it where the messages bring none; empty: '
-                              'from the noise that the calibration saw', symptom='filters trust the readings too much or too little',
-                              session=True, path=True)
-    covariance_rate: float = setting(1.0, 'Hz', 'rate of updates of the covariances at the present motion; 0: only with a new calibration',
-                                     (0.0, 100.0), 'too small: covariances lag behind fast turns; too large: computing time', live=True)
-    gravity: float = setting(0.0, 'm/s^2', 'gravity at the site of the robot, for the test of the calibration at stops; 0: that of the '
-                             'calibration, within the half per cent of variation between sites',
-                             (0.0, 20.0), 'an error of a scale below half a per cent is not detected',
-                             live=True)
-    update_gyro_bias: bool = setting(False, '', 'correct the residual bias of the gyroscope measured at stops',
-                                     symptom='headings drift as the sensor warms up; if true where the robot turns slowly and steadily at '
-                                     '"rest", that rotation counts as a bias', live=True)
-    gyro_bias_time: float = setting(600.0, 's', 'in which such an update loses its meaning while the robot does not stop', (10.0, 86400.0),
-                                    'too long: the bias of long ago is believed; too short: it is forgotten between stops', live=True)
-    public_executor: bool = setting(False, '', "use rclpy's public executor, at two to four times the computing time, "
-                                    "instead of a wait set of our own",
-                                    symptom='messages are lost above 3 kHz', fixed='the loop is chosen when the node starts')
+    calibration_file: str = setting(
+        '',
+        '',
+        'calibration.yaml to correct with, read again on ~/reload; empty: wait for imu/calibration',
+        symptom='no messages are published, see diagnostics',
+        session=True,
+        path=True,
+    )
+    wait_for_file: bool = setting(
+        False,
+        '',
+        'wait for calibration_file while it does not exist',
+        symptom='the node ends at its start',
+    )
+    adopt: str = setting(
+        FILE_THEN_TOPIC,
+        '',
+        'source of calibrations; file: calibration_file only, for the field; '
+        'topic: imu/calibration, which replaces the file; '
+        'file_then_topic: imu/calibration only while no calibration_file is named',
+        symptom='a calibration on the topic is not adopted, or replaces the file',
+        live=True,
+        choices=(FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC),
+    )
+    anyway: bool = setting(
+        False,
+        '',
+        'also correct a sensor whose decision is unproven; one whose decision is harms is never corrected',
+        symptom='the correction may increase the error of the readings',
+        live=True,
+    )
+    passthrough: bool = setting(
+        False,
+        '',
+        'publish the messages unchanged until there is a calibration',
+        symptom='uncorrected messages on the corrected topic',
+        live=True,
+    )
+    target_frame: str = setting(
+        '',
+        '',
+        'frame of the same rigid body to move the readings to, by target_xyz and target_rpy, '
+        'or where both are zero by the transforms on /tf_static; empty: the frame of the sensor',
+        symptom='subscribers expect a different frame_id',
+        live=True,
+        session=True,
+    )
+    target_xyz: tuple = setting(
+        (0.0, 0.0, 0.0),
+        'm',
+        'place of the sensor in the target frame; with target_rpy zero too: from /tf_static',
+        symptom='specific force is wrong while the body turns, right at rest',
+        live=True,
+        session=True,
+    )
+    target_rpy: tuple = setting(
+        (0.0, 0.0, 0.0),
+        'rad',
+        'roll, pitch and yaw of the sensor in the target frame; '
+        'with target_xyz zero too: from /tf_static',
+        symptom='gravity points along the wrong axis',
+        live=True,
+        session=True,
+    )
+    check_frame_id: bool = setting(
+        True,
+        '',
+        'correct only messages that carry the frame_id of the calibration',
+        symptom='no messages are published, diagnostics name both frames; '
+        'if false, messages of a different sensor are corrected',
+        live=True,
+    )
+    correct_stamps: bool = setting(
+        False,
+        '',
+        'move the stamps back by the time_offset of the calibration',
+        symptom='stamps differ from those of the driver',
+        live=True,
+    )
+    parameter_covariance: bool = setting(
+        True,
+        '',
+        'add the uncertainty of the calibration to the covariances',
+        symptom='covariances are too small, filters trust the readings too much',
+        live=True,
+    )
+    noise_file: str = setting(
+        '',
+        '',
+        'noise.yaml of this IMU, from the verb noise: '
+        'covariances follow from it where the messages bring none; empty: '
+        'from the noise that the calibration saw',
+        symptom='filters trust the readings too much or too little',
+        session=True,
+        path=True,
+    )
+    covariance_rate: float = setting(
+        1.0,
+        'Hz',
+        'rate of updates of the covariances at the present motion; 0: only with a new calibration',
+        (0.0, 100.0),
+        'too small: covariances lag behind fast turns; too large: computing time',
+        live=True,
+    )
+    gravity: float = setting(
+        0.0,
+        'm/s^2',
+        'gravity at the site of the robot, for the test of the calibration at stops; 0: that of the '
+        'calibration, within the half per cent of variation between sites',
+        (0.0, 20.0),
+        'an error of a scale below half a per cent is not detected',
+        live=True,
+    )
+    update_gyro_bias: bool = setting(
+        False,
+        '',
+        'correct the residual bias of the gyroscope measured at stops',
+        symptom='headings drift as the sensor warms up; if true where the robot turns slowly and steadily at '
+        '"rest", that rotation counts as a bias',
+        live=True,
+    )
+    gyro_bias_time: float = setting(
+        600.0,
+        's',
+        'in which such an update loses its meaning while the robot does not stop',
+        (10.0, 86400.0),
+        'too long: the bias of long ago is believed; too short: it is forgotten between stops',
+        live=True,
+    )
+    public_executor: bool = setting(
+        False,
+        '',
+        "use rclpy's public executor, at two to four times the computing time, "
+        'instead of a wait set of our own',
+        symptom='messages are lost above 3 kHz',
+        fixed='the loop is chosen when the node starts',
+    )
 
     @property
     def takes_topic(self) -> bool:
         """Whether calibrations received on the topic are adopted."""
-        return self.adopt == FROM_TOPIC or (self.adopt == FILE_THEN_TOPIC and not self.calibration_file)
+        return self.adopt == FROM_TOPIC or (
+            self.adopt == FILE_THEN_TOPIC and not self.calibration_file
+        )
 
 
 class Awaited(ImuCalibrationError):
@@ -120,7 +213,14 @@ class Adopted:
         return moved_beyond_sd(other.calibration, self.calibration)
 
 
-def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: StaticFrames, before: Adopted | None = None) -> Adopted:
+def adopt(
+    text: str,
+    source: str,
+    settings: CompensatorSettings,
+    *,
+    frames: StaticFrames,
+    before: Adopted | None = None,
+) -> Adopted:
     """
     Return the calibration in a document, ready to take the place of `before`.
 
@@ -136,17 +236,27 @@ def adopt(text: str, source: str, settings: CompensatorSettings, *, frames: Stat
         calibration = calibration_from_text(text)
         used = trust.usable(calibration, anyway=settings.anyway, live=True)
         _require_same_frame(calibration, before)
-        return Adopted(calibration, used, _prepared(used.calibration, settings, frames, before), version_of(text), source)
+        return Adopted(
+            calibration,
+            used,
+            _prepared(used.calibration, settings, frames, before),
+            version_of(text),
+            source,
+        )
     except ImuCalibrationError:
         raise
-    except Exception as error:   # no document may end the node
+    except Exception as error:  # no document may end the node
         what = shortened(f'{type(error).__name__}: {error}', 200)
-        raise DocumentError(f'a calibration must be usable, this one is not: {what}', code='not_usable') from error
+        raise DocumentError(
+            f'a calibration must be usable, this one is not: {what}', code='not_usable'
+        ) from error
 
 
 def again(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> Adopted:
     """Return the same calibration under other settings or transforms."""
-    return replace(adopted, compensation=_prepared(adopted.used.calibration, settings, frames, adopted))
+    return replace(
+        adopted, compensation=_prepared(adopted.used.calibration, settings, frames, adopted)
+    )
 
 
 def has_moved(adopted: Adopted, settings: CompensatorSettings, frames: StaticFrames) -> bool:
@@ -155,14 +265,18 @@ def has_moved(adopted: Adopted, settings: CompensatorSettings, frames: StaticFra
     return found is not None and not found.is_close(adopted.compensation.transfer)
 
 
-def _transfer(calibration: Calibration, settings: CompensatorSettings, frames: StaticFrames) -> Transfer | None:
+def _transfer(
+    calibration: Calibration, settings: CompensatorSettings, frames: StaticFrames
+) -> Transfer | None:
     """Return where the readings are to be moved: by the pose in the parameters, without one by the static transforms."""
     target, given = settings.target_frame, any(settings.target_xyz) or any(settings.target_rpy)
     if not target or given or target == calibration.frame_id:
         return requested_transfer(target, settings.target_xyz, settings.target_rpy)
     if not calibration.frame_id:
-        raise DocumentError(f"to move readings to '{target}' by {TF_STATIC} the calibration must name the frame of the sensor, it names "
-                            "none; give target_xyz and target_rpy")
+        raise DocumentError(
+            f"to move readings to '{target}' by {TF_STATIC} the calibration must name the frame of the sensor, it names "
+            'none; give target_xyz and target_rpy'
+        )
     pose = frames.pose(target, calibration.frame_id)
     if pose is None:
         raise Awaited(frames.waits_for(target, calibration.frame_id))
@@ -170,22 +284,43 @@ def _transfer(calibration: Calibration, settings: CompensatorSettings, frames: S
     return Transfer(target, mat_ts, xyz_t)
 
 
-def _prepared(calibration: Calibration, settings: CompensatorSettings, frames: StaticFrames, before: Adopted | None) -> LiveCompensation:
+def _prepared(
+    calibration: Calibration,
+    settings: CompensatorSettings,
+    frames: StaticFrames,
+    before: Adopted | None,
+) -> LiveCompensation:
     if settings.noise_file:
-        calibration = with_measured_noise(calibration, files.read_noise(files.user_path(settings.noise_file)))
+        calibration = with_measured_noise(
+            calibration, files.read_noise(files.user_path(settings.noise_file))
+        )
     transfer = _transfer(calibration, settings, frames)
-    compensation = LiveCompensation(calibration, transfer, check_frame=settings.check_frame_id,
-                                    with_parameters=settings.parameter_covariance,
-                                    correct_stamps=settings.correct_stamps, watch=_watch(calibration, transfer, settings, before))
+    compensation = LiveCompensation(
+        calibration,
+        transfer,
+        check_frame=settings.check_frame_id,
+        with_parameters=settings.parameter_covariance,
+        correct_stamps=settings.correct_stamps,
+        watch=_watch(calibration, transfer, settings, before),
+    )
     if before is not None:
         compensation.prepare(before.compensation)
     return compensation
 
 
-def _watch(calibration: Calibration, transfer: Transfer | None, settings: CompensatorSettings, before: Adopted | None) -> StopWatch:
+def _watch(
+    calibration: Calibration,
+    transfer: Transfer | None,
+    settings: CompensatorSettings,
+    before: Adopted | None,
+) -> StopWatch:
     """Return the StopWatch: the present one where its inputs are unchanged."""
     options = HealthOptions(settings.gravity, settings.update_gyro_bias, settings.gyro_bias_time)
-    watch = None if before is None or before.used.calibration is not calibration else before.compensation.watch
+    watch = (
+        None
+        if before is None or before.used.calibration is not calibration
+        else before.compensation.watch
+    )
     if before is not None and watch is not None and watch.health.options == options:
         was = before.compensation.transfer
         if was is transfer or (transfer is not None and transfer.is_close(was)):
@@ -196,5 +331,8 @@ def _watch(calibration: Calibration, transfer: Transfer | None, settings: Compen
 def _require_same_frame(calibration: Calibration, before: Adopted | None) -> None:
     known = '' if before is None else before.compensation.frame_id
     if known and calibration.frame_id and calibration.frame_id != known:
-        raise DocumentError(f"a new calibration must be for the same sensor, '{known}', this one is for '{calibration.frame_id}'; "
-                            'restart the node for another sensor', code='other_sensor')
+        raise DocumentError(
+            f"a new calibration must be for the same sensor, '{known}', this one is for '{calibration.frame_id}'; "
+            'restart the node for another sensor',
+            code='other_sensor',
+        )

@@ -23,18 +23,50 @@ PAUSE = 0.01
 class PlayerSettings:
     """Bag, topics and speed of playback."""
 
-    bag: str = setting('', '', 'rosbag2 folder, .db3 or .mcap file; it must be given', symptom='the node refuses to start with a reason',
-                       session=True, path=True)
-    topics: str = setting('', '', 'topics to play, separated by spaces; empty: all whose type is installed', symptom='topics are missing',
-                          session=True)
-    rate: float = setting(1.0, '1', 'seconds of the recording per second; 0: as fast as possible',
-                          (0.0, 10000.0), 'too large: messages are lost')
-    clock: bool = setting(False, '', 'publish /clock with the recorder\'s times, for nodes with use_sim_time',
-                          symptom='nodes with use_sim_time do not advance')
-    loop: bool = setting(False, '', 'start again at the end; the stamps then jump back', symptom='the node ends after one round')
-    wait_for_subscribers: int = setting(0, '1', 'subscribers of each topic to wait for before the start',
-                                        (0, 100), 'the first messages are missed')
-    stop_at_end: bool = setting(True, '', 'end the node after the last message', symptom='the node does not end')
+    bag: str = setting(
+        '',
+        '',
+        'rosbag2 folder, .db3 or .mcap file; it must be given',
+        symptom='the node refuses to start with a reason',
+        session=True,
+        path=True,
+    )
+    topics: str = setting(
+        '',
+        '',
+        'topics to play, separated by spaces; empty: all whose type is installed',
+        symptom='topics are missing',
+        session=True,
+    )
+    rate: float = setting(
+        1.0,
+        '1',
+        'seconds of the recording per second; 0: as fast as possible',
+        (0.0, 10000.0),
+        'too large: messages are lost',
+    )
+    clock: bool = setting(
+        False,
+        '',
+        "publish /clock with the recorder's times, for nodes with use_sim_time",
+        symptom='nodes with use_sim_time do not advance',
+    )
+    loop: bool = setting(
+        False,
+        '',
+        'start again at the end; the stamps then jump back',
+        symptom='the node ends after one round',
+    )
+    wait_for_subscribers: int = setting(
+        0,
+        '1',
+        'subscribers of each topic to wait for before the start',
+        (0, 100),
+        'the first messages are missed',
+    )
+    stop_at_end: bool = setting(
+        True, '', 'end the node after the last message', symptom='the node does not end'
+    )
 
 
 class BagPlayerNode(Node):
@@ -45,15 +77,34 @@ class BagPlayerNode(Node):
         self.settings = declare_parameters(self, PlayerSettings)
         self._bag = self._open()
         self._topics = self._choose()
-        announce(self, [], [*self._topics, *['/clock'] * self.settings.clock], note=f'from the bag {files.user_path(self.settings.bag)}')
+        announce(
+            self,
+            [],
+            [*self._topics, *['/clock'] * self.settings.clock],
+            note=f'from the bag {files.user_path(self.settings.bag)}',
+        )
         self._players = [self._publisher(name) for name in self._topics]
         first = next((int(raw.received_ns()[0]) for raw in self._bag.stretches(self._topics)), 0)
-        pace = Pace(self.settings.rate, 100.0 if self.settings.clock else 0.0, self.settings.wait_for_subscribers)
-        self._playback = Playback(self, self._players, self._batches(first), pace=pace, clock_start_ns=first, awaited=self._players,
-                                  ended='played {} messages', ends_node=self.settings.stop_at_end)
+        pace = Pace(
+            self.settings.rate,
+            100.0 if self.settings.clock else 0.0,
+            self.settings.wait_for_subscribers,
+        )
+        self._playback = Playback(
+            self,
+            self._players,
+            self._batches(first),
+            pace=pace,
+            clock_start_ns=first,
+            awaited=self._players,
+            ended='played {} messages',
+            ends_node=self.settings.stop_at_end,
+        )
         self._playback.start()
-        self.get_logger().info(f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: '
-                               f'{", ".join(self._topics)}')
+        self.get_logger().info(
+            f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: '
+            f'{", ".join(self._topics)}'
+        )
 
     def close(self) -> str:
         """Stop publishing and close the files; return the outcome."""
@@ -69,32 +120,46 @@ class BagPlayerNode(Node):
     def _open(self):
         path = self.settings.bag
         if not path:
-            raise InputError("parameter 'bag' must name a rosbag2 recording, none was given; start with --ros-args -p bag:=/path/to/bag")
+            raise InputError(
+                "parameter 'bag' must name a rosbag2 recording, none was given; start with --ros-args -p bag:=/path/to/bag"
+            )
         try:
             return Rosbag2(files.user_path(path))
-        except Exception as error:   # rosbag2 files raise many kinds
-            raise InputError(f'{path} must be a readable rosbag2 recording, got: {" ".join(str(error).split())}; check the path') from error
+        except Exception as error:  # rosbag2 files raise many kinds
+            raise InputError(
+                f'{path} must be a readable rosbag2 recording, got: {" ".join(str(error).split())}; check the path'
+            ) from error
 
     def _choose(self):
         asked = self.settings.topics.split()
         unknown = [name for name in asked if name not in self._bag.types]
         if unknown:
-            raise InputError(f'{self.settings.bag} must contain the requested topics, it has no {", ".join(unknown)}; '
-                             f'it contains {", ".join(sorted(self._bag.types))}')
+            raise InputError(
+                f'{self.settings.bag} must contain the requested topics, it has no {", ".join(unknown)}; '
+                f'it contains {", ".join(sorted(self._bag.types))}'
+            )
         chosen = []
         for name in asked or sorted(self._bag.types):
             if _message_class(self._bag.types[name]) is not None:
                 chosen.append(name)
             elif asked:
-                raise InputError(f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; omit the topic')
+                raise InputError(
+                    f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; omit the topic'
+                )
             else:
-                self.get_logger().warning(f'{name} is left out: its type {self._bag.types[name]} is not installed')
+                self.get_logger().warning(
+                    f'{name} is left out: its type {self._bag.types[name]} is not installed'
+                )
         if not chosen:
-            raise InputError(f'{self.settings.bag} must contain a topic whose type is installed, it has none; check the bag')
+            raise InputError(
+                f'{self.settings.bag} must contain a topic whose type is installed, it has none; check the bag'
+            )
         return chosen
 
     def _publisher(self, name):
-        latched = any(profile.get('durability') == 'transient_local' for profile in self._bag.qos(name))
+        latched = any(
+            profile.get('durability') == 'transient_local' for profile in self._bag.qos(name)
+        )
         # Relative, so that namespaces and remappings move it.
         qos = latched_qos() if latched else output_qos(PLAYBACK_DEPTH)
         return self.create_publisher(_message_class(self._bag.types[name]), name.lstrip('/'), qos)
@@ -105,7 +170,9 @@ class BagPlayerNode(Node):
         while True:
             until = offset
             for raw in self._bag.stretches(self._topics):
-                due = np.maximum.accumulate(np.maximum((raw.received_ns() - first_ns) * 1e-9 + offset, until))
+                due = np.maximum.accumulate(
+                    np.maximum((raw.received_ns() - first_ns) * 1e-9 + offset, until)
+                )
                 until = float(due[-1])
                 yield Batch(due, [self._players[k] for k in raw.topic], raw.packed.views(), until)
             offset = until + PAUSE

@@ -28,7 +28,13 @@ from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
 from imu_calibration.nodes.calibration_worker import CalibrationWorker, LiveSession, SessionFiles
 from imu_calibration.nodes.diagnosis_thread import Listeners, give_arrays_own_pages
-from imu_calibration.nodes.diagnostics import LOG_ERROR, LOG_INFO, Complaints, DiagnosticsPublisher, say
+from imu_calibration.nodes.diagnostics import (
+    LOG_ERROR,
+    LOG_INFO,
+    Complaints,
+    DiagnosticsPublisher,
+    say,
+)
 from imu_calibration.nodes.inputs import BatchInput, latched_qos, output_qos, watch_inputs
 from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, run_node
 from imu_calibration.nodes.robot_stand import NO_TABLE, RobotSettings, chain_of, words_of
@@ -42,7 +48,14 @@ INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
 MOST_WAITING = 200_000
 """Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and counted."""
-DOCUMENTED = ('accelerometer_model', 'gyroscope_model', 'reference_model', 'model_as_asked', 'serial', 'operator')
+DOCUMENTED = (
+    'accelerometer_model',
+    'gyroscope_model',
+    'reference_model',
+    'model_as_asked',
+    'serial',
+    'operator',
+)
 """Parameters that the document names with their values."""
 MAX_SILENCE_SECONDS = 3.0
 """Seconds after the start from which a silent topic is reported."""
@@ -52,45 +65,121 @@ MAX_SILENCE_SECONDS = 3.0
 class CalibrationNodeSettings:
     """Inputs, reference and outputs of the node."""
 
-    table_file: str = setting('', '', 'table description, path; empty or none: no table, calibrate by hand from poses held still and the '
-                              'turns between them', symptom='joint states are not listened to', session=True, path=True,
-                              fixed='all motion gathered so far belongs to the table')
-    frame_id: str = setting('', '', 'frame of the Imu messages to use, all other messages are dropped; empty: that of the first message',
-                            symptom='every Imu message is dropped, see diagnostics', session=True,
-                            fixed='all motion gathered so far is that of one sensor')
-    accelerometer_model: str = setting('', '',
-                                       'named model or effect names joined by +; empty: bias+matrix, and with a table accel_size_effect '
-                                       'when the rotation shows it', symptom='an effect of the sensor remains in the residuals',
-                                       fixed='motion is gathered for the model')
-    gyroscope_model: str = setting('', '', 'the same for the gyroscope; empty: bias+matrix',
-                                   symptom='an effect of the sensor remains in the residuals', fixed='motion is gathered for the model')
-    reference_model: str = setting('', '',
-                                   "effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or "
-                                   'azimuth is unknown', symptom='a tilted table shows as accelerometer bias',
-                                   fixed='motion is gathered for the model')
-    model_as_asked: bool = setting(False, '', 'do not extend the model by effects that the data support',
-                                   symptom='an unmodelled effect biases the parameters', fixed='motion is gathered for the model')
-    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
-                                   symptom='good parameters are called weak', session=True, path=True)
-    effects_file: str = setting('', '', 'own effects in addition to the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
-                                'tolerance, text}, or a calibration with own effects; a model may then name them',
-                                symptom='the node refuses a model that names them',
-                                session=True, path=True, fixed='motion is gathered for the model')
-    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise: motion of its biases between windows, on a table; '
-                              'empty: estimated from the windows', symptom='standard deviations of the biases are too large or too small',
-                              session=True, path=True, fixed='one session is judged by one noise')
-    save_file: str = setting('', '', 'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same folder, '
-                             'written also when the node ends with unsaved motion; empty: calibration.yaml in the working directory, by '
-                             '~/save only',
-                             symptom='the node reports at its start that the folder is not writable', session=True, path=True)
-    serial: str = setting('', '', 'serial number of the IMU, for the calibration', session=True,
-                          symptom='calibrations of several units are not distinguished')
-    operator: str = setting('', '', 'name of the operator, for the calibration', session=True,
-                            symptom='a calibration does not name its operator')
-    resume: bool = setting(False, '', 'continue with the accumulator in the folder of save_file if it exists',
-                           symptom='old motion of another IMU enters the calibration', session=True)
-    autosave_period: float = setting(0.0, 's', 'save the accumulator this often; 0: only with ~/save', (0.0, 86400.0),
-                                     'after a crash the session starts from the last ~/save', live=True)
+    table_file: str = setting(
+        '',
+        '',
+        'table description, path; empty or none: no table, calibrate by hand from poses held still and the '
+        'turns between them',
+        symptom='joint states are not listened to',
+        session=True,
+        path=True,
+        fixed='all motion gathered so far belongs to the table',
+    )
+    frame_id: str = setting(
+        '',
+        '',
+        'frame of the Imu messages to use, all other messages are dropped; empty: that of the first message',
+        symptom='every Imu message is dropped, see diagnostics',
+        session=True,
+        fixed='all motion gathered so far is that of one sensor',
+    )
+    accelerometer_model: str = setting(
+        '',
+        '',
+        'named model or effect names joined by +; empty: bias+matrix, and with a table accel_size_effect '
+        'when the rotation shows it',
+        symptom='an effect of the sensor remains in the residuals',
+        fixed='motion is gathered for the model',
+    )
+    gyroscope_model: str = setting(
+        '',
+        '',
+        'the same for the gyroscope; empty: bias+matrix',
+        symptom='an effect of the sensor remains in the residuals',
+        fixed='motion is gathered for the model',
+    )
+    reference_model: str = setting(
+        '',
+        '',
+        'effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or '
+        'azimuth is unknown',
+        symptom='a tilted table shows as accelerometer bias',
+        fixed='motion is gathered for the model',
+    )
+    model_as_asked: bool = setting(
+        False,
+        '',
+        'do not extend the model by effects that the data support',
+        symptom='an unmodelled effect biases the parameters',
+        fixed='motion is gathered for the model',
+    )
+    tolerances_file: str = setting(
+        '',
+        '',
+        'tolerances, path; empty: the installed config/tolerances.yaml',
+        symptom='good parameters are called weak',
+        session=True,
+        path=True,
+    )
+    effects_file: str = setting(
+        '',
+        '',
+        'own effects in addition to the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
+        'tolerance, text}, or a calibration with own effects; a model may then name them',
+        symptom='the node refuses a model that names them',
+        session=True,
+        path=True,
+        fixed='motion is gathered for the model',
+    )
+    noise_file: str = setting(
+        '',
+        '',
+        'noise.yaml of this IMU, from the verb noise: motion of its biases between windows, on a table; '
+        'empty: estimated from the windows',
+        symptom='standard deviations of the biases are too large or too small',
+        session=True,
+        path=True,
+        fixed='one session is judged by one noise',
+    )
+    save_file: str = setting(
+        '',
+        '',
+        'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same folder, '
+        'written also when the node ends with unsaved motion; empty: calibration.yaml in the working directory, by '
+        '~/save only',
+        symptom='the node reports at its start that the folder is not writable',
+        session=True,
+        path=True,
+    )
+    serial: str = setting(
+        '',
+        '',
+        'serial number of the IMU, for the calibration',
+        session=True,
+        symptom='calibrations of several units are not distinguished',
+    )
+    operator: str = setting(
+        '',
+        '',
+        'name of the operator, for the calibration',
+        session=True,
+        symptom='a calibration does not name its operator',
+    )
+    resume: bool = setting(
+        False,
+        '',
+        'continue with the accumulator in the folder of save_file if it exists',
+        symptom='old motion of another IMU enters the calibration',
+        session=True,
+    )
+    autosave_period: float = setting(
+        0.0,
+        's',
+        'save the accumulator this often; 0: only with ~/save',
+        (0.0, 86400.0),
+        'after a crash the session starts from the last ~/save',
+        live=True,
+    )
 
 
 class CalibrationNode(Node):
@@ -98,46 +187,87 @@ class CalibrationNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('calibration_node', **options)
-        self.settings = declare_parameters(self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node'])
-        self._session = {LiveSettings: declare_parameters(self, LiveSettings, self._change_session),
-                         WindowSettings: declare_parameters(self, WindowSettings, self._change_session)}
-        self._options = calibration_options({name: chosen or None for name, chosen in self._choices().items()})
-        self._session[LiveByHandSettings] = declare_parameters(self, LiveByHandSettings, self._change_session)
+        self.settings = declare_parameters(
+            self, CalibrationNodeSettings, self._change_files, hints=HINTS['calibration_node']
+        )
+        self._session = {
+            LiveSettings: declare_parameters(self, LiveSettings, self._change_session),
+            WindowSettings: declare_parameters(self, WindowSettings, self._change_session),
+        }
+        self._options = calibration_options(
+            {name: chosen or None for name, chosen in self._choices().items()}
+        )
+        self._session[LiveByHandSettings] = declare_parameters(
+            self, LiveByHandSettings, self._change_session
+        )
         robot = declare_parameters(self, RobotSettings)
-        joints = [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
-        announce(self, ['imu/data_raw', *joints, 'imu/temperature'], ['imu/calibration', 'imu/residual', 'imu/coverage'])
-        self._table = chain_of(self, robot, self.settings.table_file, frame_id=self.settings.frame_id)
+        joints = (
+            [] if not robot.urdf_file and self.settings.table_file in NO_TABLE else ['joint_states']
+        )
+        announce(
+            self,
+            ['imu/data_raw', *joints, 'imu/temperature'],
+            ['imu/calibration', 'imu/residual', 'imu/coverage'],
+        )
+        self._table = chain_of(
+            self, robot, self.settings.table_file, frame_id=self.settings.frame_id
+        )
         place = SessionFiles(self.settings.save_file)
         live = self._resumed(place) if self.settings.resume else self._make_live()
         joint_names = None if self._table is None else self._table.joint_names
-        self._gatherer = LiveGatherer(joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id)
+        self._gatherer = LiveGatherer(
+            joint_names, MOST_WAITING, self.settings.frame_id or live.frame_id
+        )
         self._document = self.create_publisher(String, 'imu/calibration', latched_qos())
         self._residual = self.create_publisher(Imu, 'imu/residual', output_qos())
         self._coverage = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos())
-        listeners = Listeners(lambda text: self._publish(self._document, String(data=text)), self._publish_residuals,
-                              lambda coverage: self._publish(self._coverage, markers_of(coverage, self.get_clock().now().to_msg())))
-        self.worker = CalibrationWorker(self._gatherer, live, self._make_live, place=place, autosave_period=self.settings.autosave_period,
-                                        listeners=listeners, hints=HINTS['calibration_node'], provenance=self._provenance(robot))
+        listeners = Listeners(
+            lambda text: self._publish(self._document, String(data=text)),
+            self._publish_residuals,
+            lambda coverage: self._publish(
+                self._coverage, markers_of(coverage, self.get_clock().now().to_msg())
+            ),
+        )
+        self.worker = CalibrationWorker(
+            self._gatherer,
+            live,
+            self._make_live,
+            place=place,
+            autosave_period=self.settings.autosave_period,
+            listeners=listeners,
+            hints=HINTS['calibration_node'],
+            provenance=self._provenance(robot),
+        )
         for what in ('solve', 'diagnose', 'save', 'reset'):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what))
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
         self._listen()
-        reference = ("by hand, since neither 'table_file' nor 'urdf_file' was given: hold the IMU still in 12 different attitudes and turn "
-                     'it in between' if joint_names is None else
-                     f'on {words_of(robot, self.settings.table_file)} with the joints {", ".join(joint_names)}')
+        reference = (
+            "by hand, since neither 'table_file' nor 'urdf_file' was given: hold the IMU still in 12 different attitudes and turn "
+            'it in between'
+            if joint_names is None
+            else f'on {words_of(robot, self.settings.table_file)} with the joints {", ".join(joint_names)}'
+        )
         self.get_logger().info(f'calibrates {reference}; ~/save writes {place.calibration}')
-        self._guide = CalibrationGuide(self._inputs, f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
-                                       live.observations.removesuffix('s'))
+        self._guide = CalibrationGuide(
+            self._inputs,
+            f'ros2 service call {self.get_fully_qualified_name()}/save std_srvs/srv/Trigger',
+            live.observations.removesuffix('s'),
+        )
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
 
     def _listen(self) -> None:
-        topics = {'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu),
-                  'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature)}
+        topics = {
+            'imu': (Imu, 'imu/data_raw', self._gatherer.add_imu),
+            'temperature': (Temperature, 'imu/temperature', self._gatherer.add_temperature),
+        }
         if self._table is not None:
             topics['joints'] = (JointState, 'joint_states', self._gatherer.add_joints)
-        self._inputs = {name: BatchInput(self, kind, topic, add=add, depth=INPUT_DEPTH, single=name != 'joints')
-                        for name, (kind, topic, add) in topics.items()}
+        self._inputs = {
+            name: BatchInput(self, kind, topic, add=add, depth=INPUT_DEPTH, single=name != 'joints')
+            for name, (kind, topic, add) in topics.items()
+        }
         watch_inputs(self, list(self._inputs.values()))
 
     def close(self) -> str:
@@ -147,15 +277,29 @@ class CalibrationNode(Node):
     def _choices(self) -> dict[str, Any]:
         """Return the choices that the document names."""
         settings = self.settings
-        paths = {'tolerances': settings.tolerances_file, 'catalogue': settings.effects_file, 'noise': settings.noise_file}
-        return {name: getattr(settings, name) for name in DOCUMENTED} | {k: files.user_path(path) for k, path in paths.items() if path}
+        paths = {
+            'tolerances': settings.tolerances_file,
+            'catalogue': settings.effects_file,
+            'noise': settings.noise_file,
+        }
+        return {name: getattr(settings, name) for name in DOCUMENTED} | {
+            k: files.user_path(path) for k, path in paths.items() if path
+        }
 
     def _provenance(self, robot: RobotSettings) -> dict[str, Any]:
         stand = robot.urdf_file or self.settings.table_file
-        return provenance_with('calibration_node', (), self._choices(), stand=None if stand in NO_TABLE else files.user_path(stand))
+        return provenance_with(
+            'calibration_node',
+            (),
+            self._choices(),
+            stand=None if stand in NO_TABLE else files.user_path(stand),
+        )
 
     def _make_live(self, saved: bytes | None = None) -> LiveSession:
-        options, live = replace(self._options, windows=self._session[WindowSettings]), self._session[LiveSettings]
+        options, live = (
+            replace(self._options, windows=self._session[WindowSettings]),
+            self._session[LiveSettings],
+        )
         if self._table is None:
             return LiveByHand(options, live, self._session[LiveByHandSettings], saved=saved)
         return LiveCalibration(self._table, options, live, saved=saved)
@@ -164,12 +308,19 @@ class CalibrationNode(Node):
         try:
             live = self._make_live(place.earlier())
         except ImuCalibrationError as error:
-            kept = place.put_aside()   # a save would write over it
-            say(self.get_logger(), LOG_ERROR, f'the saved session cannot be continued: {error}; a new one starts, '
-                f'earlier motion is in {kept}')
+            kept = place.put_aside()  # a save would write over it
+            say(
+                self.get_logger(),
+                LOG_ERROR,
+                f'the saved session cannot be continued: {error}; a new one starts, '
+                f'earlier motion is in {kept}',
+            )
             return self._make_live()
-        self.get_logger().info(f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
-                               if live.n_windows else f'no session in {place.accumulator}: a new session starts')
+        self.get_logger().info(
+            f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
+            if live.n_windows
+            else f'no session in {place.accumulator}: a new session starts'
+        )
         return live
 
     def _serve(self, what: str, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -180,7 +331,11 @@ class CalibrationNode(Node):
             if not self.worker.is_alive():
                 break
         response.success, response.message = answer.result() if answer.done() else (False, '')
-        say(self.get_logger(), LOG_INFO if response.success else LOG_ERROR, f'~/{what}: {response.message}')
+        say(
+            self.get_logger(),
+            LOG_INFO if response.success else LOG_ERROR,
+            f'~/{what}: {response.message}',
+        )
         self._diagnostics.publish_now()
         return response
 
@@ -201,7 +356,7 @@ class CalibrationNode(Node):
         try:
             publisher.publish(message)
         except Exception:
-            if self.context.ok():   # false while the node shuts down and the worker finishes
+            if self.context.ok():  # false while the node shuts down and the worker finishes
                 raise
 
     def _statuses(self) -> list:
@@ -209,11 +364,26 @@ class CalibrationNode(Node):
         state = self.worker.state
         about_topics = [line for each in self._inputs.values() for line in each.faults()]
         streams = state.streams
-        silent = [] if streams is None else [self._inputs[name].silence(streams.unusable.get(name, '')) for name in streams.silent]
-        if 'joints' not in self._inputs and self.count_publishers(self.resolve_topic_name('joint_states')):
-            about_topics.append("joint states are published and not listened to: "
-                                "to calibrate on a table or an arm give 'table_file' or 'urdf_file'")
-        trouble = [state.streams.message] if state.streams is not None and state.streams.word == 'trouble' and not silent else []
+        silent = (
+            []
+            if streams is None
+            else [
+                self._inputs[name].silence(streams.unusable.get(name, ''))
+                for name in streams.silent
+            ]
+        )
+        if 'joints' not in self._inputs and self.count_publishers(
+            self.resolve_topic_name('joint_states')
+        ):
+            about_topics.append(
+                'joint states are published and not listened to: '
+                "to calibrate on a table or an arm give 'table_file' or 'urdf_file'"
+            )
+        trouble = (
+            [state.streams.message]
+            if state.streams is not None and state.streams.word == 'trouble' and not silent
+            else []
+        )
         if time.monotonic() - self._started > MAX_SILENCE_SECONDS:
             self._complaints.now('calibration', about_topics + silent + trouble, state.faults)
         for level, line in self._guide.lines(state):

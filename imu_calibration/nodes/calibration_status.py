@@ -11,7 +11,17 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from imu_calibration.calibration.coverage import ARROW, RADIUS, TEXT_COLOUR, Coverage, GroupState, arrows_of, cells_of, label_of, seen_of
+from imu_calibration.calibration.coverage import (
+    ARROW,
+    RADIUS,
+    TEXT_COLOUR,
+    Coverage,
+    GroupState,
+    arrows_of,
+    cells_of,
+    label_of,
+    seen_of,
+)
 from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
 from imu_calibration.core.progress import LiveState
 from imu_calibration.document.decision import HARMS
@@ -75,11 +85,29 @@ class CalibrationGuide:
 
     """
 
-    def __init__(self, inputs: Mapping[str, MatchedInput], save_command: str, noun: str, *, clock: Callable[[], float] = time.monotonic):
-        self._inputs, self._save_command, self._noun, self._clock = inputs, save_command, noun, clock
+    def __init__(
+        self,
+        inputs: Mapping[str, MatchedInput],
+        save_command: str,
+        noun: str,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._inputs, self._save_command, self._noun, self._clock = (
+            inputs,
+            save_command,
+            noun,
+            clock,
+        )
         self._coming: set[str] = set()
         self._stamping = ''
-        self._gathered, self._verdict, self._advice, self._advised, self._diagnosed = 0, '', '', float('-inf'), ''
+        self._gathered, self._verdict, self._advice, self._advised, self._diagnosed = (
+            0,
+            '',
+            '',
+            float('-inf'),
+            '',
+        )
 
     def lines(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         """Yield (INFO or WARNING, line) for each change since the last call."""
@@ -92,9 +120,16 @@ class CalibrationGuide:
         yield from self._diagnosis(state)
 
     def _streams(self, state: WorkerState) -> Iterator[tuple[str, str]]:
-        coming = set() if state.streams is None else {name for name in state.streams.coming if name in self._inputs}
+        coming = (
+            set()
+            if state.streams is None
+            else {name for name in state.streams.coming if name in self._inputs}
+        )
         for name in sorted(coming - self._coming):
-            yield LOG_INFO, f'{MESSAGE_TYPES[name]} messages are received on {self._inputs[name].source()}'
+            yield (
+                LOG_INFO,
+                f'{MESSAGE_TYPES[name]} messages are received on {self._inputs[name].source()}',
+            )
         self._coming = coming
         line = None if state.streams is None else state.streams.stamping
         if line is not None and line.word != self._stamping:
@@ -110,11 +145,19 @@ class CalibrationGuide:
         if state.complete:
             yield LOG_INFO, f'{known}; save it with `{self._save_command}`'
         elif known:
-            yield LOG_WARN if state.verdict == HARMS else LOG_INFO, '; '.join([known, *state.lines[:2]])
+            yield (
+                LOG_WARN if state.verdict == HARMS else LOG_INFO,
+                '; '.join([known, *state.lines[:2]]),
+            )
 
     def _next(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         advice = advice_of(state)
-        if advice and advice != self._advice and not state.complete and self._clock() - self._advised >= MIN_ADVICE_SECONDS:
+        if (
+            advice
+            and advice != self._advice
+            and not state.complete
+            and self._clock() - self._advised >= MIN_ADVICE_SECONDS
+        ):
             self._advice, self._advised = advice, self._clock()
             yield LOG_INFO, f'next: {advice}'
 
@@ -125,7 +168,10 @@ class CalibrationGuide:
         what = f'{found.word}:{found.values.get("effect", "")}'
         if what != self._diagnosed:
             self._diagnosed = what
-            yield LOG_WARN if found.word == diagnosis.FAILED else LOG_INFO, f'diagnosis: {found.message}'
+            yield (
+                LOG_WARN if found.word == diagnosis.FAILED else LOG_INFO,
+                f'diagnosis: {found.message}',
+            )
 
 
 def advice_of(state: WorkerState) -> str:
@@ -136,9 +182,15 @@ def advice_of(state: WorkerState) -> str:
     return next(iter([*steps, *(group.needs for group in state.groups if group.needs)]), '')
 
 
-STATUS_LEVELS = {word: level for level, words in (
-    (OK, ('good', 'determined', 'waiting', 'nothing found', 'off', '', 'helps')),
-    (WARN, ('trouble', 'weak', 'held', 'found', 'unexplained', 'unproven')), (ERROR, ('silent', 'failed', 'harms'))) for word in words}
+STATUS_LEVELS = {
+    word: level
+    for level, words in (
+        (OK, ('good', 'determined', 'waiting', 'nothing found', 'off', '', 'helps')),
+        (WARN, ('trouble', 'weak', 'held', 'found', 'unexplained', 'unproven')),
+        (ERROR, ('silent', 'failed', 'harms')),
+    )
+    for word in words
+}
 """Word of a stream, a parameter group, a session, a diagnosis or a decision -> its level."""
 
 
@@ -147,29 +199,73 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
     found = []
     if state.streams is not None:
         level = max(STATUS_LEVELS[state.streams.word], WARN if stream_faults else OK)
-        found.append(make_status(level, 'streams', '; '.join([state.streams.message, *stream_faults]), values=state.streams.values))
-    parts = [state.judged or state.verdict or 'waiting for motion', *state.lines[:3], *[state.trouble] * bool(state.trouble), *state.faults]
+        found.append(
+            make_status(
+                level,
+                'streams',
+                '; '.join([state.streams.message, *stream_faults]),
+                values=state.streams.values,
+            )
+        )
+    parts = [
+        state.judged or state.verdict or 'waiting for motion',
+        *state.lines[:3],
+        *[state.trouble] * bool(state.trouble),
+        *state.faults,
+    ]
     incomplete = WARN if state.verdict and (state.trouble or not state.complete) else OK
     level = ERROR if state.faults else max(STATUS_LEVELS[state.verdict], incomplete)
-    found.append(make_status(level, 'calibration', '; '.join(dict.fromkeys(parts)), values={'version': state.solution, **state.values}))
+    found.append(
+        make_status(
+            level,
+            'calibration',
+            '; '.join(dict.fromkeys(parts)),
+            values={'version': state.solution, **state.values},
+        )
+    )
     if state.session is not None:
-        found.append(make_status(STATUS_LEVELS[state.session.word], 'poses', state.session.message, values=state.session.values))
+        found.append(
+            make_status(
+                STATUS_LEVELS[state.session.word],
+                'poses',
+                state.session.message,
+                values=state.session.values,
+            )
+        )
     if state.diagnosis is not None:
-        found.append(make_status(STATUS_LEVELS[state.diagnosis.word], 'diagnosis', state.diagnosis.message,
-                                 values={'outcome': state.diagnosis.word, **state.diagnosis.values}))
+        found.append(
+            make_status(
+                STATUS_LEVELS[state.diagnosis.word],
+                'diagnosis',
+                state.diagnosis.message,
+                values={'outcome': state.diagnosis.word, **state.diagnosis.values},
+            )
+        )
     return found + [_group_status(group) for group in state.groups]
 
 
 def _group_status(group: GroupState):
-    text = {'determined': 'determined', 'weak': 'weak', 'held': 'held at its prior: the motion so far contains almost no information',
-            'waiting': 'no solution yet'}[group.status]
+    text = {
+        'determined': 'determined',
+        'weak': 'weak',
+        'held': 'held at its prior: the motion so far contains almost no information',
+        'waiting': 'no solution yet',
+    }[group.status]
     if group.needs:
         text += f'; still needed: {group.needs}'
-    figures = {f'standard error [{group.unit}]': group.sd, f'tolerance [{group.unit}]': group.tolerance,
-               f'predicted after that motion [{group.unit}]': group.predicted_sd}
-    values = {'parameter': group.parameter, 'needs': group.needs,
-              **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)}}
-    return make_status(STATUS_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values)
+    figures = {
+        f'standard error [{group.unit}]': group.sd,
+        f'tolerance [{group.unit}]': group.tolerance,
+        f'predicted after that motion [{group.unit}]': group.predicted_sd,
+    }
+    values = {
+        'parameter': group.parameter,
+        'needs': group.needs,
+        **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)},
+    }
+    return make_status(
+        STATUS_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values
+    )
 
 
 def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
@@ -180,27 +276,62 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     next one, a ring of the turn between them; blue points: earlier up directions; the arms of the three sensitive points; one line of text.
     """
     made = [Marker(ns='all', action=Marker.DELETEALL)]
-    made += [_marker('cells', k, Marker.SPHERE, color=(*color, 0.9), scale=(size,) * 3, place=place)
-             for k, (place, color, size) in enumerate(cells_of(coverage))]
+    made += [
+        _marker('cells', k, Marker.SPHERE, color=(*color, 0.9), scale=(size,) * 3, place=place)
+        for k, (place, color, size) in enumerate(cells_of(coverage))
+    ]
     seen, color, diameter = seen_of(coverage)
     if len(seen):
-        made.append(_marker('seen', 0, Marker.SPHERE_LIST, color=color, scale=(diameter,) * 3, points=seen))
+        made.append(
+            _marker('seen', 0, Marker.SPHERE_LIST, color=color, scale=(diameter,) * 3, points=seen)
+        )
     made += [_arrow(*each, number=k) for k, each in enumerate(arrows_of(coverage))]
     step = coverage.next
     if step.axis is not None and coverage.up is not None and step.up is not None:
         across, angles = np.cross(step.axis, coverage.up), np.linspace(0, step.angle, 24)[:, None]
-        made.append(_marker('turn', 0, Marker.LINE_STRIP, color=(*ARROW, 0.7), scale=(0.012, 0.0, 0.0),
-                            points=0.7 * RADIUS * (np.cos(angles) * coverage.up - np.sin(angles) * across)))
+        made.append(
+            _marker(
+                'turn',
+                0,
+                Marker.LINE_STRIP,
+                color=(*ARROW, 0.7),
+                scale=(0.012, 0.0, 0.0),
+                points=0.7 * RADIUS * (np.cos(angles) * coverage.up - np.sin(angles) * across),
+            )
+        )
     place, color, line = label_of(coverage)
-    made.append(_marker('text', 0, Marker.TEXT_VIEW_FACING, color=color, scale=(0.0, 0.0, 0.09), place=place, text=line))
+    made.append(
+        _marker(
+            'text',
+            0,
+            Marker.TEXT_VIEW_FACING,
+            color=color,
+            scale=(0.0, 0.0, 0.09),
+            place=place,
+            text=line,
+        )
+    )
     return _stamped(made, coverage.frame_id, stamp)
 
 
 def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> MarkerArray:
     """Return the planner's markers: an arrow to the up direction after the driven motion, and a description of that motion."""
-    return _stamped([_arrow('driven', np.zeros(3), 1.25 * RADIUS * up, ARROW),
-                     _marker('driven', 1, Marker.TEXT_VIEW_FACING, color=TEXT_COLOUR, scale=(0.0, 0.0, 0.08),
-                             place=(0.0, 0.0, -1.5 * RADIUS), text=text)], frame_id, stamp)
+    return _stamped(
+        [
+            _arrow('driven', np.zeros(3), 1.25 * RADIUS * up, ARROW),
+            _marker(
+                'driven',
+                1,
+                Marker.TEXT_VIEW_FACING,
+                color=TEXT_COLOUR,
+                scale=(0.0, 0.0, 0.08),
+                place=(0.0, 0.0, -1.5 * RADIUS),
+                text=text,
+            ),
+        ],
+        frame_id,
+        stamp,
+    )
 
 
 def _stamped(markers, frame_id, stamp):
@@ -210,16 +341,26 @@ def _stamped(markers, frame_id, stamp):
 
 
 def _arrow(name, start, end, color, number=0):
-    return _marker(name, number, Marker.ARROW, color=color, scale=(0.025, 0.05, 0.07), points=(start, end))
+    return _marker(
+        name, number, Marker.ARROW, color=color, scale=(0.025, 0.05, 0.07), points=(start, end)
+    )
 
 
 def _marker(name, number, kind, *, color, scale, place=(0.0, 0.0, 0.0), points=(), text=''):
     """Return a marker; the fourth number of a colour is its opacity."""
     red, green, blue, opacity = map(float, (*color, 1.0)[:4])
     x, y, z = map(float, scale)
-    return Marker(ns=name, id=number, type=kind, action=Marker.ADD, color=ColorRGBA(r=red, g=green, b=blue, a=opacity),
-                  scale=Vector3(x=x, y=y, z=z), pose=Pose(position=_point(place), orientation=Quaternion(w=1.0)),
-                  points=[_point(point) for point in points], text=text)
+    return Marker(
+        ns=name,
+        id=number,
+        type=kind,
+        action=Marker.ADD,
+        color=ColorRGBA(r=red, g=green, b=blue, a=opacity),
+        scale=Vector3(x=x, y=y, z=z),
+        pose=Pose(position=_point(place), orientation=Quaternion(w=1.0)),
+        points=[_point(point) for point in points],
+        text=text,
+    )
 
 
 def _point(place):

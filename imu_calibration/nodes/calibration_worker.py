@@ -16,7 +16,12 @@ from queue import SimpleQueue
 from typing import Any
 
 from imu_calibration.calibration.diagnosis.live_diagnosis import question_about
-from imu_calibration.calibration.live import LiveByHandSettings, LiveCalibration, LiveSettings, SolvePacer
+from imu_calibration.calibration.live import (
+    LiveByHandSettings,
+    LiveCalibration,
+    LiveSettings,
+    SolvePacer,
+)
 from imu_calibration.calibration.live_poses import LiveByHand
 from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
@@ -76,7 +81,11 @@ class SessionFiles:
             When there is one that cannot be read.
 
         """
-        return files.read_bytes(self.accumulator, 'accumulator') if os.path.isfile(self.accumulator) else None
+        return (
+            files.read_bytes(self.accumulator, 'accumulator')
+            if os.path.isfile(self.accumulator)
+            else None
+        )
 
     def put_aside(self) -> Path:
         """
@@ -109,25 +118,34 @@ class SessionFiles:
             The calibration; None: only the accumulator is saved.
 
         """
-        wanted: list[tuple[Path, Callable[[], bytes]]] = [] if text is None else [(self.calibration, text.encode)]
+        wanted: list[tuple[Path, Callable[[], bytes]]] = (
+            [] if text is None else [(self.calibration, text.encode)]
+        )
         done, failed = [], []
         for path, make in [*wanted, (self.accumulator, lambda: live.saved(pending=True))]:
-            existed = os.path.exists(path)   # False where the path cannot even be
+            existed = os.path.exists(path)  # False where the path cannot even be
             try:
                 files.write_whole(path, make())
                 done.append(str(path))
             except ImuCalibrationError as error:
-                failed.append(f'{error}; {"the earlier file is unchanged" if existed else "no earlier file existed"}')
+                failed.append(
+                    f'{error}; {"the earlier file is unchanged" if existed else "no earlier file existed"}'
+                )
         if not failed:
             self.note_saved(live.n_windows)
-        lines = [f'written: {" and ".join(done)}'] * bool(done) + [f'not written: {line}' for line in failed]
+        lines = [f'written: {" and ".join(done)}'] * bool(done) + [
+            f'not written: {line}' for line in failed
+        ]
         return not failed, '; '.join(lines)
 
     def autosave(self, live: LiveSession, period: float) -> bool:
         """Save the accumulator when that is due; return whether it was. Raises an InputError when it cannot be written."""
         if not period or time.monotonic() - self.saved_at < period or not self.unsaved(live):
             return False
-        self.saved_at, n_windows = time.monotonic(), live.n_windows   # not again at once when it fails
+        self.saved_at, n_windows = (
+            time.monotonic(),
+            live.n_windows,
+        )  # not again at once when it fails
         files.write_whole(self.accumulator, live.saved(pending=False), to_disk=False)
         self.note_saved(n_windows)
         return True
@@ -139,10 +157,12 @@ class SessionFiles:
             return ''
         ends = f'{unsaved} {noun} were in no file'
         if not self.given:
-            return f"{ends} and are lost: call ~/save, or give parameter 'save_file' and they are kept"
+            return (
+                f"{ends} and are lost: call ~/save, or give parameter 'save_file' and they are kept"
+            )
         try:
             files.write_whole(self.accumulator, live.saved(pending=True))
-        except Exception as error:   # the process ends in any case
+        except Exception as error:  # the process ends in any case
             return f'{ends} and are lost: {shortened(str(error), 300)}'
         return f'{ends}: they are kept in {self.accumulator}; resume:=true continues with them'
 
@@ -177,14 +197,26 @@ class CalibrationWorker(threading.Thread):
 
     """
 
-    def __init__(self, gatherer: LiveGatherer, live: LiveSession, make_live: Callable[[], LiveSession], *, place: SessionFiles,
-                 autosave_period: float, listeners: Listeners, hints: dict[str, str] | None = None,
-                 provenance: dict | None = None):
+    def __init__(
+        self,
+        gatherer: LiveGatherer,
+        live: LiveSession,
+        make_live: Callable[[], LiveSession],
+        *,
+        place: SessionFiles,
+        autosave_period: float,
+        listeners: Listeners,
+        hints: dict[str, str] | None = None,
+        provenance: dict | None = None,
+    ):
         super().__init__(name='calibration', daemon=True)
         self.gatherer, self.live, self.make_live = gatherer, live, make_live
         self.place, self.autosave_period, self.listeners = place, autosave_period, listeners
         self.hints, self._provenance = hints or {}, provenance or {}
-        self._pacer, self._watch = SolvePacer(live.settings.solve_share), StreamWatch(live.needs_joints, live.needs_temperature)
+        self._pacer, self._watch = (
+            SolvePacer(live.settings.solve_share),
+            StreamWatch(live.needs_joints, live.needs_temperature),
+        )
         self._diagnosis = DiagnosisThread(self._diagnosis_period)
         self._diagnosed = 0
         self._asked: SimpleQueue[tuple[Callable[[], tuple[bool, str]], Future]] = SimpleQueue()
@@ -221,19 +253,31 @@ class CalibrationWorker(threading.Thread):
         self._diagnosis.end()
         if self.is_alive():
             self.join(timeout)
-        return f'a solution was still being made: {self.gathered} since the last save are lost' if self.is_alive() else \
-            self.place.keep(self.live, self.gathered)
+        return (
+            f'a solution was still being made: {self.gathered} since the last save are lost'
+            if self.is_alive()
+            else self.place.keep(self.live, self.gathered)
+        )
 
     def run(self) -> None:
         """Run the steps until `end`."""
-        import_module('scipy.optimize')  # 11 MB and 0.2 s, which the first fit of a bias process would need later
+        import_module(
+            'scipy.optimize'
+        )  # 11 MB and 0.2 s, which the first fit of a bias process would need later
         try:
             while not self._ending:
                 self._wake.wait(MESSAGE_CHECK_SECONDS)
                 self._wake.clear()
-                for step in (self._take, self._answer, self._solve_when_due, self._adopt_what_was_found, self._autosave,
-                             self._diagnose_when_due, self._tell,
-                             self._cover):
+                for step in (
+                    self._take,
+                    self._answer,
+                    self._solve_when_due,
+                    self._adopt_what_was_found,
+                    self._autosave,
+                    self._diagnose_when_due,
+                    self._tell,
+                    self._cover,
+                ):
                     self._survive(step)
             self._survive(self._take)
         finally:
@@ -248,7 +292,9 @@ class CalibrationWorker(threading.Thread):
         except ImuCalibrationError as error:
             self._faults[name] = error.with_hint(self.hints)
         except Exception as error:
-            self._faults[name] = f'{name.replace("_", " ")} failed and is left out: {shortened(f"{type(error).__name__}: {error}", 200)}'
+            self._faults[name] = (
+                f'{name.replace("_", " ")} failed and is left out: {shortened(f"{type(error).__name__}: {error}", 200)}'
+            )
         else:
             self._faults[name] = ''
 
@@ -257,7 +303,7 @@ class CalibrationWorker(threading.Thread):
         self._looked = time.monotonic()
         block = self.gatherer.flush()
         self._watch.note(block, self._looked)
-        windows: Any = self.live.push(block)   # of the kind that the session itself reads
+        windows: Any = self.live.push(block)  # of the kind that the session itself reads
         if block.imu is not None or block.joints is not None:
             self._closed = False
         if windows:
@@ -273,9 +319,9 @@ class CalibrationWorker(threading.Thread):
                 result = action()
             except ImuCalibrationError as error:
                 result = False, error.with_hint(self.hints)
-            except Exception as error:   # every request gets a result
+            except Exception as error:  # every request gets a result
                 result = False, shortened(f'{type(error).__name__}: {error}', 300)
-            self._survive(self._tell)   # the requester reads the diagnostics next
+            self._survive(self._tell)  # the requester reads the diagnostics next
             answer.set_result(result)
 
     def _solve_when_due(self) -> None:
@@ -291,11 +337,15 @@ class CalibrationWorker(threading.Thread):
                 self._diagnosis.want()
         except ImuCalibrationError as error:
             self._trouble = error.with_hint(self.hints)
-            self._faults['solution'] = '' if isinstance(error, NotObservableError) else self._trouble
+            self._faults['solution'] = (
+                '' if isinstance(error, NotObservableError) else self._trouble
+            )
 
     def _diagnose_when_due(self) -> None:
         n_windows = self.live.n_windows
-        self._diagnosis.ask_when_due(lambda: question_about(self.live.on_table), n_windows > self._diagnosed)
+        self._diagnosis.ask_when_due(
+            lambda: question_about(self.live.on_table), n_windows > self._diagnosed
+        )
         if self._diagnosis.is_running:
             self._diagnosed = max(n_windows, self._diagnosed)
 
@@ -318,7 +368,9 @@ class CalibrationWorker(threading.Thread):
 
     def _publish_solution(self, pending: bool) -> tuple[CalibrationResult, str]:
         start = time.monotonic()
-        result = self.live.solve(pending, self._provenance | {'mode': 'live', 'solution': self._n_solutions + 1})
+        result = self.live.solve(
+            pending, self._provenance | {'mode': 'live', 'solution': self._n_solutions + 1}
+        )
         self._n_solutions += 1
         self._trouble, self._new_windows, self._closed = '', False, pending
         self._faults['solution'] = ''
@@ -331,14 +383,25 @@ class CalibrationWorker(threading.Thread):
     def _solve(self) -> tuple[bool, str]:
         result, _ = self._publish_solution(pending=True)
         self._diagnosis.want()
-        return True, '; '.join([f'{result.verdict.text} ({self.live.n_windows} {self.gathered})', *summary(result, self.hints)])
+        return True, '; '.join(
+            [
+                f'{result.verdict.text} ({self.live.n_windows} {self.gathered})',
+                *summary(result, self.hints),
+            ]
+        )
 
     def _diagnose(self) -> tuple[bool, str]:
         if not self._diagnosis_period:
-            return False, "a diagnosis is not available by hand, and not if parameter 'diagnosis_period' is 0"
+            return (
+                False,
+                "a diagnosis is not available by hand, and not if parameter 'diagnosis_period' is 0",
+            )
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
-        return True, f'diagnosis of {self.live.n_windows} windows started; its result is published on /diagnostics and in the calibration'
+        return (
+            True,
+            f'diagnosis of {self.live.n_windows} windows started; its result is published on /diagnostics and in the calibration',
+        )
 
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''
@@ -360,10 +423,13 @@ class CalibrationWorker(threading.Thread):
         self.place.note_saved(0)
         self._trouble = ''
         self._diagnosis.forget()
-        return True, (f'restarted, {lost} unsaved {self.gathered} were deleted; ' if lost else 'restarted; ') + \
-            'the last calibration remains published until the next one'
+        return True, (
+            f'restarted, {lost} unsaved {self.gathered} were deleted; ' if lost else 'restarted; '
+        ) + 'the last calibration remains published until the next one'
 
-    def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> tuple[bool, str]:
+    def change(
+        self, settings: LiveSettings | WindowSettings | LiveByHandSettings
+    ) -> tuple[bool, str]:
         """Use other settings from now on; another gravity by hand changes the solution at once."""
         self.live.change(settings)
         if isinstance(settings, LiveSettings):
@@ -382,25 +448,65 @@ class CalibrationWorker(threading.Thread):
         self._watch.note_counts(counts, self._looked)
         result = self.live.result
         lines = [] if result is None else summary(result, self.hints)
-        verdict, judged, complete = ('', '', False) if result is None else (
-            str(result.verdict.word), result.verdict.text, result.verdict.complete)
-        values = {self.gathered: self.live.n_windows, 'solutions': self._n_solutions, 'saves to': str(self.place.calibration),
-                  f'{self.gathered} in no file yet': self.place.unsaved(self.live), 'process': os.getpid(), **counts}
+        verdict, judged, complete = (
+            ('', '', False)
+            if result is None
+            else (str(result.verdict.word), result.verdict.text, result.verdict.complete)
+        )
+        values = {
+            self.gathered: self.live.n_windows,
+            'solutions': self._n_solutions,
+            'saves to': str(self.place.calibration),
+            f'{self.gathered} in no file yet': self.place.unsaved(self.live),
+            'process': os.getpid(),
+            **counts,
+        }
         if self.live.needs_linearising:
-            lines = [*lines, 'an effect is outside the range of its linearisation and the stored windows are no longer available: '
-                     'calibrate the recording offline']
-        stale = self.state.solution != self._n_solutions or self.state.groups == [] or result is None
+            lines = [
+                *lines,
+                'an effect is outside the range of its linearisation and the stored windows are no longer available: '
+                'calibrate the recording offline',
+            ]
+        stale = (
+            self.state.solution != self._n_solutions or self.state.groups == [] or result is None
+        )
         groups = self.live.groups() if stale else self.state.groups
         found = self._diagnosis.state
-        diagnosis = None if self.live.on_table is None else replace(
-            found, values={**found.values, 'diagnoses': self._diagnosis.n_answers, 'being made': self._diagnosis.is_running})
-        self.state = WorkerState(groups, self._watch.state(self._looked, self.live.stamping), self._n_solutions, verdict, tuple(lines),
-                                 self._trouble, tuple(line for line in self._faults.values() if line), self.live.n_windows, values,
-                                 self.live.status(self.hints), diagnosis, judged, complete)
+        diagnosis = (
+            None
+            if self.live.on_table is None
+            else replace(
+                found,
+                values={
+                    **found.values,
+                    'diagnoses': self._diagnosis.n_answers,
+                    'being made': self._diagnosis.is_running,
+                },
+            )
+        )
+        self.state = WorkerState(
+            groups,
+            self._watch.state(self._looked, self.live.stamping),
+            self._n_solutions,
+            verdict,
+            tuple(lines),
+            self._trouble,
+            tuple(line for line in self._faults.values() if line),
+            self.live.n_windows,
+            values,
+            self.live.status(self.hints),
+            diagnosis,
+            judged,
+            complete,
+        )
 
     def _cover(self) -> None:
         """Update the picture of the coverage after a change."""
-        seen = (id(self.live), self.live.n_windows if self.live.on_table is None else 0, self._n_solutions)
+        seen = (
+            id(self.live),
+            self.live.n_windows if self.live.on_table is None else 0,
+            self._n_solutions,
+        )
         if seen != self._covered:
             self._covered = seen
             self.listeners.coverage(self.live.coverage().with_done(self.state.groups))

@@ -12,7 +12,14 @@ from imu_calibration.core.units import HOTTEST_C
 from imu_calibration.document.decision import decisions_text
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.nodes.adoption import Adopted
-from imu_calibration.nodes.diagnostics import ERROR, OK, REMINDER, WARN, DiagnosticsPublisher, make_status
+from imu_calibration.nodes.diagnostics import (
+    ERROR,
+    OK,
+    REMINDER,
+    WARN,
+    DiagnosticsPublisher,
+    make_status,
+)
 from imu_calibration.preprocessing.stamping import COUNTED
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')
@@ -30,7 +37,8 @@ TEXT_OF_REASON = {
     'not finite': 'readings are not finite: these messages are not published',
     'covariance not finite': "received covariances are invalid (not finite, or a variance below zero): the calibration's noise is used",
     'zero stamp': 'the stamps of the driver are zero: times of arrival are used for the angular acceleration',
-    'outside the invertible range': 'readings are outside the range in which the non-linear effects can be inverted: not published'}
+    'outside the invertible range': 'readings are outside the range in which the non-linear effects can be inverted: not published',
+}
 
 
 class CompensatorDiagnostics:
@@ -38,7 +46,12 @@ class CompensatorDiagnostics:
 
     def __init__(self, node: Any):
         self._node, self._counts = node, {}
-        self._received, self._last_change, self._last_source, self._last_stamps = 0, monotonic(), '', None
+        self._received, self._last_change, self._last_source, self._last_stamps = (
+            0,
+            monotonic(),
+            '',
+            None,
+        )
         self._temperature: float | None = None
         self._temperature_at, self._unusable_temperatures = monotonic(), ''
         self._stamps_at: dict = {}
@@ -51,7 +64,11 @@ class CompensatorDiagnostics:
     def note_temperature(self, temperature_c: float) -> bool:
         """Record a temperature; return whether it is usable: finite, and by its magnitude in degrees Celsius."""
         if not np.isfinite(temperature_c) or temperature_c > HOTTEST_C:
-            self._unusable_temperatures = f'in degrees Celsius, {temperature_c:.1f} is kelvin' if temperature_c > HOTTEST_C else 'finite'
+            self._unusable_temperatures = (
+                f'in degrees Celsius, {temperature_c:.1f} is kelvin'
+                if temperature_c > HOTTEST_C
+                else 'finite'
+            )
             return False
         self._temperature, self._temperature_at = temperature_c, monotonic()
         return True
@@ -63,35 +80,70 @@ class CompensatorDiagnostics:
         node.return_from_harm()
         compensation = node.compensation
         serious, notes = self._lines(compensation)
-        notes += self._stream(compensation) + [line for each in node.inputs for line in each.faults()]
+        notes += self._stream(compensation) + [
+            line for each in node.inputs for line in each.faults()
+        ]
         node.complaints.now('compensation', notes, serious)
-        doubts = [compensation.slope.doubt] if compensation is not None and compensation.slope.doubt else []
+        doubts = (
+            [compensation.slope.doubt]
+            if compensation is not None and compensation.slope.doubt
+            else []
+        )
         node.complaints.now('stamps', doubts, patience=REMINDER)
         notes += doubts
         adopted: Adopted | None = node.adopted
         notes += [] if adopted is None else adopted.caveats
         level = ERROR if serious else WARN if notes else OK
-        good = '' if adopted is None else f'corrected with calibration {adopted.version} ({decisions_text(adopted.calibration.decisions)})'
+        good = (
+            ''
+            if adopted is None
+            else f'corrected with calibration {adopted.version} ({decisions_text(adopted.calibration.decisions)})'
+        )
         frame_id = '' if adopted is None else adopted.calibration.frame_id
-        return [*self._health(compensation, frame_id),
-                make_status(level, 'compensation', '; '.join(serious + notes) or good, values=self._values(), hardware_id=frame_id)]
+        return [
+            *self._health(compensation, frame_id),
+            make_status(
+                level,
+                'compensation',
+                '; '.join(serious + notes) or good,
+                values=self._values(),
+                hardware_id=frame_id,
+            ),
+        ]
 
     def _health(self, compensation, frame_id):
         """Return a status with the validity of the calibration; log the loss of validity."""
         if compensation is None:
             return []
         state = compensation.watch.health.state
-        warm = [] if compensation.needs_temperature or self._temperature is None else \
-            outside_conditions(compensation.calibration, temperature_c=[self._temperature])
+        warm = (
+            []
+            if compensation.needs_temperature or self._temperature is None
+            else outside_conditions(compensation.calibration, temperature_c=[self._temperature])
+        )
         level = max(HEALTH_LEVELS[state.word], WARN if warm else OK)
         grave = HEALTH_LEVELS[state.word] == ERROR
-        self._node.complaints.now('health', [*[state.message] * (HEALTH_LEVELS[state.word] == WARN), *warm], [state.message] * grave)
-        return [make_status(level, 'health', '; '.join([state.message, *warm]), values={'outcome': state.word, **state.values},
-                            hardware_id=frame_id)]
+        self._node.complaints.now(
+            'health',
+            [*[state.message] * (HEALTH_LEVELS[state.word] == WARN), *warm],
+            [state.message] * grave,
+        )
+        return [
+            make_status(
+                level,
+                'health',
+                '; '.join([state.message, *warm]),
+                values={'outcome': state.word, **state.values},
+                hardware_id=frame_id,
+            )
+        ]
 
     def _stream(self, compensation):
         """Return the faults of the message stream, and log its source when it begins."""
-        node, received = self._node, self._node.uncorrected + (0 if compensation is None else compensation.received)
+        node, received = (
+            self._node,
+            self._node.uncorrected + (0 if compensation is None else compensation.received),
+        )
         if received != self._received:
             self._received, self._last_change = received, monotonic()
             source = node.imu.source()
@@ -104,8 +156,14 @@ class CompensatorDiagnostics:
     def _tell_stamps(self, compensation):
         """Log irregular stamps once, and again when their rate changes."""
         line = None if compensation is None else compensation.slope.line
-        if line is not None and (shown := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE))) != self._last_stamps:
-            if (line.word == COUNTED or self._last_stamps is not None) and monotonic() - self._stamps_at.get(shown, -np.inf) >= REMINDER:
+        if (
+            line is not None
+            and (shown := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE)))
+            != self._last_stamps
+        ):
+            if (
+                line.word == COUNTED or self._last_stamps is not None
+            ) and monotonic() - self._stamps_at.get(shown, -np.inf) >= REMINDER:
                 self._stamps_at[shown] = monotonic()
                 self._node.get_logger().info(str(line))
             self._last_stamps = shown
@@ -115,20 +173,33 @@ class CompensatorDiagnostics:
         node = self._node
         serious = [node.corrected_already] if node.corrected_already else []
         if node.problem:
-            serious.append(node.problem + (f'; calibration {node.adopted.version} remains in use' if node.adopted else ''))
+            serious.append(
+                node.problem
+                + (f'; calibration {node.adopted.version} remains in use' if node.adopted else '')
+            )
         if compensation is None:
-            what = 'messages pass unchanged' if node.settings.passthrough else 'nothing is published'
-            waiting = f'waiting for {node.awaited}; {what}' if node.awaited else f'waiting for a calibration, {what}'
+            what = (
+                'messages pass unchanged' if node.settings.passthrough else 'nothing is published'
+            )
+            waiting = (
+                f'waiting for {node.awaited}; {what}'
+                if node.awaited
+                else f'waiting for a calibration, {what}'
+            )
             return (serious + [waiting], []) if node.problem else (serious, [waiting])
         notes = []
         for reason, count in self._new_counts(compensation).items():
-            (serious if reason.startswith(SERIOUS) else notes).append(self._line(reason, compensation))
+            (serious if reason.startswith(SERIOUS) else notes).append(
+                self._line(reason, compensation)
+            )
         return serious, notes + self._outside(compensation) + self._warmth(compensation)
 
     def _new_counts(self, compensation):
         """Return the reasons whose counts exceed their earlier maximum: the counts of a new compensation start at zero."""
         counts = dict(compensation.counts)
-        new = {reason: count for reason, count in counts.items() if count > self._counts.get(reason, 0)}
+        new = {
+            reason: count for reason, count in counts.items() if count > self._counts.get(reason, 0)
+        }
         self._counts |= new
         return new
 
@@ -139,8 +210,11 @@ class CompensatorDiagnostics:
 
     def _outside(self, compensation):
         fastest, compensation.fastest_squared = sqrt(compensation.fastest_squared), 0.0
-        temperature = None if not compensation.needs_temperature or compensation.dt is None else \
-            [compensation.dt + compensation.calibration.model.temperature_ref_c]
+        temperature = (
+            None
+            if not compensation.needs_temperature or compensation.dt is None
+            else [compensation.dt + compensation.calibration.model.temperature_ref_c]
+        )
         return outside_conditions(compensation.calibration, fastest, temperature)
 
     def _warmth(self, compensation):
@@ -150,32 +224,52 @@ class CompensatorDiagnostics:
             return []
         lines = []
         if self._unusable_temperatures:
-            lines.append(f'temperatures on {node.temperature.topic_name} must be {self._unusable_temperatures}: they are ignored; correct '
-                         'the driver')
+            lines.append(
+                f'temperatures on {node.temperature.topic_name} must be {self._unusable_temperatures}: they are ignored; correct '
+                'the driver'
+            )
             self._unusable_temperatures = ''
         if monotonic() - self._temperature_at > COLD:
-            last = 'none received yet' if self._temperature is None else f'the last one, {self._temperature:.1f} C, remains in use'
+            last = (
+                'none received yet'
+                if self._temperature is None
+                else f'the last one, {self._temperature:.1f} C, remains in use'
+            )
             lines.append(f'{node.temperature.silence()}; {last}')
         return lines
 
     def _values(self):
         node, adopted = self._node, self._node.adopted
-        values = {'calibration': adopted.version if adopted else 'none', 'source': adopted.source if adopted else '',
-                  'adopt': node.settings.adopt, 'refused': node.refusal,
-                  'loop': 'wait set' if node.by_wait_set else 'public executor', 'input': node.imu.source(),
-                  'passed or held back without calibration': node.uncorrected}
+        values = {
+            'calibration': adopted.version if adopted else 'none',
+            'source': adopted.source if adopted else '',
+            'adopt': node.settings.adopt,
+            'refused': node.refusal,
+            'loop': 'wait set' if node.by_wait_set else 'public executor',
+            'input': node.imu.source(),
+            'passed or held back without calibration': node.uncorrected,
+        }
         if adopted is None:
             return values
         calibration, compensation = adopted.calibration, adopted.compensation
-        values |= {'decision': decisions_text(calibration.decisions), 'not corrected': ', '.join(adopted.used.refused) or 'none',
-                   'date': calibration.conditions.get('date', ''),
-                   'parameters': len(calibration.status), 'not determined': sum(status in LACKING for status in calibration.status),
-                   'messages': compensation.received, 'corrected': compensation.corrected, **compensation.counts}
+        values |= {
+            'decision': decisions_text(calibration.decisions),
+            'not corrected': ', '.join(adopted.used.refused) or 'none',
+            'date': calibration.conditions.get('date', ''),
+            'parameters': len(calibration.status),
+            'not determined': sum(status in LACKING for status in calibration.status),
+            'messages': compensation.received,
+            'corrected': compensation.corrected,
+            **compensation.counts,
+        }
         line, derivative = compensation.slope.line, compensation.slope.derivative
         if line is not None:
             values |= {'stamps': str(line), 'period [s]': f'{1e-9 * line.period_ns:.6g}'}
         if derivative is not None:
             noise = derivative.noise_sd(float(calibration.noise('gyroscope')[0].max()))
-            values |= {'derivative window [samples]': derivative.taps, 'derivative delay [s]': f'{derivative.delay:.4g}',
-                       'derivative noise [rad/s^2]': f'{noise:.3g}'}
+            values |= {
+                'derivative window [samples]': derivative.taps,
+                'derivative delay [s]': f'{derivative.delay:.4g}',
+                'derivative noise [rad/s^2]': f'{noise:.3g}',
+            }
         return values

@@ -22,11 +22,31 @@ from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, InputError, shortened
 from imu_calibration.document import files
 from imu_calibration.nodes import relay_loop
-from imu_calibration.nodes.adoption import Adopted, Awaited, CompensatorSettings, adopt, again, has_moved
+from imu_calibration.nodes.adoption import (
+    Adopted,
+    Awaited,
+    CompensatorSettings,
+    adopt,
+    again,
+    has_moved,
+)
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.diagnostics import LOG_ERROR, Complaints
-from imu_calibration.nodes.inputs import MatchedInput, latched_qos, output_qos, sent_ns, watch_inputs
-from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, every, guarded, run_node
+from imu_calibration.nodes.inputs import (
+    MatchedInput,
+    latched_qos,
+    output_qos,
+    sent_ns,
+    watch_inputs,
+)
+from imu_calibration.nodes.lifecycle import (
+    HINTS,
+    announce,
+    declare_parameters,
+    every,
+    guarded,
+    run_node,
+)
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.robot_stand import StaticFrames
 
@@ -46,15 +66,25 @@ class CompensatorNode(Node):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('compensator_node', **options)
-        self.settings = declare_parameters(self, CompensatorSettings, self._change_compensation, hints=HINTS['compensator_node'])
+        self.settings = declare_parameters(
+            self, CompensatorSettings, self._change_compensation, hints=HINTS['compensator_node']
+        )
         self.adopted: Adopted | None = None
         self._previous: Adopted | None = None
         self._harmful = ''
         self._current: LiveCompensation | None = None
         self._wanted: LiveCompensation | None = None
         self._reported: Adopted | None = None
-        self.problem, self.refusal, self.corrected_already, self._heard, self.awaited = '', '', '', '', ''
-        announce(self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected'])
+        self.problem, self.refusal, self.corrected_already, self._heard, self.awaited = (
+            '',
+            '',
+            '',
+            '',
+            '',
+        )
+        announce(
+            self, ['imu/data_raw', 'imu/calibration', 'imu/temperature'], ['imu/data_corrected']
+        )
         self._frames = StaticFrames(self, self._guarded(self._on_transforms))
         self.uncorrected = 0
         self.complaints = Complaints(self.get_logger())
@@ -64,9 +94,18 @@ class CompensatorNode(Node):
         group = relay_loop.OutsideExecutor() if self.by_wait_set else None
         self.imu = MatchedInput(self, Imu, 'imu/data_raw', callback=self._on_imu, group=group)
         if self.imu.topic_name == self._publisher.topic_name:
-            raise InputError(f'input and output must be two topics, both are {self.imu.topic_name}; correct the remapping')
+            raise InputError(
+                f'input and output must be two topics, both are {self.imu.topic_name}; correct the remapping'
+            )
         refuse_corrected(self.imu.topic_name)
-        self.documents = MatchedInput(self, String, 'imu/calibration', callback=self._guarded(self._on_document), raw=False, latched=True)
+        self.documents = MatchedInput(
+            self,
+            String,
+            'imu/calibration',
+            callback=self._guarded(self._on_document),
+            raw=False,
+            latched=True,
+        )
         self.temperature: MatchedInput | None = None
         self.inputs = [self.imu, self.documents]
         watch_inputs(self, self.inputs)
@@ -77,17 +116,26 @@ class CompensatorNode(Node):
         self._set_refresh(self.settings.covariance_rate)
 
     def _start(self) -> None:
-        if self.settings.calibration_file and not (path := files.user_path(self.settings.calibration_file)).exists():
+        if (
+            self.settings.calibration_file
+            and not (path := files.user_path(self.settings.calibration_file)).exists()
+        ):
             if not self.settings.wait_for_file:
-                raise InputError(f"parameter 'calibration_file' must name an existing file, {path} is missing; correct it, or "
-                                 'wait for it with wait_for_file:=true', code='calibration_missing')
+                raise InputError(
+                    f"parameter 'calibration_file' must name an existing file, {path} is missing; correct it, or "
+                    'wait for it with wait_for_file:=true',
+                    code='calibration_missing',
+                )
             self._waiting = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
             self.get_logger().info(f'waits for the file {path}')
         elif self.settings.calibration_file:
             self._try_file()
         else:
-            self.get_logger().info(f'waiting for a calibration on {self.documents.topic_name}' if self.settings.takes_topic else
-                                   "waiting for parameter 'calibration_file'")
+            self.get_logger().info(
+                f'waiting for a calibration on {self.documents.topic_name}'
+                if self.settings.takes_topic
+                else "waiting for parameter 'calibration_file'"
+            )
 
     def _look_for_file(self) -> None:
         if files.user_path(self.settings.calibration_file).exists():
@@ -113,10 +161,14 @@ class CompensatorNode(Node):
             current = self._take_over()
         if current is None or self.corrected_already:
             self.uncorrected += 1
-            return data if self.settings.passthrough and current is None and not self.corrected_already else None
+            return (
+                data
+                if self.settings.passthrough and current is None and not self.corrected_already
+                else None
+            )
         try:
             return current(data, sent_ns(information))
-        except Exception as error:   # an unforeseen message must not end the stream
+        except Exception as error:  # an unforeseen message must not end the stream
             current.counts[shortened(f'failed with {type(error).__name__}: {error}', 100)] += 1
             return None
 
@@ -137,22 +189,29 @@ class CompensatorNode(Node):
         return guarded(callback, self._failed)
 
     def _failed(self, error: Exception) -> None:
-        if self.context.ok():   # false while the node ends and publishing is impossible
-            self.complaints.event('a message could not be used, the node continues unchanged: '
-                                  + shortened(f'{type(error).__name__}: {error}', 200), LOG_ERROR)
+        if self.context.ok():  # false while the node ends and publishing is impossible
+            self.complaints.event(
+                'a message could not be used, the node continues unchanged: '
+                + shortened(f'{type(error).__name__}: {error}', 200),
+                LOG_ERROR,
+            )
 
     def _on_document(self, message: String) -> None:
         self.documents.look()
         if self.documents.mixed:
-            self.complaints.event(f'{self.documents.topic_name} has the publishers {", ".join(sorted(self.documents.names()))}: '
-                                  'no calibration is adopted; stop all but one')
+            self.complaints.event(
+                f'{self.documents.topic_name} has the publishers {", ".join(sorted(self.documents.names()))}: '
+                'no calibration is adopted; stop all but one'
+            )
             return
         self._heard = message.data
         if self.settings.takes_topic:
             self._try(self._topic, self._take_topic)
         else:
-            self.complaints.event(f"a calibration on {self.documents.topic_name} was not adopted: parameter 'adopt' is "
-                                  f"'{self.settings.adopt}' and 'calibration_file' is '{self.settings.calibration_file}'")
+            self.complaints.event(
+                f"a calibration on {self.documents.topic_name} was not adopted: parameter 'adopt' is "
+                f"'{self.settings.adopt}' and 'calibration_file' is '{self.settings.calibration_file}'"
+            )
 
     def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
         """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
@@ -170,8 +229,11 @@ class CompensatorNode(Node):
         watch = None if harmful is None else harmful.compensation.watch
         if harmful is None or previous is None or watch is None or watch.health.state.word != HARMS:
             return
-        self.complaints.event(f'calibration {harmful.version} harms, the previous calibration {previous.version} is used again: '
-                              f'{watch.health.state.message}', LOG_ERROR)
+        self.complaints.event(
+            f'calibration {harmful.version} harms, the previous calibration {previous.version} is used again: '
+            f'{watch.health.state.message}',
+            LOG_ERROR,
+        )
         self._harmful, self._previous, self.adopted = harmful.version, None, None
         self._put_in_force(again(previous, self.settings, self._frames))
 
@@ -180,10 +242,18 @@ class CompensatorNode(Node):
             self._previous = self.adopted
         self.adopted, self.problem, self.refusal, self.awaited = adopted, '', '', ''
         self._wanted = adopted.compensation
-        if self.temperature is None and (adopted.compensation.needs_temperature
-                                         or adopted.calibration.conditions.get('temperature_range_c')):
-            self.temperature = MatchedInput(self, Temperature, 'imu/temperature', callback=self._guarded(self._on_temperature), depth=10,
-                                            raw=False)
+        if self.temperature is None and (
+            adopted.compensation.needs_temperature
+            or adopted.calibration.conditions.get('temperature_range_c')
+        ):
+            self.temperature = MatchedInput(
+                self,
+                Temperature,
+                'imu/temperature',
+                callback=self._guarded(self._on_temperature),
+                depth=10,
+                raw=False,
+            )
             self.inputs.append(self.temperature)
         self._mark.publish(String(data=f'corrected with calibration {adopted.version}'))
         self.diagnostics.publish_now()
@@ -194,7 +264,10 @@ class CompensatorNode(Node):
 
     def _take_topic(self, settings: CompensatorSettings) -> None:
         if version_of(self._heard) == self._harmful:
-            raise DocumentError(f'calibration {self._harmful} increased the error at rest; calibrate again', code='increased_error')
+            raise DocumentError(
+                f'calibration {self._harmful} increased the error at rest; calibrate again',
+                code='increased_error',
+            )
         self._adopt(self._heard, self._topic, settings)
 
     def _load_file(self, settings: CompensatorSettings) -> None:
@@ -227,7 +300,9 @@ class CompensatorNode(Node):
             self._retry()
         elif self.adopted is not None and has_moved(self.adopted, self.settings, self._frames):
             self._put_in_force(again(self.adopted, self.settings, self._frames))
-            self.get_logger().warning(f"the static transform to '{self.settings.target_frame}' has moved: readings follow it")
+            self.get_logger().warning(
+                f"the static transform to '{self.settings.target_frame}' has moved: readings follow it"
+            )
 
     def _retry(self) -> None:
         if self.settings.takes_topic and self._heard:
@@ -239,8 +314,13 @@ class CompensatorNode(Node):
         if self.settings.calibration_file:
             why = self._try_file()
         else:
-            why = "parameter 'calibration_file' is empty; start the node with the file to read again"
-        response.success, response.message = not why, why or (self.adopted.line() if self.adopted else '')
+            why = (
+                "parameter 'calibration_file' is empty; start the node with the file to read again"
+            )
+        response.success, response.message = (
+            not why,
+            why or (self.adopted.line() if self.adopted else ''),
+        )
         return response
 
     def _change_compensation(self, settings: CompensatorSettings) -> None:
@@ -265,7 +345,9 @@ class CompensatorNode(Node):
     def _set_refresh(self, rate: float) -> None:
         if self._timer is not None:
             self.destroy_timer(self._timer)
-        self._timer = self.create_timer(1.0 / rate, self._guarded(self._refresh)) if rate > 0 else None
+        self._timer = (
+            self.create_timer(1.0 / rate, self._guarded(self._refresh)) if rate > 0 else None
+        )
 
     def _refresh(self) -> None:
         if self.compensation is not None:
@@ -274,13 +356,21 @@ class CompensatorNode(Node):
     def look_for_correction(self) -> None:
         """Notice when another compensator publishes the input, and when it no longer does."""
         topic = self.imu.topic_name
-        self.corrected_already = (f'{topic} is corrected already ({topic + MARK} has a publisher): no messages are published; '
-                                  'remap imu/data_raw to the raw topic') if self.count_publishers(topic + MARK) else ''
+        self.corrected_already = (
+            (
+                f'{topic} is corrected already ({topic + MARK} has a publisher): no messages are published; '
+                'remap imu/data_raw to the raw topic'
+            )
+            if self.count_publishers(topic + MARK)
+            else ''
+        )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node; return the exit code."""
-    return run_node(CompensatorNode, arguments, spin=CompensatorNode.spin, hints=HINTS['compensator_node'])
+    return run_node(
+        CompensatorNode, arguments, spin=CompensatorNode.spin, hints=HINTS['compensator_node']
+    )
 
 
 if __name__ == '__main__':

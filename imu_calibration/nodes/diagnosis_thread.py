@@ -7,7 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from imu_calibration.calibration.diagnosis.live_diagnosis import FAILED, NOT_YET, OFF, Answer, DiagnosisQuestion
+from imu_calibration.calibration.diagnosis.live_diagnosis import (
+    FAILED,
+    NOT_YET,
+    OFF,
+    Answer,
+    DiagnosisQuestion,
+)
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import SolvePacer
 from imu_calibration.core.progress import LiveState, listening
@@ -73,7 +79,9 @@ class DiagnosisThread:
         self._next, self._wanted, self._urgent = time.monotonic() + period, False, False
         self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
-        self._answered: dict | None = None   # numbers of samples of the last question; the question itself keeps all windows in memory
+        self._answered: dict | None = (
+            None  # numbers of samples of the last question; the question itself keeps all windows in memory
+        )
         self._extension: ModelExtension | None = None
 
     def change(self, period: float) -> None:
@@ -93,21 +101,32 @@ class DiagnosisThread:
 
     def forget(self) -> None:
         """Discard all results: the session is restarted."""
-        self.state, self._wanted, self._urgent = NOT_YET if self.period else self.state, False, False
+        self.state, self._wanted, self._urgent = (
+            NOT_YET if self.period else self.state,
+            False,
+            False,
+        )
         self._answered = self._extension = None
         self._session += 1
 
-    def ask_when_due(self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool) -> None:
+    def ask_when_due(
+        self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool
+    ) -> None:
         """Start the diagnosis `make_question()` (None: no diagnosis) when it is requested, or when the period is over and there is news."""
         now = time.monotonic()
-        due = self._urgent or ((self._wanted or (bool(self.period) and is_news and now >= self._next)) and self._pacer.due(now))
+        due = self._urgent or (
+            (self._wanted or (bool(self.period) and is_news and now >= self._next))
+            and self._pacer.due(now)
+        )
         if not due or self.is_running or self._ending:
             return
         question = make_question()
         if question is None:
             return
         self._wanted = self._urgent = False
-        self._thread = threading.Thread(target=self._answer, args=(question, now, self._session), name='diagnosis', daemon=True)
+        self._thread = threading.Thread(
+            target=self._answer, args=(question, now, self._session), name='diagnosis', daemon=True
+        )
         self._thread.start()
 
     def _answer(self, question, start, session):
@@ -116,8 +135,10 @@ class DiagnosisThread:
                 answer = question.answer()
         except _Ended:
             return
-        except Exception as error:   # a diagnosis that fails must not end the calibration
-            answer = Answer(LiveState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}'))
+        except Exception as error:  # a diagnosis that fails must not end the calibration
+            answer = Answer(
+                LiveState(FAILED, f'the diagnosis failed: {type(error).__name__}: {error}')
+            )
         if session == self._session:
             self.state, self._extension = answer.state, answer.extension
             self._answered, self.n_answers = question.samples, self.n_answers + 1

@@ -21,7 +21,14 @@ DIAGNOSTICS_SECONDS = 1.0
 """Seconds between two messages; diagnostic aggregators call a status stale after five."""
 
 
-def make_status(level: Any, name: str, message: str, *, values: Mapping[str, Any] | None = None, hardware_id: str = '') -> DiagnosticStatus:
+def make_status(
+    level: Any,
+    name: str,
+    message: str,
+    *,
+    values: Mapping[str, Any] | None = None,
+    hardware_id: str = '',
+) -> DiagnosticStatus:
     """
     Return one DiagnosticStatus.
 
@@ -39,8 +46,13 @@ def make_status(level: Any, name: str, message: str, *, values: Mapping[str, Any
         The sensor, usually its frame_id.
 
     """
-    pairs = [KeyValue(key=str(key), value=value if isinstance(value, str) else str(value)) for key, value in (values or {}).items()]
-    return DiagnosticStatus(level=level, name=name, message=message, hardware_id=hardware_id, values=pairs)
+    pairs = [
+        KeyValue(key=str(key), value=value if isinstance(value, str) else str(value))
+        for key, value in (values or {}).items()
+    ]
+    return DiagnosticStatus(
+        level=level, name=name, message=message, hardware_id=hardware_id, values=pairs
+    )
 
 
 class DiagnosticsPublisher:
@@ -59,8 +71,14 @@ class DiagnosticsPublisher:
         """Publish the present state, or the error that prevents its collection."""
         try:
             statuses = self._collect()
-        except Exception as error:   # diagnostics must not end their node
-            statuses = [make_status(ERROR, 'diagnostics', shortened(f'state not available: {type(error).__name__}: {error}', 300))]
+        except Exception as error:  # diagnostics must not end their node
+            statuses = [
+                make_status(
+                    ERROR,
+                    'diagnostics',
+                    shortened(f'state not available: {type(error).__name__}: {error}', 300),
+                )
+            ]
         array = DiagnosticArray(status=statuses)
         array.header.stamp = self._node.get_clock().now().to_msg()
         prefix = self._node.get_fully_qualified_name().lstrip('/')
@@ -69,7 +87,7 @@ class DiagnosticsPublisher:
         try:
             self._publisher.publish(array)
         except Exception:
-            if self._node.context.ok():   # otherwise the node is ending
+            if self._node.context.ok():  # otherwise the node is ending
                 raise
 
 
@@ -113,10 +131,23 @@ class Complaints:
         self._said: dict[str, float] = {}
         self._open: dict[str, str] = {}
 
-    def now(self, source: str, warnings: Iterable[str] = (), errors: Iterable[str] = (), *, patience: float = REPEAT_SECONDS) -> None:
+    def now(
+        self,
+        source: str,
+        warnings: Iterable[str] = (),
+        errors: Iterable[str] = (),
+        *,
+        patience: float = REPEAT_SECONDS,
+    ) -> None:
         """Log the present faults of `source` and the end of earlier ones; an ended one is repeated after `patience` seconds at least."""
-        present = {kind_of(source, line): (level, line) for level, lines in ((LOG_WARN, warnings), (LOG_ERROR, errors)) for line in lines}
-        for kind in [kind for kind in self._open if kind.startswith(source + ':') and kind not in present]:
+        present = {
+            kind_of(source, line): (level, line)
+            for level, lines in ((LOG_WARN, warnings), (LOG_ERROR, errors))
+            for line in lines
+        }
+        for kind in [
+            kind for kind in self._open if kind.startswith(source + ':') and kind not in present
+        ]:
             say(self._logger, LOG_INFO, f'over: {self._open.pop(kind)}')
         for kind, (level, line) in present.items():
             if self._due(kind, REMINDER if kind in self._open else patience):

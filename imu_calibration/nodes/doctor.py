@@ -17,7 +17,13 @@ from sensor_msgs.msg import Imu
 
 from imu_calibration.nodes.inputs import BatchInput
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.recording_evidence import GOOD, REFUSE, WARNING, CheckFinding, check_messages
+from imu_calibration.preprocessing.recording_evidence import (
+    GOOD,
+    REFUSE,
+    WARNING,
+    CheckFinding,
+    check_messages,
+)
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 from msg_adapters.imu_stream import ImuHeads
 from msg_adapters.live import LiveGatherer
@@ -77,8 +83,13 @@ def look(node: Node, spin_once: Any) -> list[StreamFindings]:
 
 def _imu_topics(node):
     """Return the published topics with Imu messages, or with names of Imu topics."""
-    return [name for name, types in sorted(node.get_topic_names_and_types())
-            if (TYPE in types or name.endswith(IMU_TOPIC_ENDINGS)) and not name.endswith(NOT_MEASURED) and node.count_publishers(name)]
+    return [
+        name
+        for name, types in sorted(node.get_topic_names_and_types())
+        if (TYPE in types or name.endswith(IMU_TOPIC_ENDINGS))
+        and not name.endswith(NOT_MEASURED)
+        and node.count_publishers(name)
+    ]
 
 
 def _spin(node, spin_once, seconds):
@@ -93,7 +104,9 @@ class _Stream:
     def __init__(self, node, topic):
         self.node, self.topic = node, topic
         self._begin()
-        self.by_wall_clock = not node.count_publishers('/clock')   # otherwise stamps are in simulated time
+        self.by_wall_clock = not node.count_publishers(
+            '/clock'
+        )  # otherwise stamps are in simulated time
         self.input = BatchInput(node, Imu, topic, add=self._add)
 
     def _begin(self):
@@ -114,19 +127,36 @@ class _Stream:
         self.input.look()
         preflight = Preflight(strict=False)
         deque(BlockCleaner(watchers=[preflight]).all_of([self.gatherer.flush()]), maxlen=0)
-        found = (*self._publishers(), *self._listeners(), *check_messages(self.heads.evidence()), *preflight.findings)
+        found = (
+            *self._publishers(),
+            *self._listeners(),
+            *check_messages(self.heads.evidence()),
+            *preflight.findings,
+        )
         return StreamFindings(self.topic, self.input.source(), found)
 
     def _publishers(self):
         for other in self.input.others:
-            yield CheckFinding('type', REFUSE, f'a topic must have one type, {other.node_name} publishes {other.topic_type} here instead '
-                               f'of {TYPE}; rename its topic')
+            yield CheckFinding(
+                'type',
+                REFUSE,
+                f'a topic must have one type, {other.node_name} publishes {other.topic_type} here instead '
+                f'of {TYPE}; rename its topic',
+            )
         names = sorted(self.input.names())
         if len(names) > 1:
-            yield CheckFinding('publishers', WARNING, f'one node must publish a topic, {len(names)} do ({", ".join(names)}): their '
-                               'messages mix; stop all but one, or rename their topics')
+            yield CheckFinding(
+                'publishers',
+                WARNING,
+                f'one node must publish a topic, {len(names)} do ({", ".join(names)}): their '
+                'messages mix; stop all but one, or rename their topics',
+            )
         if names and not self.heads.evidence().frame_ids:
-            yield CheckFinding('silence', WARNING, f'messages are required, none came in {RETRIES * LISTEN_SECONDS:g} s; check the driver')
+            yield CheckFinding(
+                'silence',
+                WARNING,
+                f'messages are required, none came in {RETRIES * LISTEN_SECONDS:g} s; check the driver',
+            )
 
     def _listeners(self):
         wrong = 0
@@ -135,10 +165,18 @@ class _Stream:
                 answer, why = qos_check_compatible(publisher.qos_profile, listener.qos_profile)
                 if answer == QoSCompatibility.ERROR:
                     wrong += 1
-                    yield CheckFinding('qos', REFUSE, f'a subscriber must request at most the offered QoS, {listener.node_name} receives '
-                                       f'nothing from {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}')
+                    yield CheckFinding(
+                        'qos',
+                        REFUSE,
+                        f'a subscriber must request at most the offered QoS, {listener.node_name} receives '
+                        f'nothing from {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}',
+                    )
         if self.input.publishers and not wrong:
-            reliable = 'reliable' if self.input.reliable else 'best effort: messages lost by the network are not repeated'
+            reliable = (
+                'reliable'
+                if self.input.reliable
+                else 'best effort: messages lost by the network are not repeated'
+            )
             yield CheckFinding('qos', GOOD, f'published {reliable}')
 
 
@@ -162,7 +200,10 @@ class ImuCheck(DoctorCheck):
     def check(self) -> Result:
         """Return the faults of each topic."""
         result = Result()
-        kinds: dict[str, tuple[Callable, Callable]] = {REFUSE: (doctor_error, result.add_error), WARNING: (doctor_warn, result.add_warning)}
+        kinds: dict[str, tuple[Callable, Callable]] = {
+            REFUSE: (doctor_error, result.add_error),
+            WARNING: (doctor_warn, result.add_warning),
+        }
         for stream in _streams():
             for finding in stream.findings:
                 if finding.severity in kinds:
@@ -185,7 +226,9 @@ class ImuReport(DoctorReport):
         for stream in _streams():
             report.add_to_report('topic', stream.source)
             for finding in stream.findings:
-                report.add_to_report(finding.check.replace('_', ' '), f'{finding.severity}: {finding.text}')
+                report.add_to_report(
+                    finding.check.replace('_', ' '), f'{finding.severity}: {finding.text}'
+                )
         if not report.items:
             report.add_to_report('topic', 'none of type sensor_msgs/msg/Imu has a publisher')
         return report

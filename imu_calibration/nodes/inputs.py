@@ -19,7 +19,10 @@ QUEUE_DEPTH = 1000
 
 def input_qos(reliable: bool = False, depth: int = QUEUE_DEPTH) -> QoSProfile:
     """Return the profile of an input (`inputs.MatchedInput`): `reliable` repeats lost messages, best effort accepts any publisher."""
-    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT)
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+    )
 
 
 def output_qos(depth: int = QUEUE_DEPTH) -> QoSProfile:
@@ -78,11 +81,30 @@ class MatchedInput:
 
     """
 
-    def __init__(self, node: Node, message_type: type, topic: str, *, callback: Callable[..., None], depth: int = QUEUE_DEPTH,
-                 group: CallbackGroup | None = None, single: bool = True, raw: bool = True, latched: bool = False):
+    def __init__(
+        self,
+        node: Node,
+        message_type: type,
+        topic: str,
+        *,
+        callback: Callable[..., None],
+        depth: int = QUEUE_DEPTH,
+        group: CallbackGroup | None = None,
+        single: bool = True,
+        raw: bool = True,
+        latched: bool = False,
+    ):
         self.node, self.message_type, self.topic, self.single = node, message_type, topic, single
-        self._callback, self._depth, self._group, self._raw, self._latched = callback, depth, group, raw, latched
-        self.type_name = '{}/msg/{}'.format(message_type.__module__.partition('.')[0], message_type.__name__)
+        self._callback, self._depth, self._group, self._raw, self._latched = (
+            callback,
+            depth,
+            group,
+            raw,
+            latched,
+        )
+        self.type_name = '{}/msg/{}'.format(
+            message_type.__module__.partition('.')[0], message_type.__name__
+        )
         self._several_since: float | None = None
         self.publishers: list[Any] = []
         self.reliable = True
@@ -97,16 +119,28 @@ class MatchedInput:
         # With its default callbacks rclpy warns of every publisher that offers less than requested, before we request less.
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         qos = latched_qos() if self._latched else input_qos(self.reliable, self._depth)
-        return self.node.create_subscription(self.message_type, self.topic, self._callback, qos, callback_group=self._group,
-                                             event_callbacks=silent, raw=self._raw)
+        return self.node.create_subscription(
+            self.message_type,
+            self.topic,
+            self._callback,
+            qos,
+            callback_group=self._group,
+            event_callbacks=silent,
+            raw=self._raw,
+        )
 
     def look(self) -> None:
         """Record the publishers, and subscribe again when they require another reliability."""
         several, known = self.mixed, self.node.get_publishers_info_by_topic(self.topic_name)
         self.publishers = [found for found in known if found.topic_type == self.type_name]
         self.others = [found for found in known if found.topic_type != self.type_name]
-        reliable = self._latched or all(found.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for found in self.publishers)
-        if reliable != self.reliable or (self._latched and several and not self.mixed):   # the last message of the one that remains
+        reliable = self._latched or all(
+            found.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT
+            for found in self.publishers
+        )
+        if reliable != self.reliable or (
+            self._latched and several and not self.mixed
+        ):  # the last message of the one that remains
             before, self.reliable = self.subscription, reliable
             self.subscription = self._subscribe()
             self.node.destroy_subscription(before)
@@ -128,15 +162,23 @@ class MatchedInput:
         """Return the faults of the topic, a line each."""
         names = self.names()
         patience = DEAD_AFTER if len(set(names)) == 1 else SEVERAL_AFTER
-        if not self.single or self._several_since is None or time.monotonic() - self._several_since < patience:
+        if (
+            not self.single
+            or self._several_since is None
+            or time.monotonic() - self._several_since < patience
+        ):
             return []
-        return [f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): their messages mix; stop all but one, '
-                f'or remap {self.topic}']
+        return [
+            f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): their messages mix; stop all but one, '
+            f'or remap {self.topic}'
+        ]
 
     def source(self) -> str:
         """Return the source of the messages, readable."""
-        return f'{self.topic_name} from {", ".join(sorted(set(self.names()))) or "an unknown node"}, ' + (
-            'reliable' if self.reliable else 'best effort')
+        return (
+            f'{self.topic_name} from {", ".join(sorted(set(self.names()))) or "an unknown node"}, '
+            + ('reliable' if self.reliable else 'best effort')
+        )
 
     def silence(self, unusable: str = '') -> str:
         """Return the likely reason of a silent topic, and a similar topic; `unusable` describes received messages that were dropped."""
@@ -144,14 +186,22 @@ class MatchedInput:
             return f'no message on {self.topic_name} is usable: {unusable}'
         what = f'no messages on {self.topic_name} ({self.type_name})'
         if self.publishers:
-            return f'{what}: {", ".join(sorted(set(self.names())))} is a publisher but does not send'
+            return (
+                f'{what}: {", ".join(sorted(set(self.names())))} is a publisher but does not send'
+            )
         if self.others:
             return f'{what}: {self.others[0].node_name} publishes {self.others[0].topic_type} there; remap {self.topic} to another topic'
         return f'{what}: {self._elsewhere()}'
 
     def _elsewhere(self) -> str:
-        there = [name for name, types in self.node.get_topic_names_and_types() if self.type_name in types and name != self.topic_name
-                 and not name.endswith(NOT_RAW) and self.node.count_publishers(name)]
+        there = [
+            name
+            for name, types in self.node.get_topic_names_and_types()
+            if self.type_name in types
+            and name != self.topic_name
+            and not name.endswith(NOT_RAW)
+            and self.node.count_publishers(name)
+        ]
         if not there:
             return 'no topic of that type has a publisher'
         near = get_close_matches(self.topic_name, there, MAX_NAMED_TOPICS, 0.0)
@@ -173,7 +223,15 @@ class BatchInput(MatchedInput):
 
     """
 
-    def __init__(self, node: Node, message_type: type, topic: str, *, add: Callable[[bytes, int], None], **options: Any):
+    def __init__(
+        self,
+        node: Node,
+        message_type: type,
+        topic: str,
+        *,
+        add: Callable[[bytes, int], None],
+        **options: Any,
+    ):
         self._add = add
         super().__init__(node, message_type, topic, callback=self._arrived, **options)
 
@@ -199,7 +257,9 @@ def sent_ns(information: dict) -> int:
 
 def watch_inputs(node: Node, inputs: list[MatchedInput]) -> None:
     """Check the publishers of the inputs periodically, by the steady clock."""
+
     def look() -> None:
         for each in inputs:
             each.look()
+
     every(node, PUBLISHER_CHECK_SECONDS, look)

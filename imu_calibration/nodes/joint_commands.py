@@ -23,8 +23,13 @@ from msg_adapters.joint_state import encode_trajectory
 COMMANDS = ('topic', 'action', 'auto')
 """How trajectories are sent; 'auto': by the action where control_msgs is installed and a server is there."""
 COMMAND_DEPTH = 10
-RESULTS = {-1: 'the goal is invalid', -2: 'the joints are not those of the controller', -3: 'the stamp is old', -4: 'a joint left the path',
-           -5: 'a joint did not reach the end'}
+RESULTS = {
+    -1: 'the goal is invalid',
+    -2: 'the joints are not those of the controller',
+    -3: 'the stamp is old',
+    -4: 'a joint left the path',
+    -5: 'a joint did not reach the end',
+}
 """Descriptions of the error codes of FollowJointTrajectory."""
 
 
@@ -32,13 +37,17 @@ class TopicCommand:
     """Sends trajectories to the topic `joint_trajectory`."""
 
     def __init__(self, node: Node):
-        self._publisher = node.create_publisher(JointTrajectory, 'joint_trajectory', output_qos(COMMAND_DEPTH))
+        self._publisher = node.create_publisher(
+            JointTrajectory, 'joint_trajectory', output_qos(COMMAND_DEPTH)
+        )
         self.name = self.topic_name = self._publisher.topic_name
         self.action_name = f'{self.topic_name.rpartition("/")[0]}/follow_joint_trajectory'
         """Action of the same controller, by the convention of ros2_control."""
         self.goals: set[bytes] = set()
         """Goals of this node; none."""
-        encode_trajectory(TrajectoryPoints.stop(()))   # loads the message types, so that no stop waits for them
+        encode_trajectory(
+            TrajectoryPoints.stop(())
+        )  # loads the message types, so that no stop waits for them
 
     @property
     def is_heard(self) -> bool:
@@ -70,8 +79,15 @@ class ActionCommand:
 
     """
 
-    def __init__(self, node: Node, action_type: Any, client: Any, *, refused: Callable[[str], None]):
-        self._topic, self._action, self._client, self._refused = TopicCommand(node), action_type, client, refused
+    def __init__(
+        self, node: Node, action_type: Any, client: Any, *, refused: Callable[[str], None]
+    ):
+        self._topic, self._action, self._client, self._refused = (
+            TopicCommand(node),
+            action_type,
+            client,
+            refused,
+        )
         self._handle: Any = None
         self._number = 0
         self.name = self.action_name = 'follow_joint_trajectory'
@@ -87,14 +103,19 @@ class ActionCommand:
     def send(self, points: TrajectoryPoints) -> None:
         """Send a trajectory as a goal."""
         from rclpy.serialization import deserialize_message
+
         self._number += 1
         number = self._number
-        goal = self._action.Goal(trajectory=deserialize_message(encode_trajectory(points), JointTrajectory))
-        self._client.send_goal_async(goal).add_done_callback(self._guarded(lambda future: self._answered(number, future.result())))
+        goal = self._action.Goal(
+            trajectory=deserialize_message(encode_trajectory(points), JointTrajectory)
+        )
+        self._client.send_goal_async(goal).add_done_callback(
+            self._guarded(lambda future: self._answered(number, future.result()))
+        )
 
     def stop(self, joint_names: tuple[str, ...]) -> None:
         """Cancel the goal, and send the trajectory without points: the first to arrive stops the joints."""
-        self._number += 1   # the result of the goal is not reported any more
+        self._number += 1  # the result of the goal is not reported any more
         handle, self._handle = self._handle, None
         self._topic.stop(joint_names)
         if handle is not None:
@@ -102,7 +123,7 @@ class ActionCommand:
 
     def _answered(self, number: int, handle: Any) -> None:
         self.goals.add(bytes(handle.goal_id.uuid))
-        if number != self._number:   # stopped before the server's response
+        if number != self._number:  # stopped before the server's response
             if handle.accepted:
                 handle.cancel_goal_async()
             return
@@ -110,7 +131,9 @@ class ActionCommand:
             self._refused('it refused the goal')
             return
         self._handle = handle
-        handle.get_result_async().add_done_callback(self._guarded(lambda future: self._ended(number, future.result().result)))
+        handle.get_result_async().add_done_callback(
+            self._guarded(lambda future: self._ended(number, future.result().result))
+        )
 
     def _guarded(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
         """Return a callback of a future whose exceptions count as a refusal: in an executor they would end the node."""
@@ -122,10 +145,15 @@ class ActionCommand:
         self._handle = None
         if result.error_code != 0:
             text = getattr(result, 'error_string', '')
-            self._refused(RESULTS.get(result.error_code, f'error code {result.error_code}') + (f' ({text})' if text else ''))
+            self._refused(
+                RESULTS.get(result.error_code, f'error code {result.error_code}')
+                + (f' ({text})' if text else '')
+            )
 
 
-def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicCommand | ActionCommand:
+def make_command(
+    node: Node, how: str, refused: Callable[[str], None]
+) -> TopicCommand | ActionCommand:
     """
     Return the interface to command joints that `how` (one of `COMMANDS`) selects.
 
@@ -141,10 +169,14 @@ def make_command(node: Node, how: str, refused: Callable[[str], None]) -> TopicC
         from control_msgs.action import FollowJointTrajectory
     except ImportError:
         if how == 'action':
-            raise InputError("parameter 'command' is action, and control_msgs is not installed: install ros-jazzy-control-msgs, "
-                             "or use topic", code='package_missing') from None
+            raise InputError(
+                "parameter 'command' is action, and control_msgs is not installed: install ros-jazzy-control-msgs, "
+                'or use topic',
+                code='package_missing',
+            ) from None
         return TopicCommand(node)
     from rclpy.action import ActionClient
+
     client = ActionClient(node, FollowJointTrajectory, 'follow_joint_trajectory')
     if how == 'auto' and not client.wait_for_server(timeout_sec=1.0):
         client.destroy()
@@ -170,11 +202,19 @@ class OtherDrivers:
     def __init__(self, node: Node, command: TopicCommand | ActionCommand):
         self._node, self._command = node, command
         self._active: set[bytes] = set()
-        self._status = node.create_subscription(GoalStatusArray, f'{command.action_name}/_action/status', self._take,
-                                                qos_profile_action_status_default)
+        self._status = node.create_subscription(
+            GoalStatusArray,
+            f'{command.action_name}/_action/status',
+            self._take,
+            qos_profile_action_status_default,
+        )
 
     def _take(self, message: Any) -> None:
-        self._active = {bytes(each.goal_info.goal_id.uuid) for each in message.status_list if each.status in _ACTIVE}
+        self._active = {
+            bytes(each.goal_info.goal_id.uuid)
+            for each in message.status_list
+            if each.status in _ACTIVE
+        }
 
     def found(self) -> str:
         """Return a line that names the other driver, '' for none."""
@@ -183,9 +223,13 @@ class OtherDrivers:
         if own in names:
             names.remove(own)
         if names:
-            return (f'{topic} must have no other publisher, there is {", ".join(names)}; stop it (after a crash its name remains for half '
-                    'a minute)')
+            return (
+                f'{topic} must have no other publisher, there is {", ".join(names)}; stop it (after a crash its name remains for half '
+                'a minute)'
+            )
         # The last status of a controller that has ended is not valid any more.
-        if self._active - self._command.goals and self._node.count_publishers(self._status.topic_name):
-            return (f'{self._command.action_name} must have no active goal, another client has one; wait until it has ended, or cancel it')
+        if self._active - self._command.goals and self._node.count_publishers(
+            self._status.topic_name
+        ):
+            return f'{self._command.action_name} must have no active goal, another client has one; wait until it has ended, or cancel it'
         return ''

@@ -16,7 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -34,14 +39,24 @@ NOT_OURS = ('use_sim_time', 'start_type_description_service', 'qos_overrides.')
 """Beginnings of the parameters that rclpy itself has."""
 
 
-TYPE_NAMES = {bool: 'true or false', int: 'a whole number', float: 'a number with a decimal point', str: 'a text',
-              tuple: 'a list of numbers with decimal points'}
+TYPE_NAMES = {
+    bool: 'true or false',
+    int: 'a whole number',
+    float: 'a number with a decimal point',
+    str: 'a text',
+    tuple: 'a list of numbers with decimal points',
+}
 _GROUPS = '_imu_calibration_groups'
 """Attribute of a node that holds its groups."""
 
 
-def declare_parameters(node: Node, group: type, take: Callable[[Any], None] | None = None, *,
-                       hints: dict[str, str] | None = None) -> Any:
+def declare_parameters(
+    node: Node,
+    group: type,
+    take: Callable[[Any], None] | None = None,
+    *,
+    hints: dict[str, str] | None = None,
+) -> Any:
     """
     Declare every field of the settings `group` as a parameter of `node` and return the settings with the given values.
 
@@ -67,11 +82,16 @@ def declare_parameters(node: Node, group: type, take: Callable[[Any], None] | No
     values = {}
     for item in describe(group):
         try:
-            value = node.declare_parameter(item.name, list(item.default) if isinstance(item.default, tuple) else item.default,
-                                           parameter_descriptor(item)).value
+            value = node.declare_parameter(
+                item.name,
+                list(item.default) if isinstance(item.default, tuple) else item.default,
+                parameter_descriptor(item),
+            ).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             kind = TYPE_NAMES[type(item.default)]
-            raise InputError(f"parameter '{item.name}' must be {kind}{range_text(item.bounds)}: {error}") from error
+            raise InputError(
+                f"parameter '{item.name}' must be {kind}{range_text(item.bounds)}: {error}"
+            ) from error
         values[item.name] = _from_ros(item, value)
     settings = override(group(), values)
     _watch(node, _Group(settings, take, hints or {}))
@@ -82,7 +102,9 @@ def parameter_descriptor(item: Setting) -> ParameterDescriptor:
     """Return the descriptor of one setting: type, meaning, unit, range, symptom of a wrong value, reason why it is fixed."""
     text = f'{item.text} [{item.unit}]' if item.unit else item.text
     descriptor = ParameterDescriptor(name=item.name, description=text, read_only=item.path)
-    notes = [f'When wrong: {item.symptom}.'] * bool(item.symptom) + [f'Fixed while the node runs: {item.fixed}.'] * (not item.live)
+    notes = [f'When wrong: {item.symptom}.'] * bool(item.symptom) + [
+        f'Fixed while the node runs: {item.fixed}.'
+    ] * (not item.live)
     descriptor.additional_constraints = ' '.join(notes)
     if isinstance(item.default, bool) or item.bounds == (None, None):
         return descriptor
@@ -91,7 +113,9 @@ def parameter_descriptor(item: Setting) -> ParameterDescriptor:
         descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     elif isinstance(item.default, float):
         low, high = _limits(item.bounds, sys.float_info.max)
-        descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high))
+        ]
     return descriptor
 
 
@@ -127,7 +151,9 @@ def _set(groups: list[_Group], parameters: list) -> SetParametersResult:
                 group.settings = settings
     except ImuCalibrationError as error:
         return SetParametersResult(successful=False, reason=error.with_hint(hints))
-    except Exception as error:   # the requester receives a response, and the node continues unchanged
+    except (
+        Exception
+    ) as error:  # the requester receives a response, and the node continues unchanged
         return SetParametersResult(successful=False, reason=f'{type(error).__name__}: {error}')
     return SetParametersResult(successful=True)
 
@@ -141,8 +167,10 @@ def _change(groups: list, parameter: Any) -> None:
         if value == getattr(group, item.name):
             return
         if not item.live:
-            raise InputError(f"parameter '{item.name}' cannot be changed while the node runs: {item.fixed}; start the node with "
-                             f'-p {item.name}:={parameter.value}')
+            raise InputError(
+                f"parameter '{item.name}' cannot be changed while the node runs: {item.fixed}; start the node with "
+                f'-p {item.name}:={parameter.value}'
+            )
         groups[place] = override(group, {item.name: value})
 
 
@@ -154,8 +182,14 @@ def unknown_parameters(node: Node) -> list[str]:
         if node.has_parameter(name) or name.startswith(NOT_OURS):
             continue
         near = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
-        lines.append(f"parameter '{name}' {UNKNOWN_PARAMETER}" + (f"; did you mean '{near[0]}'?" if near else
-                                                                     f"; see 'ros2 param list {node.get_fully_qualified_name()}'"))
+        lines.append(
+            f"parameter '{name}' {UNKNOWN_PARAMETER}"
+            + (
+                f"; did you mean '{near[0]}'?"
+                if near
+                else f"; see 'ros2 param list {node.get_fully_qualified_name()}'"
+            )
+        )
     return lines
 
 
@@ -168,17 +202,40 @@ def _from_ros(item: Setting, value: Any) -> Any:
     return tuple(value) if isinstance(item.default, tuple) else value
 
 
-_ARM = {'allow_xacro': "parameter 'allow_xacro'", 'urdf': "parameter 'urdf_file'", 'imu_link': "parameter 'imu_link'"}
+_ARM = {
+    'allow_xacro': "parameter 'allow_xacro'",
+    'urdf': "parameter 'urdf_file'",
+    'imu_link': "parameter 'imu_link'",
+}
 HINTS = {
-    'calibration_node': {'frame_id': "parameter 'frame_id'", 'gravity': "parameter 'gravity'", 'table': "parameter 'table_file'",
-                         **_ARM, 'imu_topic': 'remap imu/data_raw', 'joint_topic': 'remap joint_states',
-                         'temperature_topic': 'remap imu/temperature',
-                         'inspect': "record a bag and run 'imu_calibration inspect BAG' to {}",
-                         'diagnose': "call ~/diagnose, by hand record a bag and run 'imu_calibration diagnose BAG', to {}"},
-    'compensator_node': {'anyway': "parameter 'anyway'", 'calibration': "parameter 'calibration_file'", 'imu_topic': 'remap imu/data_raw',
-                         'target_frame': "parameter 'target_frame'", 'temperature_topic': 'remap imu/temperature'},
-    'planner_node': {**_ARM, 'table': "parameter 'table_file'", 'joint_topic': 'remap joint_states'},
-    'simulator_node': {**_ARM, 'calibration': "parameter 'calibration_file'", 'table': "parameter 'table_file'"},
+    'calibration_node': {
+        'frame_id': "parameter 'frame_id'",
+        'gravity': "parameter 'gravity'",
+        'table': "parameter 'table_file'",
+        **_ARM,
+        'imu_topic': 'remap imu/data_raw',
+        'joint_topic': 'remap joint_states',
+        'temperature_topic': 'remap imu/temperature',
+        'inspect': "record a bag and run 'imu_calibration inspect BAG' to {}",
+        'diagnose': "call ~/diagnose, by hand record a bag and run 'imu_calibration diagnose BAG', to {}",
+    },
+    'compensator_node': {
+        'anyway': "parameter 'anyway'",
+        'calibration': "parameter 'calibration_file'",
+        'imu_topic': 'remap imu/data_raw',
+        'target_frame': "parameter 'target_frame'",
+        'temperature_topic': 'remap imu/temperature',
+    },
+    'planner_node': {
+        **_ARM,
+        'table': "parameter 'table_file'",
+        'joint_topic': 'remap joint_states',
+    },
+    'simulator_node': {
+        **_ARM,
+        'calibration': "parameter 'calibration_file'",
+        'table': "parameter 'table_file'",
+    },
 }
 """Node -> {key of `errors.ERROR_KEYS`: its name in the node}; a node without an entry receives no such error."""
 
@@ -186,19 +243,32 @@ HINTS = {
 def settings_of(node: str) -> list[type]:
     """Return the settings classes that the module of `node` declares as parameters."""
     tree = ast.parse(Path(__file__).with_name(f'{node}.py').read_text())
-    calls = [call for call in ast.walk(tree) if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters']
+    calls = [
+        call
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'declare_parameters'
+    ]
     module = importlib.import_module(f'imu_calibration.nodes.{node}')
-    return [getattr(module, ast.unparse(call.args[1])) for call in sorted(calls, key=lambda call: call.lineno)]
+    return [
+        getattr(module, ast.unparse(call.args[1]))
+        for call in sorted(calls, key=lambda call: call.lineno)
+    ]
 
 
 def meaning(item: Setting) -> str:
     """Return the meaning of a setting, with unit and range."""
-    return item.text + (f' [{item.unit}]' if item.unit not in ('', '1') else '') + range_text(item.bounds)
+    return (
+        item.text
+        + (f' [{item.unit}]' if item.unit not in ('', '1') else '')
+        + range_text(item.bounds)
+    )
 
 
 def range_text(bounds: tuple) -> str:
     """Return which values are allowed."""
-    low, high = (bound if bound is None or isinstance(bound, int) else f'{bound:g}' for bound in bounds)
+    low, high = (
+        bound if bound is None or isinstance(bound, int) else f'{bound:g}' for bound in bounds
+    )
     if high is not None:
         return f', {low} to {high}' if low is not None else f', at most {high}'
     return f', at least {low}' if low is not None else ''
@@ -209,7 +279,11 @@ def value_text(value: object) -> str:
     if isinstance(value, tuple):
         return '[' + ', '.join(map(value_text, value)) + ']'
     text = json.dumps(value)
-    return text.replace('e', '.0e') if isinstance(value, float) and 'e' in text and '.' not in text else text
+    return (
+        text.replace('e', '.0e')
+        if isinstance(value, float) and 'e' in text and '.' not in text
+        else text
+    )
 
 
 HELP_WIDTH = 118
@@ -219,12 +293,19 @@ def help_text(node_class: Callable[[], Any]) -> str:
     """Return the help of a node, from the docstring of its module and the settings that it declares."""
     module = sys.modules[node_class.__module__]
     name = Path(inspect.getfile(module)).stem
-    lines = [f'usage: ros2 run imu_calibration {name} --ros-args [-p NAME:=VALUE ...] [-r FROM:=TO ...] [--params-file FILE]', '',
-             inspect.getdoc(module) or '', '', 'parameters:']
+    lines = [
+        f'usage: ros2 run imu_calibration {name} --ros-args [-p NAME:=VALUE ...] [-r FROM:=TO ...] [--params-file FILE]',
+        '',
+        inspect.getdoc(module) or '',
+        '',
+        'parameters:',
+    ]
     for group in settings_of(name):
         for item in describe(group):
             lines.append(f'  {item.name}: {value_text(item.default)}')
-            lines += textwrap.wrap(meaning(item), HELP_WIDTH, initial_indent='      ', subsequent_indent='      ')
+            lines += textwrap.wrap(
+                meaning(item), HELP_WIDTH, initial_indent='      ', subsequent_indent='      '
+            )
     return '\n'.join(lines)
 
 
@@ -240,8 +321,13 @@ LOOK_AGAIN = 0.5
 """Interval at which an idle node checks whether its end was requested, s."""
 
 
-def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = None, *, spin: Callable[[Any], None] | None = None,
-             hints: dict[str, str] | None = None) -> int:
+def run_node(
+    make_node: Callable[[], Any],
+    arguments: Sequence[str] | None = None,
+    *,
+    spin: Callable[[Any], None] | None = None,
+    hints: dict[str, str] | None = None,
+) -> int:
     """
     Run one node until a signal ends the process, and return the exit code.
 
@@ -262,12 +348,15 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     own = remove_ros_args(['', *arguments])[1:]
     if '-h' in own or '--help' in own:
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)   # the reader of a pipe may close it
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # the reader of a pipe may close it
         print(help_text(make_node))
         return 0
     if own:
-        print(f"error: arguments of the node follow --ros-args, got '{shortened(own[0])}' before it; write --ros-args -p NAME:=VALUE, "
-              'and see --help', file=sys.stderr)
+        print(
+            f"error: arguments of the node follow --ros-args, got '{shortened(own[0])}' before it; write --ros-args -p NAME:=VALUE, "
+            'and see --help',
+            file=sys.stderr,
+        )
         return 1
     # rclpy's handlers, installed by init, end the wait and call these; without them Python would also raise KeyboardInterrupt in mid-write.
     asked_to_end, node, halts = [], None, hasattr(make_node, 'halt')
@@ -278,21 +367,26 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
             node.halt()
         if halts:
             rclpy.try_shutdown()
+
     for number in SIGNALS:
         signal.signal(number, asked)
-    report = sys.unraisablehook   # incomplete objects of rclpy at the end of the context are not reported either
+    report = (
+        sys.unraisablehook
+    )  # incomplete objects of rclpy at the end of the context are not reported either
     sys.unraisablehook = lambda unraisable: None if asked_to_end else report(unraisable)
     # A node with a final message needs the context until it is sent.
-    rclpy.init(args=arguments, **({'signal_handler_options': SignalHandlerOptions.NO} if halts else {}))
+    rclpy.init(
+        args=arguments, **({'signal_handler_options': SignalHandlerOptions.NO} if halts else {})
+    )
     try:
-        if asked_to_end:   # before rclpy's handlers were installed
+        if asked_to_end:  # before rclpy's handlers were installed
             return 0
         node = make_node()
         for line in unknown_parameters(node):
             node.get_logger().warning(line)
         # At a signal rclpy wakes the executor before it ends the context: an executor that checks the context in between waits again.
         every(node, LOOK_AGAIN, lambda: None)
-        if not asked_to_end:   # an executor cannot be made any more
+        if not asked_to_end:  # an executor cannot be made any more
             (spin or rclpy.spin)(node)
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
@@ -302,7 +396,9 @@ def run_node(make_node: Callable[[], Any], arguments: Sequence[str] | None = Non
         # A context that ends while something is being made or published fails in many ways; none of them is news.
         time.sleep(HEARD)
         if not asked_to_end:
-            return _failed(f'the node cannot continue: {shortened(f"{type(error).__name__}: {error}", 300)}')
+            return _failed(
+                f'the node cannot continue: {shortened(f"{type(error).__name__}: {error}", 300)}'
+            )
     finally:
         _end(node)
     return int(getattr(node, 'failed', False))
@@ -314,14 +410,14 @@ def _failed(line: str) -> int:
 
 
 def _end(node: Any) -> None:
-    _ignore_signals()   # `ros2 launch` sends every signal twice, and the second must not interrupt saving
+    _ignore_signals()  # `ros2 launch` sends every signal twice, and the second must not interrupt saving
     if node is not None:
         last_words = node.close() if hasattr(node, 'close') else ''
-        if last_words:   # a logger would also publish, and complain that it cannot any more
+        if last_words:  # a logger would also publish, and complain that it cannot any more
             print(f'[{node.get_name()}]: {last_words}', file=sys.stderr, flush=True)
         node.destroy_node()
     rclpy.try_shutdown()
-    _ignore_signals()   # rclpy has restored the earlier handlers
+    _ignore_signals()  # rclpy has restored the earlier handlers
 
 
 def _ignore_signals() -> None:
@@ -329,17 +425,23 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def guarded(callback: Callable[..., Any], failed: Callable[[Exception], Any]) -> Callable[..., None]:
+def guarded(
+    callback: Callable[..., Any], failed: Callable[[Exception], Any]
+) -> Callable[..., None]:
     """Return `callback` with its exceptions passed to `failed`."""
+
     def call(*arguments: Any) -> None:
         try:
             callback(*arguments)
         except Exception as error:
             failed(error)
+
     return call
 
 
 def announce(node: Node, inputs: Sequence[str], outputs: Sequence[str], *, note: str = '') -> None:
     """Log the full names of topics, given as relative names, and a note."""
-    read, published = (', '.join(map(node.resolve_topic_name, names)) or 'nothing' for names in (inputs, outputs))
+    read, published = (
+        ', '.join(map(node.resolve_topic_name, names)) or 'nothing' for names in (inputs, outputs)
+    )
     node.get_logger().info(f'reads {read}; publishes {published}' + (f'; {note}' if note else ''))

@@ -34,13 +34,22 @@ class LiveCompensation(SampleCompensation):
 
     """
 
-    def __init__(self, calibration: FittedErrors, transfer: Transfer | None = None, *, check_frame: bool = True,
-                 with_parameters: bool = True, correct_stamps: bool = False,
-                 watch: StopWatch | None = None):
+    def __init__(
+        self,
+        calibration: FittedErrors,
+        transfer: Transfer | None = None,
+        *,
+        check_frame: bool = True,
+        with_parameters: bool = True,
+        correct_stamps: bool = False,
+        watch: StopWatch | None = None,
+    ):
         super().__init__(calibration, transfer, with_parameters)
         self.watch = watch
         self.frame_id, self.received = calibration.frame_id if check_frame else '', 0
-        self._message = ImuStream(None if transfer is None else transfer.frame_id, late_ns(calibration, correct_stamps))
+        self._message = ImuStream(
+            None if transfer is None else transfer.frame_id, late_ns(calibration, correct_stamps)
+        )
         self._taken, self._rate_cov, self._force_cov = -1, b'', b''
         self._no_rate = self._no_force = self._absent = self._odd = False
         self._orientation_in, self._orientation_out, self._no_orientation = None, b'', False
@@ -72,8 +81,9 @@ class LiveCompensation(SampleCompensation):
             taken = message.read(data)
         stamp_ns, readings = taken
         if self._absent:
-            readings = self._mixed(self.at_zero['gyroscope'] + self.at_zero['accelerometer'],
-                                   readings)   # does not disturb the other sensor
+            readings = self._mixed(
+                self.at_zero['gyroscope'] + self.at_zero['accelerometer'], readings
+            )  # does not disturb the other sensor
         if not stamp_ns:
             self.counts['zero stamp'] += 1
         corrected = self.correct(stamp_ns or sent_ns, *readings)
@@ -83,11 +93,20 @@ class LiveCompensation(SampleCompensation):
             corrected = self.watch.follow(stamp_ns or sent_ns, readings, corrected)
         if self._odd:
             self.counts['covariance not finite'] += 1
-        rate_cov, force_cov = self._marked(readings) if self._can_saturate else (self._rate_cov, self._force_cov)
+        rate_cov, force_cov = (
+            self._marked(readings) if self._can_saturate else (self._rate_cov, self._force_cov)
+        )
         if self._absent:
             corrected = self._mixed(taken[1], corrected)
         orientation = None if self.transfer is None else self._orientation(data)
-        return message.rewritten(data, stamp_ns, corrected, rate_cov=rate_cov, force_cov=force_cov, orientation=orientation)
+        return message.rewritten(
+            data,
+            stamp_ns,
+            corrected,
+            rate_cov=rate_cov,
+            force_cov=force_cov,
+            orientation=orientation,
+        )
 
     def _open(self, data):
         """Return whether a message with a new head can be corrected."""
@@ -98,7 +117,9 @@ class LiveCompensation(SampleCompensation):
             return False
         if self.frame_id and frame_id != self.frame_id:
             self._message.forget()
-            known = len(self.counts) < MAX_COUNTED_REASONS or f"frame_id '{frame_id}'" in self.counts
+            known = (
+                len(self.counts) < MAX_COUNTED_REASONS or f"frame_id '{frame_id}'" in self.counts
+            )
             self.counts[f"frame_id '{frame_id}'" if known else 'many further frame_ids'] += 1
             return False
         self._orientation_in = None
@@ -110,23 +131,37 @@ class LiveCompensation(SampleCompensation):
         given = self._message.covariances(data)
         self._no_force, self._no_rate = absent = [bool(cov[0, 0] == ABSENT_MARK) for cov in given]
         self._absent = any(absent)
-        self._odd = any(np.any(cov) and not missing and not is_known(cov) for cov, missing in zip(given, absent))
-        found = list(self.covariances(*(None if missing else cov for cov, missing in zip(given, absent))))
+        self._odd = any(
+            np.any(cov) and not missing and not is_known(cov) for cov, missing in zip(given, absent)
+        )
+        found = list(
+            self.covariances(*(None if missing else cov for cov, missing in zip(given, absent)))
+        )
         if self.watch is not None:
             found[1] = found[1] + self.watch.rate_cov
-        self._force_cov, self._rate_cov = (self._message.packed(cov if missing else new) for cov, new, missing in zip(given, found, absent))
+        self._force_cov, self._rate_cov = (
+            self._message.packed(cov if missing else new)
+            for cov, new, missing in zip(given, found, absent)
+        )
 
     def _mixed(self, of_absent, of_present):
         """Return six readings: of an absent sensor from the first, of the present sensor from the second."""
-        return (of_absent if self._no_rate else of_present)[:3] + (of_absent if self._no_force else of_present)[3:]
+        return (of_absent if self._no_rate else of_present)[:3] + (
+            of_absent if self._no_force else of_present
+        )[3:]
 
     def _marked(self, readings):
         """Return the covariances, of the size of the range where a sensor is saturated: the true value is not known better."""
         force_level, rate_level = self.levels
-        rate, force = max(map(abs, readings[:3])) >= rate_level, max(map(abs, readings[3:])) >= force_level
+        rate, force = (
+            max(map(abs, readings[:3])) >= rate_level,
+            max(map(abs, readings[3:])) >= force_level,
+        )
         if rate or force:
             self.counts['saturated'] += 1
-        return self._mark(rate_level) if rate else self._rate_cov, self._mark(force_level) if force else self._force_cov
+        return self._mark(rate_level) if rate else self._rate_cov, self._mark(
+            force_level
+        ) if force else self._force_cov
 
     def _mark(self, level):
         return self._message.packed(np.eye(3) * level**2)
@@ -137,5 +172,11 @@ class LiveCompensation(SampleCompensation):
         if covariance != self._orientation_in:
             given = self._message.unpacked(covariance)
             self._no_orientation, self._orientation_in = given[0, 0] == ABSENT_MARK, covariance
-            self._orientation_out = covariance if self._no_orientation else self._message.packed(self.transfer.turned_covariance(given))
-        return quaternion if self._no_orientation else self.transfer.turned_quaternion(quaternion), self._orientation_out
+            self._orientation_out = (
+                covariance
+                if self._no_orientation
+                else self._message.packed(self.transfer.turned_covariance(given))
+            )
+        return quaternion if self._no_orientation else self.transfer.turned_quaternion(
+            quaternion
+        ), self._orientation_out

@@ -27,12 +27,36 @@ from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
-from imu_calibration.kinematics.motion_limits import NOT_CHECKED, TrajectoryPoints, limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.kinematics.motion_limits import (
+    NOT_CHECKED,
+    TrajectoryPoints,
+    limit_words,
+    limits_of,
+    missing_ranges,
+    range_warnings,
+)
 from imu_calibration.nodes.calibration_status import driven_markers
-from imu_calibration.nodes.diagnostics import ERROR, LOG_ERROR, LOG_INFO, OK, WARN, Complaints, DiagnosticsPublisher, make_status, say
+from imu_calibration.nodes.diagnostics import (
+    ERROR,
+    LOG_ERROR,
+    LOG_INFO,
+    OK,
+    WARN,
+    Complaints,
+    DiagnosticsPublisher,
+    make_status,
+    say,
+)
 from imu_calibration.nodes.inputs import BatchInput, MatchedInput, latched_qos, watch_inputs
 from imu_calibration.nodes.joint_commands import COMMANDS, OtherDrivers, make_command
-from imu_calibration.nodes.lifecycle import HINTS, announce, declare_parameters, every, guarded, run_node
+from imu_calibration.nodes.lifecycle import (
+    HINTS,
+    announce,
+    declare_parameters,
+    every,
+    guarded,
+    run_node,
+)
 from imu_calibration.nodes.planner_worker import Peers, PlannerWorker, findings_from
 from imu_calibration.nodes.robot_stand import RobotSettings, chain_of
 from imu_calibration.planning.campaign import Campaign, CampaignSettings, Suspect, separator_of
@@ -51,29 +75,85 @@ from msg_adapters.layout import MessageError, Packed
 class PlannerNodeSettings:
     """Moved joints, parameters to determine, and interface of the commands."""
 
-    table_file: str = setting('', '', 'description of the table with the limits of its joints, path; empty: urdf_file describes the arm',
-                              symptom='other joints, or limits that are not theirs', session=True, path=True)
-    tolerances_file: str = setting('', '', 'tolerances, path; empty: the installed config/tolerances.yaml',
-                                   symptom='motions last too long, or end too early', session=True, path=True)
-    accelerometer_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
-    gyroscope_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
-    reference_model: str = setting('', '', 'as of calibration_node', symptom='motions for parameters that are not estimated')
-    grade: str = setting('industrial', '', 'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
-                         symptom='the predicted standard deviations are not reached', choices=tuple(sorted(GRADES)))
-    noise_file: str = setting('', '', 'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
-                              symptom='the predicted standard deviations are not reached', session=True, path=True)
-    imu_rate: float = setting(100.0, 'Hz', 'Imu messages per second', (1.0, 20000.0),
-                              'the predicted standard deviations are not reached')
-    command: str = setting('topic', '', 'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
-                           'control_msgs) or auto (the action where there is one)', symptom='nothing moves', choices=COMMANDS)
-    max_turns: float = setting(1.0, '1', 'turns of an endless joint to either side of its position at the first start, unwound at the end; '
-                               '0: unlimited, for slip rings', (0.0, 1e4), 'too large: cables are wound up; too small: slow plans',
-                               fixed='the range of every joint is set at the first start')
-    reach_deg: float = setting(0.0, 'deg', 'largest angle of each joint to either side of its position at the first start; '
-                               'sliding joints do not move; 0: the whole range', (0.0, 3600.0), 'too large: collisions',
-                               fixed='the range of every joint is set at the first start')
-    calibration_node: str = setting('calibration_node', '', 'name of the node that collects the windows',
-                                    symptom='~/start reports a missing service')
+    table_file: str = setting(
+        '',
+        '',
+        'description of the table with the limits of its joints, path; empty: urdf_file describes the arm',
+        symptom='other joints, or limits that are not theirs',
+        session=True,
+        path=True,
+    )
+    tolerances_file: str = setting(
+        '',
+        '',
+        'tolerances, path; empty: the installed config/tolerances.yaml',
+        symptom='motions last too long, or end too early',
+        session=True,
+        path=True,
+    )
+    accelerometer_model: str = setting(
+        '', '', 'as of calibration_node', symptom='motions for parameters that are not estimated'
+    )
+    gyroscope_model: str = setting(
+        '', '', 'as of calibration_node', symptom='motions for parameters that are not estimated'
+    )
+    reference_model: str = setting(
+        '', '', 'as of calibration_node', symptom='motions for parameters that are not estimated'
+    )
+    grade: str = setting(
+        'industrial',
+        '',
+        'grade of the noise that is expected before it is known: ' + ', '.join(sorted(GRADES)),
+        symptom='the predicted standard deviations are not reached',
+        choices=tuple(sorted(GRADES)),
+    )
+    noise_file: str = setting(
+        '',
+        '',
+        'noise.yaml of this IMU, from the verb noise, path; empty: that of the grade',
+        symptom='the predicted standard deviations are not reached',
+        session=True,
+        path=True,
+    )
+    imu_rate: float = setting(
+        100.0,
+        'Hz',
+        'Imu messages per second',
+        (1.0, 20000.0),
+        'the predicted standard deviations are not reached',
+    )
+    command: str = setting(
+        'topic',
+        '',
+        'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
+        'control_msgs) or auto (the action where there is one)',
+        symptom='nothing moves',
+        choices=COMMANDS,
+    )
+    max_turns: float = setting(
+        1.0,
+        '1',
+        'turns of an endless joint to either side of its position at the first start, unwound at the end; '
+        '0: unlimited, for slip rings',
+        (0.0, 1e4),
+        'too large: cables are wound up; too small: slow plans',
+        fixed='the range of every joint is set at the first start',
+    )
+    reach_deg: float = setting(
+        0.0,
+        'deg',
+        'largest angle of each joint to either side of its position at the first start; '
+        'sliding joints do not move; 0: the whole range',
+        (0.0, 3600.0),
+        'too large: collisions',
+        fixed='the range of every joint is set at the first start',
+    )
+    calibration_node: str = setting(
+        'calibration_node',
+        '',
+        'name of the node that collects the windows',
+        symptom='~/start reports a missing service',
+    )
 
 
 CLOCK_CHECK_SECONDS = 0.1
@@ -94,53 +174,110 @@ class PlannerNode(Node):
         driver_settings = declare_parameters(self, DriverSettings, self._change_driver)
         settings = self.settings
         robot = declare_parameters(self, RobotSettings)
-        announce(self, ['joint_states', 'imu/calibration', '/diagnostics'], ['joint_trajectory', 'imu/coverage'], note=NOT_CHECKED)
+        announce(
+            self,
+            ['joint_states', 'imu/calibration', '/diagnostics'],
+            ['joint_trajectory', 'imu/coverage'],
+            note=NOT_CHECKED,
+        )
         table = chain_of(self, robot, settings.table_file)
         if table is None:
-            raise InputError("planner_node requires the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them",
-                             code='table_missing')
+            raise InputError(
+                "planner_node requires the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them",
+                code='table_missing',
+            )
         self._table = table
         own = settings.tolerances_file
-        tolerances = files.read_tolerances(files.user_path(own) if own else config_file('tolerances.yaml'))
-        self._options = CalibrationOptions(settings.accelerometer_model or None, settings.gyroscope_model or None,
-                                           settings.reference_model or None, tolerances,
-                                           noise=files.read_noise(files.user_path(settings.noise_file)) if settings.noise_file else None)
+        tolerances = files.read_tolerances(
+            files.user_path(own) if own else config_file('tolerances.yaml')
+        )
+        self._options = CalibrationOptions(
+            settings.accelerometer_model or None,
+            settings.gyroscope_model or None,
+            settings.reference_model or None,
+            tolerances,
+            noise=files.read_noise(files.user_path(settings.noise_file))
+            if settings.noise_file
+            else None,
+        )
         self._lock, self._stamp, self._status = threading.RLock(), 0.0, {}
         self._newest: str | None = None
         self._n_documents = 0
         self._is_halted = False
         self._complaints, self._heard = Complaints(self.get_logger()), threading.Condition()
         self._names = tuple(self._table.joint_names)
-        self.driver, self._is_placed = Driver(self._names, limits_of(self._table), driver_settings), False
+        self.driver, self._is_placed = (
+            Driver(self._names, limits_of(self._table), driver_settings),
+            False,
+        )
         self._command = make_command(self, settings.command, self._refused)
         self._others = OtherDrivers(self, self._command)
-        self.worker = PlannerWorker(self.driver, self._make_campaign,
-                                    peers=Peers(self._measure, self._latest, self._diagnose, self._send, self._stop_joints, self._say,
-                                                self._others.found),
-                                    lock=self._lock)
+        self.worker = PlannerWorker(
+            self.driver,
+            self._make_campaign,
+            peers=Peers(
+                self._measure,
+                self._latest,
+                self._diagnose,
+                self._send,
+                self._stop_joints,
+                self._say,
+                self._others.found,
+            ),
+            lock=self._lock,
+        )
         self.worker.stamp = lambda: self._stamp
         # All that wait at once: one by one they would wait in line while a plan is made, and the motion begin where the joints were before.
-        self._joints = BatchInput(self, JointState, 'joint_states', add=self._guarded(self._joint_state), single=False)
-        self._calibrations = MatchedInput(self, String, 'imu/calibration', callback=self._guarded(self._document), raw=False, latched=True)
+        self._joints = BatchInput(
+            self, JointState, 'joint_states', add=self._guarded(self._joint_state), single=False
+        )
+        self._calibrations = MatchedInput(
+            self,
+            String,
+            'imu/calibration',
+            callback=self._guarded(self._document),
+            raw=False,
+            latched=True,
+        )
         watch_inputs(self, [self._joints, self._calibrations])
-        self.create_subscription(DiagnosticArray, '/diagnostics', self._guarded(self._diagnostic), 100)
-        self._calibrator = {what: self.create_client(Trigger, f'{settings.calibration_node}/{what}') for what in ('solve', 'diagnose')}
-        for what, answer in (('start', lambda: self._go(-1)), ('next', lambda: self._go(1)), ('stop', self._stop)):
+        self.create_subscription(
+            DiagnosticArray, '/diagnostics', self._guarded(self._diagnostic), 100
+        )
+        self._calibrator = {
+            what: self.create_client(Trigger, f'{settings.calibration_node}/{what}')
+            for what in ('solve', 'diagnose')
+        }
+        for what, answer in (
+            ('start', lambda: self._go(-1)),
+            ('next', lambda: self._go(1)),
+            ('stop', self._stop),
+        ):
             self.create_service(Trigger, f'~/{what}', partial(self._serve, what, answer))
         every(self, CLOCK_CHECK_SECONDS, self._guarded(self._tick))
-        self._coverage, self._driven = self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()), None
+        self._coverage, self._driven = (
+            self.create_publisher(MarkerArray, 'imu/coverage', latched_qos()),
+            None,
+        )
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self.worker.start()
-        self.get_logger().info(f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
-                               f'no motion before ~/start; limits: {self._limit_words()}')
+        self.get_logger().info(
+            f'will move the joints {", ".join(self._table.joint_names)} by {self._command.name}; '
+            f'no motion before ~/start; limits: {self._limit_words()}'
+        )
         for line in range_warnings(self._table):
             self.get_logger().warning(line)
 
     def close(self) -> str:
         """Stop the joints; return the outcome."""
-        unstopped = self.driver.is_driving   # the context has ended, and no message can be sent
+        unstopped = self.driver.is_driving  # the context has ended, and no message can be sent
         self.worker.end()
-        return 'the joints finish the motion that they are in' if unstopped else MID_MOTION if self._is_halted else ''
+        return (
+            'the joints finish the motion that they are in'
+            if unstopped
+            else MID_MOTION
+            if self._is_halted
+            else ''
+        )
 
     def halt(self) -> None:
         """Stop the joints; called at the first signal, while messages can still be sent."""
@@ -159,31 +296,57 @@ class PlannerNode(Node):
 
     def _make_campaign(self) -> Campaign:
         noise = expected_noise(self._options.noise, self.settings.grade, self.settings.imu_rate)
-        planner = make_planner(self._table, noise=noise, tolerances=self._options.tolerances, rate=self.settings.imu_rate,
-                               options=self._options, limits=self.driver.limits, calibration=self._latest())
-        return Campaign(planner, self._campaign_settings, lambda suspect: self._make_separator(suspect, noise),
-                        first=lambda position: planner.probe(position, self.driver.first_reach),
-                        unwind=planner.unwinding)
+        planner = make_planner(
+            self._table,
+            noise=noise,
+            tolerances=self._options.tolerances,
+            rate=self.settings.imu_rate,
+            options=self._options,
+            limits=self.driver.limits,
+            calibration=self._latest(),
+        )
+        return Campaign(
+            planner,
+            self._campaign_settings,
+            lambda suspect: self._make_separator(suspect, noise),
+            first=lambda position: planner.probe(position, self.driver.first_reach),
+            unwind=planner.unwinding,
+        )
 
     def _make_separator(self, suspect: Suspect, noise: dict) -> Planner:
         calibration = self._latest()
         if calibration is None:
-            raise InputError('a calibration is required before causes can be separated, none was received; publish imu/calibration')
-        return separator_of(self._table, calibration, suspect, noise=noise, rate=self.settings.imu_rate, options=self._options,
-                            limits=self.driver.limits)
+            raise InputError(
+                'a calibration is required before causes can be separated, none was received; publish imu/calibration'
+            )
+        return separator_of(
+            self._table,
+            calibration,
+            suspect,
+            noise=noise,
+            rate=self.settings.imu_rate,
+            options=self._options,
+            limits=self.driver.limits,
+        )
 
     def _send(self, points: TrajectoryPoints) -> None:
         self._command.send(points)
         calibration = self._latest()
-        self._driven = driven_markers(up_at(self._table, points.position[-1]), f'motion {self.driver.motions}: {self.worker.motion.words}',
-                                      frame_id=calibration.frame_id if calibration else '', stamp=self.get_clock().now().to_msg())
+        self._driven = driven_markers(
+            up_at(self._table, points.position[-1]),
+            f'motion {self.driver.motions}: {self.worker.motion.words}',
+            frame_id=calibration.frame_id if calibration else '',
+            stamp=self.get_clock().now().to_msg(),
+        )
         self._coverage.publish(self._driven)
 
     # Received messages.
 
     def _joint_state(self, serialized: bytes, _: int) -> None:
         try:
-            samples = decode_joints(find_joint_layout(serialized), Packed.join([serialized]), self._names)
+            samples = decode_joints(
+                find_joint_layout(serialized), Packed.join([serialized]), self._names
+            )
         except MessageError as error:
             self._complaints.event(f'joint_states: {error}; it is left out')
             return
@@ -191,9 +354,13 @@ class PlannerNode(Node):
         self._stamp = float(samples.stamp_ns[0]) * 1e-9 if samples.stamp_ns[0] else now
         with self._lock:
             ignored = dict(self.driver.ignored)
-            must_stop = self.driver.observe(self._stamp, samples.position[0], samples.velocity[0], now=now)
+            must_stop = self.driver.observe(
+                self._stamp, samples.position[0], samples.velocity[0], now=now
+            )
         if self.driver.ignored != ignored:
-            self._complaints.event(f'joint_states: positions must be finite{self.driver.ignored_words()}; see the driver of that joint')
+            self._complaints.event(
+                f'joint_states: positions must be finite{self.driver.ignored_words()}; see the driver of that joint'
+            )
         if must_stop:
             self._stopped()
 
@@ -221,7 +388,7 @@ class PlannerNode(Node):
         return guarded(callback, self._failed)
 
     def _failed(self, error: Exception) -> str:
-        if not self.context.ok():   # the node is ending
+        if not self.context.ok():  # the node is ending
             return ''
         line = shortened(f'an internal error: {type(error).__name__}: {error}', 200)
         if self.driver.is_driving or self.worker.doing:
@@ -262,8 +429,10 @@ class PlannerNode(Node):
         known = self._n_documents
         answer = self._ask('solve')
         if answer is None:
-            raise InputError(f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; "
-                             "check that it runs")
+            raise InputError(
+                f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; "
+                'check that it runs'
+            )
         if not answer.success:
             self._say(LOG_INFO, f'no calibration yet: {answer.message}')
             return None
@@ -278,8 +447,13 @@ class PlannerNode(Node):
             self._say(LOG_INFO, 'no diagnosis: ' + (answer.message if answer else 'no answer'))
             return None
         with self._heard:
-            came = self._heard.wait_for(lambda: self._status.get('diagnoses', '0') != known and self._status.get('being made') == 'False',
-                                        timeout=ANSWER_PATIENCE)
+            came = self._heard.wait_for(
+                lambda: (
+                    self._status.get('diagnoses', '0') != known
+                    and self._status.get('being made') == 'False'
+                ),
+                timeout=ANSWER_PATIENCE,
+            )
             values = dict(self._status)
         return findings_from(values) if came else None
 
@@ -287,7 +461,10 @@ class PlannerNode(Node):
 
     def _go(self, motions: int) -> tuple[bool, str]:
         if self.driver.is_driving or self.worker.doing:
-            return False, f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop stops it'
+            return (
+                False,
+                f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop stops it',
+            )
         if missing_ranges(self._table):
             return False, range_warnings(self._table)[0]
         if self.driver.position is None:
@@ -295,17 +472,32 @@ class PlannerNode(Node):
         if trouble := self.driver.stamp_fault(time.monotonic()):
             return False, trouble
         if not self._command.is_heard:
-            return False, f'{self._command.name} has no subscriber: start the controller, or remap joint_trajectory'
+            return (
+                False,
+                f'{self._command.name} has no subscriber: start the controller, or remap joint_trajectory',
+            )
         if other := self._others.found():
             return False, other
         if not self._calibrator['solve'].service_is_ready():
-            return False, f'service {self._calibrator["solve"].srv_name} does not exist; start calibration_node, which collects the windows'
+            return (
+                False,
+                f'service {self._calibrator["solve"].srv_name} does not exist; start calibration_node, which collects the windows',
+            )
         if not self._is_placed:
-            limits, reach = self.driver.limits.wound(self.driver.position, self.settings.max_turns), self.settings.reach_deg
-            self.driver.limits, self._is_placed = limits.reached(self.driver.position, reach) if reach else limits, True
+            limits, reach = (
+                self.driver.limits.wound(self.driver.position, self.settings.max_turns),
+                self.settings.reach_deg,
+            )
+            self.driver.limits, self._is_placed = (
+                limits.reached(self.driver.position, reach) if reach else limits,
+                True,
+            )
         self.worker.go(motions)
-        what = 'one motion, then it rests' if motions > 0 else \
-            'plans and moves until every parameter is within its tolerance; the first motion is small, the first large one slow'
+        what = (
+            'one motion, then it rests'
+            if motions > 0
+            else 'plans and moves until every parameter is within its tolerance; the first motion is small, the first large one slow'
+        )
         return True, f'{what}; limits: {self._limit_words()}'
 
     def _limit_words(self) -> str:
@@ -315,7 +507,9 @@ class PlannerNode(Node):
         self.worker.halt('stopped by ~/stop')
         return True, 'stopped: no motion before the next ~/start'
 
-    def _serve(self, what: str, answer: Any, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _serve(
+        self, what: str, answer: Any, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         try:
             response.success, response.message = answer()
         except ImuCalibrationError as error:
@@ -331,22 +525,44 @@ class PlannerNode(Node):
             say(self.get_logger(), level, line)
 
     def _statuses(self) -> list:
-        if self._driven is not None:   # again, because calibration_node's markers begin with DELETEALL
+        if (
+            self._driven is not None
+        ):  # again, because calibration_node's markers begin with DELETEALL
             self._coverage.publish(self._driven)
         driver, worker, campaign = self.driver, self.worker, self.worker.campaign
         name, excess = worker.worst
-        values = {'state': driver.state.value, 'motion': driver.motions, 'of it driven [s]': f'{driver.progress:.1f}',
-                  'it takes [s]': f'{worker.seconds:.1f}', 'elapsed [s]': f'{worker.elapsed:.1f}', 'outside tolerance': worker.outside,
-                  'furthest outside': name, 'standard deviation over tolerance': f'{excess:.2f}', 'commands': self._command.name,
-                  'ignored joint states': ' '.join(f'{name}:{count}' for name, count in driver.ignored.items())}
+        values = {
+            'state': driver.state.value,
+            'motion': driver.motions,
+            'of it driven [s]': f'{driver.progress:.1f}',
+            'it takes [s]': f'{worker.seconds:.1f}',
+            'elapsed [s]': f'{worker.elapsed:.1f}',
+            'outside tolerance': worker.outside,
+            'furthest outside': name,
+            'standard deviation over tolerance': f'{excess:.2f}',
+            'commands': self._command.name,
+            'ignored joint states': ' '.join(
+                f'{name}:{count}' for name, count in driver.ignored.items()
+            ),
+        }
         if campaign is not None and campaign.findings is not None:
-            values |= {'found': ' '.join(finding.effect for finding in campaign.findings),
-                       'mates': ' '.join(mate for finding in campaign.findings for mate in finding.mates),
-                       'separations': campaign.separations, 'separating': campaign.is_separating,
-                       'told apart': ' '.join(campaign.told_apart)}
+            values |= {
+                'found': ' '.join(finding.effect for finding in campaign.findings),
+                'mates': ' '.join(mate for finding in campaign.findings for mate in finding.mates),
+                'separations': campaign.separations,
+                'separating': campaign.is_separating,
+                'told apart': ' '.join(campaign.told_apart),
+            }
         faults = self._joints.faults() + self._calibrations.faults()
         level = ERROR if driver.state == DriveState.STOPPED else WARN if faults else OK
-        return [make_status(level, 'drive', '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults]), values=values)]
+        return [
+            make_status(
+                level,
+                'drive',
+                '; '.join([worker.doing or f'{driver.state}: {driver.reason}', *faults]),
+                values=values,
+            )
+        ]
 
 
 def main(arguments: list[str] | None = None) -> int:

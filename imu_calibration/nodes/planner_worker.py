@@ -69,9 +69,16 @@ class PlannerWorker(threading.Thread):
 
     """
 
-    def __init__(self, driver: Driver, make_campaign: Callable[[], Campaign], *, peers: Peers, lock: Any):
+    def __init__(
+        self, driver: Driver, make_campaign: Callable[[], Campaign], *, peers: Peers, lock: Any
+    ):
         super().__init__(name='planner', daemon=True)
-        self.driver, self._make_campaign, self._peers, self._lock = driver, make_campaign, peers, lock
+        self.driver, self._make_campaign, self._peers, self._lock = (
+            driver,
+            make_campaign,
+            peers,
+            lock,
+        )
         self.campaign: Campaign | None = None
         self.doing = Activity.NONE
         self.motion: Any = None
@@ -97,7 +104,7 @@ class PlannerWorker(threading.Thread):
             if self.driver.state in (DriveState.STOPPED, DriveState.DONE) or motions < 0:
                 self.driver.start()
             if motions < 0 and self.campaign is not None and self._wanted == 0:
-                self._began = None   # a new start has its own time
+                self._began = None  # a new start has its own time
         self._wanted = motions
         self._wake.set()
 
@@ -127,8 +134,10 @@ class PlannerWorker(threading.Thread):
                     self._next()
                 except ImuCalibrationError as error:
                     self._give_up(str(error))
-                except Exception as error:   # no failure may leave the joints without supervision
-                    self._give_up(f'planning failed: {shortened(f"{type(error).__name__}: {error}", 200)}')
+                except Exception as error:  # no failure may leave the joints without supervision
+                    self._give_up(
+                        f'planning failed: {shortened(f"{type(error).__name__}: {error}", 200)}'
+                    )
                 self.doing = Activity.NONE
 
     def _give_up(self, why):
@@ -138,7 +147,7 @@ class PlannerWorker(threading.Thread):
         self._peers.say(LOG_ERROR, why)
 
     def _next(self):
-        if self.driver.state is DriveState.STOPPED:   # because of the joint states
+        if self.driver.state is DriveState.STOPPED:  # because of the joint states
             self._wanted = 0
             return
         if self.campaign is None:
@@ -168,10 +177,14 @@ class PlannerWorker(threading.Thread):
             self.doing = Activity.AWAITING_REST
             if trouble := self.driver.stamp_fault(time.monotonic()):
                 raise InputError(trouble)
-            if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):   # no other driver need be searched for yet
+            if self.driver.awaits_stop and not self.driver.is_silent(
+                time.monotonic()
+            ):  # no other driver need be searched for yet
                 self.doing, end = Activity.AWAITING_STOP, time.monotonic() + patience
             if time.monotonic() > end:
-                raise InputError(f'the joints must rest before a motion begins, they moved for {patience:g} s; find the cause')
+                raise InputError(
+                    f'the joints must rest before a motion begins, they moved for {patience:g} s; find the cause'
+                )
             self._wake.wait(DRIVER_CHECK_SECONDS)
             self._wake.clear()
 
@@ -192,7 +205,10 @@ class PlannerWorker(threading.Thread):
             return None
         self.doing = Activity.PLANNING
         decision = self.campaign.decide(self.driver.position, self.elapsed)
-        self.worst, self.outside = self.campaign.worst, sum(excess > 1.0 for excess in self.campaign.planner.excess.values())
+        self.worst, self.outside = (
+            self.campaign.worst,
+            sum(excess > 1.0 for excess in self.campaign.planner.excess.values()),
+        )
         return decision
 
     def _carry_out(self, decision):
@@ -202,24 +218,45 @@ class PlannerWorker(threading.Thread):
                 self.driver.finish(decision.why)
             self._peers.say(LOG_INFO, f'done after {self.driver.motions} motions: {decision.why}')
             return
-        self._wait_for_rest()   # the joints may have been turned during planning
+        self._wait_for_rest()  # the joints may have been turned during planning
         if obstacle := self._peers.obstacle():
             raise InputError(obstacle)
         with self._lock:
-            if not self._wanted:   # stopped meanwhile
+            if not self._wanted:  # stopped meanwhile
                 return
-            points = self.driver.begin(decision.motion.points(self.driver.position), decision.motion.words, time.monotonic())
+            points = self.driver.begin(
+                decision.motion.points(self.driver.position),
+                decision.motion.words,
+                time.monotonic(),
+            )
             self.motion, self.seconds = decision.motion, points.duration
             self._began = self.stamp() if self._began is None else self._began
             self._peers.send(points)
-        self._peers.say(LOG_INFO, f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}')
+        self._peers.say(
+            LOG_INFO,
+            f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}',
+        )
 
 
 def findings_from(values: dict[str, str]) -> list[Suspect]:
     """Return the model errors in the values of calibration_node's status 'diagnosis', the strongest first."""
     if values.get('outcome') != FOUND:
         return []
-    found = [(key.removeprefix(MATES_KEY), value.split()) for key, value in values.items() if key.startswith(MATES_KEY)]
-    return [Suspect(effect, tuple(mates), {key.removeprefix(f'{SIZE_KEY}{each}.'): float(value) for each in (effect, *mates)
-                                           for key, value in values.items() if key.startswith(f'{SIZE_KEY}{each}.')})
-            for effect, mates in found]
+    found = [
+        (key.removeprefix(MATES_KEY), value.split())
+        for key, value in values.items()
+        if key.startswith(MATES_KEY)
+    ]
+    return [
+        Suspect(
+            effect,
+            tuple(mates),
+            {
+                key.removeprefix(f'{SIZE_KEY}{each}.'): float(value)
+                for each in (effect, *mates)
+                for key, value in values.items()
+                if key.startswith(f'{SIZE_KEY}{each}.')
+            },
+        )
+        for effect, mates in found
+    ]

@@ -68,13 +68,33 @@ class Playback(threading.Thread):
 
     """
 
-    def __init__(self, node: Node, publishers: Sequence, batches: Generator[Batch, None, None], *, pace: Pace, ended: str,
-                 clock_start_ns: int = 0, awaited: Sequence = (), ends_node: bool = True):
+    def __init__(
+        self,
+        node: Node,
+        publishers: Sequence,
+        batches: Generator[Batch, None, None],
+        *,
+        pace: Pace,
+        ended: str,
+        clock_start_ns: int = 0,
+        awaited: Sequence = (),
+        ends_node: bool = True,
+    ):
         super().__init__(name='playback', daemon=True)
-        self._node, self._publishers, self._batches, self._pace, self._awaited = node, publishers, batches, pace, awaited
+        self._node, self._publishers, self._batches, self._pace, self._awaited = (
+            node,
+            publishers,
+            batches,
+            pace,
+            awaited,
+        )
         self._end_text, self._ends_node = ended, ends_node
         self._clock_start_ns, self._next_clock = clock_start_ns, 0.0
-        self._clock = node.create_publisher(Clock, '/clock', QoSProfile(depth=10)) if pace.clock_rate else None
+        self._clock = (
+            node.create_publisher(Clock, '/clock', QoSProfile(depth=10))
+            if pace.clock_rate
+            else None
+        )
         self._ending = threading.Event()
         self._n_published, self._is_over, self.failed = 0, False, False
 
@@ -115,11 +135,14 @@ class Playback(threading.Thread):
         self._settle()
 
     def _wait_for_subscribers(self):
-        while any(publisher.get_subscription_count() < self._pace.subscribers for publisher in self._awaited):
+        while any(
+            publisher.get_subscription_count() < self._pace.subscribers
+            for publisher in self._awaited
+        ):
             if self._ending.wait(0.05):
                 return
         if self._awaited and self._pace.subscribers:
-            self._ending.wait(0.3)   # the other side may find us a little later than we find it
+            self._ending.wait(0.3)  # the other side may find us a little later than we find it
 
     def _publish(self, batch, start):
         done = 0
@@ -128,8 +151,12 @@ class Playback(threading.Thread):
             if self._pace.factor:
                 now = (time.monotonic() - start) * self._pace.factor
                 upto = int(np.searchsorted(batch.time, now, side='right'))
-            self._tick(float(batch.time[min(upto, len(batch.time) - 1)]) if not self._pace.factor else now)
-            for publisher, message in zip(batch.publisher[done:upto], batch.messages[done:upto], strict=True):
+            self._tick(
+                float(batch.time[min(upto, len(batch.time) - 1)]) if not self._pace.factor else now
+            )
+            for publisher, message in zip(
+                batch.publisher[done:upto], batch.messages[done:upto], strict=True
+            ):
                 publisher.publish(bytes(message))
             self._n_published += upto - done
             done = upto

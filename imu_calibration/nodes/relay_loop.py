@@ -50,12 +50,20 @@ class OutsideExecutor(CallbackGroup):
 def available() -> bool:
     """Return whether this rclpy has the inner parts that `relay` leans on."""
     wait_set = getattr(_inner, 'WaitSet', None)
-    needed = {wait_set: ('wait', 'clear_entities', 'add_subscription', 'add_guard_condition'),
-              getattr(_inner, 'Subscription', None): ('take_message',), getattr(_inner, 'Publisher', None): ('publish_raw',)}
-    return all(part is not None and all(hasattr(part, name) for name in names) for part, names in needed.items())
+    needed = {
+        wait_set: ('wait', 'clear_entities', 'add_subscription', 'add_guard_condition'),
+        getattr(_inner, 'Subscription', None): ('take_message',),
+        getattr(_inner, 'Publisher', None): ('publish_raw',),
+    }
+    return all(
+        part is not None and all(hasattr(part, name) for name in names)
+        for part, names in needed.items()
+    )
 
 
-def relay(node: Node, source: MatchedInput, publisher: Publisher, *, convert: Callable[[bytes, dict], Any]) -> None:
+def relay(
+    node: Node, source: MatchedInput, publisher: Publisher, *, convert: Callable[[bytes, dict], Any]
+) -> None:
     """
     Publish the result of `convert` for each message until the context ends.
 
@@ -73,7 +81,9 @@ def relay(node: Node, source: MatchedInput, publisher: Publisher, *, convert: Ca
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     failures = []
-    thread = threading.Thread(target=_spin, args=(executor, failures, node.context), name='callbacks', daemon=True)
+    thread = threading.Thread(
+        target=_spin, args=(executor, failures, node.context), name='callbacks', daemon=True
+    )
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)
     thread.start()
@@ -106,7 +116,7 @@ def _drain(context, source, publisher, convert):
             while context.ok():
                 try:
                     _drain_one(context, source, wait_set, guard, publish, convert)
-                except InvalidHandle:   # another subscription has just replaced it
+                except InvalidHandle:  # another subscription has just replaced it
                     continue
     finally:
         guard.destroy()

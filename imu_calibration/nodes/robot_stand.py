@@ -49,16 +49,27 @@ class StaticFrames:
 
     def waits_for(self, target: str, source: str) -> str:
         """Return a readable description of the awaited transform."""
-        return f"the transform from '{target}' to '{source}' on {TF_STATIC}: {self.transforms.why_not(target, source)}" + \
-            (f'; {self.n_unusable} received transforms are unusable (not finite)' if self.n_unusable else '')
+        return (
+            f"the transform from '{target}' to '{source}' on {TF_STATIC}: {self.transforms.why_not(target, source)}"
+            + (
+                f'; {self.n_unusable} received transforms are unusable (not finite)'
+                if self.n_unusable
+                else ''
+            )
+        )
 
     def take(self, message: Any) -> None:
         """Process a tf2_msgs/TFMessage."""
         for stamped in message.transforms:
             place, turn = stamped.transform.translation, stamped.transform.rotation
-            usable = self.transforms.add(*(clean_name(name).lstrip('/') for name in (stamped.header.frame_id, stamped.child_frame_id)),
-                                         xyz=(place.x, place.y, place.z),
-                                         quaternion=(turn.x, turn.y, turn.z, turn.w))
+            usable = self.transforms.add(
+                *(
+                    clean_name(name).lstrip('/')
+                    for name in (stamped.header.frame_id, stamped.child_frame_id)
+                ),
+                xyz=(place.x, place.y, place.z),
+                quaternion=(turn.x, turn.y, turn.z, turn.w),
+            )
             self.n_unusable += not usable
         self._changed()
 
@@ -67,9 +78,14 @@ class StaticFrames:
             try:
                 from tf2_msgs.msg import TFMessage
             except ImportError as error:
-                raise InputError(f'{TF_STATIC} needs the messages of the package tf2_msgs, which is not installed; '
-                                 'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy', code='package_missing') from error
-            self._subscription = self._node.create_subscription(TFMessage, TF_STATIC, self.take, latched_qos(TRANSFORM_DEPTH))
+                raise InputError(
+                    f'{TF_STATIC} needs the messages of the package tf2_msgs, which is not installed; '
+                    'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy',
+                    code='package_missing',
+                ) from error
+            self._subscription = self._node.create_subscription(
+                TFMessage, TF_STATIC, self.take, latched_qos(TRANSFORM_DEPTH)
+            )
 
 
 URDF_FROM_TOPIC = 'topic'
@@ -85,23 +101,46 @@ Found = TypeVar('Found')
 class RobotSettings:
     """The arm that carries the IMU."""
 
-    urdf_file: str = setting('', '', 'description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; '
-                             f'{URDF_FROM_TOPIC}: the topic robot_description; empty: table_file only. With an arm, table_file describes '
-                             'the site: up, gravity, latitude, limits of joints by name',
-                             symptom='the node waits for the missing input', session=True, path=True,
-                             fixed='all motion gathered so far is of that arm')
-    imu_link: str = setting('', '', 'link of the arm that carries the IMU; empty: the frame_id of its messages',
-                            symptom='another place and attitude of the sensor', session=True,
-                            fixed='all motion gathered so far is of that link')
-    world_frame: str = setting('', '', 'frame whose z axis points up and that /tf_static ties to the root of the arm; '
-                               'empty: up of table_file, '
-                               "otherwise the root's z axis", symptom='a tilted base shows as accelerometer bias', session=True,
-                               fixed='all motion gathered so far is for this attitude of the arm')
-    allow_xacro: bool = setting(False, '', 'expand a .xacro file, which is a program: its expressions can execute any Python code',
-                                symptom='the node refuses a .xacro file')
+    urdf_file: str = setting(
+        '',
+        '',
+        'description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; '
+        f'{URDF_FROM_TOPIC}: the topic robot_description; empty: table_file only. With an arm, table_file describes '
+        'the site: up, gravity, latitude, limits of joints by name',
+        symptom='the node waits for the missing input',
+        session=True,
+        path=True,
+        fixed='all motion gathered so far is of that arm',
+    )
+    imu_link: str = setting(
+        '',
+        '',
+        'link of the arm that carries the IMU; empty: the frame_id of its messages',
+        symptom='another place and attitude of the sensor',
+        session=True,
+        fixed='all motion gathered so far is of that link',
+    )
+    world_frame: str = setting(
+        '',
+        '',
+        'frame whose z axis points up and that /tf_static ties to the root of the arm; '
+        'empty: up of table_file, '
+        "otherwise the root's z axis",
+        symptom='a tilted base shows as accelerometer bias',
+        session=True,
+        fixed='all motion gathered so far is for this attitude of the arm',
+    )
+    allow_xacro: bool = setting(
+        False,
+        '',
+        'expand a .xacro file, which is a program: its expressions can execute any Python code',
+        symptom='the node refuses a .xacro file',
+    )
 
 
-def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str = '') -> Table | None:
+def chain_of(
+    node: Node, robot: RobotSettings, table_file: str, *, frame_id: str = ''
+) -> Table | None:
     """
     Return the chain of joints that a node's parameters describe, None for neither table nor arm.
 
@@ -126,9 +165,16 @@ def chain_of(node: Node, robot: RobotSettings, table_file: str, *, frame_id: str
     if not robot.urdf_file:
         return None if place is None else files.read_table(place)
     site = {} if place is None else files.read_mapping(place, 'table description')
-    text = (_topic_text(node) if robot.urdf_file == URDF_FROM_TOPIC
-            else files.read_robot_description(files.user_path(robot.urdf_file), robot.allow_xacro))
-    link = robot.imu_link or frame_id or clean_name(_message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id)
+    text = (
+        _topic_text(node)
+        if robot.urdf_file == URDF_FROM_TOPIC
+        else files.read_robot_description(files.user_path(robot.urdf_file), robot.allow_xacro)
+    )
+    link = (
+        robot.imu_link
+        or frame_id
+        or clean_name(_message(node, Imu, 'imu/data_raw', qos_profile_sensor_data).header.frame_id)
+    )
     if robot.world_frame:
         site['up'] = _up(node, robot.world_frame, root_of(text))
     return table_from_urdf(text, link, site)
@@ -138,33 +184,53 @@ def words_of(robot: RobotSettings, table_file: str) -> str:
     """Return a description of the result of `chain_of`."""
     if not robot.urdf_file:
         return f'the table {files.user_path(table_file)}'
-    return 'the arm of the topic robot_description' if robot.urdf_file == URDF_FROM_TOPIC else f'the arm {files.user_path(robot.urdf_file)}'
+    return (
+        'the arm of the topic robot_description'
+        if robot.urdf_file == URDF_FROM_TOPIC
+        else f'the arm {files.user_path(robot.urdf_file)}'
+    )
 
 
 def _topic_text(node):
     def is_robot(message):
         try:
             return bool(root_of(message.data))
-        except InputError as error:   # anybody can publish on the topic
+        except InputError as error:  # anybody can publish on the topic
             say(node.get_logger(), LOG_WARN, f'a robot description was ignored: {error}')
             return False
+
     return _message(node, String, 'robot_description', latched_qos(), is_robot).data
 
 
 def _up(node, world, root):
     """Return the z axis of a frame in the root of the robot."""
     frames = StaticFrames(node, lambda: None)
-    _, mat_rw = _waited_for(node, lambda: frames.pose(root, world), lambda: frames.waits_for(root, world))
+    _, mat_rw = _waited_for(
+        node, lambda: frames.pose(root, world), lambda: frames.waits_for(root, world)
+    )
     return (mat_rw @ np.array([0.0, 0.0, 1.0])).tolist()
 
 
-def _message(node: Node, kind: type, topic: str, qos: QoSProfile, usable: Callable[[Any], bool] = lambda message: True) -> Any:
+def _message(
+    node: Node,
+    kind: type,
+    topic: str,
+    qos: QoSProfile,
+    usable: Callable[[Any], bool] = lambda message: True,
+) -> Any:
     """Return the first usable message of a topic."""
     came: list[Any] = []
-    subscription = node.create_subscription(kind, topic, lambda message: came.extend([message] * usable(message)), qos)
+    subscription = node.create_subscription(
+        kind, topic, lambda message: came.extend([message] * usable(message)), qos
+    )
     try:
-        return _waited_for(node, lambda: came[0] if came else None,
-                           lambda: f'a message on {node.resolve_topic_name(topic)} ({kind.__module__.split(".")[0]}/{kind.__name__})')
+        return _waited_for(
+            node,
+            lambda: came[0] if came else None,
+            lambda: (
+                f'a message on {node.resolve_topic_name(topic)} ({kind.__module__.split(".")[0]}/{kind.__name__})'
+            ),
+        )
     finally:
         node.destroy_subscription(subscription)
 

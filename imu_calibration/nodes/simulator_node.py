@@ -48,39 +48,135 @@ trajectory is effective about half a second later."""
 class SimulatorSettings:
     """The table, its motion, the IMU and the pace."""
 
-    table_file: str = setting('', '', 'table description, path; empty: the installed config/table_simulated.yaml, or none with urdf_file',
-                              symptom='joint names differ from the expected ones', session=True, path=True)
-    profile: str = setting('quick', '',
-                           "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
-                           'a trajectory is received on joint_trajectory', symptom='the node refuses and lists the names', session=True)
-    repeat: bool = setting(False, '', 'start the profile again at its end', symptom='the table rests after one round')
-    stop_at_end: bool = setting(False, '', 'end the node at the end of the profile; otherwise the table remains at rest',
-                                symptom='the node does not end')
-    calibration_file: str = setting('', '', 'calibration document with the true parameters, path; empty: a random IMU',
-                                    symptom='another IMU is simulated', session=True, path=True)
-    grade: str = setting('industrial', '', 'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
-                         symptom='noise too large or small', choices=tuple(sorted(GRADES)))
-    hide: str = setting('', '', 'further errors of the IMU, by their physics, names joined by +: ' + ', '.join(CAUSES),
-                        symptom='the diagnosis has a different finding, or none', session=True)
-    hide_size: float = setting(1.0, '1', 'size of the hidden error, in units of the drawn size', (0.0, 100.0), 'too small: not detectable')
+    table_file: str = setting(
+        '',
+        '',
+        'table description, path; empty: the installed config/table_simulated.yaml, or none with urdf_file',
+        symptom='joint names differ from the expected ones',
+        session=True,
+        path=True,
+    )
+    profile: str = setting(
+        'quick',
+        '',
+        "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
+        'a trajectory is received on joint_trajectory',
+        symptom='the node refuses and lists the names',
+        session=True,
+    )
+    repeat: bool = setting(
+        False, '', 'start the profile again at its end', symptom='the table rests after one round'
+    )
+    stop_at_end: bool = setting(
+        False,
+        '',
+        'end the node at the end of the profile; otherwise the table remains at rest',
+        symptom='the node does not end',
+    )
+    calibration_file: str = setting(
+        '',
+        '',
+        'calibration document with the true parameters, path; empty: a random IMU',
+        symptom='another IMU is simulated',
+        session=True,
+        path=True,
+    )
+    grade: str = setting(
+        'industrial',
+        '',
+        'grade of noise and of the random IMU: ' + ', '.join(sorted(GRADES)),
+        symptom='noise too large or small',
+        choices=tuple(sorted(GRADES)),
+    )
+    hide: str = setting(
+        '',
+        '',
+        'further errors of the IMU, by their physics, names joined by +: ' + ', '.join(CAUSES),
+        symptom='the diagnosis has a different finding, or none',
+        session=True,
+    )
+    hide_size: float = setting(
+        1.0,
+        '1',
+        'size of the hidden error, in units of the drawn size',
+        (0.0, 100.0),
+        'too small: not detectable',
+    )
     seed: int = setting(0, '1', 'seed of noise and motion', (0, 2**31 - 1), 'two runs differ')
-    imu_seed: int = setting(-1, '1', 'seed of the random IMU; -1: the same as seed', (-1, 2**31 - 1), 'two runs simulate different IMUs')
-    imu_rate: float = setting(200.0, 'Hz', 'Imu messages per second of simulated time',
-                              (1.0, 20000.0), 'too large: the machine cannot keep up')
-    joint_rate: float = setting(100.0, 'Hz', 'JointState messages per second of simulated time',
-                                (1.0, 20000.0), 'too small: fast motion is not followed')
-    velocity: bool = setting(True, '', 'whether JointState holds velocities', symptom='velocities are missing')
-    encoder_resolution: float = setting(0.0, 'rad', 'step of the joint positions; 0: continuous', (0.0, 0.1), 'too large: rough reference')
-    stamp_jitter: float = setting(0.0, 's', 'standard deviation of the Imu stamps', (0.0, 0.01), 'too large: stamps out of order')
-    temperature: bool = setting(False, '', 'publish imu/temperature, warming up from 25 C', symptom='thermal effects cannot be calibrated')
+    imu_seed: int = setting(
+        -1,
+        '1',
+        'seed of the random IMU; -1: the same as seed',
+        (-1, 2**31 - 1),
+        'two runs simulate different IMUs',
+    )
+    imu_rate: float = setting(
+        200.0,
+        'Hz',
+        'Imu messages per second of simulated time',
+        (1.0, 20000.0),
+        'too large: the machine cannot keep up',
+    )
+    joint_rate: float = setting(
+        100.0,
+        'Hz',
+        'JointState messages per second of simulated time',
+        (1.0, 20000.0),
+        'too small: fast motion is not followed',
+    )
+    velocity: bool = setting(
+        True, '', 'whether JointState holds velocities', symptom='velocities are missing'
+    )
+    encoder_resolution: float = setting(
+        0.0,
+        'rad',
+        'step of the joint positions; 0: continuous',
+        (0.0, 0.1),
+        'too large: rough reference',
+    )
+    stamp_jitter: float = setting(
+        0.0,
+        's',
+        'standard deviation of the Imu stamps',
+        (0.0, 0.01),
+        'too large: stamps out of order',
+    )
+    temperature: bool = setting(
+        False,
+        '',
+        'publish imu/temperature, warming up from 25 C',
+        symptom='thermal effects cannot be calibrated',
+    )
     frame_id: str = setting('imu_link', '', 'frame of the Imu messages', symptom='another frame_id')
-    truth: bool = setting(False, '', 'publish imu/truth: readings of a perfect IMU', symptom='no messages on imu/truth')
-    time_factor: float = setting(1.0, '1', 'seconds of simulated time per second; 0: as fast as possible',
-                                 (0.0, 10000.0), 'too large: messages are lost')
-    clock: bool = setting(False, '', 'publish /clock, for nodes with use_sim_time', symptom='nodes with use_sim_time do not advance')
-    start_time: float = setting(0.0, 's', 'first stamp; 0: the present time', (0.0, 4e9), 'stamps of another day')
-    wait_for_subscribers: int = setting(0, '1', 'subscribers of imu/data_raw to wait for before the start',
-                                        (0, 100), 'the first messages are missed')
+    truth: bool = setting(
+        False,
+        '',
+        'publish imu/truth: readings of a perfect IMU',
+        symptom='no messages on imu/truth',
+    )
+    time_factor: float = setting(
+        1.0,
+        '1',
+        'seconds of simulated time per second; 0: as fast as possible',
+        (0.0, 10000.0),
+        'too large: messages are lost',
+    )
+    clock: bool = setting(
+        False,
+        '',
+        'publish /clock, for nodes with use_sim_time',
+        symptom='nodes with use_sim_time do not advance',
+    )
+    start_time: float = setting(
+        0.0, 's', 'first stamp; 0: the present time', (0.0, 4e9), 'stamps of another day'
+    )
+    wait_for_subscribers: int = setting(
+        0,
+        '1',
+        'subscribers of imu/data_raw to wait for before the start',
+        (0, 100),
+        'the first messages are missed',
+    )
 
 
 NO_PROFILE = ('', 'none')
@@ -94,32 +190,79 @@ class SimulatorNode(Node):
         super().__init__('simulator_node')
         self.settings = settings = declare_parameters(self, SimulatorSettings)
         self._controller = declare_parameters(self, ControllerSettings)
-        announce(self, ['joint_trajectory'], ['imu/data_raw', 'joint_states', *['imu/temperature'] * settings.temperature,
-                                              *['imu/truth'] * settings.truth, *['/clock'] * settings.clock])
+        announce(
+            self,
+            ['joint_trajectory'],
+            [
+                'imu/data_raw',
+                'joint_states',
+                *['imu/temperature'] * settings.temperature,
+                *['imu/truth'] * settings.truth,
+                *['/clock'] * settings.clock,
+            ],
+        )
         self._table, self._motion = self._make_table()
         imu_seed = settings.seed if settings.imu_seed < 0 else settings.imu_seed
-        truth = files.read_calibration(files.user_path(settings.calibration_file)) if settings.calibration_file else None
-        model, values = true_imu(self._table, (truth.model, truth.values) if truth else None, settings.grade, seed=imu_seed)
+        truth = (
+            files.read_calibration(files.user_path(settings.calibration_file))
+            if settings.calibration_file
+            else None
+        )
+        model, values = true_imu(
+            self._table,
+            (truth.model, truth.values) if truth else None,
+            settings.grade,
+            seed=imu_seed,
+        )
         start_ns = int(settings.start_time * 1e9) or time.time_ns()
-        causes = hidden_causes(settings.hide.split('+') if settings.hide else [], imu_seed, settings.hide_size)
-        self._simulation = LiveSimulation(model, values, self._table, motion=self._motion, options=self._options(), seed=settings.seed,
-                                          start_ns=start_ns, causes=causes)
+        causes = hidden_causes(
+            settings.hide.split('+') if settings.hide else [], imu_seed, settings.hide_size
+        )
+        self._simulation = LiveSimulation(
+            model,
+            values,
+            self._table,
+            motion=self._motion,
+            options=self._options(),
+            seed=settings.seed,
+            start_ns=start_ns,
+            causes=causes,
+        )
         self._trajectories = queue.Queue()
         self._driven = {'followed': 0, 'refused': 0, 'why refused': ''}
         self._publish_truth(model, values)
         kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
-        kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [(Imu, 'imu/truth')] * settings.truth
-        publishers = [self.create_publisher(kind, topic, output_qos(PLAYBACK_DEPTH)) for kind, topic in kinds]
+        kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [
+            (Imu, 'imu/truth')
+        ] * settings.truth
+        publishers = [
+            self.create_publisher(kind, topic, output_qos(PLAYBACK_DEPTH)) for kind, topic in kinds
+        ]
         self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
-        pace = Pace(settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers)
-        self._playback = Playback(self, publishers, self._batches(), pace=pace, clock_start_ns=start_ns, awaited=publishers[:1],
-                                  ended='the profile has ended, {} messages were published')
+        pace = Pace(
+            settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers
+        )
+        self._playback = Playback(
+            self,
+            publishers,
+            self._batches(),
+            pace=pace,
+            clock_start_ns=start_ns,
+            awaited=publishers[:1],
+            ended='the profile has ended, {} messages were published',
+        )
         self.create_subscription(JointTrajectory, 'joint_trajectory', self._trajectories.put, 10)
         self._diagnostics = DiagnosticsPublisher(self, self._statuses)
         self._playback.start()
-        moves = 'rests and follows joint_trajectory' if settings.profile in NO_PROFILE else f'moves by the profile {settings.profile}'
-        self.get_logger().info(f'a table with the joints {", ".join(self._table.joint_names)} {moves}, '
-                               f'{settings.time_factor:g} times as fast as real time')
+        moves = (
+            'rests and follows joint_trajectory'
+            if settings.profile in NO_PROFILE
+            else f'moves by the profile {settings.profile}'
+        )
+        self.get_logger().info(
+            f'a table with the joints {", ".join(self._table.joint_names)} {moves}, '
+            f'{settings.time_factor:g} times as fast as real time'
+        )
 
     def close(self) -> str:
         """Stop publishing; return the outcome."""
@@ -135,20 +278,41 @@ class SimulatorNode(Node):
         robot = declare_parameters(self, RobotSettings)
         table = chain_of(self, robot, settings.table_file, frame_id=settings.frame_id)
         table = table or files.read_table(config_file('table_simulated.yaml'))
-        profile = None if settings.profile in NO_PROFILE else make_profile(settings.profile, settings.seed, table)
+        profile = (
+            None
+            if settings.profile in NO_PROFILE
+            else make_profile(settings.profile, settings.seed, table)
+        )
         if profile is not None and profile.table is not None:
             table = Table.from_mapping(profile.table)
-        return table, TableController(profile, table.joint_names, limits=limits_of(table), settings=self._controller,
-                                      repeat=settings.repeat)
+        return table, TableController(
+            profile,
+            table.joint_names,
+            limits=limits_of(table),
+            settings=self._controller,
+            repeat=settings.repeat,
+        )
 
     def _options(self):
         settings = self.settings
-        noise = replace(GRADES[settings.grade].noise, encoder_resolution=settings.encoder_resolution, stamp_jitter=settings.stamp_jitter)
-        return SimulationOptions(settings.imu_rate, settings.joint_rate, noise, settings.velocity, 25.0 if settings.temperature else None,
-                                 frame_id=settings.frame_id)
+        noise = replace(
+            GRADES[settings.grade].noise,
+            encoder_resolution=settings.encoder_resolution,
+            stamp_jitter=settings.stamp_jitter,
+        )
+        return SimulationOptions(
+            settings.imu_rate,
+            settings.joint_rate,
+            noise,
+            settings.velocity,
+            25.0 if settings.temperature else None,
+            frame_id=settings.frame_id,
+        )
 
     def _publish_truth(self, model, values):
-        truth = true_calibration(model, values, self.settings.frame_id, simulated={'seed': self.settings.seed})
+        truth = true_calibration(
+            model, values, self.settings.frame_id, simulated={'seed': self.settings.seed}
+        )
         self._truth = self.create_publisher(String, '~/truth', latched_qos())
         self._truth.publish(String(data=calibration_to_text(truth)))
 
@@ -158,21 +322,35 @@ class SimulatorNode(Node):
         while until < self._motion.end or not self.settings.stop_at_end:
             while not self._trajectories.empty():
                 self._take_over(until, self._trajectories.get())
-            until = min(until + step, self._motion.end) if self.settings.stop_at_end else until + step
+            until = (
+                min(until + step, self._motion.end) if self.settings.stop_at_end else until + step
+            )
             yield self._batch(self._simulation.take(until), until)
 
     def _batch(self, block, until):
         encode = partial(encode_joints, with_velocity=self.settings.velocity)
-        parts = [(self._to['imu/data_raw'], block.imu, encode_imu), (self._to['joint_states'], block.joints, encode)]
+        parts = [
+            (self._to['imu/data_raw'], block.imu, encode_imu),
+            (self._to['joint_states'], block.joints, encode),
+        ]
         if 'imu/temperature' in self._to:
             parts.append((self._to['imu/temperature'], block.temperature, encode_temperature))
         if 'imu/truth' in self._to:
             parts.append((self._to['imu/truth'], self._simulation.truth(block), encode_imu))
-        due = np.concatenate([(samples.stamp_ns - self._simulation.start_ns) * 1e-9 for _, samples, _ in parts])
+        due = np.concatenate(
+            [(samples.stamp_ns - self._simulation.start_ns) * 1e-9 for _, samples, _ in parts]
+        )
         publishers = [publisher for publisher, samples, _ in parts for _ in range(len(samples))]
-        messages = [message for _, samples, encode in parts if len(samples) for message in Packed.of_rows(encode(samples)).views()]
+        messages = [
+            message
+            for _, samples, encode in parts
+            if len(samples)
+            for message in Packed.of_rows(encode(samples)).views()
+        ]
         order = np.argsort(due, kind='stable')
-        return Batch(due[order], [publishers[k] for k in order], [messages[k] for k in order], until)
+        return Batch(
+            due[order], [publishers[k] for k in order], [messages[k] for k in order], until
+        )
 
     def _take_over(self, now, message):
         try:

@@ -29,9 +29,17 @@ SESSION = 'quick'
 """Profile on which the sizes of collinear effects are derived from the size of the finding."""
 
 
-def make_separator(table: Table, calibration: Calibration, causes: Sequence[tuple[str, str]], *, noise: Mapping[str, NoiseModel],
-                   rate: float = 100.0, options: CalibrationOptions = CalibrationOptions(),
-                   sizes: Mapping[str, float] | None = None, limits: MotionLimits | None = None) -> Planner:
+def make_separator(
+    table: Table,
+    calibration: Calibration,
+    causes: Sequence[tuple[str, str]],
+    *,
+    noise: Mapping[str, NoiseModel],
+    rate: float = 100.0,
+    options: CalibrationOptions = CalibrationOptions(),
+    sizes: Mapping[str, float] | None = None,
+    limits: MotionLimits | None = None,
+) -> Planner:
     """
     Return a planner whose goal is to separate causes.
 
@@ -62,8 +70,10 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     """
     first, *mates = causes
     if first not in calibration.model.slices:
-        raise InputError(f"the calibration must contain '{first[1]}', which is to be separated; give that of the diagnosis",
-                         key='calibration')
+        raise InputError(
+            f"the calibration must contain '{first[1]}', which is to be separated; give that of the diagnosis",
+            key='calibration',
+        )
     model = calibration.model
     for sensor, name in mates:
         if (sensor, name) not in model.slices:
@@ -71,20 +81,33 @@ def make_separator(table: Table, calibration: Calibration, causes: Sequence[tupl
     for key in causes:
         effect = model.catalogue.find(*key, model.joint_names)
         if special(effect) or effect.smooth or 'temperature' in effect.needs:
-            raise InputError(f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
-                             'omit it')
+            raise InputError(
+                f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
+                'omit it'
+            )
     values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
     problem = PlanningProblem(MotionLibrary(table, limits), coordinates, dict(noise), rate=rate)
     questions = len(model.catalogue.effects(model.joint_names))
-    problem.goal = ToldApart(coordinates, suspected(problem, causes, table, sizes=sizes or {}), questions)
-    names = {name: k for k, name in enumerate(calibration.param_names) if k not in _indices(calibration.model, first)}
+    problem.goal = ToldApart(
+        coordinates, suspected(problem, causes, table, sizes=sizes or {}), questions
+    )
+    names = {
+        name: k
+        for k, name in enumerate(calibration.param_names)
+        if k not in _indices(calibration.model, first)
+    }
     problem.known = coordinates.information_from(names, calibration.covariance)
     return Planner(problem)
 
 
-def suspected(problem: PlanningProblem, causes: Sequence[tuple[str, str]], table: Table, *,
-              sizes: Mapping[str, float]) -> list[Cause]:
+def suspected(
+    problem: PlanningProblem,
+    causes: Sequence[tuple[str, str]],
+    table: Table,
+    *,
+    sizes: Mapping[str, float],
+) -> list[Cause]:
     """
     Return the causes with their sizes: the first as estimated, the mates with the size that imitates it.
 
@@ -95,8 +118,16 @@ def suspected(problem: PlanningProblem, causes: Sequence[tuple[str, str]], table
     found = []
     for key in causes:
         places, names = _indices(coordinates.model, key), coordinates.model.param_names
-        known = coordinates.values[places] if not found else [sizes.get(names[k], np.nan) for k in places]
-        found.append(Cause(key, _places(coordinates, key), np.asarray(known, float) / coordinates.units[places]))
+        known = (
+            coordinates.values[places]
+            if not found
+            else [sizes.get(names[k], np.nan) for k in places]
+        )
+        found.append(
+            Cause(
+                key, _places(coordinates, key), np.asarray(known, float) / coordinates.units[places]
+            )
+        )
     unknown = [cause for cause in found if np.isnan(cause.size).any()]
     passing = _imitating(problem, found, unknown, table) if unknown else {}
     return [replace(cause, size=passing.get(cause.key, cause.size)) for cause in found]
@@ -106,14 +137,24 @@ def _imitating(problem, causes, unknown, table):
     """Return the sizes that causes must have to pass for the first one on a usual session, by key."""
     windows = problem.predictor.predict([make_profile(SESSION, 0, table).segments])[0]
     times = np.array([window.middle for window in windows])
-    information = problem.coordinates.prior_information + exact_information(windows, times, problem.noise)
+    information = problem.coordinates.prior_information + exact_information(
+        windows, times, problem.noise
+    )
     first, found = causes[0], {}
-    rest = np.setdiff1d(np.arange(len(information)), np.concatenate([cause.places for cause in causes]))
+    rest = np.setdiff1d(
+        np.arange(len(information)), np.concatenate([cause.places for cause in causes])
+    )
     inner = np.linalg.inv(information[np.ix_(rest, rest)])
     for cause in unknown:
         across = information[np.ix_(cause.places, rest)] @ inner
-        bb = information[np.ix_(cause.places, cause.places)] - across @ information[np.ix_(rest, cause.places)]
-        ba = information[np.ix_(cause.places, first.places)] - across @ information[np.ix_(rest, first.places)]
+        bb = (
+            information[np.ix_(cause.places, cause.places)]
+            - across @ information[np.ix_(rest, cause.places)]
+        )
+        ba = (
+            information[np.ix_(cause.places, first.places)]
+            - across @ information[np.ix_(rest, first.places)]
+        )
         found[cause.key] = np.linalg.solve(bb, ba @ first.size)
     return found
 
@@ -124,7 +165,9 @@ def _indices(model, key):
 
 
 def _places(coordinates, key):
-    return np.array([int(np.argmax(np.abs(coordinates.basis[k]))) for k in _indices(coordinates.model, key)])
+    return np.array(
+        [int(np.argmax(np.abs(coordinates.basis[k]))) for k in _indices(coordinates.model, key)]
+    )
 
 
 TIME_OVER = 'the time given is over'
@@ -139,10 +182,23 @@ MAX_REMAINING_SHARE = 0.93
 class CampaignSettings:
     """When to end."""
 
-    time_limit: float = setting(1800.0, 's', 'time given to all motions together, by the stamps of the joint states', (1.0, 1e6),
-                                'too small: parameters stay outside their tolerance', live=True)
-    separations: int = setting(2, '1', 'largest number of extra motions that separate collinear causes of the diagnosis; 0: none, and '
-                               'no diagnosis at the end', (0, 20), 'too small: a finding remains collinear with other effects', live=True)
+    time_limit: float = setting(
+        1800.0,
+        's',
+        'time given to all motions together, by the stamps of the joint states',
+        (1.0, 1e6),
+        'too small: parameters stay outside their tolerance',
+        live=True,
+    )
+    separations: int = setting(
+        2,
+        '1',
+        'largest number of extra motions that separate collinear causes of the diagnosis; 0: none, and '
+        'no diagnosis at the end',
+        (0, 20),
+        'too small: a finding remains collinear with other effects',
+        live=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -174,11 +230,21 @@ class Campaign:
 
     """
 
-    def __init__(self, planner: Planner, settings: CampaignSettings = CampaignSettings(),
-                 make_separator: Callable[[Suspect], Planner] | None = None, *,
-                 first: Callable[[np.ndarray], Any] = lambda position: None,
-                 unwind: Callable[[np.ndarray], Any] = lambda position: None):
-        self.planner, self.settings, self._make_separator, self._unwind = planner, settings, make_separator, unwind
+    def __init__(
+        self,
+        planner: Planner,
+        settings: CampaignSettings = CampaignSettings(),
+        make_separator: Callable[[Suspect], Planner] | None = None,
+        *,
+        first: Callable[[np.ndarray], Any] = lambda position: None,
+        unwind: Callable[[np.ndarray], Any] = lambda position: None,
+    ):
+        self.planner, self.settings, self._make_separator, self._unwind = (
+            planner,
+            settings,
+            make_separator,
+            unwind,
+        )
         self._first: Callable[[np.ndarray], Any] | None = first
         self._separator: Planner | None = None
         self.findings: list[Suspect] | None = None
@@ -198,20 +264,29 @@ class Campaign:
     def take(self, calibration: Any) -> None:
         """Replace the predicted information by that measured in the motions so far."""
         self.planner.take(calibration)
-        self._left.append(sum(max(math.log(excess), 0.0) for excess in self.planner.excess.values() if excess > 0))
+        self._left.append(
+            sum(max(math.log(excess), 0.0) for excess in self.planner.excess.values() if excess > 0)
+        )
 
     def take_findings(self, findings: list[Suspect] | None) -> str:
         """Store the findings of a diagnosis, None if it failed; return the resulting action as text, '' for none."""
         self._is_asked = True
         self.findings = self.findings if findings is None else findings
         for finding in findings or []:
-            if finding.mates and self.separations < self.settings.separations and self._make_separator is not None:
+            if (
+                finding.mates
+                and self.separations < self.settings.separations
+                and self._make_separator is not None
+            ):
                 what = f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion so far'
                 try:
                     self._separator = self._make_separator(finding)
                 except ImuCalibrationError as error:
                     return f'{what}, and no motion is known that separates them: {error}'
-                self.separations, self.told_apart = self.separations + 1, (finding.effect, *finding.mates)
+                self.separations, self.told_apart = (
+                    self.separations + 1,
+                    (finding.effect, *finding.mates),
+                )
                 self._left.clear()
                 return f'{what}: planning the motion that separates them'
         return ''
@@ -237,7 +312,11 @@ class Campaign:
         if first is not None and (motion := first(position)) is not None:
             return Decision(motion, 'the first motion is small and slow')
         decision = self._decide(position, elapsed)
-        if decision.motion is None and not decision.diagnose and (motion := self._unwind(position)) is not None:
+        if (
+            decision.motion is None
+            and not decision.diagnose
+            and (motion := self._unwind(position)) is not None
+        ):
             return Decision(motion, f'{decision.why}; before the end, endless joints are unwound')
         return decision
 
@@ -245,7 +324,9 @@ class Campaign:
         if elapsed >= self.settings.time_limit:
             return Decision(why=f'{TIME_OVER}{self._outside()}')
         step = None if self._separator is None else self._separator.next_motion(position)
-        if step is None or step.motion is None:   # predicted only: a calibration has no information on causes that its model lacks
+        if (
+            step is None or step.motion is None
+        ):  # predicted only: a calibration has no information on causes that its model lacks
             has_separated, self._separator = self._separator is not None, None
             if has_separated:
                 return Decision(diagnose=True, why='the causes should be separable now')
@@ -253,7 +334,9 @@ class Campaign:
                 return self._ending(IN_VAIN)
             step = self.planner.next_motion(position)
         if step.motion is not None and elapsed + step.seconds > self.settings.time_limit:
-            return Decision(why=f'{TIME_OVER}: the next motion takes {step.seconds:.0f} s{self._outside()}')
+            return Decision(
+                why=f'{TIME_OVER}: the next motion takes {step.seconds:.0f} s{self._outside()}'
+            )
         if step.motion is not None:
             self._is_asked = False
             return step
@@ -267,27 +350,45 @@ class Campaign:
     @property
     def _promises_in_vain(self):
         """Whether the last motions gave almost none of the predicted reduction."""
-        return len(self._left) > STALL_MOTIONS and self._left[-1] > MAX_REMAINING_SHARE * self._left[-1 - STALL_MOTIONS] > 0
+        return (
+            len(self._left) > STALL_MOTIONS
+            and self._left[-1] > MAX_REMAINING_SHARE * self._left[-1 - STALL_MOTIONS] > 0
+        )
 
     def _outside(self):
         missing = [name for name, excess in self.planner.excess.items() if excess > 1.0]
         if not missing:
             return ''
-        return f'; outside its tolerance: {", ".join(missing[:3])}' + (f' and {len(missing) - 3} more' if missing[3:] else '')
+        return f'; outside its tolerance: {", ".join(missing[:3])}' + (
+            f' and {len(missing) - 3} more' if missing[3:] else ''
+        )
 
     def _named(self):
         if not self.findings:
             return ''
-        mates = [f' (collinear with {", ".join(each.mates)})' if each.mates else '' for each in self.findings]
-        return '; beyond bias and matrix there is ' + ', '.join(each.effect + text for each, text in zip(self.findings, mates, strict=True))
+        mates = [
+            f' (collinear with {", ".join(each.mates)})' if each.mates else ''
+            for each in self.findings
+        ]
+        return '; beyond bias and matrix there is ' + ', '.join(
+            each.effect + text for each, text in zip(self.findings, mates, strict=True)
+        )
 
 
 LONGEST_SEPARATION = 180.0
 """Longest plan that separates causes, s; causes that need more count as one cause for this table."""
 
 
-def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, noise: dict[str, NoiseModel], rate: float = 100.0,
-                 options: CalibrationOptions = CalibrationOptions(), limits: MotionLimits | None = None) -> Planner:
+def separator_of(
+    table: Table,
+    calibration: Calibration,
+    suspect: Suspect,
+    *,
+    noise: dict[str, NoiseModel],
+    rate: float = 100.0,
+    options: CalibrationOptions = CalibrationOptions(),
+    limits: MotionLimits | None = None,
+) -> Planner:
     """
     Return the planner of the motion that separates a suspect from its mates.
 
@@ -312,14 +413,27 @@ def separator_of(table: Table, calibration: Calibration, suspect: Suspect, *, no
         When an effect is unknown, or no motion can show it.
 
     """
-    causes = [(options.catalogue.owner_of(name, table.joint_names), name) for name in (suspect.effect, *suspect.mates)]
-    planner = make_separator(table, with_suspect(calibration, causes[0], suspect.sizes), causes, noise=noise, rate=rate, options=options,
-                             sizes=suspect.sizes, limits=limits)
+    causes = [
+        (options.catalogue.owner_of(name, table.joint_names), name)
+        for name in (suspect.effect, *suspect.mates)
+    ]
+    planner = make_separator(
+        table,
+        with_suspect(calibration, causes[0], suspect.sizes),
+        causes,
+        noise=noise,
+        rate=rate,
+        options=options,
+        sizes=suspect.sizes,
+        limits=limits,
+    )
     planner.within(LONGEST_SEPARATION)
     return planner
 
 
-def with_suspect(calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]) -> Calibration:
+def with_suspect(
+    calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]
+) -> Calibration:
     """Return the calibration with an effect at its estimated size; the other parameters do not change."""
     if cause in calibration.model.slices:
         return calibration
@@ -328,8 +442,14 @@ def with_suspect(calibration: Calibration, cause: tuple[str, str], sizes: dict[s
     values = model.start_from(calibration.model, calibration.values)
     values[model.slices[cause]] = [sizes.get(name, 0.0) for name in effect.param_names()]
     places = [model.param_names.index(name) for name in calibration.param_names]
-    covariance, status = np.diag(model.prior()[1]**2), [HELD] * len(values)
+    covariance, status = np.diag(model.prior()[1] ** 2), [HELD] * len(values)
     covariance[np.ix_(places, places)] = calibration.covariance
     for place, known in zip(places, calibration.status, strict=True):
         status[place] = known
-    return replace(calibration, model=model.at(values), values=values, covariance=covariance, status=tuple(status))
+    return replace(
+        calibration,
+        model=model.at(values),
+        values=values,
+        covariance=covariance,
+        status=tuple(status),
+    )

@@ -35,7 +35,9 @@ class Coordinates:
 
     """
 
-    def __init__(self, model: SensorModel, tolerances: np.ndarray, values: np.ndarray | None = None):
+    def __init__(
+        self, model: SensorModel, tolerances: np.ndarray, values: np.ndarray | None = None
+    ):
         start = model.start() if values is None else np.asarray(values, float)
         self.values = np.where(np.isfinite(start), start, 0.0)
         self.model, self.tolerances = model.at(self.values), np.asarray(tolerances, float)
@@ -68,8 +70,14 @@ class Coordinates:
     @cached_property
     def slopes(self) -> dict[str, np.ndarray]:
         """Sensor -> derivative of the coefficients of the columns by z, shape (n_columns, 3, n)."""
-        return {sensor: np.einsum('cap,pq->caq', coefficient_jacobian(self.folded, sensor, self.values) * self.units, self.basis)
-                for sensor in SENSORS}
+        return {
+            sensor: np.einsum(
+                'cap,pq->caq',
+                coefficient_jacobian(self.folded, sensor, self.values) * self.units,
+                self.basis,
+            )
+            for sensor in SENSORS
+        }
 
     @property
     def names(self) -> list[str]:
@@ -78,7 +86,9 @@ class Coordinates:
 
     def sd(self, covariance: np.ndarray) -> np.ndarray:
         """Return standard deviations of all parameters, SI, from the covariance of z."""
-        return self.units * np.sqrt(np.clip(np.einsum('pi,ij,pj->p', self.basis, covariance, self.basis), 0, None))
+        return self.units * np.sqrt(
+            np.clip(np.einsum('pi,ij,pj->p', self.basis, covariance, self.basis), 0, None)
+        )
 
     def information_from(self, names: Mapping[str, int], covariance: np.ndarray) -> np.ndarray:
         """
@@ -92,7 +102,9 @@ class Coordinates:
             Of all its parameters, SI; parameters that this model lacks are averaged over.
 
         """
-        shared = [(k, names[name]) for k, name in enumerate(self.model.param_names) if name in names]
+        shared = [
+            (k, names[name]) for k, name in enumerate(self.model.param_names) if name in names
+        ]
         if not shared:
             return np.zeros((self.size,) * 2)
         own, theirs = (np.array(part) for part in zip(*shared, strict=True))
@@ -100,7 +112,9 @@ class Coordinates:
         basis = self.basis[own]
         values, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
         # Directions that the gauge fixes have no variance and no component in the basis; KNOWN_SHARE is as good as certain.
-        rows = (vectors.T @ basis) / np.sqrt(np.maximum(values, max(1e-13 * values.max(), KNOWN_SHARE**2)))[:, None]
+        rows = (vectors.T @ basis) / np.sqrt(
+            np.maximum(values, max(1e-13 * values.max(), KNOWN_SHARE**2))
+        )[:, None]
         known = rows.T @ rows - self.prior_information
         weights, directions = scipy.linalg.eigh((known + known.T) / 2)
         return (directions * np.maximum(weights, 0.0)) @ directions.T
@@ -109,7 +123,11 @@ class Coordinates:
 def _basis(gauge):
     """Return orthonormal directions that a gauge leaves free; unaffected parameters are separate coordinates."""
     concerned = np.any(gauge != 0, axis=0)
-    inner = scipy.linalg.null_space(gauge[:, concerned] / np.abs(gauge).max()) if concerned.any() else np.zeros((0, 0))
+    inner = (
+        scipy.linalg.null_space(gauge[:, concerned] / np.abs(gauge).max())
+        if concerned.any()
+        else np.zeros((0, 0))
+    )
     free = np.flatnonzero(~concerned)
     basis = np.zeros((len(concerned), len(free) + inner.shape[1]))
     basis[free, np.arange(len(free))] = 1.0
@@ -131,12 +149,18 @@ class WithinTolerances:
 
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
         """Return the weighted sum of the logarithms of the excess."""
-        return (self.weights * np.maximum(np.log(margin * self.coordinates.excess(covariance)), 0.0)).sum(axis=1)
+        return (
+            self.weights * np.maximum(np.log(margin * self.coordinates.excess(covariance)), 0.0)
+        ).sum(axis=1)
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the parameters outside their tolerance."""
         excess = self.coordinates.excess(covariance)
-        return tuple(name for name, ratio in zip(self.coordinates.names, excess, strict=True) if ratio > 1.0 + 1e-6)
+        return tuple(
+            name
+            for name, ratio in zip(self.coordinates.names, excess, strict=True)
+            if ratio > 1.0 + 1e-6
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,27 +210,44 @@ class ToldApart:
             own = covariance[:, a.places[:, None], a.places]
             if len(out):
                 cross = covariance[:, a.places[:, None], out]
-                own = own - cross @ np.linalg.solve(covariance[:, out[:, None], out], cross.transpose(0, 2, 1))
+                own = own - cross @ np.linalg.solve(
+                    covariance[:, out[:, None], out], cross.transpose(0, 2, 1)
+                )
             information = np.linalg.inv(own) - prior[np.ix_(a.places, a.places)]
-            found[:, number] = np.einsum('i,kij,j->k', a.size, information, a.size) / self.enough[a.key]
+            found[:, number] = (
+                np.einsum('i,kij,j->k', a.size, information, a.size) / self.enough[a.key]
+            )
         return np.maximum(found, 1e-12)
 
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
         """Return half the sum of the logarithms of the shortfall of separable pairs, the worst weighted three times."""
-        lacking = np.maximum(-0.5 * np.log(self.noncentrality(covariance)[:, self.reachable] / margin**2), 0.0)
+        lacking = np.maximum(
+            -0.5 * np.log(self.noncentrality(covariance)[:, self.reachable] / margin**2), 0.0
+        )
         return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1, initial=0.0)
 
     def leave_out_of_reach(self, covariance: np.ndarray) -> None:
         """Drop pairs, in either order, that this covariance, (n, n), a lower bound of all plans, does not separate."""
         enough_left = self.noncentrality(covariance[None])[0] >= 1.0
-        apart = {(a.key, b.key) for (a, b), reached in zip(self.pairs, enough_left, strict=True) if reached}
-        self.reachable = np.array([(a.key, b.key) in apart and (b.key, a.key) in apart for a, b in self.pairs])
+        apart = {
+            (a.key, b.key)
+            for (a, b), reached in zip(self.pairs, enough_left, strict=True)
+            if reached
+        }
+        self.reachable = np.array(
+            [(a.key, b.key) in apart and (b.key, a.key) in apart for a, b in self.pairs]
+        )
 
     def missing(self, covariance: np.ndarray) -> tuple[str, ...]:
         """Return the pairs that would not be separated."""
         found = self.noncentrality(covariance[None])[0]
-        return tuple(dict.fromkeys(' and '.join(sorted((a.key[1], b.key[1])))
-                                   for (a, b), value in zip(self.pairs, found, strict=True) if value < 1.0))
+        return tuple(
+            dict.fromkeys(
+                ' and '.join(sorted((a.key[1], b.key[1])))
+                for (a, b), value in zip(self.pairs, found, strict=True)
+                if value < 1.0
+            )
+        )
 
 
 Goal = WithinTolerances | ToldApart
@@ -223,6 +264,10 @@ def enough(size: int, questions: int) -> float:
     from scipy.stats import ncx2  # here, because its import is slow
 
     threshold = chi2_isf(FAMILY_WISE / questions, size)
-    named = next(value for value in np.geomspace(1.0, 1e4, 2000) if ncx2.sf(threshold, size, value) >= SEPARATION_PROBABILITY)
+    named = next(
+        value
+        for value in np.geomspace(1.0, 1e4, 2000)
+        if ncx2.sf(threshold, size, value) >= SEPARATION_PROBABILITY
+    )
     quantile = ndtri(SEPARATION_PROBABILITY)
-    return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE))**2))
+    return float(max(named, (quantile + np.sqrt(quantile**2 + 2 * TIE)) ** 2))

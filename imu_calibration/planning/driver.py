@@ -42,26 +42,72 @@ class DriveState(StrEnum):
 class DriverSettings:
     """Tolerances on the path and on times."""
 
-    following_tolerance: float = setting(0.05, 'rad', 'largest distance of a rotating joint from its path, independent of delay '
-                                         'and speed; beyond it all stop', (1e-4, 1.0), 'too small: stops without a reason; too large: late',
-                                         live=True)
-    following_tolerance_m: float = setting(0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above', live=True)
-    stall_patience: float = setting(3.0, 's', 'joints without progress for this time, by their clock and by ours, have stalled, or '
-                                    'the trajectory was refused; after a stop in mid-motion the next one waits for so long, since the '
-                                    'stop may be as late',
-                                    (0.2, 60.0), 'too small: a controller that is slow to begin is called refusing', live=True)
-    silence: float = setting(1.0, 's', 'all joints stop after this time without joint states', (0.1, 60.0),
-                             'too small: stops when the machine is busy', live=True)
-    settling_time: float = setting(0.5, 's', 'the joints must have rested for so long before the next motion', (0.0, 60.0),
-                                   'too small: decaying vibration is measured', live=True)
-    settling_patience: float = setting(20.0, 's', 'all joints stop if they do not rest within this time', (0.5, 600.0),
-                                       'too small: a soft arm is called restless', live=True)
-    first_reach: float = setting(0.1, 'rad', 'the very first motion turns each joint by at most this and back; 0: none', (0.0, 1.0),
-                                 'too small: a wrong sign or joint is not noticed', live=True)
-    first_reach_m: float = setting(0.01, 'm', 'the same for a joint that slides', (0.0, 0.5), 'as above', live=True)
-    first_speed: float = setting(0.3, '1', 'share of its speed at which motions after a start are made, up to the first one that is larger '
-                                 'than first_reach', (0.01, 1.0),
-                                 'too large: a wrong table is noticed at full speed', live=True)
+    following_tolerance: float = setting(
+        0.05,
+        'rad',
+        'largest distance of a rotating joint from its path, independent of delay '
+        'and speed; beyond it all stop',
+        (1e-4, 1.0),
+        'too small: stops without a reason; too large: late',
+        live=True,
+    )
+    following_tolerance_m: float = setting(
+        0.01, 'm', 'the same for a joint that slides', (1e-5, 0.5), 'as above', live=True
+    )
+    stall_patience: float = setting(
+        3.0,
+        's',
+        'joints without progress for this time, by their clock and by ours, have stalled, or '
+        'the trajectory was refused; after a stop in mid-motion the next one waits for so long, since the '
+        'stop may be as late',
+        (0.2, 60.0),
+        'too small: a controller that is slow to begin is called refusing',
+        live=True,
+    )
+    silence: float = setting(
+        1.0,
+        's',
+        'all joints stop after this time without joint states',
+        (0.1, 60.0),
+        'too small: stops when the machine is busy',
+        live=True,
+    )
+    settling_time: float = setting(
+        0.5,
+        's',
+        'the joints must have rested for so long before the next motion',
+        (0.0, 60.0),
+        'too small: decaying vibration is measured',
+        live=True,
+    )
+    settling_patience: float = setting(
+        20.0,
+        's',
+        'all joints stop if they do not rest within this time',
+        (0.5, 600.0),
+        'too small: a soft arm is called restless',
+        live=True,
+    )
+    first_reach: float = setting(
+        0.1,
+        'rad',
+        'the very first motion turns each joint by at most this and back; 0: none',
+        (0.0, 1.0),
+        'too small: a wrong sign or joint is not noticed',
+        live=True,
+    )
+    first_reach_m: float = setting(
+        0.01, 'm', 'the same for a joint that slides', (0.0, 0.5), 'as above', live=True
+    )
+    first_speed: float = setting(
+        0.3,
+        '1',
+        'share of its speed at which motions after a start are made, up to the first one that is larger '
+        'than first_reach',
+        (0.01, 1.0),
+        'too large: a wrong table is noticed at full speed',
+        live=True,
+    )
 
 
 class Driver:
@@ -77,7 +123,12 @@ class Driver:
 
     """
 
-    def __init__(self, joint_names: tuple[str, ...], limits: MotionLimits, settings: DriverSettings = DriverSettings()):
+    def __init__(
+        self,
+        joint_names: tuple[str, ...],
+        limits: MotionLimits,
+        settings: DriverSettings = DriverSettings(),
+    ):
         self.joint_names, self.limits = tuple(joint_names), limits
         self.change(settings)
         self.state, self.reason, self.motions = DriveState.IDLE, 'no motion before start', 0
@@ -95,7 +146,9 @@ class Driver:
     def change(self, settings: DriverSettings) -> None:
         """Use other settings from now on; speed and tolerances from the next motion on."""
         self.settings = settings
-        self.tolerance = np.where(self.limits.turns, settings.following_tolerance, settings.following_tolerance_m)
+        self.tolerance = np.where(
+            self.limits.turns, settings.following_tolerance, settings.following_tolerance_m
+        )
 
     @property
     def first_reach(self) -> np.ndarray:
@@ -115,8 +168,11 @@ class Driver:
     @property
     def rests(self) -> bool:
         """Whether the joints have rested for the settling time and no command is pending."""
-        return (self._rested_at is not None and self._time - self._rested_since >= self.settings.settling_time
-                and not self.awaits_stop)
+        return (
+            self._rested_at is not None
+            and self._time - self._rested_since >= self.settings.settling_time
+            and not self.awaits_stop
+        )
 
     @property
     def awaits_stop(self) -> bool:
@@ -128,7 +184,10 @@ class Driver:
         """
         if self._stopped is None:
             return False
-        return min(self._time - self._stopped[0], self._heard - self._stopped[1]) < self.settings.stall_patience
+        return (
+            min(self._time - self._stopped[0], self._heard - self._stopped[1])
+            < self.settings.stall_patience
+        )
 
     def is_silent(self, now: float) -> bool:
         """Whether the time since the last joint state exceeds `silence`, by a steady clock."""
@@ -139,8 +198,10 @@ class Driver:
         constant = self._heard - self._advanced
         if self.is_silent(now) or not constant > self.settings.silence:
             return ''
-        return (f'the stamps of the joint states must advance, they have not for {constant:.1f} s while messages arrive: stopped; correct '
-                'the clock of their publisher')
+        return (
+            f'the stamps of the joint states must advance, they have not for {constant:.1f} s while messages arrive: stopped; correct '
+            'the clock of their publisher'
+        )
 
     def start(self) -> None:
         """Allow motions, once the joints rest; the first one will be slow."""
@@ -162,17 +223,33 @@ class Driver:
         Raises an InputError if no motion is allowed at present, or the motion exceeds a limit.
         """
         if self.state not in (DriveState.IDLE, DriveState.MEASURING):
-            raise InputError(f'a motion may begin if the joints rest and no fault is present, the state is {self.state}: {self.reason}; '
-                             'start anew', code='wrong_state')
+            raise InputError(
+                f'a motion may begin if the joints rest and no fault is present, the state is {self.state}: {self.reason}; '
+                'start anew',
+                code='wrong_state',
+            )
         if self.position is None or self.is_silent(now):
-            raise InputError('joint states are needed before a motion, none were received; publish them', code='no_joint_states')
+            raise InputError(
+                'joint states are needed before a motion, none were received; publish them',
+                code='no_joint_states',
+            )
         if not self.rests:
-            raise InputError('the joints must rest before a motion begins, they have just moved; start again when they rest',
-                             code='joints_moving')
-        points = points.ordered(self.joint_names).slowed(self.settings.first_speed if self._slow else 1.0)
+            raise InputError(
+                'the joints must rest before a motion begins, they have just moved; start again when they rest',
+                code='joints_moving',
+            )
+        points = points.ordered(self.joint_names).slowed(
+            self.settings.first_speed if self._slow else 1.0
+        )
         self._require_within_limits(points)
-        is_small = np.all(np.abs(points.position - self.position) <= self.first_reach + MAX_REST_MOVEMENT * self.tolerance)
-        self._watch, self._slow = PathWatch(self.position, points, self.tolerance), self._slow and bool(is_small)
+        is_small = np.all(
+            np.abs(points.position - self.position)
+            <= self.first_reach + MAX_REST_MOVEMENT * self.tolerance
+        )
+        self._watch, self._slow = (
+            PathWatch(self.position, points, self.tolerance),
+            self._slow and bool(is_small),
+        )
         self.motions += 1
         self._become(DriveState.MOVING, words)
         return points
@@ -184,10 +261,17 @@ class Driver:
         # A joint whose encoder reads slightly outside its range may return into it.
         outside = np.maximum(self.limits.lower - self.position, self.position - self.limits.upper)
         beyond -= max(float(np.max(outside)), 0.0)
-        if beyond > LIMIT_ROUNDING or max(speed, acceleration) > 1.0 + LIMIT_ROUNDING or points.acceleration is None:
-            raise InputError('a motion must have accelerations and stay within the limits of the joints, it leaves the range by '
-                             f'{max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of the speed and {acceleration:.3f} of the '
-                             'acceleration; it is not sent', code='joint_limits')
+        if (
+            beyond > LIMIT_ROUNDING
+            or max(speed, acceleration) > 1.0 + LIMIT_ROUNDING
+            or points.acceleration is None
+        ):
+            raise InputError(
+                'a motion must have accelerations and stay within the limits of the joints, it leaves the range by '
+                f'{max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of the speed and {acceleration:.3f} of the '
+                'acceleration; it is not sent',
+                code='joint_limits',
+            )
 
     def observe(self, time: float, position: np.ndarray, rate: np.ndarray, *, now: float) -> bool:
         """
@@ -205,11 +289,17 @@ class Driver:
             Seconds of a steady clock.
 
         """
-        if not np.all(np.isfinite(position)):   # ros2_control publishes NaN until the hardware was read
+        if not np.all(
+            np.isfinite(position)
+        ):  # ros2_control publishes NaN until the hardware was read
             for joint in np.flatnonzero(~np.isfinite(position)):
-                self.ignored[self.joint_names[joint]] = self.ignored.get(self.joint_names[joint], 0) + 1
+                self.ignored[self.joint_names[joint]] = (
+                    self.ignored.get(self.joint_names[joint], 0) + 1
+                )
             return False
-        if self._stopped is not None and time < self._time:   # after a clock step backwards the wait starts again
+        if (
+            self._stopped is not None and time < self._time
+        ):  # after a clock step backwards the wait starts again
             self._stopped = time, now
         if time != self._time or self.position is None:
             self._advanced = now
@@ -226,7 +316,11 @@ class Driver:
             if trouble := self._straying():
                 return self.stop(trouble)
             if self._watch.at_end:
-                self._rested_at, self._rested_since, self._settling_since = self.position, time, time
+                self._rested_at, self._rested_since, self._settling_since = (
+                    self.position,
+                    time,
+                    time,
+                )
                 self._become(DriveState.SETTLING, self.reason)
             return False
         return self._settle()
@@ -234,8 +328,10 @@ class Driver:
     def tick(self, now: float) -> bool:
         """Check the time limits; return whether all joints must stop."""
         if self.is_driving and self.is_silent(now):
-            return self.stop(f'no usable joint state for {now - self._heard:.1f} s: stopped; see that joint states are published'
-                             + self.ignored_words())
+            return self.stop(
+                f'no usable joint state for {now - self._heard:.1f} s: stopped; see that joint states are published'
+                + self.ignored_words()
+            )
         return False
 
     def ignored_words(self) -> str:
@@ -271,15 +367,19 @@ class Driver:
     def _beyond(self, position, rate):
         """Return the fault of joint positions and speeds, '' for none."""
         assert self.position is not None
-        over = np.maximum(self.limits.lower - position, position - self.limits.upper) - self.tolerance
+        over = (
+            np.maximum(self.limits.lower - position, position - self.limits.upper) - self.tolerance
+        )
         if np.max(over) > 0:
             joint = int(np.argmax(over))
             return f'joint {self._place_of(joint, position)} is beyond its range: stopped; see the limits in the description of the joints'
         fast = np.where(np.isfinite(rate), np.abs(rate), 0.0) / self.limits.speed
         if np.max(fast) > OVERSPEED:
             joint = int(np.argmax(fast))
-            return (f'joint {self.joint_names[joint]} turns at {fast[joint]:.2f} times its largest speed: stopped; '
-                    'see the limits in the description of the joints and in the controller')
+            return (
+                f'joint {self.joint_names[joint]} turns at {fast[joint]:.2f} times its largest speed: stopped; '
+                'see the limits in the description of the joints and in the controller'
+            )
         return ''
 
     def _straying(self):
@@ -287,21 +387,30 @@ class Driver:
         watch = self._watch
         if watch.has_strayed:
             joint = watch.suspect()
-            return (f'joint {self._place_of(joint, self.position)} does not follow: the joints are '
-                    f'{self._amount(joint, watch.deviation.max() * watch.tolerance[joint])} from their path: stopped; '
-                    'see whether something holds it')
+            return (
+                f'joint {self._place_of(joint, self.position)} does not follow: the joints are '
+                f'{self._amount(joint, watch.deviation.max() * watch.tolerance[joint])} from their path: stopped; '
+                'see whether something holds it'
+            )
         if watch.has_stalled_for <= self.settings.stall_patience:
             return ''
         if not watch.has_begun:
-            return (f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the controller refused it or does not '
-                    'listen, see its log')
-        return (f'joint {self.joint_names[watch.suspect()]} has made no progress for {watch.waited:.1f} s: stopped; '
-                'see whether something holds it')
+            return (
+                f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the controller refused it or does not '
+                'listen, see its log'
+            )
+        return (
+            f'joint {self.joint_names[watch.suspect()]} has made no progress for {watch.waited:.1f} s: stopped; '
+            'see whether something holds it'
+        )
 
     def _note_rest(self):
         """Restart the timer when the joints have moved, or their clock was set back."""
-        if (self._rested_at is None or self._time < self._rested_since
-                or np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)):
+        if (
+            self._rested_at is None
+            or self._time < self._rested_since
+            or np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)
+        ):
             self._rested_at, self._rested_since = self.position, self._time
 
     def _settle(self):
@@ -310,7 +419,9 @@ class Driver:
             self._watch = None
             self._become(DriveState.MEASURING, self.reason)
         elif self._time - self._settling_since > self.settings.settling_patience:
-            return self.stop(f'the joints do not rest within {self.settings.settling_patience:g} s: stopped; find the cause of the motion')
+            return self.stop(
+                f'the joints do not rest within {self.settings.settling_patience:g} s: stopped; find the cause of the motion'
+            )
         return False
 
     def _place_of(self, joint, position):

@@ -63,13 +63,19 @@ class PlannedMotion:
 
     def travel(self, position: np.ndarray) -> tuple[Segment, ...]:
         """Return the way from where the joints are to the place of the motion: one move, or none."""
-        return MotionBuilder(len(self.place), limits=self.limits, start=position).move_to(self.place).segments
+        return (
+            MotionBuilder(len(self.place), limits=self.limits, start=position)
+            .move_to(self.place)
+            .segments
+        )
 
     def from_position(self, position: np.ndarray) -> tuple[Segment, ...]:
         """Return all segments from the present position, with whole turns of endless joints unchanged."""
         way = self.travel(position)
         shift = (way[-1].end if way else np.asarray(position, float)) - self.place
-        return way + tuple(replace(segment, start=segment.start + shift) for segment in self.segments)
+        return way + tuple(
+            replace(segment, start=segment.start + shift) for segment in self.segments
+        )
 
     def seconds_from(self, position: np.ndarray) -> float:
         """Return the length with the way to its place, s."""
@@ -85,7 +91,9 @@ class PlannedMotion:
         units = np.where(self.limits.turns, 180.0 / np.pi, 1.0)
         rates = [segment.rate_to for segment in self.segments if segment.kind == 'spin']
         found = {'place_deg_or_m': np.round(self.place * units, 4).tolist()}
-        return found | ({'rates_deg_s_or_m_s': np.round(np.array(rates) * units, 4).tolist()} if rates else {})
+        return found | (
+            {'rates_deg_s_or_m_s': np.round(np.array(rates) * units, 4).tolist()} if rates else {}
+        )
 
     @property
     def words(self) -> str:
@@ -99,8 +107,12 @@ def trajectory(joint_names: tuple[str, ...], segments: tuple[Segment, ...]) -> T
     if not segments:
         return TrajectoryPoints.stop(joint_names)
     edges = np.concatenate([[0.0], np.cumsum([segment.duration for segment in segments])])
-    times = np.concatenate([np.linspace(a, b, max(int(np.ceil((b - a) / TRAJECTORY_STEP_SECONDS)), 1) + 1)[1:]
-                            for a, b in zip(edges, edges[1:], strict=False)])
+    times = np.concatenate(
+        [
+            np.linspace(a, b, max(int(np.ceil((b - a) / TRAJECTORY_STEP_SECONDS)), 1) + 1)[1:]
+            for a, b in zip(edges, edges[1:], strict=False)
+        ]
+    )
     motion = motion_at(segments, times)
     rate, acceleration = motion.rate.copy(), motion.acceleration.copy()
     rate[-1], acceleration[-1] = 0.0, 0.0
@@ -115,7 +127,10 @@ def motion_at(segments: tuple[Segment, ...], time: np.ndarray) -> JointMotion:
 def place_words(names: tuple[str, ...], place: np.ndarray, limits: MotionLimits) -> str:
     """Return the text of a position: ``outer 45°, slide 120 mm``."""
     units = [(1 / DEG, '°') if turning else (1000.0, ' mm') for turning in limits.turns]
-    return ', '.join(f'{name} {round(value * factor):d}{unit}' for name, value, (factor, unit) in zip(names, place, units, strict=True))
+    return ', '.join(
+        f'{name} {round(value * factor):d}{unit}'
+        for name, value, (factor, unit) in zip(names, place, units, strict=True)
+    )
 
 
 N_TRIED = 512
@@ -131,13 +146,19 @@ HEADING = 0.4
 def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends within which places are chosen: of joints that turn, at most one turn about the middle of the range."""
     wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
-    middle = 0.5 * (np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END))   # 0 without ends
-    return np.where(wide, middle - np.pi, limits.lower), np.where(wide, middle + np.pi, limits.upper)
+    middle = 0.5 * (
+        np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END)
+    )  # 0 without ends
+    return np.where(wide, middle - np.pi, limits.lower), np.where(
+        wide, middle + np.pi, limits.upper
+    )
 
 
 def up_at(table: Table, position: np.ndarray) -> np.ndarray:
     """Return which direction of the sensor frame points up where the joints rest at a position, unit vector, shape (3,)."""
-    return reference_motion(table, rest_at(np.asarray(position, float)[None])).mat_sn[0] @ np.array([0.0, 0.0, 1.0])
+    return reference_motion(table, rest_at(np.asarray(position, float)[None])).mat_sn[0] @ np.array(
+        [0.0, 0.0, 1.0]
+    )
 
 
 def candidates(limits: MotionLimits) -> np.ndarray:
@@ -149,8 +170,13 @@ def candidates(limits: MotionLimits) -> np.ndarray:
     spread = lower + (upper - lower) * qmc.Sobol(len(limits), seed=5).random(N_TRIED)
     parts = [home[None], spread]
     if len(limits) <= 3:
-        steps = [np.arange(np.ceil(a / POSITION_GRID - 1e-9), np.floor(b / POSITION_GRID + 1e-9) + 1) * POSITION_GRID
-                 if turning else np.linspace(a, b, 3) for a, b, turning in zip(lower, upper, limits.turns, strict=True)]
+        steps = [
+            np.arange(np.ceil(a / POSITION_GRID - 1e-9), np.floor(b / POSITION_GRID + 1e-9) + 1)
+            * POSITION_GRID
+            if turning
+            else np.linspace(a, b, 3)
+            for a, b, turning in zip(lower, upper, limits.turns, strict=True)
+        ]
         grid = np.stack(np.meshgrid(*steps, indexing='ij'), axis=-1).reshape(-1, len(limits))
         parts.insert(1, grid[np.lexsort(np.abs(grid).T)])
     return np.concatenate(parts)
@@ -165,7 +191,9 @@ def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
     """
     tried = candidates(limits)
     mats = reference_motion(table, rest_at(tried)).mat_sn
-    features = np.concatenate([mats[:, :, 2], HEADING * mats[:, :, 0], HEADING * mats[:, :, 1]], axis=1)
+    features = np.concatenate(
+        [mats[:, :, 2], HEADING * mats[:, :, 0], HEADING * mats[:, :, 1]], axis=1
+    )
     chosen, distance = [0], np.linalg.norm(features - features[0], axis=1)
     while len(chosen) < REST_PLACES and distance.max() > 0.05:
         nearly = distance > distance.max() - 1e-6
@@ -206,19 +234,42 @@ class MotionLibrary:
 
     def __init__(self, table: Table, limits: MotionLimits | None = None):
         self.table, limits = table, limits or limits_of(table)
-        self.limits = MotionLimits(limits.lower, limits.upper, LIMIT_SHARE * limits.speed, LIMIT_SHARE * limits.acceleration, limits.turns)
+        self.limits = MotionLimits(
+            limits.lower,
+            limits.upper,
+            LIMIT_SHARE * limits.speed,
+            LIMIT_SHARE * limits.acceleration,
+            limits.turns,
+        )
         self.names = tuple(table.joint_names)
         self.spread = choose_places(table, self.limits)
-        self.motions = [PlannedMotion(kind, self.names, place, segments, text, self.limits) for kind, place, segments, text in (
-            *self._rests(), *self._spins(), *self._swings(), *self._together())]
+        self.motions = [
+            PlannedMotion(kind, self.names, place, segments, text, self.limits)
+            for kind, place, segments, text in (
+                *self._rests(),
+                *self._spins(),
+                *self._swings(),
+                *self._together(),
+            )
+        ]
         self.places = np.unique(np.round([motion.place for motion in self.motions], 9), axis=0)
-        self.place_of = np.array([int(np.argmin(np.abs(self.places - motion.place).sum(axis=1))) for motion in self.motions])
+        self.place_of = np.array(
+            [
+                int(np.argmin(np.abs(self.places - motion.place).sum(axis=1)))
+                for motion in self.motions
+            ]
+        )
 
     def _rests(self):
         for place in self.spread:
             yield MotionKind.MOVE, place, (), ''
             for dwell in DWELLS:
-                yield MotionKind.POSE, place, self._builder(place).rest(dwell).segments, f'rest for {dwell:g} s'
+                yield (
+                    MotionKind.POSE,
+                    place,
+                    self._builder(place).rest(dwell).segments,
+                    f'rest for {dwell:g} s',
+                )
 
     def _spins(self):
         moving = np.flatnonzero(self.limits.turns & (self.limits.upper > self.limits.lower))
@@ -228,8 +279,11 @@ class MotionLibrary:
                     rates = np.zeros(len(self.names))
                     rates[joint] = share * self.limits.speed[joint]
                     if self.limits.endless[joint]:
-                        yield from ((MotionKind.SPIN, *self._whole_turns(place, sense * rates, seconds))
-                                    for sense in (1.0, -1.0) for seconds in SPIN_TIME)
+                        yield from (
+                            (MotionKind.SPIN, *self._whole_turns(place, sense * rates, seconds))
+                            for sense in (1.0, -1.0)
+                            for seconds in SPIN_TIME
+                        )
                     elif made := self._sweep(place, rates):
                         yield MotionKind.SPIN, *made
 
@@ -249,15 +303,24 @@ class MotionLibrary:
         for number, joints in enumerate(sets):
             for place in self._subset(TOGETHER_PLACES, number + 2):
                 frequency = np.full(len(self.names), 0.5)
-                frequency[list(joints)] = 0.5 * np.array([1.0, 1.4, 0.7, 1.7, 0.6, 1.2, 0.85, 1.55] * 2)[:len(joints)]
+                frequency[list(joints)] = (
+                    0.5 * np.array([1.0, 1.4, 0.7, 1.7, 0.6, 1.2, 0.85, 1.55] * 2)[: len(joints)]
+                )
                 for seconds in SWING_TIME:
-                    yield MotionKind.TOGETHER, *self._swing(place, np.isin(np.arange(len(self.names)), joints), frequency, seconds)
+                    yield (
+                        MotionKind.TOGETHER,
+                        *self._swing(
+                            place, np.isin(np.arange(len(self.names)), joints), frequency, seconds
+                        ),
+                    )
         for pair in pairs:
             if self.limits.endless[list(pair)].all():
                 for place in self._subset(TOGETHER_PLACES, sum(pair)):
                     for sense in (1.0, -1.0):
                         rates = np.zeros(len(self.names))
-                        rates[list(pair)] = self.limits.speed[list(pair)].min() * np.array([1.0, sense])
+                        rates[list(pair)] = self.limits.speed[list(pair)].min() * np.array(
+                            [1.0, sense]
+                        )
                         yield MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0)
 
     def _subset(self, count: int, first: int) -> np.ndarray:
@@ -277,7 +340,11 @@ class MotionLibrary:
         turns = np.ceil((seconds * speed + extra) / (2 * np.pi))
         held = (2 * np.pi * turns - extra) / speed
         ending = 'turn' if turns == 1 else 'turns'
-        return place, self._spun(place, rates, held), f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}'
+        return (
+            place,
+            self._spun(place, rates, held),
+            f'spin {self._rate_words(rates)} for {turns:.0f} whole {ending}',
+        )
 
     def _sweep(self, place, rates):
         """Turn a limited joint at a constant rate through its range and back; None if that is too short for a window."""
@@ -290,7 +357,11 @@ class MotionLibrary:
             held = self._longest(start, share * there, joint)
             if held >= SPIN_TIME[0]:
                 segments = self._spun(start, share * there, min(held, SPIN_TIME[1]))
-                return start, segments, f'sweep {self._rate_words(share * rates)} for {min(held, SPIN_TIME[1]):.1f} s and back'
+                return (
+                    start,
+                    segments,
+                    f'sweep {self._rate_words(share * rates)} for {min(held, SPIN_TIME[1]):.1f} s and back',
+                )
         return None
 
     def _longest(self, start, rates, joint):
@@ -298,7 +369,9 @@ class MotionLibrary:
         trial = self._spun(start, rates, 1.0)
         time = np.linspace(0.0, sum(segment.duration for segment in trial), 400)
         reached = np.abs(motion_at(trial, time).position[:, joint] - start[joint]).max()
-        return 1.0 + (0.96 * (self.limits.upper[joint] - self.limits.lower[joint]) - reached) / np.abs(rates[0, joint])
+        return 1.0 + (
+            0.96 * (self.limits.upper[joint] - self.limits.lower[joint]) - reached
+        ) / np.abs(rates[0, joint])
 
     def _spun(self, place, rates, seconds) -> tuple[Segment, ...]:
         return self._builder(place).spin(np.degrees(rates), seconds).segments
@@ -309,20 +382,49 @@ class MotionLibrary:
         unit = np.where(shares, 1.0, 0.0)
         swung = self._builder(np.zeros(len(place))).swing(unit, frequency, seconds).segments
         motion = motion_at(swung, np.linspace(0.0, seconds, int(60 * seconds)))
-        most = [np.maximum(np.abs(values).max(axis=0), 1e-9) for values in (motion.position, motion.rate, motion.acceleration)]
+        most = [
+            np.maximum(np.abs(values).max(axis=0), 1e-9)
+            for values in (motion.position, motion.rate, motion.acceleration)
+        ]
         lower, upper = reachable(self.limits)
         room = np.where(self.limits.endless, np.inf, 0.48 * (upper - lower))
-        reach = [room / most[0], self.limits.speed / most[1], self.limits.acceleration / most[2],
-                 np.array([MAX_SWING[bool(turning)] for turning in self.limits.turns])]
-        amplitude = 0.99 * unit * np.minimum.reduce(reach)   # the largest values are between the instants of `motion`
+        reach = [
+            room / most[0],
+            self.limits.speed / most[1],
+            self.limits.acceleration / most[2],
+            np.array([MAX_SWING[bool(turning)] for turning in self.limits.turns]),
+        ]
+        amplitude = (
+            0.99 * unit * np.minimum.reduce(reach)
+        )  # the largest values are between the instants of `motion`
         middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))
-        far = ', '.join(f'{name} by {value:.0f}° at {hertz:.2g} Hz' if turning else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'
-                        for name, size, value, hertz, turning, on in
-                        zip(self.names, amplitude, np.degrees(amplitude), frequency, self.limits.turns, unit, strict=True) if on)
-        return middle, self._builder(middle).swing(amplitude, frequency, seconds).segments, f'swing {far} for {seconds:g} s'
+        far = ', '.join(
+            f'{name} by {value:.0f}° at {hertz:.2g} Hz'
+            if turning
+            else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'
+            for name, size, value, hertz, turning, on in zip(
+                self.names,
+                amplitude,
+                np.degrees(amplitude),
+                frequency,
+                self.limits.turns,
+                unit,
+                strict=True,
+            )
+            if on
+        )
+        return (
+            middle,
+            self._builder(middle).swing(amplitude, frequency, seconds).segments,
+            f'swing {far} for {seconds:g} s',
+        )
 
     def _rate_words(self, rates: Sequence[float]) -> str:
-        return ' and '.join(f'{name} at {np.degrees(rate):+.0f} deg/s' for name, rate in zip(self.names, rates, strict=True) if rate)
+        return ' and '.join(
+            f'{name} at {np.degrees(rate):+.0f} deg/s'
+            for name, rate in zip(self.names, rates, strict=True)
+            if rate
+        )
 
 
 SPEED, ACCELERATION = 60.0 * DEG, 90.0 * DEG
@@ -331,5 +433,11 @@ SPEED, ACCELERATION = 60.0 * DEG, 90.0 * DEG
 
 def yaw_table(gravity: float | None = None) -> Table:
     """Return the table: one vertical joint without end, whose angle is known from odometry or marks on the floor."""
-    joint = Joint('yaw', (0.0, 0.0, 1.0), limits=JointLimits(None, None, SPEED, ACCELERATION, endless=True))
-    return Table((joint,), gravity=STANDARD_GRAVITY if gravity is None else gravity, mount_xyz=(0.0, 0.0, 0.0))
+    joint = Joint(
+        'yaw', (0.0, 0.0, 1.0), limits=JointLimits(None, None, SPEED, ACCELERATION, endless=True)
+    )
+    return Table(
+        (joint,),
+        gravity=STANDARD_GRAVITY if gravity is None else gravity,
+        mount_xyz=(0.0, 0.0, 0.0),
+    )

@@ -103,18 +103,30 @@ class PathWatch:
         self._remember(time, place)
         rests = self._rests[self._at]
         # Joints may end a rest before the scheduled time, so its end is evaluated as well.
-        stop = np.searchsorted(self._time, self._time[self._rest_end[self._at]] + elapsed + MAX_LEAD_SECONDS, side='right')
+        stop = np.searchsorted(
+            self._time,
+            self._time[self._rest_end[self._at]] + elapsed + MAX_LEAD_SECONDS,
+            side='right',
+        )
         ahead = slice(self._at, max(stop, self._at + 1))
         away = np.max(np.abs(self._path[ahead] - place), axis=1)
         fits = np.flatnonzero(away <= max(DEAD_BAND, np.min(away)))
         # The remainder below a step is kept; otherwise a slow pace would never end a rest.
         expected = self.progress + self._remainder + elapsed * (self.pace if rests else 1.0)
-        before, self._at = self._at, self._at + int(fits[np.argmin(np.abs(self._time[ahead][fits] - expected))])
-        self._remainder = float(np.clip(expected - self.progress, -PATH_STEP_SECONDS, PATH_STEP_SECONDS))
+        before, self._at = (
+            self._at,
+            self._at + int(fits[np.argmin(np.abs(self._time[ahead][fits] - expected))]),
+        )
+        self._remainder = float(
+            np.clip(expected - self.progress, -PATH_STEP_SECONDS, PATH_STEP_SECONDS)
+        )
         self.deviation = np.abs(self._path[self._at] - place)
         further = self._at > before or self.at_end
         if further and not rests and self.has_begun:
-            self._came, self._took = self._came + float(self._time[self._at] - self._time[before]), self._took + elapsed + self.waited
+            self._came, self._took = (
+                self._came + float(self._time[self._at] - self._time[before]),
+                self._took + elapsed + self.waited,
+            )
         self.waited, self._now = 0.0 if further else self.waited + elapsed, now
         if self.waited == 0.0:
             self._further = now
@@ -135,8 +147,8 @@ class PathWatch:
         """Return the joint with the smallest share of the commanded motion: before this point after a deviation, after it in a stall."""
         near, place = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1, self._recent[-1][1]
         if self.has_strayed:
-            wanted = np.ptp(self._path[max(self._at - near, 0):self._at + 1], axis=0)
-        else:   # distance to the following path: of joints with equal motion, a joint that has arrived is not the cause
-            wanted = np.max(np.abs(self._path[self._at:self._at + near + 1] - place), axis=0)
+            wanted = np.ptp(self._path[max(self._at - near, 0) : self._at + 1], axis=0)
+        else:  # distance to the following path: of joints with equal motion, a joint that has arrived is not the cause
+            wanted = np.max(np.abs(self._path[self._at : self._at + near + 1] - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
         return int(np.argmax(wanted - moved - LATENESS_TIE * self._most))

@@ -17,7 +17,12 @@ from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints, limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.coordinates import Coordinates, ToldApart, WithinTolerances
-from imu_calibration.planning.motion_library import MotionKind, MotionLibrary, PlannedMotion, trajectory
+from imu_calibration.planning.motion_library import (
+    MotionKind,
+    MotionLibrary,
+    PlannedMotion,
+    trajectory,
+)
 from imu_calibration.planning.planning_problem import PROBABILITY, PlanningProblem
 from imu_calibration.planning.posterior import Posterior
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -35,7 +40,15 @@ MIN_PLAN_GAIN = 2e-3
 class CandidateMotions:
     """The gain of every motion from where the joints are."""
 
-    def __init__(self, problem: PlanningProblem, posterior: Posterior, place: int, *, margin: float = 1.0, factor: float = 1.0):
+    def __init__(
+        self,
+        problem: PlanningProblem,
+        posterior: Posterior,
+        place: int,
+        *,
+        margin: float = 1.0,
+        factor: float = 1.0,
+    ):
         self.places = problem.library.place_of
         self.seconds = problem.seconds + problem.way_seconds[place, self.places]
         size = posterior.size
@@ -54,10 +67,14 @@ class CandidateMotions:
     @property
     def best(self) -> int:
         """The motion with the largest gain per second."""
-        return int(np.argmax(np.where(self.possible, self.gain / np.maximum(self.seconds, 1e-9), -np.inf)))
+        return int(
+            np.argmax(np.where(self.possible, self.gain / np.maximum(self.seconds, 1e-9), -np.inf))
+        )
 
 
-def greedy(problem: PlanningProblem, start: int, *, first: Sequence[int] = (), longest: float = np.inf) -> list[int]:
+def greedy(
+    problem: PlanningProblem, start: int, *, first: Sequence[int] = (), longest: float = np.inf
+) -> list[int]:
     """
     Return motions that reach the goal, or the smallest distance to it, each with the best gain per second at its step.
 
@@ -83,7 +100,9 @@ def greedy(problem: PlanningProblem, start: int, *, first: Sequence[int] = (), l
         choice = CandidateMotions(problem, posterior, place, margin=margin, factor=factor)
         must = len(chosen) < len(first)
         number = first[len(chosen)] if must else choice.best
-        if not must and (choice.hopeless(number) or spent + float(choice.seconds[number]) > longest):
+        if not must and (
+            choice.hopeless(number) or spent + float(choice.seconds[number]) > longest
+        ):
             break
         taken.append((factor * choice.information[number], float(choice.seconds[number])))
         posterior.take(choice.information[number], taken[-1][1])
@@ -102,14 +121,18 @@ def greedy(problem: PlanningProblem, start: int, *, first: Sequence[int] = (), l
 
 def remaining(problem: PlanningProblem, sequence: Sequence[int], start: int) -> float:
     """Return the distance to the goal after motions; 0 where they reach it."""
-    return float(problem.goal.left(problem.covariance_after(sequence, start, cautious=True)[0][None])[0])
+    return float(
+        problem.goal.left(problem.covariance_after(sequence, start, cautious=True)[0][None])[0]
+    )
 
 
-def exchanged(problem: PlanningProblem, sequence: Sequence[int], start: int, *, fixed: int = 0) -> list[int]:
+def exchanged(
+    problem: PlanningProblem, sequence: Sequence[int], start: int, *, fixed: int = 0
+) -> list[int]:
     """Return a shorter plan that does as much: motions are left out, latest first and none of the first `fixed`."""
     best, goal = list(sequence), remaining(problem, sequence, start) + 1e-9
     for place in range(len(best) - 1, fixed - 1, -1):
-        trial = best[:place] + best[place + 1:]
+        trial = best[:place] + best[place + 1 :]
         if remaining(problem, trial, start) <= goal:
             best = trial
     return best
@@ -170,7 +193,11 @@ class Plan:
     @property
     def scope(self) -> str:
         """Motions to choose from, in a sentence about what is out of reach."""
-        return 'by hand' if self.start is None else 'for every motion of these joints within their limits'
+        return (
+            'by hand'
+            if self.start is None
+            else 'for every motion of these joints within their limits'
+        )
 
     @property
     def seconds(self) -> float:
@@ -189,7 +216,10 @@ class Plan:
     @property
     def points(self) -> TrajectoryPoints:
         """The whole plan as one trajectory."""
-        return trajectory(tuple(self.model.joint_names), tuple(segment for one in self.segments for segment in one))
+        return trajectory(
+            tuple(self.model.joint_names),
+            tuple(segment for one in self.segments for segment in one),
+        )
 
 
 class Planner:
@@ -211,14 +241,18 @@ class Planner:
     def take(self, calibration: Calibration) -> None:
         """Replace the prediction by the covariance of a calibration, for the parameters that the model shares with it."""
         names = {name: k for k, name in enumerate(calibration.param_names)}
-        self.problem.known = self.problem.coordinates.information_from(names, calibration.covariance)
+        self.problem.known = self.problem.coordinates.information_from(
+            names, calibration.covariance
+        )
         self._posterior = self.problem.posterior()
 
     @property
     def excess(self) -> dict[str, float]:
         """Standard deviation over tolerance of each requested parameter, estimated or predicted."""
         coordinates = self.problem.coordinates
-        return dict(zip(coordinates.names, coordinates.excess(self._posterior.known).tolist(), strict=True))
+        return dict(
+            zip(coordinates.names, coordinates.excess(self._posterior.known).tolist(), strict=True)
+        )
 
     def next_motion(self, position: np.ndarray) -> Decision:
         """Return the motion with the largest gain per second from where the joints are, and count on it."""
@@ -234,7 +268,11 @@ class Planner:
             return Decision(why=STUCK)
         self._posterior.take(choice.information[number], float(choice.seconds[number]))
         motion = self._named(number)
-        reason = 'a session begins with rests in many attitudes' if must else f'it gains most per second for {", ".join(missing[:3])}'
+        reason = (
+            'a session begins with rests in many attitudes'
+            if must
+            else f'it gains most per second for {", ".join(missing[:3])}'
+        )
         return Decision(motion, reason, motion.seconds_from(position))
 
     def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
@@ -245,9 +283,20 @@ class Planner:
         limits = library.limits
         room = np.stack([position - limits.lower, limits.upper - position])
         away = np.where(room[1] >= room[0], 1.0, -1.0) * np.clip(room.max(axis=0), 0.0, reach)
-        segments = MotionBuilder(len(position), limits=limits, start=position).move_to(position + away).move_to(position).segments
-        return PlannedMotion(MotionKind.MOVE, library.names, np.asarray(position, float), segments,
-                             'a small motion of every joint and back', limits)
+        segments = (
+            MotionBuilder(len(position), limits=limits, start=position)
+            .move_to(position + away)
+            .move_to(position)
+            .segments
+        )
+        return PlannedMotion(
+            MotionKind.MOVE,
+            library.names,
+            np.asarray(position, float),
+            segments,
+            'a small motion of every joint and back',
+            limits,
+        )
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
         """Return the move that turns endless joints with restricted turns back to the middle of their range; None within half a turn."""
@@ -257,9 +306,17 @@ class Planner:
         far = np.abs(position - middle) > np.pi
         if not np.any(far):
             return None
-        return PlannedMotion(MotionKind.MOVE, library.names, np.where(far, middle, position), (), 'unwinding', limits)
+        return PlannedMotion(
+            MotionKind.MOVE, library.names, np.where(far, middle, position), (), 'unwinding', limits
+        )
 
-    def plan(self, position: np.ndarray | None = None, *, with_bound: bool = True, longest: float = np.inf) -> Plan:
+    def plan(
+        self,
+        position: np.ndarray | None = None,
+        *,
+        with_bound: bool = True,
+        longest: float = np.inf,
+    ) -> Plan:
         """Return a whole plan from the present position (default: home)."""
         problem = self.problem
         start = problem.library.spread[0] if position is None else np.asarray(position, float)
@@ -273,14 +330,19 @@ class Planner:
             factor = problem.variance_factor(windows)
             relaxed = problem.relaxation(factor=factor)
             bound = problem.lower_bound(factor=factor, relaxed=relaxed)
-            if seconds > MAX_BOUND_RATIO * bound:   # what limits the relaxed plan counts more: a second attempt
+            if (
+                seconds > MAX_BOUND_RATIO * bound
+            ):  # what limits the relaxed plan counts more: a second attempt
                 weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
                 problem.goal = WithinTolerances(problem.coordinates, weights)
                 other = self._sequence(place, first, longest)
                 problem.goal = goal
                 windows, _, less = problem.timed(other, place)
                 if less < seconds and remaining(problem, other, place) == 0.0:
-                    sequence, bound = other, problem.lower_bound(factor=problem.variance_factor(windows))
+                    sequence, bound = (
+                        other,
+                        problem.lower_bound(factor=problem.variance_factor(windows)),
+                    )
         return self._plan_of(sequence, start, place, bound)
 
     def _sequence(self, place, first, longest):
@@ -294,13 +356,26 @@ class Planner:
 
     def _plan_of(self, sequence, start, place, bound):
         problem, coordinates = self.problem, self.problem.coordinates
-        covariance, cautious = (problem.covariance_after(sequence, place, cautious=each)[0] for each in (False, True))
-        steps = [problem.covariance_after(sequence[:count], place) for count in range(len(sequence) + 1)]
+        covariance, cautious = (
+            problem.covariance_after(sequence, place, cautious=each)[0] for each in (False, True)
+        )
+        steps = [
+            problem.covariance_after(sequence[:count], place) for count in range(len(sequence) + 1)
+        ]
         self._visited.clear()
-        return Plan(coordinates.model, tuple(self._named(number) for number in sequence), np.array([seconds for _, seconds in steps[1:]]),
-                    coordinates.sd(covariance), coordinates.tolerances, coordinates.wanted,
-                    coordinates.excess(np.array([step for step, _ in steps])), problem.goal.missing(cautious), start, bound,
-                    problem.goal.words)
+        return Plan(
+            coordinates.model,
+            tuple(self._named(number) for number in sequence),
+            np.array([seconds for _, seconds in steps[1:]]),
+            coordinates.sd(covariance),
+            coordinates.tolerances,
+            coordinates.wanted,
+            coordinates.excess(np.array([step for step, _ in steps])),
+            problem.goal.missing(cautious),
+            start,
+            bound,
+            problem.goal.words,
+        )
 
     def _named(self, number: int) -> PlannedMotion:
         """Return a motion of the repertoire; a rest where there was one already is a return."""
@@ -311,9 +386,16 @@ class Planner:
         return motion
 
 
-def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: dict | None = None, rate: float = 100.0,
-                 options: CalibrationOptions = CalibrationOptions(), limits: MotionLimits | None = None,
-                 calibration: Calibration | None = None) -> Planner:
+def make_planner(
+    table: Table,
+    *,
+    noise: Mapping[str, NoiseModel],
+    tolerances: dict | None = None,
+    rate: float = 100.0,
+    options: CalibrationOptions = CalibrationOptions(),
+    limits: MotionLimits | None = None,
+    calibration: Calibration | None = None,
+) -> Planner:
     """
     Return the planner of a table or an arm.
 
@@ -335,17 +417,24 @@ def make_planner(table: Table, *, noise: Mapping[str, NoiseModel], tolerances: d
 
     """
     model = choose_model(options, table)
-    values = None if calibration is None else model.start_from(calibration.model, calibration.values)
+    values = (
+        None if calibration is None else model.start_from(calibration.model, calibration.values)
+    )
     coordinates = Coordinates(model, tolerances_of(model, tolerances or options.tolerances), values)
     step = table.joint_noise_rad or 0.0
-    beside = {sensor: replace(own, reference=ReferenceNoise.of_steps(step, sensor)) for sensor, own in noise.items()}
+    beside = {
+        sensor: replace(own, reference=ReferenceNoise.of_steps(step, sensor))
+        for sensor, own in noise.items()
+    }
     planner = Planner(PlanningProblem(MotionLibrary(table, limits), coordinates, beside, rate=rate))
     if calibration is not None:
         planner.take(calibration)
     return planner
 
 
-def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str, NoiseModel], rate: float) -> Plan:
+def plan_by_hand(
+    model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str, NoiseModel], rate: float
+) -> Plan:
     """
     Return the poses and turns that bring every parameter within its tolerance, each the best per second at its time.
 
@@ -359,8 +448,15 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
         Samples per second.
 
     """
-    force_sd, rate_sd = (float(np.sqrt(noise[s].low_variance.mean() / (HOLD_TIME * rate) + sum(p.sd**2 for p in noise[s].bias_processes)))
-                         for s in ('accelerometer', 'gyroscope'))
+    force_sd, rate_sd = (
+        float(
+            np.sqrt(
+                noise[s].low_variance.mean() / (HOLD_TIME * rate)
+                + sum(p.sd**2 for p in noise[s].bias_processes)
+            )
+        )
+        for s in ('accelerometer', 'gyroscope')
+    )
     turn_sd = float(np.sqrt(noise['gyroscope'].low_variance.mean() * (np.pi / TURN_RATE) / rate))
     knowledge = knowledge_at_first(model, tolerances, noise=(force_sd, rate_sd, turn_sd))
     steps = foretold(knowledge)
@@ -370,8 +466,16 @@ def plan_by_hand(model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str
         history.append(knowledge.sd(knowledge.information))
     wanted = ~model.fixed
     missing = np.array(model.model.param_names)[wanted & (history[-1] > tolerances)].tolist()
-    return Plan(model.model, tuple(steps), np.cumsum([step.seconds for step in steps]), history[-1], tolerances, wanted,
-                np.array(history)[:, wanted] / tolerances[wanted], tuple(missing))
+    return Plan(
+        model.model,
+        tuple(steps),
+        np.cumsum([step.seconds for step in steps]),
+        history[-1],
+        tolerances,
+        wanted,
+        np.array(history)[:, wanted] / tolerances[wanted],
+        tuple(missing),
+    )
 
 
 PLAN_FORMAT = 'imu_calibration/plan/1'
@@ -380,18 +484,41 @@ PLAN_FORMAT = 'imu_calibration/plan/1'
 def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     """Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so."""
     begins = [0.0, *plan.ends.tolist()]
-    of_joints = {} if plan.start is None else {
-        'probability': PROBABILITY, 'joints': list(plan.model.joint_names) if plan.motions else []}
+    of_joints = (
+        {}
+        if plan.start is None
+        else {
+            'probability': PROBABILITY,
+            'joints': list(plan.model.joint_names) if plan.motions else [],
+        }
+    )
     return {
         'format': PLAN_FORMAT,
         'seconds': round(plan.seconds, 3),
-        'lower_bound_seconds': None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3),
+        'lower_bound_seconds': None
+        if np.isnan(plan.lower_bound_seconds)
+        else round(plan.lower_bound_seconds, 3),
         **of_joints,
-        'motions': [{'kind': str(motion.kind), 'text': motion.words, 'begins': round(begin, 3), 'ends': round(end, 3),
-                     'seconds': round(motion.seconds, 3), **motion.details}
-                    for motion, begin, end in zip(plan.motions, begins[:-1], begins[1:], strict=True)],
-        'parameters': {name: {'sd': float(f'{plan.sd[k]:.6g}'), 'tolerance': float(f'{plan.tolerances[k]:.6g}'),
-                              'met': name not in plan.missing} for k, name in enumerate(plan.model.param_names) if plan.wanted[k]},
+        'motions': [
+            {
+                'kind': str(motion.kind),
+                'text': motion.words,
+                'begins': round(begin, 3),
+                'ends': round(end, 3),
+                'seconds': round(motion.seconds, 3),
+                **motion.details,
+            }
+            for motion, begin, end in zip(plan.motions, begins[:-1], begins[1:], strict=True)
+        ],
+        'parameters': {
+            name: {
+                'sd': float(f'{plan.sd[k]:.6g}'),
+                'tolerance': float(f'{plan.tolerances[k]:.6g}'),
+                'met': name not in plan.missing,
+            }
+            for k, name in enumerate(plan.model.param_names)
+            if plan.wanted[k]
+        },
         'missing': list(plan.missing),
         'provenance': provenance,
     }
@@ -399,10 +526,20 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
 
 def trajectory_to_mapping(points: TrajectoryPoints) -> dict[str, Any]:
     """Return a trajectory as the fields of trajectory_msgs/JointTrajectory, as ``ros2 topic pub`` reads them."""
-    columns = {'positions': points.position, 'velocities': points.rate, 'accelerations': points.acceleration}
+    columns = {
+        'positions': points.position,
+        'velocities': points.rate,
+        'accelerations': points.acceleration,
+    }
     rows = []
     for k, time in enumerate(points.time):
         seconds, nanoseconds = divmod(round(float(time) * 1e9), 1_000_000_000)
-        rows.append({name: [float(f'{value:.9g}') for value in values[k]] for name, values in columns.items() if values is not None}
-                    | {'time_from_start': {'sec': seconds, 'nanosec': nanoseconds}})
+        rows.append(
+            {
+                name: [float(f'{value:.9g}') for value in values[k]]
+                for name, values in columns.items()
+                if values is not None
+            }
+            | {'time_from_start': {'sec': seconds, 'nanosec': nanoseconds}}
+        )
     return {'joint_names': list(points.joint_names), 'points': rows}

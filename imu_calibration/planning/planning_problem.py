@@ -57,7 +57,14 @@ class PlanningProblem:
 
     """
 
-    def __init__(self, library: MotionLibrary, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float = 100.0):
+    def __init__(
+        self,
+        library: MotionLibrary,
+        coordinates: Coordinates,
+        noise: dict[str, NoiseModel],
+        *,
+        rate: float = 100.0,
+    ):
         self.library, self.coordinates, self.noise, self.rate = library, coordinates, noise, rate
         self.known: np.ndarray | None = None
         """Information about z of an earlier calibration, in addition to the prior."""
@@ -89,8 +96,13 @@ class PlanningProblem:
     def ways(self) -> dict[tuple[int, int], tuple[Segment, ...]]:
         """(place, place) -> the move from one to the other."""
         places = self.library.places
-        return {(a, b): MotionBuilder(len(start), limits=self.library.limits, start=start).move_to(end).segments
-                for a, start in enumerate(places) for b, end in enumerate(places)}
+        return {
+            (a, b): MotionBuilder(len(start), limits=self.library.limits, start=start)
+            .move_to(end)
+            .segments
+            for a, start in enumerate(places)
+            for b, end in enumerate(places)
+        }
 
     @cached_property
     def way_windows(self) -> dict[tuple[int, int], list[PlannedWindow]]:
@@ -106,7 +118,12 @@ class PlanningProblem:
     def way_information(self, place: int) -> np.ndarray:
         """Return the information about z and the biases in the move from a place to each motion, shape (k, m, m)."""
         posterior, targets = self.posterior(), self.library.place_of
-        found = np.array([posterior.information_of(self.way_windows[place, b]) for b in range(len(self.library.places))])
+        found = np.array(
+            [
+                posterior.information_of(self.way_windows[place, b])
+                for b in range(len(self.library.places))
+            ]
+        )
         return found[targets]
 
     @property
@@ -128,13 +145,23 @@ class PlanningProblem:
         """Return the first rests of a session, in widely different attitudes, each place the nearest one; the first rest is longer."""
         rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE]
         left, chosen = {int(self.library.place_of[k]): None for k in rests}, []
-        left = dict.fromkeys(list(left)[:LEAST_RESTS])   # places are in the order of their distance in attitude
+        left = dict.fromkeys(
+            list(left)[:LEAST_RESTS]
+        )  # places are in the order of their distance in attitude
         while len(chosen) < LEAST_RESTS and (left or len(chosen) > 1):
-            if not left:   # a chain with few attitudes returns to them
-                left = dict.fromkeys(int(self.library.place_of[k]) for k in chosen if self.library.place_of[k] != place)
+            if not left:  # a chain with few attitudes returns to them
+                left = dict.fromkeys(
+                    int(self.library.place_of[k])
+                    for k in chosen
+                    if self.library.place_of[k] != place
+                )
             place = min(left, key=lambda at: self.way_seconds[place, at])
             del left[place]
-            here = [k for k in rests if self.library.place_of[k] == place and (chosen or self.seconds[k] >= FIRST_REST)]
+            here = [
+                k
+                for k in rests
+                if self.library.place_of[k] == place and (chosen or self.seconds[k] >= FIRST_REST)
+            ]
             chosen.append(min(here, key=self.seconds.__getitem__))
         return chosen
 
@@ -148,14 +175,20 @@ class PlanningProblem:
         if not isinstance(self.goal, WithinTolerances):
             return 1.0
         counts = np.array([window.samples for window in windows if window.kind == 'static'])
-        rests = (counts.sum()**2 / (counts**2).sum() if len(counts) else 1.0) + (0 if self.known is None else LEAST_RESTS)
+        rests = (counts.sum() ** 2 / (counts**2).sum() if len(counts) else 1.0) + (
+            0 if self.known is None else LEAST_RESTS
+        )
         return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * rests) / (BATCH_DOF * rests))
 
     def least_session(self) -> float:
         """Return the least time of the rests with which a session begins, and of the ways between them, s."""
         rests = self.first_rests(0)
         away = self.way_seconds[~np.eye(len(self.way_seconds), dtype=bool)]
-        return float(self.seconds[rests].sum() + max(len(rests) - 1, 0) * away.min(initial=np.inf)) if len(rests) > 1 else 0.0
+        return (
+            float(self.seconds[rests].sum() + max(len(rests) - 1, 0) * away.min(initial=np.inf))
+            if len(rests) > 1
+            else 0.0
+        )
 
     def lower_bound(self, *, factor: float = 1.0, relaxed: Relaxation | None = None) -> float:
         """
@@ -189,24 +222,44 @@ class PlanningProblem:
         model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
         lengths = np.geomspace(0.01, MAX_REACHABLE_SECONDS, 2000)
         for sensor in SENSORS:
-            for k, parameter in enumerate(range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names)))):
-                prior = coordinates.prior_sd[parameter]**2
-                wanted = coordinates.tolerances[parameter]**2
+            for k, parameter in enumerate(
+                range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names)))
+            ):
+                prior = coordinates.prior_sd[parameter] ** 2
+                wanted = coordinates.tolerances[parameter] ** 2
                 room = 1.0 / (1.0 / wanted - 1.0 / prior) if wanted < prior else np.inf
                 white = factor * self.noise[sensor].low_variance[k % 3] / self.rate
                 enough = least_bias_variance(self.noise[sensor], white, lengths) <= room
-                floor = max(floor, float(lengths[max(int(np.argmax(enough)) - 1, 0)]) if enough.any() else np.inf)
+                floor = max(
+                    floor,
+                    float(lengths[max(int(np.argmax(enough)) - 1, 0)]) if enough.any() else np.inf,
+                )
         return floor
 
-    def relaxation(self, *, common: tuple[float, float] = (0.0, 0.0), factor: float = 1.0) -> Relaxation:
+    def relaxation(
+        self, *, common: tuple[float, float] = (0.0, 0.0), factor: float = 1.0
+    ) -> Relaxation:
         """Return the relaxed plan; `common`: (share of the biases' covariance, seconds of the longest session that counts)."""
         share, seconds = common
         edges = [key for key, windows in self.way_windows.items() if windows]
         own = np.flatnonzero(self.seconds > 0)
-        everything = [*(self.windows[number] for number in own), *(self.way_windows[key] for key in edges)]
+        everything = [
+            *(self.windows[number] for number in own),
+            *(self.way_windows[key] for key in edges),
+        ]
         empty = np.zeros_like(self.coordinates.prior_information)
-        most = np.array([sum((additive_bound(window, self.noise, share=1.0 - share, factor=factor) for window in windows), empty)
-                         for windows in everything])
+        most = np.array(
+            [
+                sum(
+                    (
+                        additive_bound(window, self.noise, share=1.0 - share, factor=factor)
+                        for window in windows
+                    ),
+                    empty,
+                )
+                for windows in everything
+            ]
+        )
         cost = np.concatenate([self.seconds[own], [self.way_seconds[key] for key in edges]])
         prior, asked = self.prior, self.coordinates.asked
         if share:
@@ -221,18 +274,26 @@ class PlanningProblem:
         """
         prior, asked, model = prior.copy(), asked.copy(), self.coordinates.model
         for sensor in SENSORS:
-            for parameter in range(*model.part(sensor, Role.OFFSET).indices(len(model.param_names))):
+            for parameter in range(
+                *model.part(sensor, Role.OFFSET).indices(len(model.param_names))
+            ):
                 place = int(np.argmax(np.abs(self.coordinates.basis[parameter])))
                 before = 1.0 / prior[place, place]
-                offset = share * common_variance(self.noise[sensor], seconds) / self.coordinates.units[parameter]**2
+                offset = (
+                    share
+                    * common_variance(self.noise[sensor], seconds)
+                    / self.coordinates.units[parameter] ** 2
+                )
                 after = before + offset
-                room = (1.0 - before * offset / after) * (after / before)**2
+                room = (1.0 - before * offset / after) * (after / before) ** 2
                 prior[place, place] = 1.0 / after
                 # Without any margin a small number is used: the value then exceeds any session of interest.
                 asked[np.abs(asked[:, place]) > 0.5] /= np.sqrt(max(room, 1e-4))
         return prior, asked
 
-    def timed(self, sequence: Sequence[int], start: int) -> tuple[list[PlannedWindow], np.ndarray, float]:
+    def timed(
+        self, sequence: Sequence[int], start: int
+    ) -> tuple[list[PlannedWindow], np.ndarray, float]:
         """Return (windows, their middles, total time) of motions one after the other from a place, with the ways between them."""
         windows, times, now, place = [], [], 0.0, start
         for number in sequence:
@@ -245,12 +306,19 @@ class PlanningProblem:
             place = target
         return windows, np.array(times), float(now)
 
-    def covariance_after(self, sequence: Sequence[int], start: int, *, cautious: bool = False) -> tuple[np.ndarray, float]:
+    def covariance_after(
+        self, sequence: Sequence[int], start: int, *, cautious: bool = False
+    ) -> tuple[np.ndarray, float]:
         """Return (covariance of z, total time) after motions one after the other from a place; `cautious`: with `variance_factor`."""
         windows, times, seconds = self.timed(sequence, start)
         total = self.prior
         if windows:
-            total = total + exact_information(windows, times, self.noise, factor=self.variance_factor(windows) if cautious else 1.0)
+            total = total + exact_information(
+                windows,
+                times,
+                self.noise,
+                factor=self.variance_factor(windows) if cautious else 1.0,
+            )
         return np.linalg.inv(total), seconds
 
     def best_covariance(self, seconds: float) -> np.ndarray:
@@ -259,12 +327,18 @@ class PlanningProblem:
 
         Every motion fills the whole time at once, and the biases are independent between windows.
         """
-        moves = [(windows, float(self.way_seconds[key])) for key, windows in self.way_windows.items() if windows]
+        moves = [
+            (windows, float(self.way_seconds[key]))
+            for key, windows in self.way_windows.items()
+            if windows
+        ]
         everything = [*zip(self.windows, self.seconds.tolist(), strict=True), *moves]
         total = self.prior
         for windows, length in everything:
             if windows:
-                total = total + sum(additive_bound(window, self.noise) for window in windows) * max(seconds / length, 1.0)
+                total = total + sum(additive_bound(window, self.noise) for window in windows) * max(
+                    seconds / length, 1.0
+                )
         return np.linalg.inv(total)
 
 
@@ -279,19 +353,36 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
         Samples per second.
 
     """
-    figures = {'accelerometer': (noise.accel_density, noise.accel_instability, noise.accel_resolution),
-               'gyroscope': (noise.gyro_density, noise.gyro_instability, noise.gyro_resolution)}
-    return {sensor: NoiseModel(np.full(3, density**2 * rate + resolution**2 / 12), np.ones(3),
-                               bias_processes=(BiasProcess(instability, noise.correlation_time),) if instability > 0 else ())
-            for sensor, (density, instability, resolution) in figures.items()}
+    figures = {
+        'accelerometer': (noise.accel_density, noise.accel_instability, noise.accel_resolution),
+        'gyroscope': (noise.gyro_density, noise.gyro_instability, noise.gyro_resolution),
+    }
+    return {
+        sensor: NoiseModel(
+            np.full(3, density**2 * rate + resolution**2 / 12),
+            np.ones(3),
+            bias_processes=(BiasProcess(instability, noise.correlation_time),)
+            if instability > 0
+            else (),
+        )
+        for sensor, (density, instability, resolution) in figures.items()
+    }
 
 
 def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel of samples at `rate` (Hz): the identified model, or that of a grade."""
     if grade not in GRADES:
-        raise InputError(f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise")
+        raise InputError(
+            f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise"
+        )
     if figures is None:
         return noise_of_grade(GRADES[grade].noise, rate)
-    slow = bias_processes(figures)   # the slow part as Gauss-Markov processes
-    return {sensor: NoiseModel(np.array([axis.white**2 * rate for axis in figures.sensor(sensor)]), np.ones(3), bias_processes=slow[sensor])
-            for sensor in SENSORS}
+    slow = bias_processes(figures)  # the slow part as Gauss-Markov processes
+    return {
+        sensor: NoiseModel(
+            np.array([axis.white**2 * rate for axis in figures.sensor(sensor)]),
+            np.ones(3),
+            bias_processes=slow[sensor],
+        )
+        for sensor in SENSORS
+    }

@@ -38,7 +38,9 @@ class Relaxation:
     """How much each parameter limits the relaxed plan, sum 1, shape (p,)."""
 
 
-def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, asked: np.ndarray) -> Relaxation:
+def relax(
+    information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, asked: np.ndarray
+) -> Relaxation:
     """
     Return the relaxed plan with the best certificate found; NaN where a tolerance is out of reach.
 
@@ -60,7 +62,13 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     weights = np.full(len(asked), 1.0 / len(asked))
     if _worst(known, asked) <= 1.0:
         return Relaxation(0.0, weights)
-    if _worst(known + MAX_REACHABLE_SECONDS * np.sum(information / seconds[:, None, None], axis=0), asked) > 1.0:
+    if (
+        _worst(
+            known + MAX_REACHABLE_SECONDS * np.sum(information / seconds[:, None, None], axis=0),
+            asked,
+        )
+        > 1.0
+    ):
         return Relaxation(np.nan, weights)
     flat = used = information.reshape(len(seconds), -1)
     kept, root = np.arange(len(seconds)), np.linalg.cholesky(known)
@@ -70,7 +78,9 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
     for number in range(MAX_WEIGHT_STEPS):
         direction = np.tensordot(share[kept], used, 1).reshape(known.shape)
         scale = _scale(direction, root, rows)
-        covariance = inverse_normal(known + scale * direction)   # nearly singular in unreachable directions
+        covariance = inverse_normal(
+            known + scale * direction
+        )  # nearly singular in unreachable directions
         x = covariance @ asked.T
         variance = np.einsum('pn,np->p', asked, x)
         prices = (x * weights) @ x.T
@@ -85,7 +95,9 @@ def relax(information: np.ndarray, seconds: np.ndarray, known: np.ndarray, *, as
                 best = Relaxation(float(bound), weights)
             if relaxed < CERTIFICATE_RATIO * best.seconds:
                 break
-            kept = np.flatnonzero((worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds)))
+            kept = np.flatnonzero(
+                (worth > 0.3 * worth.max()) | (share * seconds > 1e-4 * (share @ seconds))
+            )
             used = flat[kept]
         spent = share[kept] * seconds[kept]
         share[kept] *= np.sqrt(np.maximum(worth[kept], 1e-12) / (worth[kept] @ spent / spent.sum()))
@@ -101,9 +113,11 @@ def _worst(information, asked):
 
 def _scale(direction, root, rows):
     """Return how much of `direction` must be added to ``root @ root.T`` for the worst parameter to meet its tolerance."""
-    inner = scipy.linalg.solve_triangular(root, scipy.linalg.solve_triangular(root, direction, lower=True).T, lower=True)
+    inner = scipy.linalg.solve_triangular(
+        root, scipy.linalg.solve_triangular(root, direction, lower=True).T, lower=True
+    )
     values, vectors = scipy.linalg.eigh(0.5 * (inner + inner.T))
-    squares = (rows @ vectors)**2
+    squares = (rows @ vectors) ** 2
     low, high = -30.0, 60.0
     while high - low > 1e-4:
         middle = 0.5 * (low + high)
@@ -162,7 +176,9 @@ class WindowPredictor:
 
     """
 
-    def __init__(self, table: Table, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float):
+    def __init__(
+        self, table: Table, coordinates: Coordinates, noise: dict[str, NoiseModel], *, rate: float
+    ):
         self.table, self.coordinates, self.noise, self.rate = table, coordinates, noise, rate
 
     def predict(self, motions: Sequence[tuple[Segment, ...]]) -> list[list[PlannedWindow]]:
@@ -170,19 +186,33 @@ class WindowPredictor:
         cuts = [list(self._cut(segments)) for segments in motions]
         flat = [cut for one in cuts for cut in one]
         blocks = np.cumsum([len(cut[0]) for cut in flat]) // BELIEF_BLOCK_ROWS
-        wander = cache(self._wander)   # many motions last equally long, at least a move and its way back
-        windows = iter([window for block in np.unique(blocks)
-                        for window in self._windows([flat[k] for k in np.flatnonzero(blocks == block)], wander)])
+        wander = cache(
+            self._wander
+        )  # many motions last equally long, at least a move and its way back
+        windows = iter(
+            [
+                window
+                for block in np.unique(blocks)
+                for window in self._windows(
+                    [flat[k] for k in np.flatnonzero(blocks == block)], wander
+                )
+            ]
+        )
         return [[next(windows) for _ in one] for one in cuts]
 
     def _windows(self, cuts, wander):
         motion = JointMotion.concatenate(cut[0] for cut in cuts)
         edges = np.cumsum([0] + [len(cut[0]) for cut in cuts])
         model = self.coordinates.folded
-        temperature = np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None
+        temperature = (
+            np.full(len(motion), model.temperature_ref_c) if model.needs_temperature else None
+        )
         references = References(model, self.table, motion, temperature_c=temperature)
         designs = {sensor: columns(references, sensor) for sensor in SENSORS}
-        return [self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander) for cut, a, b in zip(cuts, edges, edges[1:], strict=False)]
+        return [
+            self._window(cut, {s: designs[s][a:b] for s in SENSORS}, wander)
+            for cut, a, b in zip(cuts, edges, edges[1:], strict=False)
+        ]
 
     def _cut(self, segments) -> Iterator[tuple[JointMotion, str, float, float, float]]:
         """Yield (motion at some instants, kind, middle, length with settling, seconds of data) of each window."""
@@ -192,9 +222,19 @@ class WindowPredictor:
             lost = 0.0 if kind == 'dynamic' else WINDOW_SETTINGS.settling
             seconds = segment.duration - lost
             if seconds >= getattr(WINDOW_SETTINGS, f'{kind}_minimum'):
-                count = LEAST_INSTANTS if kind == 'static' else max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
+                count = (
+                    LEAST_INSTANTS
+                    if kind == 'static'
+                    else max(int(np.ceil(seconds * SAMPLING)), LEAST_INSTANTS)
+                )
                 time = lost + (np.arange(count) + 0.5) / count * seconds
-                yield Profile('', (segment,)).at(time), kind, begin + lost + seconds / 2, segment.duration, seconds
+                yield (
+                    Profile('', (segment,)).at(time),
+                    kind,
+                    begin + lost + seconds / 2,
+                    segment.duration,
+                    seconds,
+                )
             begin += segment.duration
 
     def _wander(self, sensor, count, seconds):
@@ -204,7 +244,11 @@ class WindowPredictor:
         Given its value in the middle, the bias before is independent of the bias after, with the mirrored covariance.
         """
         half = count // 2
-        return np.linalg.eigh(self.noise[sensor].wander_within(((np.arange(count - half, count) + 0.5) / count - 0.5) * seconds))
+        return np.linalg.eigh(
+            self.noise[sensor].wander_within(
+                ((np.arange(count - half, count) + 0.5) / count - 0.5) * seconds
+            )
+        )
 
     def _window(self, cut, designs, wander_of):
         motion, kind, middle, length, seconds = cut
@@ -216,7 +260,9 @@ class WindowPredictor:
             reference = noise.reference.variance([kind], np.array([seconds]))[0]
             after, turned = wander_of(sensor, count, seconds)
             wander = np.concatenate([after, np.zeros(count % 2), after])
-            early, centre, late = np.split(np.column_stack([np.ones(count), design]), [len(after), count - len(after)])
+            early, centre, late = np.split(
+                np.column_stack([np.ones(count), design]), [len(after), count - len(after)]
+            )
             # Without the copy numpy multiplies reversed rows without BLAS.
             rows = np.concatenate([turned.T @ early[::-1].copy(), centre, turned.T @ late])
             ones, rows = rows[:, 0], rows[:, 1:]
@@ -249,30 +295,35 @@ class Posterior:
 
     def __init__(self, information: np.ndarray, noise: dict[str, NoiseModel]):
         self.size, self.noise = len(information), noise
-        processes = [process for sensor in SENSORS for process in noise[sensor].bias_processes for _ in range(3)]
+        processes = [
+            process
+            for sensor in SENSORS
+            for process in noise[sensor].bias_processes
+            for _ in range(3)
+        ]
         self._power = np.array([process.sd**2 for process in processes])
         self._times = np.array([process.time for process in processes])
         total = self.size + len(processes)
         self.covariance = np.zeros((total, total))
-        self.covariance[:self.size, :self.size] = np.linalg.inv(information)
-        self.covariance[self.size:, self.size:] = np.diag(self._power)
+        self.covariance[: self.size, : self.size] = np.linalg.inv(information)
+        self.covariance[self.size :, self.size :] = np.diag(self._power)
         self._last = 0.0
 
     @property
     def known(self) -> np.ndarray:
         """Covariance of z, shape (n, n)."""
-        return self.covariance[:self.size, :self.size]
+        return self.covariance[: self.size, : self.size]
 
     def information_of(self, windows: Sequence[PlannedWindow]) -> np.ndarray:
         """Return the information about z and the biases in the windows of a motion, shape (m, m)."""
         total = np.zeros_like(self.covariance)
         for window in windows:
             first = self.size
-            total[:self.size, :self.size] += window.within
+            total[: self.size, : self.size] += window.within
             for sensor in SENSORS:
                 noise = self.noise[sensor]
                 rows = np.zeros((3, len(total)))
-                rows[:, :self.size] = window.means[sensor]
+                rows[:, : self.size] = window.means[sensor]
                 for number in range(3 * len(noise.bias_processes)):
                     rows[number % 3, first + number] = 1.0
                 first += 3 * len(noise.bias_processes)
@@ -296,7 +347,9 @@ class Posterior:
         ndarray, shape (k, m, m)
 
         """
-        steps, motion = np.unique(0.5 * (self._last + seconds), return_inverse=True)   # many motions last equally long
+        steps, motion = np.unique(
+            0.5 * (self._last + seconds), return_inverse=True
+        )  # many motions last equally long
         return np.linalg.inv(np.linalg.inv(self._forgotten(steps))[motion] + information)
 
     def take(self, information: np.ndarray, seconds: float) -> None:
@@ -306,15 +359,20 @@ class Posterior:
 
     def _forgotten(self, steps):
         decay = np.ones((len(steps), len(self.covariance)))
-        decay[:, self.size:] = np.exp(-steps[:, None] / self._times)
+        decay[:, self.size :] = np.exp(-steps[:, None] / self._times)
         spread = decay[:, :, None] * self.covariance * decay[:, None, :]
         at = np.arange(self.size, len(self.covariance))
-        spread[:, at, at] += (1 - decay[:, at]**2) * self._power
+        spread[:, at, at] += (1 - decay[:, at] ** 2) * self._power
         return spread
 
 
-def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise: dict[str, NoiseModel], *,
-                      factor: float = 1.0) -> np.ndarray:
+def exact_information(
+    windows: Sequence[PlannedWindow],
+    times: np.ndarray,
+    noise: dict[str, NoiseModel],
+    *,
+    factor: float = 1.0,
+) -> np.ndarray:
     """
     Return the information about z of the windows of a whole plan, as the calibration weighs them, shape (n, n).
 
@@ -332,14 +390,22 @@ def exact_information(windows: Sequence[PlannedWindow], times: np.ndarray, noise
     total = np.sum([window.within for window in windows], axis=0) / factor
     for sensor in SENSORS:
         model = noise[sensor]
-        variance = factor * np.stack([window.variance[sensor] for window in windows]) + model.offset_sd**2
-        whitening = Whitening(variance, times, [np.arange(len(times))], processes=model.bias_processes)
-        rows = whitening(np.stack([window.means[sensor] for window in windows])).reshape(-1, len(total))
+        variance = (
+            factor * np.stack([window.variance[sensor] for window in windows]) + model.offset_sd**2
+        )
+        whitening = Whitening(
+            variance, times, [np.arange(len(times))], processes=model.bias_processes
+        )
+        rows = whitening(np.stack([window.means[sensor] for window in windows])).reshape(
+            -1, len(total)
+        )
         total = total + rows.T @ rows
     return total
 
 
-def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share: float = 1.0, factor: float = 1.0) -> np.ndarray:
+def additive_bound(
+    window: PlannedWindow, noise: dict[str, NoiseModel], *, share: float = 1.0, factor: float = 1.0
+) -> np.ndarray:
     """
     Return an information matrix that bounds from above what a window adds in any plan, shape (n, n).
 
@@ -353,7 +419,10 @@ def additive_bound(window: PlannedWindow, noise: dict[str, NoiseModel], *, share
     total = window.within / factor
     for sensor in SENSORS:
         model = noise[sensor]
-        floor = share * sum(process.sd**2 * np.tanh(window.length / (4 * process.time)) for process in model.bias_processes)
+        floor = share * sum(
+            process.sd**2 * np.tanh(window.length / (4 * process.time))
+            for process in model.bias_processes
+        )
         variance = factor * window.variance[sensor] + model.offset_sd**2 + floor
         rows = window.means[sensor]
         total += rows.T @ (rows / variance[:, None])
@@ -367,7 +436,10 @@ def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarra
     ``1' G^-1 1`` is the information about a constant with the process, at most ``(T + 2 time) / (2 time sd^2)``, that of observing
     it all the time; of several processes the inverses add up.
     """
-    return sum(process.sd**2 * 2 * process.time / (seconds + 2 * process.time) for process in noise.bias_processes)
+    return sum(
+        process.sd**2 * 2 * process.time / (seconds + 2 * process.time)
+        for process in noise.bias_processes
+    )
 
 
 def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) -> np.ndarray:
@@ -389,8 +461,10 @@ def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) ->
     best = white / seconds
     for chosen in noise.bias_processes:
         k = np.sqrt(1 / chosen.time**2 + 2 * chosen.sd**2 / (chosen.time * white))
-        level, steep = 1 / (chosen.time * k)**2, np.tanh(k * seconds / 2)
-        information = (level * seconds + 2 * (1 - level) * steep / (k * (1 + k * chosen.time * steep))) / white
+        level, steep = 1 / (chosen.time * k) ** 2, np.tanh(k * seconds / 2)
+        information = (
+            level * seconds + 2 * (1 - level) * steep / (k * (1 + k * chosen.time * steep))
+        ) / white
         others = tuple(process for process in noise.bias_processes if process is not chosen)
         rest = common_variance(replace(noise, bias_processes=others), seconds)
         best = np.maximum(best, 1 / information + rest)

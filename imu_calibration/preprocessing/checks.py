@@ -4,7 +4,6 @@ Checks of a recording before the estimate: their registry, and the checks of fro
 `CHECKS` is the registry: a check is a function of the `Evidence` that yields `Finding` objects; adding one is adding an entry.
 """
 
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -12,7 +11,15 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import value_checks
-from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, EvidenceGatherer, RecordingEvidence
+from imu_calibration.preprocessing.recording_evidence import (
+    GOOD,
+    NOTE,
+    REFUSE,
+    WARNING,
+    CheckFinding,
+    EvidenceGatherer,
+    RecordingEvidence,
+)
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, FrozenPart, in_long_runs
 from imu_calibration.preprocessing.stamping import IRREGULAR, MAX_IRREGULAR_SHARE
 from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner, StreamStatistics
@@ -30,27 +37,48 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         noisy = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
-            yield CheckFinding('frozen', REFUSE, f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} '
-                               'samples; check the sensor and its driver')
+            yield CheckFinding(
+                'frozen',
+                REFUSE,
+                f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} '
+                'samples; check the sensor and its driver',
+            )
             continue
         for axis in np.flatnonzero(constant):
             if noisy.any():
-                yield CheckFinding('frozen', REFUSE, f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the '
-                                   'remaining axes do; check the sensor and its driver')
+                yield CheckFinding(
+                    'frozen',
+                    REFUSE,
+                    f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the '
+                    'remaining axes do; check the sensor and its driver',
+                )
         for axis in np.flatnonzero(~constant):
-            moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(evidence.resolution[part], axis)
-            same = (range_[:, part][:, axis] == 0) & ~_at_end(chunks.mean[:, part][:, axis], evidence.ends[part][axis])
+            moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(
+                evidence.resolution[part], axis
+            )
+            same = (range_[:, part][:, axis] == 0) & ~_at_end(
+                chunks.mean[:, part][:, axis], evidence.ends[part][axis]
+            )
             stuck = in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
-                yield CheckFinding('frozen', WARNING,
-                                   f'{sensor} {"xyz"[axis]} is constant for {seconds:.1f} s while different axes move; '
-                                   'check its connection, and exclude that time', samples=int(stuck.sum() * chunks.size))
+                yield CheckFinding(
+                    'frozen',
+                    WARNING,
+                    f'{sensor} {"xyz"[axis]} is constant for {seconds:.1f} s while different axes move; '
+                    'check its connection, and exclude that time',
+                    samples=int(stuck.sum() * chunks.size),
+                )
 
 
 def _at_end(values, ends):
     """Return which values are clipping limits of an output: clipped, not frozen."""
-    return np.logical_or.reduce([np.isclose(values, sign * end.level, rtol=1e-9) & (end.n_clipped > 0) for sign, end in zip((1, -1), ends)])
+    return np.logical_or.reduce(
+        [
+            np.isclose(values, sign * end.level, rtol=1e-9) & (end.n_clipped > 0)
+            for sign, end in zip((1, -1), ends)
+        ]
+    )
 
 
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -61,13 +89,23 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         if part.who != 'joints':
             sensors.setdefault((part.start, part.stop), []).append(part)
     for span, parts in sensors.items():
-        yield CheckFinding('frozen', WARNING, f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats '
-                           f'one reading {span_words([span])}, which its noise does not allow; check the sensor and its driver, and '
-                           'exclude that time', samples=parts[0].samples)
+        yield CheckFinding(
+            'frozen',
+            WARNING,
+            f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats '
+            f'one reading {span_words([span])}, which its noise does not allow; check the sensor and its driver, and '
+            'exclude that time',
+            samples=parts[0].samples,
+        )
     if joints:
-        yield CheckFinding('frozen', WARNING, 'joint states must follow the table, they are constant while the IMU turns, '
-                           f'{span_words([(part.start, part.stop) for part in joints])}; check the driver of the table, or exclude the '
-                           'time in which the IMU was carried', samples=sum(part.samples for part in joints))
+        yield CheckFinding(
+            'frozen',
+            WARNING,
+            'joint states must follow the table, they are constant while the IMU turns, '
+            f'{span_words([(part.start, part.stop) for part in joints])}; check the driver of the table, or exclude the '
+            'time in which the IMU was carried',
+            samples=sum(part.samples for part in joints),
+        )
 
 
 def span_words(spans: Sequence[tuple[float, float]]) -> str:
@@ -83,7 +121,7 @@ STAMP_FAULTS = {
     'backward stamp': 'step back in time: samples that arrive late are left out; publish in order',
     'stray stamp': 'have a stray stamp: a single outlying stamp is excluded',
     'spike': 'are spikes: readings that differ from their neighbours beyond any motion are excluded; if they are many, check the bus and '
-             'the driver',
+    'the driver',
 }
 """Reason for which samples were dropped -> what they do, and the remedy."""
 SPIKE_SHARE = 5e-3
@@ -97,20 +135,37 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     clean = []
     for name, found in evidence.streams.items():
         # Spikes are samples with accepted stamps, and a clock reset drops no sample.
-        total = found.count + sum(count for reason, count in found.dropped.items() if reason not in ('clock reset', 'spike'))
+        total = found.count + sum(
+            count
+            for reason, count in found.dropped.items()
+            if reason not in ('clock reset', 'spike')
+        )
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())
-            yield CheckFinding('stamps', REFUSE, f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total} '
-                               f'only {found.count} do ({reasons}); correct the driver and record again')
+            yield CheckFinding(
+                'stamps',
+                REFUSE,
+                f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total} '
+                f'only {found.count} do ({reasons}); correct the driver and record again',
+            )
             continue
         if found.unstamped:
-            yield CheckFinding('stamps', WARNING, f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
-                               'is used; the driver should stamp each sample at its measurement')
+            yield CheckFinding(
+                'stamps',
+                WARNING,
+                f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
+                'is used; the driver should stamp each sample at its measurement',
+            )
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
-            text = f'{count} of {total} samples {STAMP_FAULTS[reason]}' if reason != 'clock reset' else (
-                f'the stamps jump {"once" if count == 1 else f"{count} times"}: the clock was set while recording; the parts are processed '
-                'separately')
+            text = (
+                f'{count} of {total} samples {STAMP_FAULTS[reason]}'
+                if reason != 'clock reset'
+                else (
+                    f'the stamps jump {"once" if count == 1 else f"{count} times"}: the clock was set while recording; the parts are processed '
+                    'separately'
+                )
+            )
             yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {text}')
         clean += [] if found.dropped else [MESSAGES[name]]
     if clean:
@@ -119,7 +174,11 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def _fast_streams(evidence):
     """Return (message type, StreamStatistics) of the IMU and the joints."""
-    return [(MESSAGES[name], evidence.streams[name]) for name in ('imu', 'joints') if name in evidence.streams]
+    return [
+        (MESSAGES[name], evidence.streams[name])
+        for name in ('imu', 'joints')
+        if name in evidence.streams
+    ]
 
 
 def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -127,8 +186,12 @@ def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     for name, found in _fast_streams(evidence):
         if found.n_gaps:
             severity = WARNING if found.gap_total > GAP_SHARE * found.duration else NOTE
-            yield CheckFinding('gaps', severity, f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s '
-                               f'of {found.duration:.0f} s, the longest {found.longest_step:.2f} s; motion within a gap is not used')
+            yield CheckFinding(
+                'gaps',
+                severity,
+                f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s '
+                f'of {found.duration:.0f} s, the longest {found.longest_step:.2f} s; motion within a gap is not used',
+            )
 
 
 def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -136,11 +199,17 @@ def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     for name, found in _fast_streams(evidence):
         nominal, real = found.rate, found.real_rate
         if nominal and abs(real / nominal - 1) > RATE_SHARE:
-            yield CheckFinding('sampling', WARNING, f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is '
-                               f'{real:.2f} Hz: samples were lost, or stamps are made when messages arrive; check the driver and the '
-                               'load of the recorder')
+            yield CheckFinding(
+                'sampling',
+                WARNING,
+                f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is '
+                f'{real:.2f} Hz: samples were lost, or stamps are made when messages arrive; check the driver and the '
+                'load of the recorder',
+            )
         elif nominal:
-            yield CheckFinding('sampling', GOOD, f'{name}: {real:.2f} Hz, as the steps between stamps promise')
+            yield CheckFinding(
+                'sampling', GOOD, f'{name}: {real:.2f} Hz, as the steps between stamps promise'
+            )
 
 
 def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -148,14 +217,27 @@ def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     for name, found in _fast_streams(evidence):
         faults = []
         if found.stamping is not None:
-            yield CheckFinding('jitter', WARNING if found.stamping.word == IRREGULAR else NOTE,
-                               f"{name}: {found.stamping}; stamps by the sensor's own clock would be better")
-        if found.stamp_step_ns and found.stamp_step_ns % WHOLE_MS == 0 and found.stamp_step_ns < 0.5e9 * found.period:
+            yield CheckFinding(
+                'jitter',
+                WARNING if found.stamping.word == IRREGULAR else NOTE,
+                f"{name}: {found.stamping}; stamps by the sensor's own clock would be better",
+            )
+        if (
+            found.stamp_step_ns
+            and found.stamp_step_ns % WHOLE_MS == 0
+            and found.stamp_step_ns < 0.5e9 * found.period
+        ):
             faults.append(f'all stamps are multiples of {found.stamp_step_ns // WHOLE_MS} ms')
         if found.irregular > MAX_IRREGULAR_SHARE:
-            faults.append(f'{100 * found.irregular:.0f} % of the steps are off the usual {found.period * 1e3:.4g} ms by more than a tenth')
+            faults.append(
+                f'{100 * found.irregular:.0f} % of the steps are off the usual {found.period * 1e3:.4g} ms by more than a tenth'
+            )
         if faults:
-            yield CheckFinding('jitter', NOTE, f"{name}: {', '.join(faults)}; stamps by the sensor's own clock would be better")
+            yield CheckFinding(
+                'jitter',
+                NOTE,
+                f"{name}: {', '.join(faults)}; stamps by the sensor's own clock would be better",
+            )
 
 
 def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -169,21 +251,41 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     shorter = min(imu.duration, joints.duration)
     late = (joints.first_ns - imu.first_ns) * 1e-9
     if overlap <= 0 and shorter > 0:
-        yield CheckFinding('clocks', REFUSE, f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
-                           f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on '
-                           'one computer')
+        yield CheckFinding(
+            'clocks',
+            REFUSE,
+            f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
+            f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on '
+            'one computer',
+        )
     elif overlap < 0.9 * shorter:
-        yield CheckFinding('clocks', WARNING, f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin '
-                           f'{abs(late):.1f} s {"after" if late > 0 else "before"} the Imu: only the overlap is used; are both stamped '
-                           'by one clock?')
+        yield CheckFinding(
+            'clocks',
+            WARNING,
+            f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin '
+            f'{abs(late):.1f} s {"after" if late > 0 else "before"} the Imu: only the overlap is used; are both stamped '
+            'by one clock?',
+        )
 
 
 CHECKS = (
-    value_checks.force_unit, stamps, clocks, frozen, frozen_for_a_time,
-    value_checks.rate_unit, value_checks.full_scale, value_checks.handedness, value_checks.bias, value_checks.gravity,
+    value_checks.force_unit,
+    stamps,
+    clocks,
+    frozen,
+    frozen_for_a_time,
+    value_checks.rate_unit,
+    value_checks.full_scale,
+    value_checks.handedness,
+    value_checks.bias,
+    value_checks.gravity,
     value_checks.clipping,
-    value_checks.repeated_readings, value_checks.resolution, value_checks.temperature,
-    sampling, gaps, jitter,
+    value_checks.repeated_readings,
+    value_checks.resolution,
+    value_checks.temperature,
+    sampling,
+    gaps,
+    jitter,
 )
 """In the order in which they refuse: a wrong unit causes failures of later checks as well."""
 
@@ -221,7 +323,11 @@ class Preflight(EvidenceGatherer):
         """
         self.streams, self.lost = cleaner.statistics(), cleaner.lost
         evidence = self.evidence(self.streams)
-        self.findings = tuple(finding for check in CHECKS for finding in check(evidence)) if 'imu' in evidence.streams else ()
+        self.findings = (
+            tuple(finding for check in CHECKS for finding in check(evidence))
+            if 'imu' in evidence.streams
+            else ()
+        )
         if self._strict:
             refuse(self.findings)
 

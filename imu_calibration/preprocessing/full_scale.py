@@ -66,18 +66,39 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     turns = []
     for first, ((_, start), (stop, _)) in enumerate(zip(rest.ranges, rest.ranges[1:])):
         span = chunks.time[stop] - chunks.time[start - 1]
-        unbroken = whole[start:stop].all() and span < 1.5 * np.median(chunks.duration) * (stop - start + 1)
-        if stop > start and unbroken and span < MAX_TURN_SECONDS and up[first] @ up[first + 1] < np.cos(LEAST_ANGLE):
-            turns.append(((chunks.mean[start:stop, 3:] - rest.rate) * chunks.duration[start:stop, None], up[first], up[first + 1]))
+        unbroken = whole[start:stop].all() and span < 1.5 * np.median(chunks.duration) * (
+            stop - start + 1
+        )
+        if (
+            stop > start
+            and unbroken
+            and span < MAX_TURN_SECONDS
+            and up[first] @ up[first + 1] < np.cos(LEAST_ANGLE)
+        ):
+            turns.append(
+                (
+                    (chunks.mean[start:stop, 3:] - rest.rate) * chunks.duration[start:stop, None],
+                    up[first],
+                    up[first + 1],
+                )
+            )
     if len(turns) < LEAST_TURNS:
         return None
-    turns = turns[::max(len(turns) // MOST_TURNS, 1)]
-    return believed_factor(lambda factor: float(np.median([_missed(vectors / factor, before, after) for vectors, before, after in turns])))
+    turns = turns[:: max(len(turns) // MOST_TURNS, 1)]
+    return believed_factor(
+        lambda factor: float(
+            np.median(
+                [_missed(vectors / factor, before, after) for vectors, before, after in turns]
+            )
+        )
+    )
 
 
 def _missed(vectors, before, after):
     turned = before
-    for step in Rotation.from_rotvec(-vectors).as_matrix():   # gravity turns the other way in the sensor's axes
+    for step in Rotation.from_rotvec(
+        -vectors
+    ).as_matrix():  # gravity turns the other way in the sensor's axes
         turned = step @ turned
     return np.arccos(np.clip(turned @ after, -1.0, 1.0))
 
@@ -117,7 +138,9 @@ class Extremes:
         near = near[below]
         if largest == self.level:
             at = np.flatnonzero(values == largest)
-            self.n_jumps += int(np.count_nonzero(np.where(at > 0, values[at - 1], before) < (1 - JUMP) * largest))
+            self.n_jumps += int(
+                np.count_nonzero(np.where(at > 0, values[at - 1], before) < (1 - JUMP) * largest)
+            )
         if len(near) > MAX_NEAR_OUTPUTS:
             near = np.partition(near, len(near) - MAX_NEAR_OUTPUTS)[-MAX_NEAR_OUTPUTS:]
         for value, count in zip(*np.unique(near, return_counts=True)):
@@ -132,7 +155,9 @@ class Extremes:
     @property
     def n_clipped(self) -> int:
         """Samples at the largest value if their number is far above that of neighbouring values, else 0."""
-        counts = [count for value, count in self._below.items() if value > NEAR_LARGEST_SHARE * self.level][:10]
+        counts = [
+            count for value, count in self._below.items() if value > NEAR_LARGEST_SHARE * self.level
+        ][:10]
         usual = sum(counts) / len(counts) if counts else 1.0
         return self.count if self.count >= max(MIN_CLIPPED_SAMPLES, PILE * usual) else 0
 
@@ -176,7 +201,9 @@ class Turning:
     @property
     def factor(self) -> float:
         """True rate over measured rate: 1, or pi / 180 for deg/s."""
-        return float(np.median(np.linalg.svd(self.matrix, compute_uv=False)[:round(np.trace(self.seen))]))
+        return float(
+            np.median(np.linalg.svd(self.matrix, compute_uv=False)[: round(np.trace(self.seen))])
+        )
 
 
 def relate_turns(chunks: Chunks) -> Turning | None:
@@ -216,10 +243,19 @@ def _fit(direction, change, turn_time, rate):
     normal = design.T @ design
     inverse = np.linalg.pinv(normal + 1e-9 * np.trace(normal) * np.eye(3 * width))
     solution = inverse @ (design.T @ target)
-    rest = float(((target - design @ solution)**2).sum())
-    sd = CHUNK_SD_FACTOR * np.sqrt(np.diag(inverse) * rest / max(len(target) - 3 * width, 1)).reshape(3, width)[:, :-1]
+    rest = float(((target - design @ solution) ** 2).sum())
+    sd = (
+        CHUNK_SD_FACTOR
+        * np.sqrt(np.diag(inverse) * rest / max(len(target) - 3 * width, 1)).reshape(3, width)[
+            :, :-1
+        ]
+    )
     matrix = solution.reshape(3, width)[:, :-1]
-    return matrix, np.linalg.norm(sd, axis=0) < DETERMINED_SD_SHARE * np.linalg.norm(matrix, axis=0), 1.0 - rest / float((target**2).sum())
+    return (
+        matrix,
+        np.linalg.norm(sd, axis=0) < DETERMINED_SD_SHARE * np.linalg.norm(matrix, axis=0),
+        1.0 - rest / float((target**2).sum()),
+    )
 
 
 def _pairs(chunks):
@@ -234,8 +270,16 @@ def _pairs(chunks):
     step = np.diff(chunks.time)
     change = np.diff(direction, axis=0)
     whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
-    whole &= (np.abs(length / usual - 1) < FORCE_BAND) & (np.linalg.norm(chunks.sd[:, :3], axis=1) < FORCE_BAND * usual)
-    good = whole[1:] & whole[:-1] & (step > 0) & (step < 1.5 * np.median(step)) & (np.linalg.norm(change, axis=1) < LARGEST_TURN)
+    whole &= (np.abs(length / usual - 1) < FORCE_BAND) & (
+        np.linalg.norm(chunks.sd[:, :3], axis=1) < FORCE_BAND * usual
+    )
+    good = (
+        whole[1:]
+        & whole[:-1]
+        & (step > 0)
+        & (step < 1.5 * np.median(step))
+        & (np.linalg.norm(change, axis=1) < LARGEST_TURN)
+    )
     if good.sum() < 20:
         return None
     middle = unit_rows(direction[1:] + direction[:-1])

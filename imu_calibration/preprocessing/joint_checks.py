@@ -13,7 +13,14 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import nearest_rotation, rpy_from_rotation
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse, span_words
-from imu_calibration.preprocessing.on_table import TESTED_RATE, exchanged, find_exchange, match_axes, same_motion, signs_or_delay
+from imu_calibration.preprocessing.on_table import (
+    TESTED_RATE,
+    exchanged,
+    find_exchange,
+    match_axes,
+    same_motion,
+    signs_or_delay,
+)
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.scan import MIN_TURN_RATE
 from imu_calibration.preprocessing.value_checks import force_error, wrong_rate_unit
@@ -45,30 +52,50 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     table : Table
 
     """
-    windows = [window for window in windows if len(window) > 2 and len(window.motion) == len(window)]
+    windows = [
+        window for window in windows if len(window) > 2 and len(window.motion) == len(window)
+    ]
     if not windows:
         return None
     expected = [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
     turning = [np.linalg.norm(rate, axis=1) > MIN_TURN_RATE for rate in expected]
     repeats = [np.diff(window.rate_s, axis=0) == 0 for window in windows]
     same = [np.append(each.all(axis=1), False) for each in repeats]
-    bias = np.median(np.concatenate([window.rate_s - rate for window, rate in zip(windows, expected)]), axis=0)
+    bias = np.median(
+        np.concatenate([window.rate_s - rate for window, rate in zip(windows, expected)]), axis=0
+    )
     coarse = np.concatenate(repeats).mean() > OFTEN
     step = np.min([smallest_step(window.rate_s) for window in windows], axis=0)
-    known = np.isfinite(step)   # an axis without motion has the steps of the other axes
+    known = np.isfinite(step)  # an axis without motion has the steps of the other axes
     step = np.where(known, step, step[known].max(initial=0.0)) if coarse else np.zeros(3)
-    spans = _joined((float(window.time[start]), float(window.time[stop - 1]))
-                    for window, flags, turns, rate in zip(windows, same, turning, expected) for start, stop in runs_of(flags)
-                    if window.time[stop - 1] - window.time[start] >= LASTING and turns[start:stop].mean() > 0.5
-                    and not _rounded(window.rate_s[start], rate[start:stop], bias, step))
+    spans = _joined(
+        (float(window.time[start]), float(window.time[stop - 1]))
+        for window, flags, turns, rate in zip(windows, same, turning, expected)
+        for start, stop in runs_of(flags)
+        if window.time[stop - 1] - window.time[start] >= LASTING
+        and turns[start:stop].mean() > 0.5
+        and not _rounded(window.rate_s[start], rate[start:stop], bias, step)
+    )
     if spans:
-        return CheckFinding('frozen', REFUSE, f'the gyroscope must measure all the time, it repeats one reading {span_words(spans)} '
-                            'while the joints turn; check the sensor and its driver, and exclude that time')
+        return CheckFinding(
+            'frozen',
+            REFUSE,
+            f'the gyroscope must measure all the time, it repeats one reading {span_words(spans)} '
+            'while the joints turn; check the sensor and its driver, and exclude that time',
+        )
     for k, name in enumerate(table.joint_names):
-        spans = _joined(span for window, rate in zip(windows, expected) for span in _frozen(window, table, rate + bias, joint=k))
+        spans = _joined(
+            span
+            for window, rate in zip(windows, expected)
+            for span in _frozen(window, table, rate + bias, joint=k)
+        )
         if spans:
-            return CheckFinding('frozen', REFUSE, f'joint states must follow the table, {name} is constant {span_words(spans)} while the '
-                                'IMU turns about its axis; check the driver of the table, and exclude that time')
+            return CheckFinding(
+                'frozen',
+                REFUSE,
+                f'joint states must follow the table, {name} is constant {span_words(spans)} while the '
+                'IMU turns about its axis; check the driver of the table, and exclude that time',
+            )
     return None
 
 
@@ -77,24 +104,39 @@ def _frozen(window, table, expected, *, joint):
     for start, stop in runs_of(np.abs(window.motion.rate[:, joint]) < MAX_REPEATED_RATE):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
-        motion, rest = window.motion.select(slice(start, stop)), (window.rate_s - expected)[start:stop]
+        motion, rest = (
+            window.motion.select(slice(start, stop)),
+            (window.rate_s - expected)[start:stop],
+        )
         faster = motion.rate.copy()
         faster[:, joint] += 1.0
-        plain, changed = (reference_motion(table, each, attitude=False).rate_s for each in (motion, replace(motion, rate=faster)))
+        plain, changed = (
+            reference_motion(table, each, attitude=False).rate_s
+            for each in (motion, replace(motion, rate=faster))
+        )
         axis = changed - plain
         slope = np.gradient(expected[start:stop], window.time[start:stop], axis=0)
-        lag = (rest * slope).sum() / max((slope**2).sum(), 1e-300)   # a late clock turns the rates of the other joints about this axis too
+        lag = (rest * slope).sum() / max(
+            (slope**2).sum(), 1e-300
+        )  # a late clock turns the rates of the other joints about this axis too
         rest = rest - lag * slope
         along, measured = (rest * axis).sum(axis=1), (window.rate_s[start:stop] * axis).sum(axis=1)
         square = float(along @ along)
-        if square > len(along) * MIN_TURN_RATE**2 and square > FROZEN_SHARE * (rest**2).sum() and square > OWN**2 * (measured @ measured):
+        if (
+            square > len(along) * MIN_TURN_RATE**2
+            and square > FROZEN_SHARE * (rest**2).sum()
+            and square > OWN**2 * (measured @ measured)
+        ):
             yield float(window.time[start]), float(window.time[stop - 1])
 
 
 def _rounded(reading, expected, bias, step):
     """Return whether one reading represents the reference rates, shape (n, 3), up to one step per axis and wrong gains and axes."""
     error = np.linalg.norm(reading - expected - bias, axis=1)
-    return bool((np.ptp(expected, axis=0) <= step).all() and (error <= np.linalg.norm(step) + OWN * np.linalg.norm(expected, axis=1)).all())
+    return bool(
+        (np.ptp(expected, axis=0) <= step).all()
+        and (error <= np.linalg.norm(step) + OWN * np.linalg.norm(expected, axis=1)).all()
+    )
 
 
 def _joined(spans):
@@ -112,8 +154,10 @@ LEAST_POWER_SHARE = {'accelerometer': 0.03, 'gyroscope': 0.01}
 """Directions in which the reference has less than this share of its largest power are not used."""
 RELATED = 0.5
 """Smallest squared correlation for a check of factors and axes."""
-WORDS = {'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
-         'gyroscope': ('angular rates', 'the rates of the joints')}
+WORDS = {
+    'accelerometer': ('specific force at rest', 'gravity in the attitudes of the joints'),
+    'gyroscope': ('angular rates', 'the rates of the joints'),
+}
 
 
 NO_EXCHANGE = 'no exchange of axes makes them so'
@@ -131,7 +175,9 @@ class Reduced(Protocol):
         """Moving windows with kept samples."""
 
 
-def against_joints(gathered: Reduced, model: SensorModel, table: Table | None = None) -> tuple[CheckFinding, ...]:
+def against_joints(
+    gathered: Reduced, model: SensorModel, table: Table | None = None
+) -> tuple[CheckFinding, ...]:
     """
     Return the findings of a comparison of measured rates and forces with those implied by the joints.
 
@@ -163,7 +209,7 @@ def _moments(accumulator, model, sensor):
     weight = np.array([row.count if sensor == 'gyroscope' else 1.0 for row in rows])
     means = np.array([row.sensors[sensor].mean for row in rows])
     if sensor == 'gyroscope':
-        means = means - weight @ means / weight.sum()   # the bias
+        means = means - weight @ means / weight.sum()  # the bias
     total = (means * weight[:, None]).T @ means
     for (name, _), factor in accumulator.within.items():
         if name == sensor == 'gyroscope':
@@ -191,8 +237,10 @@ def _rates(moments, windows, table):
     if table is not None:
         exchange = find_exchange(windows, table)
         if exchange and not exchange.joints and exchange.span is None:
-            return []   # `_axes` reports turned or exchanged IMU axes, with the mount that fits
-        finding = (exchanged(exchange, windows, table) if exchange else None) or standing_still(windows, table)
+            return []  # `_axes` reports turned or exchanged IMU axes, with the mount that fits
+        finding = (exchanged(exchange, windows, table) if exchange else None) or standing_still(
+            windows, table
+        )
     finding = finding or same_motion(moments, windows, table)
     return [] if finding is None else [finding]
 
@@ -203,14 +251,25 @@ def _rate_units(moments):
     if not ratio > 0:
         return
     if 40 < ratio < 80:
-        yield wrong_rate_unit(f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
-                              'gyroscope_scale 57.29578; convert them in the driver')
+        yield wrong_rate_unit(
+            f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
+            'gyroscope_scale 57.29578; convert them in the driver'
+        )
     elif 1 / 80 < ratio < 1 / 40:
-        yield CheckFinding('rate_unit', REFUSE, f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as '
-                           'the IMU: probably degrees; convert them in the driver of the table')
-    elif not 0.5 < ratio < 2.0 and np.linalg.norm(cross)**2 > RELATED * np.trace(measured) * np.trace(reference) / 3:
-        yield wrong_rate_unit(f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
-                              'convert them in the driver')
+        yield CheckFinding(
+            'rate_unit',
+            REFUSE,
+            f'joint positions must be in radians, the joints turn {1 / ratio:.1f} times as fast as '
+            'the IMU: probably degrees; convert them in the driver of the table',
+        )
+    elif (
+        not 0.5 < ratio < 2.0
+        and np.linalg.norm(cross) ** 2 > RELATED * np.trace(measured) * np.trace(reference) / 3
+    ):
+        yield wrong_rate_unit(
+            f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
+            'convert them in the driver'
+        )
 
 
 def _axes(sensor, moments, table, windows):
@@ -218,29 +277,42 @@ def _axes(sensor, moments, table, windows):
     seen, inverse = _seen(sensor, reference)
     matrix = cross @ inverse
     if np.trace(matrix @ reference @ matrix.T) < RELATED * np.trace(measured):
-        return   # a different fault dominates the readings and is reported by other checks
+        return  # a different fault dominates the readings and is reported by other checks
     match = match_axes(matrix, seen)
     if not match.wrong:
         return
-    delay = signs_or_delay(windows, table) if sensor == 'gyroscope' and table is not None and match.turned and match.mirrored else None
+    delay = (
+        signs_or_delay(windows, table)
+        if sensor == 'gyroscope' and table is not None and match.turned and match.mirrored
+        else None
+    )
     if delay and delay.sure:
         yield CheckFinding('on_table', REFUSE, f'both streams must share one clock: {delay.words}')
         return
     what, whose = WORDS[sensor]
-    yield CheckFinding('handedness', REFUSE,
-                       f'{what} must be {whose}, {match.words(seen) or NO_EXCHANGE}: {_cause(match, matrix, seen, table)}'
-                       + (f'; or {delay.words}' if delay else ''))
+    yield CheckFinding(
+        'handedness',
+        REFUSE,
+        f'{what} must be {whose}, {match.words(seen) or NO_EXCHANGE}: {_cause(match, matrix, seen, table)}'
+        + (f'; or {delay.words}' if delay else ''),
+    )
 
 
 def _cause(match, matrix, seen, table):
     if match.turned and match.mirrored:
-        return ('this recording does not separate a rotated sensor from a wrong sign; '
-                'correct mount.rpy_deg or the sign of a joint axis in the table, or the signs in the driver')
+        return (
+            'this recording does not separate a rotated sensor from a wrong sign; '
+            'correct mount.rpy_deg or the sign of a joint axis in the table, or the signs in the driver'
+        )
     if match.mirrored:
         return 'left-handed axes, which no mounting explains; correct signs and order in the driver, or the joint axes in the table'
     fits = ''
     if table is not None and np.trace(seen) > 2.5:
-        fits = ', [' + ', '.join(f'{angle:z.0f}' for angle in _mount_rpy_deg(matrix, table)) + '] would fit'
+        fits = (
+            ', ['
+            + ', '.join(f'{angle:z.0f}' for angle in _mount_rpy_deg(matrix, table))
+            + '] would fit'
+        )
     return f'the sensor is turned against the table; correct mount.rpy_deg in the table{fits}'
 
 
@@ -264,7 +336,9 @@ def check_units(gathered: Reduced, model: SensorModel, table: Table | None = Non
     rows = gathered.accumulator.rows
     static = [row for row in rows if row.kind == 'static']
     if static:
-        length = float(np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static]))
+        length = float(
+            np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static])
+        )
         check_force(length)
     refuse(against_joints(gathered, model, table))
 

@@ -23,7 +23,10 @@ AGREEMENT_TIE = 0.05
 def signed_permutations() -> np.ndarray:
     """Return the 48 matrices that exchange axes and signs, the identity first, then by number of changes; shape (48, 3, 3)."""
     every_sign = product((1.0, -1.0), repeat=3)
-    found = [np.eye(3)[list(order)] * np.array(signs)[:, None] for order, signs in product(permutations(range(3)), every_sign)]
+    found = [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order, signs in product(permutations(range(3)), every_sign)
+    ]
     return np.array(sorted(found, key=lambda matrix: (matrix != np.eye(3)).any(axis=1).sum()))
 
 
@@ -58,7 +61,11 @@ class AxisMatch:
 
 def _wrong_axes(matrix):
     """Return (row, column, sign) of the entries of a signed permutation that differ from the identity."""
-    return [(int(i), int(j), float(matrix[i, j])) for i, j in np.argwhere(matrix) if i != j or matrix[i, j] < 0]
+    return [
+        (int(i), int(j), float(matrix[i, j]))
+        for i, j in np.argwhere(matrix)
+        if i != j or matrix[i, j] < 0
+    ]
 
 
 def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
@@ -80,7 +87,13 @@ def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
     best = scores.max()
     near = scores >= best - AGREEMENT_TIE
     proper = np.linalg.det(candidates) > 0
-    return AxisMatch(candidates[np.argmax(near)], float(best), float(scores[0]), bool((near & proper).any()), bool((near & ~proper).any()))
+    return AxisMatch(
+        candidates[np.argmax(near)],
+        float(best),
+        float(scores[0]),
+        bool((near & proper).any()),
+        bool((near & ~proper).any()),
+    )
 
 
 SAME = 0.5
@@ -126,26 +139,46 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
     table : Table
 
     """
-    windows = [window for window in windows if len(window) >= MIN_TESTED_SAMPLES and len(window.motion) == len(window)]
+    windows = [
+        window
+        for window in windows
+        if len(window) >= MIN_TESTED_SAMPLES and len(window.motion) == len(window)
+    ]
     if not windows:
         return None
     time = np.concatenate([window.time for window in windows])
     every = slice(None, None, max(1, len(time) // MAX_TESTED_SAMPLES))
-    time, motion = time[every], JointMotion.concatenate(window.motion for window in windows).select(every)
-    measured = np.concatenate([np.hstack([window.rate_s, window.force_s]) for window in windows])[every]
+    time, motion = (
+        time[every],
+        JointMotion.concatenate(window.motion for window in windows).select(every),
+    )
+    measured = np.concatenate([np.hstack([window.rate_s, window.force_s]) for window in windows])[
+        every
+    ]
     rate = measured[:, :3] = measured[:, :3] - np.median(measured[:, :3], axis=0)
-    squares = np.stack([((rate - reference_motion(table, motion).rate_s)**2).sum(axis=1), (rate**2).sum(axis=1), np.ones(len(time))])
+    squares = np.stack(
+        [
+            ((rate - reference_motion(table, motion).rate_s) ** 2).sum(axis=1),
+            (rate**2).sum(axis=1),
+            np.ones(len(time)),
+        ]
+    )
     piece = ((time - time.min()) / TESTED_PIECE_SECONDS).astype(int)
     residual, power, count = np.array([np.bincount(piece, weights=each) for each in squares])
     tested = power > TESTED_RATE**2 * count
     part = (tested & (residual > (1.0 - SAME) * power))[piece]
     if part.sum() < MIN_TESTED_SAMPLES:
         return None
-    for chosen, span in ((tested[piece], None), (part, (float(time[part].min()), float(time[part].max())))):
+    for chosen, span in (
+        (tested[piece], None),
+        (part, (float(time[part].min()), float(time[part].max()))),
+    ):
         (order, signs), axes, instead, share = _best(measured[chosen], motion.select(chosen), table)
         joints = _joint_phrases(table.joint_names, order, signs)
         if share >= LEAST_SHARE_EXPLAINED and (joints or _axis_phrases(axes)):
-            return Exchange(joints, _axis_phrases(axes), _axis_phrases(instead) if joints else (), share, span)
+            return Exchange(
+                joints, _axis_phrases(axes), _axis_phrases(instead) if joints else (), share, span
+            )
     return None
 
 
@@ -154,16 +187,26 @@ def _best(measured, motion, table):
     candidates, axes = _candidates(motion.position.shape[1]), signed_permutations()
     shares = np.empty((2, len(candidates), len(axes)))
     for k, (order, signs) in enumerate(candidates):
-        parts = (getattr(motion, name)[:, order] * signs for name in ('position', 'rate', 'acceleration', 'jerk'))
+        parts = (
+            getattr(motion, name)[:, order] * signs
+            for name in ('position', 'rate', 'acceleration', 'jerk')
+        )
         reference = reference_motion(table, JointMotion(motion.time, *parts))
-        for row, known, expected in zip(shares, (measured[:, :3], measured[:, 3:]), (reference.rate_s, reference.force_s)):
+        for row, known, expected in zip(
+            shares, (measured[:, :3], measured[:, 3:]), (reference.rate_s, reference.force_s)
+        ):
             cross = np.einsum('pij,ij->p', axes, known.T @ expected)
             row[k] = (2.0 * cross - (expected**2).sum()) / max((known**2).sum(), 1e-300)
     near = shares[0] >= shares[0].max() - AGREEMENT_TIE
     near &= shares[1] >= shares[1][near].max() - AGREEMENT_TIE
-    joint_changes = [np.count_nonzero((np.array(order) != range(len(order))) | (np.array(signs) < 0)) for order, signs in candidates]
+    joint_changes = [
+        np.count_nonzero((np.array(order) != range(len(order))) | (np.array(signs) < 0))
+        for order, signs in candidates
+    ]
     axis_changes = (axes != np.eye(3)).any(axis=2).sum(axis=1)
-    changes = np.add.outer(joint_changes, axis_changes) + np.logical_and.outer(joint_changes, axis_changes)
+    changes = np.add.outer(joint_changes, axis_changes) + np.logical_and.outer(
+        joint_changes, axis_changes
+    )
     k, p = np.unravel_index(np.argmin(np.where(near, changes, np.inf)), changes.shape)
     return candidates[k], axes[p], axes[np.argmax(near[0])], float(shares[0, k, p])
 
@@ -172,20 +215,33 @@ def _candidates(n_joints):
     """Return (index of the joint with the readings of each joint, signs) of the candidates, the description itself first."""
     identity, plus = list(range(n_joints)), [1.0] * n_joints
     if n_joints <= MAX_PERMUTED_JOINTS:
-        return [(list(order), list(signs)) for order in permutations(identity) for signs in product((1.0, -1.0), repeat=n_joints)]
+        return [
+            (list(order), list(signs))
+            for order in permutations(identity)
+            for signs in product((1.0, -1.0), repeat=n_joints)
+        ]
     reversed_joints = [(identity, [-1.0 if k == j else 1.0 for k in identity]) for j in identity]
-    return [(identity, plus), *reversed_joints,
-            *(([{a: b, b: a}.get(k, k) for k in identity], plus) for a, b in combinations(identity, 2))]
+    return [
+        (identity, plus),
+        *reversed_joints,
+        *(([{a: b, b: a}.get(k, k) for k in identity], plus) for a, b in combinations(identity, 2)),
+    ]
 
 
 def _joint_phrases(names, order, signs):
-    return tuple(f'{names[k]} turns {"the other way round" if j == k else f"as {names[j]} should" + ", reversed" * (sign < 0)}'
-                 for k, (j, sign) in enumerate(zip(order, signs)) if k != j or sign < 0)
+    return tuple(
+        f'{names[k]} turns {"the other way round" if j == k else f"as {names[j]} should" + ", reversed" * (sign < 0)}'
+        for k, (j, sign) in enumerate(zip(order, signs))
+        if k != j or sign < 0
+    )
 
 
 def _axis_phrases(axes, seen=np.eye(3)):
-    return tuple(f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}"
-                 for i, j, sign in _wrong_axes(axes) if seen[j, j] > 0.5)
+    return tuple(
+        f"measured {'xyz'[i]} is {'minus ' if sign < 0 else ''}the reference's {'xyz'[j]}"
+        for i, j, sign in _wrong_axes(axes)
+        if seen[j, j] > 0.5
+    )
 
 
 MIN_RATE_GAIN = 0.05
@@ -219,18 +275,37 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     matrix = cross @ np.linalg.pinv(reference, rcond=0.01)
     gain = np.sqrt(np.trace(matrix @ reference @ matrix.T) / np.trace(reference))
     explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
-    if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:   # other checks report units, signs and axes
-        return _a_period_late(windows, table) if table is not None and explained < 1.0 - SHARE_TIE else None
-    key, cause = 'imu_topic', 'this IMU does not turn when the table does; give the topic of the IMU on the table'
+    if (
+        explained >= SAME and gain > 0.1 * MIN_RATE_GAIN
+    ):  # other checks report units, signs and axes
+        return (
+            _a_period_late(windows, table)
+            if table is not None and explained < 1.0 - SHARE_TIE
+            else None
+        )
+    key, cause = (
+        'imu_topic',
+        'this IMU does not turn when the table does; give the topic of the IMU on the table',
+    )
     if np.trace(measured) > MIN_RATE_GAIN * np.trace(reference):
         cause, key = (_cause(windows, table) if table is not None else ''), None
     elif gain > MIN_RATE_GAIN:
         return None
     if not cause:
-        key, cause = 'imu_topic', ('its motion is not that of the table; give the topic of the IMU on the table, and check '
-                                   'the names of the joints and both clocks')
-    return CheckFinding('on_table', REFUSE, 'the gyroscope must measure the motion of the joints, they explain '
-                        f'{100 * min(explained, 1.0):.0f} % of its rates at a gain of {gain:.2g}: {cause}', key=key)
+        key, cause = (
+            'imu_topic',
+            (
+                'its motion is not that of the table; give the topic of the IMU on the table, and check '
+                'the names of the joints and both clocks'
+            ),
+        )
+    return CheckFinding(
+        'on_table',
+        REFUSE,
+        'the gyroscope must measure the motion of the joints, they explain '
+        f'{100 * min(explained, 1.0):.0f} % of its rates at a gain of {gain:.2g}: {cause}',
+        key=key,
+    )
 
 
 def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckFinding | None:
@@ -239,13 +314,22 @@ def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckF
     late = abs(shift.seconds) > LEAST_SHIFT and shift.share > exchange.share - SHARE_TIE
     if late and shift.share > exchange.share + SHARE_TIE:
         return None
-    phrases = ', '.join(exchange.joints + exchange.axes) + (f' (or {", ".join(exchange.instead)})' if exchange.instead else '')
+    phrases = ', '.join(exchange.joints + exchange.axes) + (
+        f' (or {", ".join(exchange.instead)})' if exchange.instead else ''
+    )
     span = '' if exchange.span is None else ' from {:.0f} s to {:.0f} s'.format(*exchange.span)
-    remedy = ('correct names and axes in the table description, or the joint states' if exchange.joints
-              else 'correct the axes in the driver of the IMU') + ('' if exchange.span is None else ', or exclude that time')
-    return CheckFinding('on_table', REFUSE, f'the rates of the gyroscope must agree with the joints{span}, '
-                        f'{100 * exchange.share:.0f} % of them are explained if {phrases}; {remedy}'
-                        + (f'; or {_late(shift.seconds)}' if late else ''))
+    remedy = (
+        'correct names and axes in the table description, or the joint states'
+        if exchange.joints
+        else 'correct the axes in the driver of the IMU'
+    ) + ('' if exchange.span is None else ', or exclude that time')
+    return CheckFinding(
+        'on_table',
+        REFUSE,
+        f'the rates of the gyroscope must agree with the joints{span}, '
+        f'{100 * exchange.share:.0f} % of them are explained if {phrases}; {remedy}'
+        + (f'; or {_late(shift.seconds)}' if late else ''),
+    )
 
 
 def _cause(windows, table):
@@ -259,16 +343,27 @@ def _a_period_late(windows, table):
     """Return the finding for streams of a repeating motion that agree clearly better a period earlier or later, or None."""
     shift, share, unshifted, ambiguous = _best_shift(windows, table)
     # opposite rates: a wrong sign, or half a period
-    if ambiguous or abs(shift) <= LEAST_SHIFT or unshifted < 0 or share < max(LEAST_SHARE_EXPLAINED, unshifted + SHARE_TIE):
+    if (
+        ambiguous
+        or abs(shift) <= LEAST_SHIFT
+        or unshifted < 0
+        or share < max(LEAST_SHARE_EXPLAINED, unshifted + SHARE_TIE)
+    ):
         return None
-    return CheckFinding('on_table', REFUSE, f'both streams must share one clock, the joints explain {100 * unshifted:.0f} % of the rates '
-                        f'with a delay up to {LEAST_SHIFT} s and {100 * share:.0f} % with a larger one: {_late(shift)}')
+    return CheckFinding(
+        'on_table',
+        REFUSE,
+        f'both streams must share one clock, the joints explain {100 * unshifted:.0f} % of the rates '
+        f'with a delay up to {LEAST_SHIFT} s and {100 * share:.0f} % with a larger one: {_late(shift)}',
+    )
 
 
 def _late(shift):
     side = 'behind' if shift > 0 else 'ahead of'
-    return (f'the stamps of the IMU are about {abs(shift):.1f} s {side} those of the joints; '
-            'set both clocks by one source, or stamp in the drivers')
+    return (
+        f'the stamps of the IMU are about {abs(shift):.1f} s {side} those of the joints; '
+        'set both clocks by one source, or stamp in the drivers'
+    )
 
 
 class _Shift(NamedTuple):
@@ -332,30 +427,56 @@ def _best_shift(windows, table):
         grid = start + period * np.arange(first, int((window.time[-1] - start) / period) + 1)
         part = slice(first, first + len(grid))
         inside[part] = 1.0
-        for line, rate in ((measured, window.rate_s - bias), (reference, reference_motion(table, window.motion).rate_s)):
-            line[part] = np.stack([np.interp(grid, window.time, column) for column in rate.T], axis=1)
-    measured, reference = (inside * (line - line.sum(axis=0) / inside.sum()) for line in (measured, reference))
+        for line, rate in (
+            (measured, window.rate_s - bias),
+            (reference, reference_motion(table, window.motion).rate_s),
+        ):
+            line[part] = np.stack(
+                [np.interp(grid, window.time, column) for column in rate.T], axis=1
+            )
+    measured, reference = (
+        inside * (line - line.sum(axis=0) / inside.sum()) for line in (measured, reference)
+    )
     most = min(int(LARGEST_SHIFT / period), len(measured) // 2)
     power = [(line**2).sum(axis=1, keepdims=True) for line in (measured, reference)]
-    products, *energies = (_correlations(*pair, most) for pair in ((measured, reference), (power[0], inside), (inside, power[1])))
+    products, *energies = (
+        _correlations(*pair, most)
+        for pair in ((measured, reference), (power[0], inside), (inside, power[1]))
+    )
     paired = np.logical_and(*(energy > 0.5 * whole.sum() for energy, whole in zip(energies, power)))
-    shares = np.where(paired, products * np.abs(products) / np.maximum(np.prod(energies, axis=0), 1e-300), 0.0)
+    shares = np.where(
+        paired, products * np.abs(products) / np.maximum(np.prod(energies, axis=0), 1e-300), 0.0
+    )
     middle, lag = RESOLVED * most, int(RESOLVED * LEAST_SHIFT / period)
-    near = np.abs(shares[middle - lag:middle + lag + 1])
+    near = np.abs(shares[middle - lag : middle + lag + 1])
     place = int(np.argmax(near)) + middle - lag
     # The nearest peak to zero delay among those within SHARE_TIE of the highest: periodic motion has many.
     inner = shares[1:-1]
-    peaks = 1 + np.flatnonzero((inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - SHARE_TIE))
+    peaks = 1 + np.flatnonzero(
+        (inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - SHARE_TIE)
+    )
     best = int(peaks[np.argmin(np.abs(peaks - middle))]) if len(peaks) else int(np.argmax(shares))
-    other = shares[middle + lag + 1:] if best < middle else shares[:max(middle - lag, 0)]
-    twin = 0 < place - middle + lag < 2 * lag and shares[best] < 1.0 - SHARE_TIE and other.max(initial=-1.0) > shares[best] - SHARE_TIE
-    return _Shift((best - middle) * period / RESOLVED, float(shares[best]), float(shares[place]), bool(twin))
+    other = shares[middle + lag + 1 :] if best < middle else shares[: max(middle - lag, 0)]
+    twin = (
+        0 < place - middle + lag < 2 * lag
+        and shares[best] < 1.0 - SHARE_TIE
+        and other.max(initial=-1.0) > shares[best] - SHARE_TIE
+    )
+    return _Shift(
+        (best - middle) * period / RESOLVED, float(shares[best]), float(shares[place]), bool(twin)
+    )
 
 
 def _correlations(first, second, most):
     """Return the sums of first(t) second(t - s) for s up to +-most samples, in steps of 1 / RESOLVED of a sample."""
     size = 1 << int(np.ceil(np.log2(2 * len(first))))
-    sums = np.fft.irfft((np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))).sum(axis=1), size)
+    sums = np.fft.irfft(
+        (np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))).sum(axis=1),
+        size,
+    )
     shifts = np.arange(-most, most + 1)
     from scipy.interpolate import CubicSpline  # here, because its import is slow
-    return CubicSpline(shifts, sums[shifts])(np.arange(-most * RESOLVED, most * RESOLVED + 1) / RESOLVED)
+
+    return CubicSpline(shifts, sums[shifts])(
+        np.arange(-most * RESOLVED, most * RESOLVED + 1) / RESOLVED
+    )

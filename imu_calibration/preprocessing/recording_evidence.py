@@ -10,7 +10,12 @@ import numpy as np
 
 from imu_calibration.core.samples import smallest_step
 from imu_calibration.preprocessing import scan
-from imu_calibration.preprocessing.full_scale import Extremes, Turning, factor_between_rests, relate_turns
+from imu_calibration.preprocessing.full_scale import (
+    Extremes,
+    Turning,
+    factor_between_rests,
+    relate_turns,
+)
 from imu_calibration.preprocessing.stream_cleaning import CleanedBlock, StreamStatistics
 
 RESOLUTION_SAMPLES = 20_000
@@ -56,7 +61,9 @@ class RecordingEvidence:
     def frozen_parts(self) -> list[scan.FrozenPart]:
         """Where a sensor is frozen, or the joints are while the IMU turns."""
         rate = np.zeros(3) if self.rest is None else self.rest.rate
-        return scan.frozen_parts(self.chunks, self.frozen) + scan.frozen_joints(self.awake, self.still_joints_ns, rate)
+        return scan.frozen_parts(self.chunks, self.frozen) + scan.frozen_joints(
+            self.awake, self.still_joints_ns, rate
+        )
 
     @cached_property
     def rest(self) -> scan.Rest | None:
@@ -85,7 +92,11 @@ class RecordingEvidence:
         """Gravity as the accelerometer reads it, or None without samples."""
         if self.rest is not None:
             return self.rest.length
-        return float(np.median(np.linalg.norm(self.chunks.mean[:, :3], axis=1))) if len(self.chunks) else None
+        return (
+            float(np.median(np.linalg.norm(self.chunks.mean[:, :3], axis=1)))
+            if len(self.chunks)
+            else None
+        )
 
 
 class EvidenceGatherer:
@@ -93,7 +104,10 @@ class EvidenceGatherer:
 
     def __init__(self, gravity: float):
         self.gravity = gravity
-        self._chunks, self._ends = scan.ChunkSeries(), tuple((Extremes(), Extremes()) for _ in range(6))
+        self._chunks, self._ends = (
+            scan.ChunkSeries(),
+            tuple((Extremes(), Extremes()) for _ in range(6)),
+        )
         self._resolution, self._joints = np.full(6, np.inf), scan.StandingJoints()
         self._temperature_c: tuple[float, float] | None = None
 
@@ -105,20 +119,35 @@ class EvidenceGatherer:
             self._joints.push(joints.stamp_ns, joints.position)
         for _, temperature in cleaned.temperature:
             low, high = self._temperature_c or (np.inf, -np.inf)
-            self._temperature_c = (min(low, float(temperature.temperature_c.min())), max(high, float(temperature.temperature_c.max())))
+            self._temperature_c = (
+                min(low, float(temperature.temperature_c.min())),
+                max(high, float(temperature.temperature_c.max())),
+            )
 
     def evidence(self, statistics: dict[str, StreamStatistics]) -> RecordingEvidence:
         """Return the RecordingEvidence, with the StreamStatistics of each stream."""
         streams = {name: found for name, found in statistics.items() if found.count}
         resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
         chunks, series = self._chunks.chunks(), self._chunks
-        return RecordingEvidence(streams, chunks, series.n_samples, series.n_changed, series.n_repeated, resolution, self._ends,
-                                 self._temperature_c, self.gravity, self._joints.stretches())
+        return RecordingEvidence(
+            streams,
+            chunks,
+            series.n_samples,
+            series.n_changed,
+            series.n_repeated,
+            resolution,
+            self._ends,
+            self._temperature_c,
+            self.gravity,
+            self._joints.stretches(),
+        )
 
     def _take_imu(self, imu):
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
         if self._chunks.n_samples < RESOLUTION_SAMPLES:
-            self._resolution = np.minimum(self._resolution, smallest_step(columns[:, :RESOLUTION_SAMPLES].T))
+            self._resolution = np.minimum(
+                self._resolution, smallest_step(columns[:, :RESOLUTION_SAMPLES].T)
+            )
         self._chunks.push(imu.stamp_ns, columns)
         for column, (upwards, downwards) in zip(columns, self._ends):
             upwards.push(column)
@@ -162,7 +191,12 @@ class CheckFinding:
 
     def to_mapping(self) -> dict:
         """Return the entry for the calibration file."""
-        return {'check': self.check, 'severity': self.severity, 'text': self.text, 'samples': self.samples}
+        return {
+            'check': self.check,
+            'severity': self.severity,
+            'text': self.text,
+            'samples': self.samples,
+        }
 
 
 OLD = 0.5
@@ -192,19 +226,30 @@ def check_messages(evidence: MessageEvidence) -> tuple[CheckFinding, ...]:
     """Return the findings in `MessageEvidence`; empty without messages."""
     if not evidence.frame_ids:
         return ()
-    return tuple(finding for check in (frame, covariance, orientation, age) for finding in check(evidence))
+    return tuple(
+        finding for check in (frame, covariance, orientation, age) for finding in check(evidence)
+    )
 
 
 def frame(evidence: MessageEvidence) -> Iterator[CheckFinding]:
     """Every message names its frame, the same one."""
     names = sorted(evidence.frame_ids)
     if '' in names:
-        yield CheckFinding('frame', WARNING, f'messages must name their frame, {evidence.frame_ids[""]} of '
-                           f'{sum(evidence.frame_ids.values())} have an '
-                           "empty frame_id: they cannot be transformed; set the driver's frame_id, usually imu_link")
+        yield CheckFinding(
+            'frame',
+            WARNING,
+            f'messages must name their frame, {evidence.frame_ids[""]} of '
+            f'{sum(evidence.frame_ids.values())} have an '
+            "empty frame_id: they cannot be transformed; set the driver's frame_id, usually imu_link",
+        )
     if len(names) > 1:
-        yield CheckFinding('frame', WARNING, 'messages of one topic must be of one sensor, frame_ids are '
-                           + ', '.join(f"'{name}'" for name in names) + '; give each sensor a topic of its own')
+        yield CheckFinding(
+            'frame',
+            WARNING,
+            'messages of one topic must be of one sensor, frame_ids are '
+            + ', '.join(f"'{name}'" for name in names)
+            + '; give each sensor a topic of its own',
+        )
     elif names[0]:
         yield CheckFinding('frame', GOOD, f"frame_id '{names[0]}'")
 
@@ -214,23 +259,47 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
     for name, matrix in evidence.covariances.items():
         if matrix[0, 0] == ABSENT_MARK:
             if name != 'orientation':
-                yield CheckFinding('covariance', NOTE, f'the covariance marks the {name} in these messages as absent (-1)')
+                yield CheckFinding(
+                    'covariance',
+                    NOTE,
+                    f'the covariance marks the {name} in these messages as absent (-1)',
+                )
             continue
         if not np.isfinite(matrix).all() or (np.diag(matrix) < 0).any():
-            yield CheckFinding('covariance', WARNING, f'variances of the {name} must be finite and not negative, they are '
-                               f'{_numbers(np.diag(matrix))}; filters that believe them diverge: correct the driver, or fill them with '
-                               'compensator_node')
+            yield CheckFinding(
+                'covariance',
+                WARNING,
+                f'variances of the {name} must be finite and not negative, they are '
+                f'{_numbers(np.diag(matrix))}; filters that believe them diverge: correct the driver, or fill them with '
+                'compensator_node',
+            )
         elif not matrix.any():
             if name != 'orientation':
-                yield CheckFinding('covariance', NOTE, f'the covariance of the {name} is unknown (zeros): estimators need it; '
-                                   'compensator_node fills it')
+                yield CheckFinding(
+                    'covariance',
+                    NOTE,
+                    f'the covariance of the {name} is unknown (zeros): estimators need it; '
+                    'compensator_node fills it',
+                )
         elif not np.allclose(matrix, matrix.T, rtol=0, atol=SYMMETRY * np.abs(matrix).max()):
-            yield CheckFinding('covariance', WARNING, f'the covariance of the {name} must be symmetric, it is not; correct the driver')
+            yield CheckFinding(
+                'covariance',
+                WARNING,
+                f'the covariance of the {name} must be symmetric, it is not; correct the driver',
+            )
         elif not np.diag(matrix).all():
-            yield CheckFinding('covariance', WARNING, f'variances of the {name} must be greater than zero, they are '
-                               f'{_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct the driver')
+            yield CheckFinding(
+                'covariance',
+                WARNING,
+                f'variances of the {name} must be greater than zero, they are '
+                f'{_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct the driver',
+            )
         else:
-            yield CheckFinding('covariance', GOOD, f'standard deviations of the {name}: {_numbers(np.sqrt(np.diag(matrix)))}')
+            yield CheckFinding(
+                'covariance',
+                GOOD,
+                f'standard deviations of the {name}: {_numbers(np.sqrt(np.diag(matrix)))}',
+            )
 
 
 def orientation(evidence: MessageEvidence) -> Iterator[CheckFinding]:
@@ -240,11 +309,19 @@ def orientation(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         return
     size = float(np.linalg.norm(evidence.orientation))
     if not abs(size - 1) < 0.01:
-        yield CheckFinding('orientation', WARNING, f'an orientation must be a unit quaternion, its length is {size:.3g}: set '
-                           'orientation_covariance[0] to -1 where the sensor gives none (REP 145)')
+        yield CheckFinding(
+            'orientation',
+            WARNING,
+            f'an orientation must be a unit quaternion, its length is {size:.3g}: set '
+            'orientation_covariance[0] to -1 where the sensor gives none (REP 145)',
+        )
     elif not given.any() and np.array_equal(np.abs(evidence.orientation), [0, 0, 0, 1]):
-        yield CheckFinding('orientation', NOTE, 'the orientation is the identity with an unknown covariance: set '
-                           'orientation_covariance[0] to -1 where the sensor gives none (REP 145)')
+        yield CheckFinding(
+            'orientation',
+            NOTE,
+            'the orientation is the identity with an unknown covariance: set '
+            'orientation_covariance[0] to -1 where the sensor gives none (REP 145)',
+        )
 
 
 def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
@@ -253,11 +330,17 @@ def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         return
     median = float(np.median(evidence.age))
     if abs(median) > OLD:
-        yield CheckFinding('age', WARNING, f'stamps must agree with the clock of this computer within {OLD} s, they are '
-                           f'{abs(median):.3g} s {"behind" if median > 0 else "ahead of"} it: transforms and filters drop such messages; '
-                           'synchronise the clocks, or for a recording play /clock and set use_sim_time')
+        yield CheckFinding(
+            'age',
+            WARNING,
+            f'stamps must agree with the clock of this computer within {OLD} s, they are '
+            f'{abs(median):.3g} s {"behind" if median > 0 else "ahead of"} it: transforms and filters drop such messages; '
+            'synchronise the clocks, or for a recording play /clock and set use_sim_time',
+        )
     else:
-        yield CheckFinding('age', GOOD, f'stamps are {1e3 * median:.1f} ms old when messages are received')
+        yield CheckFinding(
+            'age', GOOD, f'stamps are {1e3 * median:.1f} ms old when messages are received'
+        )
 
 
 def _numbers(values):

@@ -37,8 +37,16 @@ class QuietFloor:
         return np.median(np.array(history), axis=0) if history else None
 
 
-def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, *, ratio: float, longest: float,
-                        floors: tuple[QuietFloor, QuietFloor], resting: np.ndarray) -> np.ndarray:
+def quiet_beside_joints(
+    force_s: np.ndarray,
+    rate_s: np.ndarray,
+    period: float,
+    *,
+    ratio: float,
+    longest: float,
+    floors: tuple[QuietFloor, QuietFloor],
+    resting: np.ndarray,
+) -> np.ndarray:
     """
     Return a mask of the samples in a quiet span, or in a vibration of a table with resting joints.
 
@@ -66,8 +74,14 @@ def quiet_beside_joints(force_s: np.ndarray, rate_s: np.ndarray, period: float, 
     cells = Cells(force_s, rate_s, period)
     quiet = quiet_samples(cells, ratio=ratio, longest=longest, floor=floors[0], resting=resting)
     width = 2 * int(round(BELOW / period / 2)) + 1
-    below = quiet_samples(Cells(low_passed(force_s, width), low_passed(rate_s, width), period), ratio=ratio, longest=longest,
-                          floor=floors[1], resting=resting, spans=SPANS[1:])
+    below = quiet_samples(
+        Cells(low_passed(force_s, width), low_passed(rate_s, width), period),
+        ratio=ratio,
+        longest=longest,
+        floor=floors[1],
+        resting=resting,
+        spans=SPANS[1:],
+    )
     if quiet[resting].all() or width < 3:
         return quiet
     return quiet | (below & _steady(cells, ratio=ratio, resting=resting))
@@ -84,7 +98,7 @@ def _low_passed_piece(values, first, last, width):
     """Return `low_passed` of all values, from `first` to before `last`."""
     reach = 3 * (width // 2)
     start = max(first - reach, 0)
-    return low_passed(values[start:last + reach], width)[first - start:last - start]
+    return low_passed(values[start : last + reach], width)[first - start : last - start]
 
 
 def _steady(cells, *, ratio, resting):
@@ -92,13 +106,22 @@ def _steady(cells, *, ratio, resting):
     width = cells.width(SPANS[0])
     variance, at_rest = cells.variance(width), _free_of(~cells.all_of(resting), width)
     around = 2 * int(round(cells.cells_in(STEADY_SECONDS))) + 1
-    least = minimum_filter1d(np.where(at_rest[:, None], variance, np.inf), around, axis=0, mode='nearest')
+    least = minimum_filter1d(
+        np.where(at_rest[:, None], variance, np.inf), around, axis=0, mode='nearest'
+    )
     floor = np.maximum(least, cells.least)
     return cells.samples(_covered(at_rest & np.all(variance <= ratio**2 * floor, axis=1), width))
 
 
-def quiet_samples(cells: 'Cells', *, ratio: float, longest: float, floor: QuietFloor, resting: np.ndarray | None = None,
-                  spans: tuple[float, ...] = SPANS) -> np.ndarray:
+def quiet_samples(
+    cells: 'Cells',
+    *,
+    ratio: float,
+    longest: float,
+    floor: QuietFloor,
+    resting: np.ndarray | None = None,
+    spans: tuple[float, ...] = SPANS,
+) -> np.ndarray:
     """
     Return a mask of the samples in a quiet span.
 
@@ -134,10 +157,14 @@ def quiet_samples(cells: 'Cells', *, ratio: float, longest: float, floor: QuietF
         if limit is None and np.isinf(shorter).all():
             return np.zeros(cells.edges[-1], bool)
         # at rest the variance hardly grows with the span; otherwise the quietest part was moving as well
-        shorter = limit = np.maximum(shorter if limit is None else np.minimum(limit, _GROWTH * shorter), cells.least)
-        calm = np.all(variance <= ratio ** 2 * limit, axis=1)
+        shorter = limit = np.maximum(
+            shorter if limit is None else np.minimum(limit, _GROWTH * shorter), cells.least
+        )
+        calm = np.all(variance <= ratio**2 * limit, axis=1)
         quiet &= _covered(calm, width)
-        if width > 1 and resting is None:   # a change of attitude between two samples: no quiet span contains it
+        if (
+            width > 1 and resting is None
+        ):  # a change of attitude between two samples: no quiet span contains it
             across = _covered(calm, width - 1)
             quiet[:-1] &= across
             quiet[1:] &= across
@@ -164,7 +191,7 @@ def least_variance(values: np.ndarray) -> float:
     change = np.abs(np.diff(some, axis=1))
     step = np.where(change > 0, change, np.inf).min(axis=1, initial=np.inf)
     step = np.where(np.isfinite(step), step, 0.0)
-    return np.sum(step ** 2 / 4) + 3 * (1e-5 * np.abs(some).max(initial=1e-2)) ** 2
+    return np.sum(step**2 / 4) + 3 * (1e-5 * np.abs(some).max(initial=1e-2)) ** 2
 
 
 class Cells:
@@ -183,13 +210,15 @@ class Cells:
     def __init__(self, force_s: np.ndarray, rate_s: np.ndarray, period: float):
         n = len(force_s)
         self._period, self._size = period, max(1, min(int(_GRID / period), n))
-        self.edges = np.append(np.arange(0, n - self._size + 1, self._size), n)  # the last cell takes the remainder
+        self.edges = np.append(
+            np.arange(0, n - self._size + 1, self._size), n
+        )  # the last cell takes the remainder
         self.least = np.array([least_variance(values) for values in (force_s, rate_s)])
         """Of force and rate."""
         self._sums = []
         for values in (force_s, rate_s):
             sums, squares = [], np.zeros(len(self.edges) - 1)
-            for axis in values.T:   # one at a time: a long recording is large
+            for axis in values.T:  # one at a time: a long recording is large
                 centred = axis - axis.mean()
                 sums.append(np.add.reduceat(centred, self.edges[:-1]))
                 squares += np.add.reduceat(np.square(centred, out=centred), self.edges[:-1])
@@ -201,14 +230,20 @@ class Cells:
 
     def width(self, seconds: float) -> int:
         """Return the number of cells of a span, at least that of `_MIN_QUIET_SAMPLES`."""
-        return min(max(int(np.ceil(_MIN_QUIET_SAMPLES / self._size)), int(round(self.cells_in(seconds)))), len(self.edges) - 1)
+        return min(
+            max(int(np.ceil(_MIN_QUIET_SAMPLES / self._size)), int(round(self.cells_in(seconds)))),
+            len(self.edges) - 1,
+        )
 
     def variance(self, width: int) -> np.ndarray:
         """Return the variances of force and rate over `width` cells from each cell on, axes added, shape (n_spans, 2)."""
         count, variances = self.edges[width:] - self.edges[:-width], []
         for sums, squares in self._sums:
             total, square = sums[:, width:] - sums[:, :-width], squares[width:] - squares[:-width]
-            variances.append(np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0) / np.maximum(count - 1, 1))
+            variances.append(
+                np.maximum(square - np.einsum('ij,ij->j', total, total) / count, 0.0)
+                / np.maximum(count - 1, 1)
+            )
         return np.stack(variances, axis=1)
 
     def all_of(self, flags: np.ndarray) -> np.ndarray:
@@ -281,16 +316,29 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
     """
     step = np.diff(imu.stamp_ns)
     if not (np.isfinite(imu.force_s).all() and np.isfinite(imu.rate_s).all()):
-        raise InputError('samples must be finite to search for rest, got NaN or infinite values; drop them first', code='not_finite')
+        raise InputError(
+            'samples must be finite to search for rest, got NaN or infinite values; drop them first',
+            code='not_finite',
+        )
     if np.any(step < 0):
-        raise InputError('stamps must not decrease in the search for rest, got a backward step; clean the stream first',
-                         code='stamps_backwards')
+        raise InputError(
+            'stamps must not decrease in the search for rest, got a backward step; clean the stream first',
+            code='stamps_backwards',
+        )
     if not np.any(step > 0):
         return []
     period = np.median(step[step > 0]) / 1e9
-    quiet = quiet_samples(Cells(imu.force_s, imu.rate_s, period), ratio=settings.quiet_ratio, longest=settings.static_minimum,
-                          floor=QuietFloor())
-    found = [piece for piece in _intervals(imu.stamp_ns, quiet, period, settings) if _keeps_attitude(imu.force_s[piece], period)]
+    quiet = quiet_samples(
+        Cells(imu.force_s, imu.rate_s, period),
+        ratio=settings.quiet_ratio,
+        longest=settings.static_minimum,
+        floor=QuietFloor(),
+    )
+    found = [
+        piece
+        for piece in _intervals(imu.stamp_ns, quiet, period, settings)
+        if _keeps_attitude(imu.force_s[piece], period)
+    ]
     found = _at_one_rate(imu.rate_s, found, period, settings.static_minimum)
     return _not_turning(imu.rate_s, _trimmed(imu, found, period, settings.static_minimum))
 
@@ -308,7 +356,7 @@ def _intervals(stamp_ns, quiet, period, settings):
 def _keeps_attitude(force, period):
     """Return whether the scatter over the interval equals the scatter over short spans: under vibration, slow turns are quiet."""
     width = min(max(10, int(round(SPANS[0] / period))), len(force))
-    pieces = force[:len(force) // width * width].reshape(-1, width, 3)
+    pieces = force[: len(force) // width * width].reshape(-1, width, 3)
     local = np.mean(pieces.var(axis=1, ddof=1).sum(axis=1)) + least_variance(force)
     return force.var(axis=0).sum() <= _LARGEST_GROWTH * local
 
@@ -318,14 +366,22 @@ def _at_one_rate(rate, found, period, shortest):
     if not found:
         return found
     noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
-    least = np.maximum(noise, 1e-3 * _farthest(rate, np.array([np.median(axis) for axis in rate.T])))
+    least = np.maximum(
+        noise, 1e-3 * _farthest(rate, np.array([np.median(axis) for axis in rate.T]))
+    )
     width, parts = max(10, int(round(_STEP_SPAN / period))), []
     for piece in found:
         count = (piece.stop - piece.start) // width
-        means = rate[piece.start:piece.start + count * width].reshape(count, width, 3).mean(axis=1)
+        means = (
+            rate[piece.start : piece.start + count * width].reshape(count, width, 3).mean(axis=1)
+        )
         steps = np.flatnonzero(np.any(np.abs(np.diff(means, axis=0)) > least, axis=1)) + 1
         edges = [piece.start, *(piece.start + width * steps), piece.stop]
-        parts += [slice(int(a), int(b)) for a, b in zip(edges, edges[1:]) if (b - a) * period >= shortest or len(edges) == 2]
+        parts += [
+            slice(int(a), int(b))
+            for a, b in zip(edges, edges[1:])
+            if (b - a) * period >= shortest or len(edges) == 2
+        ]
     return parts
 
 
@@ -336,19 +392,30 @@ def _farthest(values, centre):
 
 def _trimmed(imu, found, period, shortest):
     """Trim both ends of intervals where the low-passed readings exceed the scatter of the middle: a turn begins below the noise."""
-    first, last = (np.array([getattr(piece, end) for piece in found], int) for end in ('start', 'stop'))
+    first, last = (
+        np.array([getattr(piece, end) for piece in found], int) for end in ('start', 'stop')
+    )
     width = 2 * int(round(BELOW / period / 2)) + 1
     for values in (imu.force_s, imu.rate_s) if found else ():
         slow = [_low_passed_piece(values, a, b, width) for a, b in zip(first, last)]
-        middles = [slice(*(np.linspace(a, b, 5).astype(int)[1:4:2] - a)) for a, b in zip(first, last)]
+        middles = [
+            slice(*(np.linspace(a, b, 5).astype(int)[1:4:2] - a)) for a, b in zip(first, last)
+        ]
         centres = [piece[middle].mean(axis=0) for piece, middle in zip(slow, middles)]
-        spread = [np.mean((piece[middle] - centre)**2) for piece, middle, centre in zip(slow, middles, centres)]
-        spread = np.maximum(np.maximum(spread, np.median(spread)), least_variance(values) / 3 / width)
+        spread = [
+            np.mean((piece[middle] - centre) ** 2)
+            for piece, middle, centre in zip(slow, middles, centres)
+        ]
+        spread = np.maximum(
+            np.maximum(spread, np.median(spread)), least_variance(values) / 3 / width
+        )
         for k, (piece, middle, centre) in enumerate(zip(slow, middles, centres)):
-            off = np.sum((piece - centre)**2, axis=1) > 3 * _LEAVES**2 * spread[k]
-            before, after, start = off[:middle.start], off[middle.stop:], first[k]
+            off = np.sum((piece - centre) ** 2, axis=1) > 3 * _LEAVES**2 * spread[k]
+            before, after, start = off[: middle.start], off[middle.stop :], first[k]
             last[k] = start + middle.stop + int(np.argmax(after)) if after.any() else last[k]
-            first[k] = start + middle.start - int(np.argmax(before[::-1])) if before.any() else start
+            first[k] = (
+                start + middle.start - int(np.argmax(before[::-1])) if before.any() else start
+            )
     return [slice(int(a), int(b)) for a, b in zip(first, last) if (b - a) * period >= shortest]
 
 
@@ -361,9 +428,13 @@ def _not_turning(rate, found):
     usual = np.median(means, axis=0)
     limit = np.maximum(_TURNING_SD * noise, 0.01 * _farthest(rate, usual))
     keep = np.all(np.abs(means - usual) <= limit, axis=1)
-    if len(found) >= _ENOUGH:   # an isolated deviation from both neighbours; the drift of warming biases is smooth
+    if (
+        len(found) >= _ENOUGH
+    ):  # an isolated deviation from both neighbours; the drift of warming biases is smooth
         step = np.diff(means, axis=0)
-        alone = np.minimum(np.minimum(np.abs(step[:-1]), np.abs(step[1:])), 0.5 * np.abs(step[1:] - step[:-1]))
+        alone = np.minimum(
+            np.minimum(np.abs(step[:-1]), np.abs(step[1:])), 0.5 * np.abs(step[1:] - step[:-1])
+        )
         scatter = np.median(np.abs(step), axis=0) / (0.6745 * np.sqrt(2))
         keep[1:-1] &= np.all(alone <= np.maximum(_SCATTERS * scatter, noise), axis=1)
     return [piece for piece, kept in zip(found, keep, strict=True) if kept]

@@ -63,7 +63,10 @@ class ChunkSeries:
         """Process clean samples of one epoch of the clock: stamps, shape (n,), and force and rate, shape (6, n)."""
         self._count_changes(columns)
         if self._rest is not None:
-            stamp_ns, columns = np.concatenate([self._rest[0], stamp_ns]), np.concatenate([self._rest[1], columns], axis=1)
+            stamp_ns, columns = (
+                np.concatenate([self._rest[0], stamp_ns]),
+                np.concatenate([self._rest[1], columns], axis=1),
+            )
         self._rest = (stamp_ns, columns)
         if self.size is None and len(stamp_ns) >= FIRST:
             self.size = _size(stamp_ns, self._chunk_time)
@@ -76,8 +79,18 @@ class ChunkSeries:
             self.size = _size(self._rest[0], self._chunk_time)
             self._cut()
         parts = self._parts or [(np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)))]
-        time, duration, mean, sd, extent = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return Chunks(time, duration, mean, sd, extent, self.size or MIN_CHUNK_SAMPLES, int(self._first_ns or 0))
+        time, duration, mean, sd, extent = (
+            np.concatenate(column) for column in zip(*parts, strict=True)
+        )
+        return Chunks(
+            time,
+            duration,
+            mean,
+            sd,
+            extent,
+            self.size or MIN_CHUNK_SAMPLES,
+            int(self._first_ns or 0),
+        )
 
     def _count_changes(self, columns):
         joined = columns if self._last is None else np.concatenate([self._last, columns], axis=1)
@@ -96,8 +109,12 @@ class ChunkSeries:
             return
         if self._first_ns is None:
             self._first_ns = stamp_ns[0]
-        self._parts.append(_describe(((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size),
-                                     columns[:, :used].reshape(6, n, self.size)))
+        self._parts.append(
+            _describe(
+                ((stamp_ns[:used] - self._first_ns) * 1e-9).reshape(n, self.size),
+                columns[:, :used].reshape(6, n, self.size),
+            )
+        )
         self._n_chunks += n
 
 
@@ -108,12 +125,20 @@ def _size(stamps, chunk_time):
 
 def _describe(time, values):
     start = values[:, :, :1].copy()
-    values = values - start   # avoids cancellation with large offsets
+    values = values - start  # avoids cancellation with large offsets
     mean = values.mean(axis=2)
-    sd = np.sqrt(np.maximum(np.einsum('ijk,ijk->ij', values, values) / values.shape[2] - mean**2, 0.0))
+    sd = np.sqrt(
+        np.maximum(np.einsum('ijk,ijk->ij', values, values) / values.shape[2] - mean**2, 0.0)
+    )
     size = time.shape[1]
     spread = values.max(axis=2) - values.min(axis=2)
-    return time.mean(axis=1), (time[:, -1] - time[:, 0]) * size / (size - 1), (mean + start[:, :, 0]).T, sd.T, spread.T
+    return (
+        time.mean(axis=1),
+        (time[:, -1] - time[:, 0]) * size / (size - 1),
+        (mean + start[:, :, 0]).T,
+        sd.T,
+        spread.T,
+    )
 
 
 LEAST_CHUNKS = 4
@@ -166,7 +191,9 @@ class Rest:
         spread = np.linalg.eigvalsh(np.cov(unit_rows(scaled - centre).T))[0]
         if spread < LEAST_SPREAD or np.linalg.norm(centre) > FARTHEST:
             return None
-        return centre * np.median(self.norm), float(np.sqrt(rest + centre @ centre) * np.median(self.norm))
+        return centre * np.median(self.norm), float(
+            np.sqrt(rest + centre @ centre) * np.median(self.norm)
+        )
 
     @property
     def length(self) -> float:
@@ -181,7 +208,12 @@ def find_rest(chunks: Chunks) -> Rest | None:
         return None
     runs = _stretches(still)
     force = np.array([chunks.mean[a:b, :3].mean(axis=0) for a, b in runs])
-    return Rest(force, np.median(chunks.mean[still, 3:], axis=0), np.median(chunks.range[still], axis=0), runs)
+    return Rest(
+        force,
+        np.median(chunks.mean[still, 3:], axis=0),
+        np.median(chunks.range[still], axis=0),
+        runs,
+    )
 
 
 def still_chunks(chunks: Chunks) -> np.ndarray:
@@ -198,13 +230,20 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
         scatter = np.linalg.norm(chunks.sd[:, part], axis=1)
         quiet &= scatter <= 3.0 * np.quantile(scatter, 0.1) + 1e-3 * np.median(scatter)
     turn = np.linalg.norm(np.diff(unit_rows(chunks.mean[:, :3]), axis=0), axis=1)
-    still = quiet & (np.append(turn, 0.0) < MAX_CHUNK_TURN) & (np.append(0.0, turn) < MAX_CHUNK_TURN)
+    still = (
+        quiet & (np.append(turn, 0.0) < MAX_CHUNK_TURN) & (np.append(0.0, turn) < MAX_CHUNK_TURN)
+    )
     if still.sum() < LEAST_CHUNKS:
         return still
     rate = np.median(chunks.mean[still, 3:], axis=0)
     away = np.linalg.norm(chunks.mean[:, 3:] - rate, axis=1)
     # A spin at constant rate about the vertical is as quiet as rest, but has rates.
-    return still & (away <= np.maximum(0.05 * away.max(), 3.0 * np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1))))
+    return still & (
+        away
+        <= np.maximum(
+            0.05 * away.max(), 3.0 * np.median(np.linalg.norm(chunks.sd[still, 3:], axis=1))
+        )
+    )
 
 
 def _stretches(still):
@@ -265,23 +304,39 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
         Smallest step between readings of each column.
 
     """
-    flat = {sensor: (chunks.range[:, part] == 0).all(axis=1) for sensor, part in SENSOR_COLUMNS.items()}
+    flat = {
+        sensor: (chunks.range[:, part] == 0).all(axis=1) for sensor, part in SENSOR_COLUMNS.items()
+    }
     found = {sensor: in_long_runs(flags) for sensor, flags in flat.items()}
-    rest = find_rest(chunks.select(~np.logical_or(*flat.values()))) if np.logical_or(*found.values()).any() else None
+    rest = (
+        find_rest(chunks.select(~np.logical_or(*flat.values())))
+        if np.logical_or(*found.values()).any()
+        else None
+    )
     for sensor, part in SENSOR_COLUMNS.items():
-        if rest is None or not rest.range[part].all() or (rest.range[part] < MIN_NOISE_STEPS * resolution[part]).any() \
-                or len(runs_of(found[sensor])) > len(rest.force):
+        if (
+            rest is None
+            or not rest.range[part].all()
+            or (rest.range[part] < MIN_NOISE_STEPS * resolution[part]).any()
+            or len(runs_of(found[sensor])) > len(rest.force)
+        ):
             found[sensor] = np.zeros(len(chunks), bool)
     return found
 
 
 def frozen_parts(chunks: Chunks, frozen: dict[str, np.ndarray]) -> list[FrozenPart]:
     """Return the stretches of `frozen_chunks` in order of time."""
-    parts = [_part(chunks, sensor, start, stop) for sensor, flags in frozen.items() for start, stop in long_runs(flags)]
+    parts = [
+        _part(chunks, sensor, start, stop)
+        for sensor, flags in frozen.items()
+        for start, stop in long_runs(flags)
+    ]
     return sorted(parts, key=lambda part: part.start)
 
 
-def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray) -> list[FrozenPart]:
+def frozen_joints(
+    chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray
+) -> list[FrozenPart]:
     """
     Return the stretches in which all joint positions are constant for a second while the IMU turns.
 
@@ -298,19 +353,29 @@ def frozen_joints(chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray
     """
     inside = np.zeros(len(chunks), bool)
     for start, stop in (still_ns - chunks.first_ns) * 1e-9:
-        inside |= (chunks.time - chunks.duration / 2 >= start) & (chunks.time + chunks.duration / 2 <= stop)
+        inside |= (chunks.time - chunks.duration / 2 >= start) & (
+            chunks.time + chunks.duration / 2 <= stop
+        )
     if not inside.any():
         return []
     rates = chunks.mean[:, 3:]
-    turning = min((np.linalg.norm(rates - rate, axis=1) > MIN_TURN_RATE for rate in (rate_at_rest, np.median(rates[inside], axis=0))),
-                  key=lambda flags: np.count_nonzero(flags & inside))
+    turning = min(
+        (
+            np.linalg.norm(rates - rate, axis=1) > MIN_TURN_RATE
+            for rate in (rate_at_rest, np.median(rates[inside], axis=0))
+        ),
+        key=lambda flags: np.count_nonzero(flags & inside),
+    )
     return [_part(chunks, 'joints', start, stop) for start, stop in long_runs(turning & inside)]
 
 
 def _part(chunks, who, start, stop):
-    return FrozenPart(who, float(chunks.time[start] - chunks.duration[start] / 2),
-                      float(chunks.time[stop - 1] + chunks.duration[stop - 1] / 2),
-                      int((stop - start) * chunks.size))
+    return FrozenPart(
+        who,
+        float(chunks.time[start] - chunks.duration[start] / 2),
+        float(chunks.time[stop - 1] + chunks.duration[stop - 1] / 2),
+        int((stop - start) * chunks.size),
+    )
 
 
 class StandingJoints:
@@ -327,11 +392,13 @@ class StandingJoints:
     def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
         """Process joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
         if len(self._last) != position.shape[1]:
-            self._last = np.full(position.shape[1], np.nan)   # differs from any position
-        starts = np.flatnonzero(np.any(position != np.concatenate([self._last[None], position[:-1]]), axis=1))
+            self._last = np.full(position.shape[1], np.nan)  # differs from any position
+        starts = np.flatnonzero(
+            np.any(position != np.concatenate([self._last[None], position[:-1]]), axis=1)
+        )
         ends = np.append(self._open[0, 1], stamp_ns)[np.append(starts, len(stamp_ns))]
         found = np.column_stack([np.append(self._open[0, 0], stamp_ns[starts]), ends])
-        self._found = np.concatenate([self._found, self._long(found[:-1])])[:self.CAPACITY]
+        self._found = np.concatenate([self._found, self._long(found[:-1])])[: self.CAPACITY]
         self._open, self._last = found[-1:], position[-1].copy()
 
     def stretches(self) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Single outlying readings: a glitch on the bus, a corrupt message; dropped before any averaging."""
 
-
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, runs_of
@@ -28,7 +27,7 @@ BETWEEN = (0.03, 0.4)
 NOISE_ROUNDING = 1e-7
 """Share of the readings below which differences are due to rounding."""
 _CANDIDATE = 6.0
-_NORMAL = 1.4826 / np.sqrt(1.5)   # sd of white noise over the median of |x_k - (x_k-1 + x_k+1) / 2|
+_NORMAL = 1.4826 / np.sqrt(1.5)  # sd of white noise over the median of |x_k - (x_k-1 + x_k+1) / 2|
 
 
 class SpikeFilter:
@@ -59,7 +58,11 @@ class SpikeFilter:
                 passed += self.finish()
             self._held = part if self._held is None else type(part).concatenate([self._held, part])
             self._values = np.vstack([self._values, np.hstack([part.force_s, part.rate_s])])
-            passed += self._decide(max(len(self._held) - SPIKE_REACH, 0) if self._first + len(self._values) > NOISE_SAMPLES else 0)
+            passed += self._decide(
+                max(len(self._held) - SPIKE_REACH, 0)
+                if self._first + len(self._values) > NOISE_SAMPLES
+                else 0
+            )
         return passed
 
     def finish(self) -> list[ImuSamples]:
@@ -76,9 +79,11 @@ class SpikeFilter:
         at = len(self._values) - len(self._held) + np.arange(count)
         spiky = self._spikes(at)
         self.dropped, self._held = self.dropped + int(np.count_nonzero(spiky)), held
-        kept = max((at[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0) * NOISE_SAMPLES   # the first kept row has no second difference
+        kept = (
+            max((at[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0) * NOISE_SAMPLES
+        )  # the first kept row has no second difference
         self._values, self._first = self._values[kept:], self._first + kept
-        self._noise = self._noise[-2 - (len(self._values) + SPIKE_REACH) // NOISE_SAMPLES:]
+        self._noise = self._noise[-2 - (len(self._values) + SPIKE_REACH) // NOISE_SAMPLES :]
         return [samples.select(~spiky) if spiky.any() else samples]
 
     def _spikes(self, at):
@@ -90,31 +95,49 @@ class SpikeFilter:
         second = np.vstack([second[:1], second, second[-1:]])
         self._add_noise(second)
         chunk = np.maximum((self._first + at) // NOISE_SAMPLES - 1, 0)
-        limit = LARGE * self._noise[np.clip(chunk - self._n_noise + len(self._noise), 0, len(self._noise) - 1)]
+        limit = (
+            LARGE
+            * self._noise[
+                np.clip(chunk - self._n_noise + len(self._noise), 0, len(self._noise) - 1)
+            ]
+        )
         spiky = np.zeros(len(at), bool)
         row, column = np.nonzero(second[at] > _CANDIDATE / LARGE * limit)
         if len(row):
             first = np.clip(at[row] - SPIKE_REACH, 0, len(values) - 2 * SPIKE_REACH - 1)
             window, column = first[:, None] + np.arange(2 * SPIKE_REACH + 1), column[:, None]
             inner = np.clip(at[row], 2, len(values) - 3)
-            knock = _knocked(values[inner[:, None] + [-2, -1, 1, 2]], limit[row]) & (inner == at[row])
+            knock = _knocked(values[inner[:, None] + [-2, -1, 1, 2]], limit[row]) & (
+                inner == at[row]
+            )
             # during vibration, as at the first touch of a hand, the previous noise does not apply; a spike affects three second
             # differences, two in six
             shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
             limit = np.maximum(limit[row, column[:, 0]], shaking)
             first = np.clip(at[row] - SPIKE_NEIGHBOURS, 0, len(values) - 2 * SPIKE_NEIGHBOURS - 1)
-            around, place = values[first[:, None] + np.arange(2 * SPIKE_NEIGHBOURS + 1), column], at[row] - first
-            spiky[row[~knock & (_contradicted(around, place, limit) | _off_the_median(around, place, limit))]] = True
+            around, place = (
+                values[first[:, None] + np.arange(2 * SPIKE_NEIGHBOURS + 1), column],
+                at[row] - first,
+            )
+            spiky[
+                row[
+                    ~knock
+                    & (_contradicted(around, place, limit) | _off_the_median(around, place, limit))
+                ]
+            ] = True
         return spiky
 
     def _add_noise(self, second):
         """Estimate the noise sd of each complete chunk, at least the converter's step, shape (n_chunks, 6)."""
         start = self._n_noise * NOISE_SAMPLES - self._first
         count = (len(second) - 1 - start) // NOISE_SAMPLES if len(second) > NOISE_SAMPLES else 0
-        if self._n_noise == 0 and count == 0:   # a stream that ended before
+        if self._n_noise == 0 and count == 0:  # a stream that ended before
             parts, values = second[None], self._values[None]
         else:
-            parts, values = (rows[start:start + count * NOISE_SAMPLES].reshape(count, NOISE_SAMPLES, 6) for rows in (second, self._values))
+            parts, values = (
+                rows[start : start + count * NOISE_SAMPLES].reshape(count, NOISE_SAMPLES, 6)
+                for rows in (second, self._values)
+            )
         if not len(parts):
             return
         change = np.abs(np.diff(values, axis=1))
@@ -125,8 +148,15 @@ class SpikeFilter:
         known = np.vstack([self._noise[-1:], usual])
         last = np.maximum.accumulate(np.where(known > 0, np.arange(len(known))[:, None], 0))
         usual = np.take_along_axis(known, last, axis=0)[1:]
-        noise = np.maximum(np.maximum(usual, np.where(np.isfinite(steps), steps, 0.0)), NOISE_ROUNDING * np.abs(_median(values)))
-        self._noise, self._n_noise, self._step = np.vstack([self._noise, noise]), self._n_noise + len(noise), steps[-1]
+        noise = np.maximum(
+            np.maximum(usual, np.where(np.isfinite(steps), steps, 0.0)),
+            NOISE_ROUNDING * np.abs(_median(values)),
+        )
+        self._noise, self._n_noise, self._step = (
+            np.vstack([self._noise, noise]),
+            self._n_noise + len(noise),
+            steps[-1],
+        )
 
 
 def _median(values):
@@ -137,7 +167,12 @@ def _median(values):
 
 def _knocked(beside, limit):
     """Return where two or more of the six readings deviate in the neighbours `beside` (m, 4, 6) as well: motion affects several axes."""
-    return np.count_nonzero(np.abs(np.einsum('mkc,k->mc', beside, [-1.0, 2.0, -2.0, 1.0])) > SHARED * limit, axis=1) >= 2
+    return (
+        np.count_nonzero(
+            np.abs(np.einsum('mkc,k->mc', beside, [-1.0, 2.0, -2.0, 1.0])) > SHARED * limit, axis=1
+        )
+        >= 2
+    )
 
 
 def _contradicted(around, place, limit):
@@ -147,11 +182,18 @@ def _contradicted(around, place, limit):
     A motion with such a deviation at one reading also affects its neighbours: the impulse response of 0.9 of the Nyquist bandwidth has a
     tenth there. Both lines must therefore agree with the cubic; `place` of the reading in `around` is the middle except at the ends.
     """
-    a, b, x, c, d = around[:, SPIKE_NEIGHBOURS - 2:SPIKE_NEIGHBOURS + 3].T
+    a, b, x, c, d = around[:, SPIKE_NEIGHBOURS - 2 : SPIKE_NEIGHBOURS + 3].T
     predicted = (4 * (b + c) - (a + d)) / 6
-    off, apart = np.abs(x - predicted), np.maximum(np.abs(2 * b - a - predicted), np.abs(2 * c - d - predicted))
+    off, apart = (
+        np.abs(x - predicted),
+        np.maximum(np.abs(2 * b - a - predicted), np.abs(2 * c - d - predicted)),
+    )
     # The prediction is as noisy as the reading.
-    return (place == SPIKE_NEIGHBOURS) & (off > 1.4 * limit) & (apart < PREDICTION_SHARE * off + PREDICTION_MARGIN * limit)
+    return (
+        (place == SPIKE_NEIGHBOURS)
+        & (off > 1.4 * limit)
+        & (apart < PREDICTION_SHARE * off + PREDICTION_MARGIN * limit)
+    )
 
 
 def _off_the_median(around, place, limit):
@@ -160,5 +202,8 @@ def _off_the_median(around, place, limit):
     off = np.abs(around - ordered[:, [SPIKE_NEIGHBOURS]])
     own = off[rows, place]
     beside = off[rows[:, None], np.clip(place[:, None] + [-2, -1, 1, 2], 0, 2 * SPIKE_NEIGHBOURS)]
-    knock = ((beside > np.maximum(BETWEEN[0] * own, 0.5 * limit)[:, None]) & (beside < BETWEEN[1] * own[:, None])).any(axis=1)
+    knock = (
+        (beside > np.maximum(BETWEEN[0] * own, 0.5 * limit)[:, None])
+        & (beside < BETWEEN[1] * own[:, None])
+    ).any(axis=1)
     return (own > np.maximum(limit, SPIKE_SPREADS * (ordered[:, -3] - ordered[:, 2]))) & ~knock

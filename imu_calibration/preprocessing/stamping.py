@@ -74,10 +74,14 @@ class StampLine:
         if self.word == IRREGULAR:
             return f'the steps between stamps scatter and follow no clock near {rate:.4g} Hz'
         if self.at_once >= PACKET:
-            return f'stamps are times of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn ' \
+            return (
+                f'stamps are times of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn '
                 'through them'
-        return (f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular times at {rate:.4g} Hz are drawn '
-                'through them')
+            )
+        return (
+            f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular times at {rate:.4g} Hz are drawn '
+            'through them'
+        )
 
 
 def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
@@ -94,7 +98,7 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
     step = step[np.abs(step) <= PAUSE_NS]
     if len(step) < MIN_PERIOD_STEPS:
         return None
-    in_order = np.diff(np.sort(stamp_ns))   # exchanged neighbours are no error of the stamps
+    in_order = np.diff(np.sort(stamp_ns))  # exchanged neighbours are no error of the stamps
     in_order = in_order[in_order <= PAUSE_NS]
     line = _regular(in_order, float(np.median(in_order)))
     if line is not None or len(stamp_ns) < 4 * LAG:
@@ -108,7 +112,9 @@ def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
         if line.period_ns >= 1.0:
             return line
     # Where more than half of the samples are lost the usual step is two periods.
-    return _regular(in_order, float(np.quantile(in_order, 0.1))) or StampLine(IRREGULAR, max(period, 1.0))
+    return _regular(in_order, float(np.quantile(in_order, 0.1))) or StampLine(
+        IRREGULAR, max(period, 1.0)
+    )
 
 
 def _regular(step: np.ndarray, usual: float) -> StampLine | None:
@@ -116,7 +122,10 @@ def _regular(step: np.ndarray, usual: float) -> StampLine | None:
         return None
     number = np.rint(step / usual)
     # the sample is late, and the next one earlier
-    number[(step <= MAX_REGULAR_STEP * usual) | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE_STEP_SHARE))] = 1.0
+    number[
+        (step <= MAX_REGULAR_STEP * usual)
+        | ((number < MOST_LOST) & (np.abs(step / usual - number) > WHOLE_STEP_SHARE))
+    ] = 1.0
     used = (step > 0) & (number <= MOST_LOST)
     return StampLine(REGULAR, float(step[used].sum() / number[used].sum()))
 
@@ -138,7 +147,11 @@ def regular_share(step: np.ndarray, period: float) -> float:
 def _without_losses(apart: np.ndarray, resolution: float) -> np.ndarray:
     """Return the differences across `LAG` steps, without the ones that contain lost samples or a pause."""
     off = np.abs(apart - np.median(apart)) if len(apart) else apart
-    return apart[off <= 3 * np.median(off) + 0.5 * np.median(apart) / LAG + resolution] if len(apart) else apart
+    return (
+        apart[off <= 3 * np.median(off) + 0.5 * np.median(apart) / LAG + resolution]
+        if len(apart)
+        else apart
+    )
 
 
 def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
@@ -187,7 +200,9 @@ class CountedClock:
 
     def __init__(self, line: StampLine):
         self._period, self._arrivals = line.period_ns, line.arrivals
-        self._margin = LOST_PERIOD_SHARE * line.period_ns + (0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns))
+        self._margin = LOST_PERIOD_SHARE * line.period_ns + (
+            0.0 if line.arrivals else 0.25 * (line.high_ns - line.low_ns)
+        )
         self._raw, self._times = np.zeros(0, np.int64), [np.zeros(0, np.int64)]
         self._begin()
 
@@ -206,10 +221,13 @@ class CountedClock:
     def take(self, final: bool = False) -> np.ndarray:
         """Return the times that are determined now (all with `final`), int64, ns, in the order of the stamps."""
         while len(self._raw) >= CLOCK_BLOCK + LOSS_REACH or (final and len(self._raw)):
-            pause = np.flatnonzero(np.diff(self._raw[:CLOCK_BLOCK + LOSS_REACH]) > PAUSE_NS)
+            pause = np.flatnonzero(np.diff(self._raw[: CLOCK_BLOCK + LOSS_REACH]) > PAUSE_NS)
             end = len(self._raw) if not len(pause) else int(pause[0]) + 1
-            self._work(self._raw[:min(CLOCK_BLOCK, end)], self._raw[min(CLOCK_BLOCK, end):min(CLOCK_BLOCK + LOSS_REACH, end)])
-            self._raw = self._raw[min(CLOCK_BLOCK, end):]
+            self._work(
+                self._raw[: min(CLOCK_BLOCK, end)],
+                self._raw[min(CLOCK_BLOCK, end) : min(CLOCK_BLOCK + LOSS_REACH, end)],
+            )
+            self._raw = self._raw[min(CLOCK_BLOCK, end) :]
             if len(pause) and end <= CLOCK_BLOCK:
                 self._finish()
         if final:
@@ -223,10 +241,14 @@ class CountedClock:
             self._origin_ns = int(stamp_ns[0])
         stamp = (np.concatenate([stamp_ns, ahead_ns]) - self._origin_ns).astype(float)
         number = self._numbered(stamp, len(stamp_ns))
-        stamp = stamp[:len(stamp_ns)]
-        self._before = np.stack([np.concatenate([self._before[0], number]), np.concatenate([self._before[1], stamp])])[:, -LOSS_REACH:]
+        stamp = stamp[: len(stamp_ns)]
+        self._before = np.stack(
+            [np.concatenate([self._before[0], number]), np.concatenate([self._before[1], stamp])]
+        )[:, -LOSS_REACH:]
         self._next = number[-1] + 1
-        if len(number) >= CLOCK_BLOCK // 2 or not self._points:   # the few samples of a shorter one may all be late
+        if (
+            len(number) >= CLOCK_BLOCK // 2 or not self._points
+        ):  # the few samples of a shorter one may all be late
             late = stamp - self._period * number
             usual = late.min() if self._arrivals else late.mean()
             self._points.append((float(number.mean()), float(usual + self._period * number.mean())))
@@ -241,16 +263,26 @@ class CountedClock:
         number = self._next + np.arange(len(stamp))
         step = np.diff(stamp, prepend=self._before[1, -1] if self._before.shape[1] else stamp[0])
         for k in np.flatnonzero(step[:count] > MAX_REGULAR_STEP * self._period):
-            past = np.concatenate([self._before[1] - self._period * self._before[0], stamp[:k] - self._period * number[:k]])[-LOSS_REACH:]
+            past = np.concatenate(
+                [
+                    self._before[1] - self._period * self._before[0],
+                    stamp[:k] - self._period * number[:k],
+                ]
+            )[-LOSS_REACH:]
             if len(past):
-                jump = middle(stamp[k:k + LOSS_REACH] - self._period * number[k:k + LOSS_REACH]) - middle(past)
+                jump = middle(
+                    stamp[k : k + LOSS_REACH] - self._period * number[k : k + LOSS_REACH]
+                ) - middle(past)
                 number[k:] += np.round(jump / self._period) if jump > self._margin else 0.0
         return number[:count]
 
     def _tell(self, number: np.ndarray) -> None:
         """Compute the times of a block, from its point and the points of its neighbours."""
         points = np.array(self._points)
-        ends = (points[0] - (CLOCK_BLOCK, CLOCK_BLOCK * self._period), points[-1] + (CLOCK_BLOCK, CLOCK_BLOCK * self._period))
+        ends = (
+            points[0] - (CLOCK_BLOCK, CLOCK_BLOCK * self._period),
+            points[-1] + (CLOCK_BLOCK, CLOCK_BLOCK * self._period),
+        )
         points = np.vstack([ends[0], points, ends[1]])
         times = np.interp(number, points[:, 0], points[:, 1])
         self._times.append(self._origin_ns + np.rint(times).astype(np.int64))
@@ -261,7 +293,11 @@ class CountedClock:
             return
         (n0, t0), (n1, t1) = self._points[-2:]
         period = (t1 - t0) / (n1 - n0)
-        self._period = period if abs(period - self._period) > FOLLOW * self._period else self._period + NEW_WEIGHT * (period - self._period)
+        self._period = (
+            period
+            if abs(period - self._period) > FOLLOW * self._period
+            else self._period + NEW_WEIGHT * (period - self._period)
+        )
         self._points = self._points[-2:]
 
     def _finish(self) -> None:
@@ -306,7 +342,10 @@ class SampleTimes:
             return samples
         samples, ready = self._without_repeated(samples), []
         while len(samples):
-            part, samples = samples.select(slice(0, CLOCK_BLOCK - self._unseen)), samples.select(slice(CLOCK_BLOCK - self._unseen, None))
+            part, samples = (
+                samples.select(slice(0, CLOCK_BLOCK - self._unseen)),
+                samples.select(slice(CLOCK_BLOCK - self._unseen, None)),
+            )
             self._unseen = (self._unseen + len(part)) % CLOCK_BLOCK
             self._history = np.concatenate([self._history, part.stamp_ns])[-STAMP_HISTORY:]
             ready += self._take(part)
@@ -324,18 +363,25 @@ class SampleTimes:
         """Return whether all steps agree with the known clock: the usual case, without further tests."""
         if self._learning or self._clock is not None or self.line is None or not len(samples):
             return False
-        step = np.diff(np.concatenate([self._history[-self._unseen - 1:], samples.stamp_ns]))   # the complete block of the next review
+        step = np.diff(
+            np.concatenate([self._history[-self._unseen - 1 :], samples.stamp_ns])
+        )  # the complete block of the next review
         if not np.all(is_regular(step, self.line.period_ns)):
             return False
         self._unseen = (self._unseen + len(samples)) % CLOCK_BLOCK
-        self._history = np.concatenate([self._history, samples.stamp_ns[-STAMP_HISTORY:]])[-STAMP_HISTORY:]
+        self._history = np.concatenate([self._history, samples.stamp_ns[-STAMP_HISTORY:]])[
+            -STAMP_HISTORY:
+        ]
         self._last = samples.select(slice(len(samples) - 1, None))
         return True
 
     def _without_repeated(self, samples: ImuSamples) -> ImuSamples:
         joined = samples if self._last is None else ImuSamples.concatenate([self._last, samples])
         at = np.flatnonzero(joined.stamp_ns[1:] == joined.stamp_ns[:-1])
-        same = at[np.all(joined.force_s[at] == joined.force_s[at + 1], axis=1) & np.all(joined.rate_s[at] == joined.rate_s[at + 1], axis=1)]
+        same = at[
+            np.all(joined.force_s[at] == joined.force_s[at + 1], axis=1)
+            & np.all(joined.rate_s[at] == joined.rate_s[at + 1], axis=1)
+        ]
         self._last = joined.select(slice(len(joined) - 1, None))
         if not len(same):
             return samples
@@ -349,7 +395,7 @@ class SampleTimes:
         if self._learning:
             self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
             stamp_ns = self._held.stamp_ns
-            some = stamp_ns[:MIN_PERIOD_STEPS + 1] if len(stamp_ns) < STAMP_HISTORY else stamp_ns
+            some = stamp_ns[: MIN_PERIOD_STEPS + 1] if len(stamp_ns) < STAMP_HISTORY else stamp_ns
             line = describe_stamps(some) if len(stamp_ns) > MIN_PERIOD_STEPS else None
             if line is None and len(stamp_ns) < STAMP_HISTORY:
                 return []
@@ -366,7 +412,9 @@ class SampleTimes:
         """Return the held samples and a further part, unchanged or with times from the clock."""
         if self._clock is None:
             held, self._held = self._held, None
-            self.n_irregular += len(part or ()) if self.line is not None and self.line.word == IRREGULAR else 0
+            self.n_irregular += (
+                len(part or ()) if self.line is not None and self.line.word == IRREGULAR else 0
+            )
             return [held, part]
         if part is not None:
             self._clock.push(part.stamp_ns)
@@ -378,7 +426,10 @@ class SampleTimes:
         times = self._clock.take(final)
         if not len(times):
             return []
-        timed, self._held = self._held.select(slice(0, len(times))), self._held.select(slice(len(times), None))
+        timed, self._held = (
+            self._held.select(slice(0, len(times))),
+            self._held.select(slice(len(times), None)),
+        )
         self.n_rebuilt += len(times)
         return [replace(timed, stamp_ns=times)]
 
@@ -391,8 +442,11 @@ class SampleTimes:
         """Return whether the steps of the last block differ from the known clock."""
         if self.line is None:
             return True
-        step = np.diff(self._history[-CLOCK_BLOCK - 1:])
-        return bool(np.count_nonzero(~is_regular(step, self.line.period_ns)) > MAX_IRREGULAR_SHARE * len(step))
+        step = np.diff(self._history[-CLOCK_BLOCK - 1 :])
+        return bool(
+            np.count_nonzero(~is_regular(step, self.line.period_ns))
+            > MAX_IRREGULAR_SHARE * len(step)
+        )
 
     def _judge(self, line: StampLine | None) -> list:
         """Start or stop counting according to the stamps; return the samples that become ready."""
@@ -400,8 +454,13 @@ class SampleTimes:
             return []
         before, self.line = self.line, line
         self._odd_lines[line.word] = line
-        changed = before is not None and abs(line.period_ns - before.period_ns) > FOLLOW * before.period_ns
-        if (line.word == COUNTED) == (self._clock is not None) and not (changed and self._clock is not None):
+        changed = (
+            before is not None
+            and abs(line.period_ns - before.period_ns) > FOLLOW * before.period_ns
+        )
+        if (line.word == COUNTED) == (self._clock is not None) and not (
+            changed and self._clock is not None
+        ):
             return []
         ready = []
         if self._clock is not None:

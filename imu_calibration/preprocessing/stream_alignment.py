@@ -11,7 +11,11 @@ from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSa
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
 from imu_calibration.preprocessing import window_cutter
-from imu_calibration.preprocessing.rest_detection import QUIETNESS_REACH, QuietFloor, quiet_beside_joints
+from imu_calibration.preprocessing.rest_detection import (
+    QUIETNESS_REACH,
+    QuietFloor,
+    quiet_beside_joints,
+)
 from imu_calibration.preprocessing.window import PhasedSamples, WindowSettings
 from imu_calibration.preprocessing.window_cutter import LEAST_READINGS, LOST, STILL, JointRun
 
@@ -82,7 +86,12 @@ class MotionChunks:
     its margin (or are given up), so the division of the streams into blocks has no effect. The waiting times bound the memory.
     """
 
-    def __init__(self, settings: WindowSettings, noise_rad: float | None, floors: tuple[QuietFloor, QuietFloor]):
+    def __init__(
+        self,
+        settings: WindowSettings,
+        noise_rad: float | None,
+        floors: tuple[QuietFloor, QuietFloor],
+    ):
         self.counts = Counter()
         self.time_origin = 0.0
         self._settings, self._noise_rad, self._floors = settings, noise_rad, floors
@@ -117,7 +126,12 @@ class MotionChunks:
             return self.time_origin
         return self.time_origin + (self._imu.newest_ns - self._start_ns) / 1e9
 
-    def add(self, imu: ImuSamples | None = None, joints: JointSamples | None = None, temperature: TemperatureSamples | None = None) -> None:
+    def add(
+        self,
+        imu: ImuSamples | None = None,
+        joints: JointSamples | None = None,
+        temperature: TemperatureSamples | None = None,
+    ) -> None:
         """Add cleaned samples, each stream in the order of its stamps."""
         if imu is not None and len(imu):
             if self._start_ns is None:
@@ -128,13 +142,18 @@ class MotionChunks:
                 self._first_joint_ns = int(joints.stamp_ns[0])
             self._joints.add(self._not_late(joints, None))
         if temperature is not None and len(temperature):
-            self._temperature.add(replace(temperature, branch=self._branch.of(temperature.temperature_c)))
+            self._temperature.add(
+                replace(temperature, branch=self._branch.of(temperature.temperature_c))
+            )
 
     def take(self, final: bool = False) -> Iterator[PhasedSamples]:
         """Yield the chunks that can be processed (all with `final`) as `PhasedSamples`, without samples that have no joints."""
         if self._start_ns is not None:
             passed = np.inf if final else self._passed_ns()
-            while self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed and self._advance(passed, final):
+            while (
+                self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
+                and self._advance(passed, final)
+            ):
                 chunk = self._work(self._next_start_ns(), final)
                 self._chunk += 1
                 if chunk is not None:
@@ -150,7 +169,10 @@ class MotionChunks:
 
     def _passed_ns(self):
         """Return the stamp that all streams have passed or will never pass."""
-        imu, joints, temperature = (-NEVER if b.newest_ns is None else b.newest_ns for b in (self._imu, self._joints, self._temperature))
+        imu, joints, temperature = (
+            -NEVER if b.newest_ns is None else b.newest_ns
+            for b in (self._imu, self._joints, self._temperature)
+        )
         given_up = _ns(JOINT_WAIT)
         imu, joints = max(imu, joints - given_up), max(joints, imu - given_up)
         return min(imu, joints, max(temperature, imu - _ns(TEMPERATURE_WAIT)))
@@ -160,7 +182,9 @@ class MotionChunks:
         oldest = self._imu.first_from(self._next_start_ns())
         if oldest is None:
             if not final:
-                self._chunk = max(self._chunk, int((passed - self._margin_ns - self._start_ns) // self._chunk_ns))
+                self._chunk = max(
+                    self._chunk, int((passed - self._margin_ns - self._start_ns) // self._chunk_ns)
+                )
             return False
         self._chunk = (oldest - self._start_ns) // self._chunk_ns
         return self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
@@ -169,7 +193,11 @@ class MotionChunks:
         """Return `samples` without the ones in chunks already processed."""
         if self._start_ns is None or self._chunk == 0:
             return samples
-        late = int(np.searchsorted(samples.stamp_ns, self._next_start_ns() - (0 if reason else self._margin_ns)))
+        late = int(
+            np.searchsorted(
+                samples.stamp_ns, self._next_start_ns() - (0 if reason else self._margin_ns)
+            )
+        )
         if reason:
             self._count(reason, late)
         return samples.select(slice(late, None)) if late else samples
@@ -181,11 +209,15 @@ class MotionChunks:
             oldest = self._joints.newest_ns - _ns(JOINT_WAIT)
         else:
             oldest = (self._temperature.newest_ns or 0) - _ns(JOINT_WAIT)
-        for buffer, keep_one in ((self._imu, False), (self._joints, False), (self._temperature, True)):
+        for buffer, keep_one in (
+            (self._imu, False),
+            (self._joints, False),
+            (self._temperature, True),
+        ):
             buffer.forget_before(oldest, keep_one)
 
     def _count(self, reason, number):
-        self.counts += Counter({reason: int(number)})   # without zeros
+        self.counts += Counter({reason: int(number)})  # without zeros
 
     def _work(self, start_ns, final):
         """Return the chunk from `start_ns` on, or None when no sample in it can be used."""
@@ -194,10 +226,19 @@ class MotionChunks:
         core = slice(*np.searchsorted(imu.stamp_ns, [start_ns, stop_ns]))
         time = (imu.stamp_ns - self._start_ns) / 1e9
         period = float(np.median(np.diff(time))) if len(time) > 1 else self._settings.gap / 5
-        runs, limit = self._joint_runs(start_ns - self._margin_ns, stop_ns + self._margin_ns, period)
+        runs, limit = self._joint_runs(
+            start_ns - self._margin_ns, stop_ns + self._margin_ns, period
+        )
         phase, level, joint_step = self._phases(time, runs, final)
-        quiet = quiet_beside_joints(imu.force_s, imu.rate_s, period, ratio=self._settings.quiet_ratio,
-                                    longest=self._settings.static_minimum, floors=self._floors, resting=phase == STILL)
+        quiet = quiet_beside_joints(
+            imu.force_s,
+            imu.rate_s,
+            period,
+            ratio=self._settings.quiet_ratio,
+            longest=self._settings.static_minimum,
+            floors=self._floors,
+            resting=phase == STILL,
+        )
         after_gap = self._after_gaps(imu.stamp_ns[core], limit)
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
@@ -205,10 +246,22 @@ class MotionChunks:
         temperature, branch = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
         vibration = self._vibration.of(period, imu.force_s[core])
         corrected = None if imu.corrected is None else imu.corrected[core]
-        return self._without_lost(PhasedSamples(
-            imu.stamp_ns[core], imu.force_s[core], imu.rate_s[core], JointMotion(time[core] + self.time_origin, *motion, branch, vibration),
-            temperature, phase[core], quiet[core], after_gap,
-            np.zeros(len(after_gap), bool), joint_step[core], corrected), self._at_edge(imu.stamp_ns[core], limit, final))
+        return self._without_lost(
+            PhasedSamples(
+                imu.stamp_ns[core],
+                imu.force_s[core],
+                imu.rate_s[core],
+                JointMotion(time[core] + self.time_origin, *motion, branch, vibration),
+                temperature,
+                phase[core],
+                quiet[core],
+                after_gap,
+                np.zeros(len(after_gap), bool),
+                joint_step[core],
+                corrected,
+            ),
+            self._at_edge(imu.stamp_ns[core], limit, final),
+        )
 
     def _joint_runs(self, first_ns, last_ns, period):
         """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""
@@ -219,8 +272,17 @@ class MotionChunks:
         time = (joints.stamp_ns - self._start_ns) / 1e9
         step = np.diff(time)
         joint_limit = max(limit, 3 * float(np.median(step))) if len(step) else limit
-        runs = [JointRun(time[a:b], joints.position[a:b], joints.velocity[a:b], settings=self._settings, noise_rad=self._noise_rad)
-                for a, b in runs_of(np.ones(len(time)), step > joint_limit) if b - a >= LEAST_READINGS]
+        runs = [
+            JointRun(
+                time[a:b],
+                joints.position[a:b],
+                joints.velocity[a:b],
+                settings=self._settings,
+                noise_rad=self._noise_rad,
+            )
+            for a, b in runs_of(np.ones(len(time)), step > joint_limit)
+            if b - a >= LEAST_READINGS
+        ]
         return runs, limit
 
     def _phases(self, time, runs, final):
@@ -229,7 +291,10 @@ class MotionChunks:
         level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
         steps = np.zeros(level.shape)
         for k, run in enumerate(runs):
-            first = self._first_joint_ns is not None and run.time[0] <= (self._first_joint_ns - self._start_ns) / 1e9
+            first = (
+                self._first_joint_ns is not None
+                and run.time[0] <= (self._first_joint_ns - self._start_ns) / 1e9
+            )
             inside = run.covered(time, before=first, after=final and k == len(runs) - 1)
             phase[inside], level[inside] = run.at(time[inside])
             steps[inside] = run.step
@@ -241,11 +306,17 @@ class MotionChunks:
             need = np.flatnonzero((phase != LOST) & run.near_motion(time, self.short_rest))
             if not len(need):
                 continue
-            parts = np.split(need, np.flatnonzero(np.diff(time[need]) > 2 * self._settings.overlap) + 1)
+            parts = np.split(
+                need, np.flatnonzero(np.diff(time[need]) > 2 * self._settings.overlap) + 1
+            )
             for part in parts:
                 stretch = slice(part[0], part[-1] + 1)
                 curve = run.curve(time[stretch], self._settings.overlap, self._noise_rad)
-                for target, values in zip(motion, (curve.position, curve.rate, curve.acceleration, curve.jerk), strict=True):
+                for target, values in zip(
+                    motion,
+                    (curve.position, curve.rate, curve.acceleration, curve.jerk),
+                    strict=True,
+                ):
                     target[stretch] = values
 
     def _after_gaps(self, stamp_ns, limit):
@@ -267,7 +338,9 @@ class MotionChunks:
             return np.zeros(len(stamp_ns), bool)
         edge = (stamp_ns < self._first_joint_ns) & (stamp_ns >= self._first_joint_ns - _ns(limit))
         if final and self._joints.newest_ns is not None:
-            edge |= (stamp_ns > self._joints.newest_ns) & (stamp_ns <= self._joints.newest_ns + _ns(limit))
+            edge |= (stamp_ns > self._joints.newest_ns) & (
+                stamp_ns <= self._joints.newest_ns + _ns(limit)
+            )
         return edge
 
     def _without_lost(self, samples, edge):

@@ -8,7 +8,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples, JointSamples, NominalScaling, SampleBlock, TemperatureSamples
+from imu_calibration.core.samples import (
+    ImuSamples,
+    JointSamples,
+    NominalScaling,
+    SampleBlock,
+    TemperatureSamples,
+)
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
 
@@ -18,7 +24,11 @@ BACKWARD_RESET_NS = _SECOND
 FORWARD_RESET_NS = 3600 * _SECOND
 """A larger forward step is a reset of the clock as well (a computer that receives the date after start-up)."""
 NEVER_NS = 1 << 62
-_NEEDED = {ImuSamples: ('force_s', 'rate_s'), JointSamples: ('position',), TemperatureSamples: ('temperature_c',)}
+_NEEDED = {
+    ImuSamples: ('force_s', 'rate_s'),
+    JointSamples: ('position',),
+    TemperatureSamples: ('temperature_c',),
+}
 
 
 class StreamCheck:
@@ -60,7 +70,9 @@ class StreamCheck:
     def finish(self) -> list[tuple[int, Any]]:
         """Return the buffered samples, as `push` does."""
         held, self._held = self._held, None
-        return self._without_spikes(([] if held is None else self._accept(held)) + self._end_epoch(), ended=True)
+        return self._without_spikes(
+            ([] if held is None else self._accept(held)) + self._end_epoch(), ended=True
+        )
 
     def statistics(self, gap: float = 0.1) -> 'StreamStatistics':
         """
@@ -72,8 +84,14 @@ class StreamCheck:
             Steps longer than this, and than five median periods, are counted as gaps, s.
 
         """
-        return StreamStatistics(self._n_accepted, dict(self.counts), self._span_ns / 1e9, *self._steps.summary(gap), *self._extent_ns,
-                                None if self._times is None else self._times.odd_line(self._n_accepted))
+        return StreamStatistics(
+            self._n_accepted,
+            dict(self.counts),
+            self._span_ns / 1e9,
+            *self._steps.summary(gap),
+            *self._extent_ns,
+            None if self._times is None else self._times.odd_line(self._n_accepted),
+        )
 
     def _without_spikes(self, accepted, ended=False):
         """Pass the samples of an IMU through the filter; each epoch of the clock is one stream."""
@@ -95,10 +113,12 @@ class StreamCheck:
         return [(self._filtered_epoch, part) for part in self._spikes.finish()]
 
     def _count(self, reason, number):
-        self.counts += Counter({reason: int(number)})   # without zeros
+        self.counts += Counter({reason: int(number)})  # without zeros
 
     def _finite(self, samples):
-        columns = [getattr(samples, name).reshape(len(samples), -1) for name in _NEEDED[type(samples)]]
+        columns = [
+            getattr(samples, name).reshape(len(samples), -1) for name in _NEEDED[type(samples)]
+        ]
         if all(np.isfinite(column).all() for column in columns):
             return samples
         finite = np.logical_and.reduce([np.isfinite(column).all(axis=1) for column in columns])
@@ -111,11 +131,17 @@ class StreamCheck:
         if not len(samples):
             return samples
         started = self._before_held is not None
-        stamps = np.concatenate([[self._before_held], samples.stamp_ns]) if started else samples.stamp_ns
+        stamps = (
+            np.concatenate([[self._before_held], samples.stamp_ns]) if started else samples.stamp_ns
+        )
         step = np.diff(stamps)
         far = np.abs(step) > BACKWARD_RESET_NS
         stray = np.zeros(len(stamps), bool)
-        stray[1:-1] = far[:-1] & far[1:] & (np.abs(step[:-1] + step[1:]) < np.minimum(np.abs(step[:-1]), np.abs(step[1:])))
+        stray[1:-1] = (
+            far[:-1]
+            & far[1:]
+            & (np.abs(step[:-1] + step[1:]) < np.minimum(np.abs(step[:-1]), np.abs(step[1:])))
+        )
         if not started and len(step):
             stray[0] = _is_reset(step[0])
         stray = stray[started:]
@@ -171,10 +197,17 @@ class StreamCheck:
         keep = stamps > before
         samples = samples if keep.all() else samples.select(keep)
         if len(samples):
-            joined = samples.stamp_ns if self._newest is None else np.concatenate([[self._newest], samples.stamp_ns])
+            joined = (
+                samples.stamp_ns
+                if self._newest is None
+                else np.concatenate([[self._newest], samples.stamp_ns])
+            )
             self._steps.add(np.diff(joined))
             self._span_ns += int(joined[-1] - joined[0])
-            self._extent_ns = min(self._extent_ns[0], int(samples.stamp_ns[0])), max(self._extent_ns[1], int(samples.stamp_ns[-1]))
+            self._extent_ns = (
+                min(self._extent_ns[0], int(samples.stamp_ns[0])),
+                max(self._extent_ns[1], int(samples.stamp_ns[-1])),
+            )
             self._newest = joined[-1]
             self._n_accepted += len(samples)
         return [(self.epoch, samples)]
@@ -268,9 +301,17 @@ class StepHistogram:
         mean, total = self._sum_ns / np.maximum(self._number, 1), int(self._number.sum())
         median = mean[np.searchsorted(np.cumsum(self._number), (total + 1) // 2)]
         longer = mean > max(gap * 1e9, 5 * median)
-        irregular = self._number[np.abs(mean - median) > MAX_STEP_DEVIATION * median].sum() / max(total, 1)
-        return (float(median / 1e9), self.common_step_ns, int(self._number[longer].sum()), float(self._sum_ns[longer].sum() / 1e9),
-                self._longest_ns / 1e9, float(irregular))
+        irregular = self._number[np.abs(mean - median) > MAX_STEP_DEVIATION * median].sum() / max(
+            total, 1
+        )
+        return (
+            float(median / 1e9),
+            self.common_step_ns,
+            int(self._number[longer].sum()),
+            float(self._sum_ns[longer].sum() / 1e9),
+            self._longest_ns / 1e9,
+            float(irregular),
+        )
 
 
 STREAMS = ('imu', 'joints', 'temperature')
@@ -278,7 +319,11 @@ MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 """Stream -> message type; names of reasons for lost messages begin with it."""
 CLEANING_BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
-_SAMPLE_TYPES: dict[str, Any] = {'imu': ImuSamples, 'joints': JointSamples, 'temperature': TemperatureSamples}
+_SAMPLE_TYPES: dict[str, Any] = {
+    'imu': ImuSamples,
+    'joints': JointSamples,
+    'temperature': TemperatureSamples,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +366,12 @@ class BlockCleaner:
 
     """
 
-    def __init__(self, joint_names: Sequence[str] = (), nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()):
+    def __init__(
+        self,
+        joint_names: Sequence[str] = (),
+        nominal: NominalScaling | None = None,
+        watchers: Sequence[Watcher] = (),
+    ):
         self._names, self._nominal, self._watchers = tuple(joint_names), nominal, watchers
         self._checks = {name: StreamCheck() for name in STREAMS}
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
@@ -341,7 +391,11 @@ class BlockCleaner:
     def counts(self) -> dict[str, int]:
         """Return the dropped samples per stream: 'imu not finite', 'joints repeated stamp', ... -> number of samples."""
         self._clean()
-        return {f'{name} {reason}': count for name, check in self._checks.items() for reason, count in check.counts.items()}
+        return {
+            f'{name} {reason}': count
+            for name, check in self._checks.items()
+            for reason, count in check.counts.items()
+        }
 
     def epoch(self, stream: str) -> int:
         """Return how often the clock of a stream was reset."""
@@ -350,8 +404,12 @@ class BlockCleaner:
     def statistics(self, gap: float = 0.1) -> dict[str, StreamStatistics]:
         """Return stream name -> `StreamStatistics`; `gap` as for `StreamCheck.statistics`."""
         self._clean()
-        return {name: replace(check.statistics(gap), unstamped=self.notes.get(f'{MESSAGES[name]} zero stamp', 0))
-                for name, check in self._checks.items()}
+        return {
+            name: replace(
+                check.statistics(gap), unstamped=self.notes.get(f'{MESSAGES[name]} zero stamp', 0)
+            )
+            for name, check in self._checks.items()
+        }
 
     @property
     def stamping(self) -> StampLine | None:
@@ -400,11 +458,18 @@ class BlockCleaner:
     def _clean(self) -> None:
         for name, parts in self._raw.items():
             if parts:
-                self._ready[name] += self._checks[name].push(parts[0] if len(parts) == 1 else _SAMPLE_TYPES[name].concatenate(parts))
+                self._ready[name] += self._checks[name].push(
+                    parts[0] if len(parts) == 1 else _SAMPLE_TYPES[name].concatenate(parts)
+                )
                 self._raw[name] = []
 
     def _hand_on(self):
-        cleaned = CleanedBlock(**{name: [(epoch, part) for epoch, part in parts if len(part)] for name, parts in self._ready.items()})
+        cleaned = CleanedBlock(
+            **{
+                name: [(epoch, part) for epoch, part in parts if len(part)]
+                for name, parts in self._ready.items()
+            }
+        )
         self._ready = {name: [] for name in STREAMS}
         for watcher in self._watchers:
             watcher.push(cleaned)
@@ -415,7 +480,12 @@ class BlockCleaner:
             return joints
         missing = [name for name in self._names if name not in joints.names]
         if missing:
-            raise InputError(f"joint states must hold the table's joints {', '.join(self._names)}, got {', '.join(joints.names)}; "
-                             'correct the names in the table or choose another joint topic', code='joint_names')
+            raise InputError(
+                f"joint states must hold the table's joints {', '.join(self._names)}, got {', '.join(joints.names)}; "
+                'correct the names in the table or choose another joint topic',
+                code='joint_names',
+            )
         order = [joints.names.index(name) for name in self._names]
-        return JointSamples(joints.stamp_ns, joints.position[:, order], joints.velocity[:, order], self._names)
+        return JointSamples(
+            joints.stamp_ns, joints.position[:, order], joints.velocity[:, order], self._names
+        )

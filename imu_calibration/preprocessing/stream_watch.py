@@ -107,33 +107,67 @@ class StreamWatch:
     def state(self, now: float, stamping: StampLine | None = None) -> StreamState:
         """Return the StreamState at `now`; `stamping` as its field."""
         values: dict[str, Any] = {f'{name} messages': count for name, count in self._count.items()}
-        values |= {f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()}
+        values |= {
+            f'{name} rate [Hz]': f'{1 / period:.1f}' for name, period in self._period.items()
+        }
         values |= {f'dropped: {reason}': count for reason, count in self._lost.items()}
         values |= self._notes | ({'imu stamps': str(stamping)} if stamping else {})
-        silent = tuple(name for name, patience in self._needed.items() if now - self._arrived.get(name, float('-inf')) > patience)
-        coming = tuple(name for name in self._arrived if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER))
+        silent = tuple(
+            name
+            for name, patience in self._needed.items()
+            if now - self._arrived.get(name, float('-inf')) > patience
+        )
+        coming = tuple(
+            name
+            for name in self._arrived
+            if now - self._arrived[name] <= self._needed.get(name, SILENT_AFTER)
+        )
         unusable = {name: self._recently(now, MESSAGES[name]) for name in silent}
         word, text = self._word(silent, now, stamping)
-        return StreamState(word, text, values, silent, coming, {name: what for name, what in unusable.items() if what}, stamping)
+        return StreamState(
+            word,
+            text,
+            values,
+            silent,
+            coming,
+            {name: what for name, what in unusable.items() if what},
+            stamping,
+        )
 
     def _recently(self, now, beginning=''):
         """Return the recently dropped samples for reasons with that beginning; '' if none."""
         if self._lost_at is None or now - self._lost_at >= RECENT_SECONDS:
             return ''
-        return ', '.join(f'{count} {reason}' for reason, count in self._recent.items() if reason.startswith(beginning))
+        return ', '.join(
+            f'{count} {reason}'
+            for reason, count in self._recent.items()
+            if reason.startswith(beginning)
+        )
 
     def _word(self, silent, now, stamping):
         """Return the state of the streams and the line that describes it."""
         if silent:
             none = len(silent) == len(self._needed)
-            return SILENT if none else TROUBLE, f'no {" and no ".join(MESSAGES[name] for name in silent)} messages received' + (
-                '' if none else ', no data can be used until then')
-        lead = (self._newest['imu'] - self._newest['joints']) * 1e-9 if 'joints' in self._needed else 0.0
+            return (
+                SILENT if none else TROUBLE,
+                f'no {" and no ".join(MESSAGES[name] for name in silent)} messages received'
+                + ('' if none else ', no data can be used until then'),
+            )
+        lead = (
+            (self._newest['imu'] - self._newest['joints']) * 1e-9
+            if 'joints' in self._needed
+            else 0.0
+        )
         if self._apart_for(lead, now) > SILENT_AFTER:
-            return TROUBLE, (f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; '
-                             'bring the clocks together')
+            return TROUBLE, (
+                f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; '
+                'bring the clocks together'
+            )
         if stamping is not None and stamping.word == IRREGULAR:
-            return TROUBLE, f"{stamping}: sampling times are unknown; the driver should stamp by the sensor's clock"
+            return (
+                TROUBLE,
+                f"{stamping}: sampling times are unknown; the driver should stamp by the sensor's clock",
+            )
         if self._unstamped_at is not None and now - self._unstamped_at < RECENT_SECONDS:
             notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())
             return TROUBLE, f'{notes}: the driver sets none, the time of arrival is used'

@@ -5,10 +5,24 @@ from collections.abc import Iterator
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.units import DEG, GRAVITY_PLACE_SHARE, OTHER_UNITS, STANDARD_GRAVITY, significant, unit_of_rest
+from imu_calibration.core.units import (
+    DEG,
+    GRAVITY_PLACE_SHARE,
+    OTHER_UNITS,
+    STANDARD_GRAVITY,
+    significant,
+    unit_of_rest,
+)
 from imu_calibration.preprocessing.full_scale import FACTORS, nearest_power
 from imu_calibration.preprocessing.on_table import MIN_MATCH, match_axes
-from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE, WARNING, CheckFinding, RecordingEvidence
+from imu_calibration.preprocessing.recording_evidence import (
+    GOOD,
+    NOTE,
+    REFUSE,
+    WARNING,
+    CheckFinding,
+    RecordingEvidence,
+)
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
@@ -39,23 +53,35 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     length = evidence.length
     if length is None:
         return
-    if (error := force_error(length, 'at rest' if evidence.rest is not None else 'in the middle')) is not None:
+    if (
+        error := force_error(length, 'at rest' if evidence.rest is not None else 'in the middle')
+    ) is not None:
         yield CheckFinding('force_unit', REFUSE, str(error), key=error.key or '')
     else:
-        yield CheckFinding('force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}')
+        yield CheckFinding(
+            'force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}'
+        )
 
 
 def force_error(length: float, where: str = 'at rest') -> InputError | None:
     """Return the error for a median length of the specific force that is not gravity in m/s^2, None for one that can be."""
     said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
     if unit := unit_of_rest(length):
-        return InputError(f'{said}it is probably {unit}, accelerometer_scale {OTHER_UNITS[unit]:.6g}; convert it in the driver',
-                          key='nominal', code='force_unit')
+        return InputError(
+            f'{said}it is probably {unit}, accelerometer_scale {OTHER_UNITS[unit]:.6g}; convert it in the driver',
+            key='nominal',
+            code='force_unit',
+        )
     if length < LINEAR:
-        return InputError(f'{said}it is probably acceleration without gravity, as phones compute it; record the raw accelerometer',
-                          key='imu_topic', code='without_gravity')
+        return InputError(
+            f'{said}it is probably acceleration without gravity, as phones compute it; record the raw accelerometer',
+            key='imu_topic',
+            code='without_gravity',
+        )
     if not 3.0 < length < 30.0:
-        return InputError(f'{said}counts or volts?; convert it in the driver', key='nominal', code='force_unit')
+        return InputError(
+            f'{said}counts or volts?; convert it in the driver', key='nominal', code='force_unit'
+        )
     return None
 
 
@@ -75,17 +101,25 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         if 0.6 < ratio * DEG < 1.6:
             yield wrong_rate_unit(f'{came}probably deg/s, gyroscope_scale 57.29578; {convert}')
         elif 0.6 < ratio / DEG < 1.6:
-            yield wrong_rate_unit(f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert them once')
+            yield wrong_rate_unit(
+                f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert them once'
+            )
         elif _full_scale(evidence) is not None:
             return
         elif not 0.5 < ratio < 2.0:
             yield wrong_rate_unit(f'{came}counts or volts?; {convert}')
         else:
-            yield CheckFinding('rate_unit', GOOD, f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}')
+            yield CheckFinding(
+                'rate_unit',
+                GOOD,
+                f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}',
+            )
     elif largest > MAX_GYRO_RATE:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
-        yield wrong_rate_unit(f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
-                              f'{convert}')
+        yield wrong_rate_unit(
+            f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
+            f'{convert}'
+        )
 
 
 def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -95,20 +129,31 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         return
     came = f'angular rates are {factor:.3g} times the rotation of gravity from one rest to the next'
     if abs(np.log2(factor)) % 1 == 0:
-        yield CheckFinding('full_scale', WARNING, f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; '
-                           'correct its setting (a calibration would include the factor in the matrix, and be wrong after the correction)')
+        yield CheckFinding(
+            'full_scale',
+            WARNING,
+            f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; '
+            'correct its setting (a calibration would include the factor in the matrix, and be wrong after the correction)',
+        )
     else:
-        yield CheckFinding('full_scale', WARNING,
-                           f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at rest')
+        yield CheckFinding(
+            'full_scale',
+            WARNING,
+            f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at rest',
+        )
 
 
 def _full_scale(evidence):
     """Return the factor of the rates if a wrong full-scale range may explain it, else None."""
     factor, turning = evidence.rate_factor, evidence.turning
-    if factor is None and turning is not None:   # no rests available
+    if factor is None and turning is not None:  # no rests available
         factor = nearest_power(1.0 / turning.factor)
         factor = factor if np.log2(factor) % 1 == 0 else None
-    return factor if factor is not None and factor != 1.0 and FACTORS[0] < factor < FACTORS[-1] else None
+    return (
+        factor
+        if factor is not None and factor != 1.0 and FACTORS[0] < factor < FACTORS[-1]
+        else None
+    )
 
 
 def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -119,16 +164,29 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     match = match_axes(turning.matrix, turning.seen)
     if not match.wrong:
         if turning.everywhere:
-            yield CheckFinding('handedness', GOOD, 'accelerometer and gyroscope share right-handed axes')
+            yield CheckFinding(
+                'handedness', GOOD, 'accelerometer and gyroscope share right-handed axes'
+            )
         return
-    what = ', '.join(f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}"
-                     for i, j, sign in match.exchanges(turning.seen))
+    what = ', '.join(
+        f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}"
+        for i, j, sign in match.exchanges(turning.seen)
+    )
     if not what or match.agreement < MIN_MATCH:
         what = 'no exchange of axes makes them fit'
-    kinds = {(True, False): 'one is turned against the other', (False, True): 'one of them is left-handed'}
-    kind = kinds.get((match.turned, match.mirrored), 'turned or left-handed, not separable in this recording')
-    yield CheckFinding('handedness', REFUSE, 'accelerometer and gyroscope must share right-handed axes, gravity does not rotate '
-                       f'according to the rates: {what} ({kind}); correct signs and order of the axes in the driver')
+    kinds = {
+        (True, False): 'one is turned against the other',
+        (False, True): 'one of them is left-handed',
+    }
+    kind = kinds.get(
+        (match.turned, match.mirrored), 'turned or left-handed, not separable in this recording'
+    )
+    yield CheckFinding(
+        'handedness',
+        REFUSE,
+        'accelerometer and gyroscope must share right-handed axes, gravity does not rotate '
+        f'according to the rates: {what} ({kind}); correct signs and order of the axes in the driver',
+    )
 
 
 def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -143,15 +201,31 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         held = _held(evidence, sensor)
         words, total, level = [], 0, 0.0
         for axis, ends in enumerate(evidence.ends[part]):
-            counts = [_clipped(end, sign * held[:, axis], evidence.chunks.size) if end.level > least[axis] and (fine[axis] or end.jumped)
-                      else 0 for sign, end in zip((1, -1), ends)]
+            counts = [
+                _clipped(end, sign * held[:, axis], evidence.chunks.size)
+                if end.level > least[axis] and (fine[axis] or end.jumped)
+                else 0
+                for sign, end in zip((1, -1), ends)
+            ]
             if sum(counts):
                 words.append(f'{"xyz"[axis]} {sum(counts)}')
-                total, level = total + sum(counts), max([level, *(end.level for end, count in zip(ends, counts) if count)])
+                total, level = (
+                    total + sum(counts),
+                    max([level, *(end.level for end, count in zip(ends, counts) if count)]),
+                )
         if words:
-            people = f' ({level / DEG:.0f} deg/s)' if unit == 'rad/s' else f' ({level / STANDARD_GRAVITY:.1f} g)'
-            yield CheckFinding('clipping', WARNING, f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at '
-                               'the end of the range; larger values are lost, move less or choose a wider range', samples=total)
+            people = (
+                f' ({level / DEG:.0f} deg/s)'
+                if unit == 'rad/s'
+                else f' ({level / STANDARD_GRAVITY:.1f} g)'
+            )
+            yield CheckFinding(
+                'clipping',
+                WARNING,
+                f'the {sensor} clips at {level:.4g} {unit}{people}: {", ".join(words)} readings at '
+                'the end of the range; larger values are lost, move less or choose a wider range',
+                samples=total,
+            )
 
 
 def _held(evidence, sensor):
@@ -169,15 +243,23 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The biases are such as sensors have."""
     rest = evidence.rest
     if rest is None or rest.bias is None or not 3.0 < evidence.length < 30.0:
-        return   # with few attitudes, a steady spin about the vertical is not distinguishable from rest
+        return  # with few attitudes, a steady spin about the vertical is not distinguishable from rest
     found = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
     for sensor, _, unit in CHANNELS:
         size = float(np.linalg.norm(found[sensor]))
         if size > MOST_BIAS[sensor]:
-            people = f'{size / STANDARD_GRAVITY:.2f} g' if sensor == 'accelerometer' else f'{size / DEG:.0f} deg/s'
+            people = (
+                f'{size / STANDARD_GRAVITY:.2f} g'
+                if sensor == 'accelerometer'
+                else f'{size / DEG:.0f} deg/s'
+            )
             values = ', '.join(f'{value:+.2f}' for value in found[sensor])
-            yield CheckFinding('bias', WARNING, f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of '
-                               'sensor has; check offsets in the driver, the supply and the soldering of the sensor')
+            yield CheckFinding(
+                'bias',
+                WARNING,
+                f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of '
+                'sensor has; check offsets in the driver, the supply and the soldering of the sensor',
+            )
 
 
 def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -192,11 +274,17 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     else:
         what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
     if abs(off) > GRAVITY_SHARE:
-        yield CheckFinding('gravity', WARNING, f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads '
-                           f'{rest.length:.3f} ({what}), {100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
-                           f'{100 * GRAVITY_PLACE_SHARE} % between sites)')
+        yield CheckFinding(
+            'gravity',
+            WARNING,
+            f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads '
+            f'{rest.length:.3f} ({what}), {100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
+            f'{100 * GRAVITY_PLACE_SHARE} % between sites)',
+        )
     else:
-        yield CheckFinding('gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})')
+        yield CheckFinding(
+            'gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})'
+        )
 
 
 def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -204,9 +292,13 @@ def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
     share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
     if share > REPEATED_SHARE and evidence.quiet_range.all():
-        yield CheckFinding('repeated_readings', WARNING, f'{100 * share:.0f} % of the samples repeat all six readings of the one before: '
-                           'the driver publishes faster than the sensor measures, and noise is underestimated; publish each measurement '
-                           'once')
+        yield CheckFinding(
+            'repeated_readings',
+            WARNING,
+            f'{100 * share:.0f} % of the samples repeat all six readings of the one before: '
+            'the driver publishes faster than the sensor measures, and noise is underestimated; publish each measurement '
+            'once',
+        )
 
 
 def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -220,11 +312,18 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         constant = coarse & (range_ == 0)
         if coarse.any():
             size = step[coarse].max()
-            people = f'{size / DEG:.2g} deg/s' if unit == 'rad/s' else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
-            yield CheckFinding('resolution', NOTE,
-                               f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}'
-                               + (f' and constant at rest on {_axes(constant)}' if constant.any() else '')
-                               + ': means over short windows are rounded too; the noise is at least step/sqrt(12)')
+            people = (
+                f'{size / DEG:.2g} deg/s'
+                if unit == 'rad/s'
+                else f'{size:.2g} m/s^2, {1e3 * size / STANDARD_GRAVITY:.2g} mg'
+            )
+            yield CheckFinding(
+                'resolution',
+                NOTE,
+                f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}'
+                + (f' and constant at rest on {_axes(constant)}' if constant.any() else '')
+                + ': means over short windows are rounded too; the noise is at least step/sqrt(12)',
+            )
 
 
 def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -234,10 +333,16 @@ def temperature(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     low, high = evidence.temperature_c
     if low < -80 or high > 180:
         kelvin = ': kelvin?' if 200 < low and high < 450 else ''
-        yield CheckFinding('temperature', WARNING, f'temperature must be in degrees Celsius, it lies between {low:.1f} and '
-                           f'{high:.1f}{kelvin}; convert it in the driver')
+        yield CheckFinding(
+            'temperature',
+            WARNING,
+            f'temperature must be in degrees Celsius, it lies between {low:.1f} and '
+            f'{high:.1f}{kelvin}; convert it in the driver',
+        )
     else:
-        yield CheckFinding('temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius')
+        yield CheckFinding(
+            'temperature', GOOD, f'temperature {low:.1f} to {high:.1f} degrees Celsius'
+        )
 
 
 def _axes(flags):

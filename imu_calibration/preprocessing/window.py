@@ -69,8 +69,16 @@ class Window:
 
     def select(self, index: Any) -> 'Window':
         """Return the samples at `index` (slice, mask or integer array)."""
-        rows = {name: value[index] for name, value in vars(self).items() if isinstance(value, np.ndarray) and name != 'joint_step'}
-        return replace(self, motion=self.motion.select(index) if len(self.motion) == len(self) else self.motion, **rows)
+        rows = {
+            name: value[index]
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray) and name != 'joint_step'
+        }
+        return replace(
+            self,
+            motion=self.motion.select(index) if len(self.motion) == len(self) else self.motion,
+            **rows,
+        )
 
     @property
     def period(self) -> float:
@@ -117,14 +125,26 @@ class PhasedSamples(AlignedArrays):
         return self.motion.time
 
 
-def make_window(samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE) -> Window:
+def make_window(
+    samples: PhasedSamples, kind: WindowKind, reason: UnusedReason = UnusedReason.NONE
+) -> Window:
     """Return the `Window` of a kind that holds all of `samples`."""
     motion, temperature = samples.motion, samples.temperature_c
     if np.isnan(temperature).any():
         motion, temperature = replace(motion, thermal_branch=None), None
     motion = _mean_motion(motion) if kind == WindowKind.STATIC else motion
-    return Window(kind, samples.stamp_ns, samples.time, samples.force_s, samples.rate_s, motion, temperature, reason,
-                  samples.joint_step.max(axis=0), samples.corrected)
+    return Window(
+        kind,
+        samples.stamp_ns,
+        samples.time,
+        samples.force_s,
+        samples.rate_s,
+        motion,
+        temperature,
+        reason,
+        samples.joint_step.max(axis=0),
+        samples.corrected,
+    )
 
 
 STORED_IN_MEMORY = 64 << 20
@@ -174,7 +194,11 @@ def chunks(windows: Iterable[Window]) -> Iterator[list[Window]]:
 
 def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
     """Return the motion of all windows in one piece, and the temperatures (window means where static), or None."""
-    known = [[w.temperature_c.mean()] if w.kind == WindowKind.STATIC else w.temperature_c for w in windows if w.temperature_c is not None]
+    known = [
+        [w.temperature_c.mean()] if w.kind == WindowKind.STATIC else w.temperature_c
+        for w in windows
+        if w.temperature_c is not None
+    ]
     temperatures = np.concatenate(known) if len(known) == len(windows) else None
     if len(windows) == 1:
         return windows[0].motion, temperatures
@@ -185,15 +209,21 @@ def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | No
     """Return the result of `joined_motion`, and for each sample the row of the motion that belongs to it."""
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
-    rows = np.concatenate([np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
-                           for w, s, n in zip(windows, starts, lengths)])
+    rows = np.concatenate(
+        [
+            np.arange(s, s + n) if n == len(w.time) else np.full(len(w.time), s)
+            for w, s, n in zip(windows, starts, lengths)
+        ]
+    )
     return *joined_motion(windows), rows
 
 
 def _mean_motion(motion):
     """Return one row: the mean position and, when the slope of a straight line is significant, this slope."""
     mean = motion.position.mean(axis=0)
-    some = slice(None, None, max(1, len(motion) // 500))  # the levels are averages over 0.2 s, so these contain the same information
+    some = slice(
+        None, None, max(1, len(motion) // 500)
+    )  # the levels are averages over 0.2 s, so these contain the same information
     time, position = motion.time[some] - motion.time[some].mean(), motion.position[some] - mean
     slope = time @ position / max(time @ time, 1e-12)
     rest = (position - time[:, None] * slope).std(axis=0)
@@ -201,32 +231,98 @@ def _mean_motion(motion):
     # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no creep
     slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
     zero, branch = np.zeros((1, len(mean))), motion.thermal_branch
-    return JointMotion(motion.time.mean(keepdims=True), mean[None], slope[None], zero, zero,
-                       None if branch is None else branch.mean(keepdims=True), motion.vibration.mean(axis=0, keepdims=True))
+    return JointMotion(
+        motion.time.mean(keepdims=True),
+        mean[None],
+        slope[None],
+        zero,
+        zero,
+        None if branch is None else branch.mean(keepdims=True),
+        motion.vibration.mean(axis=0, keepdims=True),
+    )
 
 
 @dataclass(frozen=True)
 class WindowSettings:
     """Settings for static windows, constant-rate spins and dynamic stretches."""
 
-    static_rate: float = setting(0.002, 'rad/s', 'joints slower than this, and the IMU quiet, count as at rest', (0.0, 1.0),
-                                 'too small: no static windows; too large: slow creep enters the means', live=True)
-    quiet_ratio: float = setting(3.0, '1', 'at rest the IMU may scatter by this factor more than where it is quietest', (1.2, 100.0),
-                                 'too small: no static windows; too large: knocks and vibration enter the means', live=True)
-    settling: float = setting(0.5, 's', 'kept out after a joint stops and after a ramp ends', (0.0, 60.0),
-                              'too small: ringing of the table shows as between-window variance', live=True)
-    turn_on: float = setting(0.0, 's', 'kept out at the start of a recording', (0.0, 3600.0),
-                             'too small: the turn-on transient shows as bias drift', fixed='the session has begun')
-    static_minimum: float = setting(1.0, 's', 'shortest static window', (0.05, 600.0), 'too large: short poses are lost', live=True)
-    window_maximum: float = setting(20.0, 's', 'longer windows are cut, which bounds memory', (1.0, 600.0),
-                                    'too large: bias wander inside a window; too small: windows no longer independent', live=True)
-    spin_rate_variation: float = setting(0.01, '1', 'largest relative change of each joint rate in a constant-rate spin', (0.0, 0.5),
-                                         'too small: spins are treated as dynamic stretches', live=True)
+    static_rate: float = setting(
+        0.002,
+        'rad/s',
+        'joints slower than this, and the IMU quiet, count as at rest',
+        (0.0, 1.0),
+        'too small: no static windows; too large: slow creep enters the means',
+        live=True,
+    )
+    quiet_ratio: float = setting(
+        3.0,
+        '1',
+        'at rest the IMU may scatter by this factor more than where it is quietest',
+        (1.2, 100.0),
+        'too small: no static windows; too large: knocks and vibration enter the means',
+        live=True,
+    )
+    settling: float = setting(
+        0.5,
+        's',
+        'kept out after a joint stops and after a ramp ends',
+        (0.0, 60.0),
+        'too small: ringing of the table shows as between-window variance',
+        live=True,
+    )
+    turn_on: float = setting(
+        0.0,
+        's',
+        'kept out at the start of a recording',
+        (0.0, 3600.0),
+        'too small: the turn-on transient shows as bias drift',
+        fixed='the session has begun',
+    )
+    static_minimum: float = setting(
+        1.0,
+        's',
+        'shortest static window',
+        (0.05, 600.0),
+        'too large: short poses are lost',
+        live=True,
+    )
+    window_maximum: float = setting(
+        20.0,
+        's',
+        'longer windows are cut, which bounds memory',
+        (1.0, 600.0),
+        'too large: bias wander inside a window; too small: windows no longer independent',
+        live=True,
+    )
+    spin_rate_variation: float = setting(
+        0.01,
+        '1',
+        'largest relative change of each joint rate in a constant-rate spin',
+        (0.0, 0.5),
+        'too small: spins are treated as dynamic stretches',
+        live=True,
+    )
     spin_minimum: float = setting(1.0, 's', 'shortest constant-rate spin', (0.05, 600.0), live=True)
     dynamic_minimum: float = setting(0.3, 's', 'shortest dynamic stretch', (0.05, 600.0), live=True)
-    gap: float = setting(0.1, 's', 'a longer hole in either stream ends a window; also never below five IMU periods', (0.001, 60.0),
-                         'too small: every lost message cuts a window', live=True)
-    chunk: float = setting(20.0, 's', 'the joints are smoothed in pieces of this length', (2.0, 600.0),
-                           fixed='the pieces count from the first sample on')
-    overlap: float = setting(2.0, 's', 'margin on both sides of a piece, so that its ends do not show', (0.2, 60.0),
-                             fixed='the pieces count from the first sample on')
+    gap: float = setting(
+        0.1,
+        's',
+        'a longer hole in either stream ends a window; also never below five IMU periods',
+        (0.001, 60.0),
+        'too small: every lost message cuts a window',
+        live=True,
+    )
+    chunk: float = setting(
+        20.0,
+        's',
+        'the joints are smoothed in pieces of this length',
+        (2.0, 600.0),
+        fixed='the pieces count from the first sample on',
+    )
+    overlap: float = setting(
+        2.0,
+        's',
+        'margin on both sides of a piece, so that its ends do not show',
+        (0.2, 60.0),
+        fixed='the pieces count from the first sample on',
+    )

@@ -12,7 +12,14 @@ from imu_calibration.core.samples import runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics.joint_curve import fit_joint_curve
 from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
-from imu_calibration.preprocessing.window import PhasedSamples, UnusedReason, Window, WindowKind, WindowSettings, make_window
+from imu_calibration.preprocessing.window import (
+    PhasedSamples,
+    UnusedReason,
+    Window,
+    WindowKind,
+    WindowSettings,
+    make_window,
+)
 
 
 class Phase(IntEnum):
@@ -37,8 +44,13 @@ PHASE_REACH = RATE_SPAN / 2 + LONGEST_SPAN
 """Readings at a larger distance do not change a phase, s."""
 
 
-def joint_phases(time: np.ndarray, position: np.ndarray, settings: WindowSettings, *,
-                 noise_rad: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+def joint_phases(
+    time: np.ndarray,
+    position: np.ndarray,
+    settings: WindowSettings,
+    *,
+    noise_rad: float | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the phase of each joint reading of a stretch without gaps.
 
@@ -74,12 +86,18 @@ def joint_phases(time: np.ndarray, position: np.ndarray, settings: WindowSetting
     if still.any():
         long_half = _half_width(min(LONGEST_SPAN, settings.static_minimum), period, half)
         long_rate, _, _ = _slopes(time, rows, long_half)
-        still &= _widened(_slow(long_rate, settings.static_rate, long_half, period, step, noise), long_half)
+        still &= _widened(
+            _slow(long_rate, settings.static_rate, long_half, period, step, noise), long_half
+        )
     if still.all():
         return np.full(len(time), STILL, np.int8), level.T
-    noise = np.maximum(np.maximum(noise, step / np.sqrt(12)), _white_noise(rows, 0.5, ~still)[:, None])
+    noise = np.maximum(
+        np.maximum(noise, step / np.sqrt(12)), _white_noise(rows, 0.5, ~still)[:, None]
+    )
     steady_half = _half_width(min(LONGEST_SPAN, settings.spin_minimum), period, half)
-    steady = _steady(rate, settings, steady_half, 4 * noise * _slope_gain(half, period), ripple, half, 3 * noise)
+    steady = _steady(
+        rate, settings, steady_half, 4 * noise * _slope_gain(half, period), ripple, half, 3 * noise
+    )
     return np.where(still, STILL, np.where(steady, STEADY, MOVING)).astype(np.int8), level.T
 
 
@@ -110,17 +128,23 @@ def _slope_gain(half, period):
 
 
 def _slow(rate, static_rate, half, period, step, noise):
-    allowed = static_rate + 4 * noise * _slope_gain(half, period) + 1.5 * step / ((2 * half + 1) * period)
+    allowed = (
+        static_rate + 4 * noise * _slope_gain(half, period) + 1.5 * step / ((2 * half + 1) * period)
+    )
     return np.all(np.abs(rate) <= allowed, axis=0)
 
 
 def _steady(rate, settings, half, allowance, ripple, ripple_half, noise):
     size = 2 * half + 1
-    high, low = (f(rate, size, axis=1, mode='nearest') for f in (maximum_filter1d, minimum_filter1d))
+    high, low = (
+        f(rate, size, axis=1, mode='nearest') for f in (maximum_filter1d, minimum_filter1d)
+    )
     change = np.maximum(settings.spin_rate_variation * np.abs(high + low) / 2, settings.static_rate)
     # a rate that swings by `change` within the span moves the readings by this
     swing = change * RATE_SPAN / (2 * np.pi)
-    rough = np.sqrt(np.maximum(uniform_filter1d(ripple ** 2, 2 * ripple_half + 1, axis=1, mode='nearest'), 0.0))
+    rough = np.sqrt(
+        np.maximum(uniform_filter1d(ripple**2, 2 * ripple_half + 1, axis=1, mode='nearest'), 0.0)
+    )
     even = maximum_filter1d(rough - swing, size, axis=1, mode='nearest') <= noise
     return _widened(np.all((high - low <= change + 2 * allowance) & even, axis=0), half)
 
@@ -139,7 +163,7 @@ def _slopes(time, rows, half):
     t, p = time - time.mean(), rows - middle
     sum_t, sum_tt = _window_sums(np.stack([t, t * t]), half)
     sum_p, sum_tp = _window_sums(p, half), _window_sums(p * t, half)
-    spread = np.maximum(sum_tt - sum_t ** 2 / count, 1e-18)
+    spread = np.maximum(sum_tt - sum_t**2 / count, 1e-18)
     slope = (sum_tp - sum_t * sum_p / count) / spread
     return slope, sum_p / count + middle, p - sum_p / count - slope * (t - sum_t / count)
 
@@ -147,10 +171,10 @@ def _slopes(time, rows, half):
 def _window_sums(rows, half):
     n = rows.shape[1]
     sums = np.empty((len(rows), n + 2 * half + 1))
-    sums[:, :half + 1] = 0.0
-    np.cumsum(rows, axis=1, out=sums[:, half + 1:half + 1 + n])
-    sums[:, half + 1 + n:] = sums[:, half + n, None]
-    return sums[:, 2 * half + 1:] - sums[:, :n]
+    sums[:, : half + 1] = 0.0
+    np.cumsum(rows, axis=1, out=sums[:, half + 1 : half + 1 + n])
+    sums[:, half + 1 + n :] = sums[:, half + n, None]
+    return sums[:, 2 * half + 1 :] - sums[:, :n]
 
 
 LEAST_READINGS = 4
@@ -160,7 +184,15 @@ LEAST_READINGS = 4
 class JointRun:
     """Joint readings without gaps."""
 
-    def __init__(self, time: np.ndarray, position: np.ndarray, velocity: np.ndarray, *, settings: WindowSettings, noise_rad: float | None):
+    def __init__(
+        self,
+        time: np.ndarray,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        *,
+        settings: WindowSettings,
+        noise_rad: float | None,
+    ):
         self.time, self.position, self.velocity = time, position, velocity
         self.phase, self.level = joint_phases(time, position, settings, noise_rad=noise_rad)
         self._moving = time[self.phase != STILL]
@@ -194,10 +226,15 @@ class JointRun:
     def curve(self, time: np.ndarray, overlap: float, noise_rad: float | None) -> JointMotion:
         """Return the `JointMotion` of a smooth curve at instants."""
         first, stop = np.searchsorted(self.time, [time[0] - overlap, time[-1] + overlap])
-        first, stop = max(0, min(first, len(self.time) - LEAST_READINGS)), min(len(self.time), max(stop, LEAST_READINGS))
+        first, stop = (
+            max(0, min(first, len(self.time) - LEAST_READINGS)),
+            min(len(self.time), max(stop, LEAST_READINGS)),
+        )
         piece = slice(first, stop)
         velocity = None if np.isnan(self.velocity[piece]).all() else self.velocity[piece]
-        return fit_joint_curve(self.time[piece], self.position[piece], velocity, noise_sd=noise_rad).at(time)
+        return fit_joint_curve(
+            self.time[piece], self.position[piece], velocity, noise_sd=noise_rad
+        ).at(time)
 
 
 BEST_BIAS, BEST_TIME = 1e-4, 100.0
@@ -228,8 +265,10 @@ class WanderLimit:
         length = int(round(PIECE_SECONDS / period)) if period > 0 else 0
         pieces = len(samples) // length if length else 0
         if pieces >= MIN_NOISE_PIECES:
-            means = samples.force_s[:pieces * length].reshape(pieces, length, 3).mean(axis=1)
-            self._densities.append(float(np.sqrt(np.median(np.diff(means, axis=0).var(axis=0) / 2) * length * period)))
+            means = samples.force_s[: pieces * length].reshape(pieces, length, 3).mean(axis=1)
+            self._densities.append(
+                float(np.sqrt(np.median(np.diff(means, axis=0).var(axis=0) / 2) * length * period))
+            )
 
     def pieces(self, samples: PhasedSamples) -> int:
         """Return the number of windows into which motion is cut; one if no rest has occurred yet."""
@@ -237,7 +276,13 @@ class WanderLimit:
             return 1
         density = float(np.median(self._densities))
         jitter = np.diff(samples.time, 2).std() / np.sqrt(6)
-        if STANDARD_GRAVITY * np.sqrt((samples.rate_s**2).sum(axis=1).mean()) * jitter * np.sqrt(_period(samples)) > density:
+        if (
+            STANDARD_GRAVITY
+            * np.sqrt((samples.rate_s**2).sum(axis=1).mean())
+            * jitter
+            * np.sqrt(_period(samples))
+            > density
+        ):
             return 1
         longest = max(MIN_MOVING_SECONDS, density * np.sqrt(BEST_TIME / 2) / BEST_BIAS)
         return ceil((samples.time[-1] - samples.time[0]) / longest)
@@ -248,7 +293,9 @@ def _period(samples):
 
 
 _USES = (*tuple(WindowKind)[1:], *tuple(UnusedReason)[1:])
-_STATIC, _SPIN, _DYNAMIC, _SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(len(_USES))
+_STATIC, _SPIN, _DYNAMIC, _SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(
+    len(_USES)
+)
 _MIN_WINDOW_SAMPLES = 5
 
 
@@ -276,13 +323,19 @@ class WindowCutter:
     @property
     def n_waiting(self) -> int:
         """Samples held."""
-        return (0 if self._waiting is None else len(self._waiting)) + (0 if self._open is None else len(self._open[0]))
+        return (0 if self._waiting is None else len(self._waiting)) + (
+            0 if self._open is None else len(self._open[0])
+        )
 
     def push(self, samples: PhasedSamples | None, final: bool = False) -> list[Window]:
         """Add the next samples (or None) and return the complete windows; with `final` all remaining ones."""
         windows = []
         if self._waiting is not None:
-            samples = self._waiting if samples is None else PhasedSamples.concatenate([self._waiting, samples])
+            samples = (
+                self._waiting
+                if samples is None
+                else PhasedSamples.concatenate([self._waiting, samples])
+            )
             self._waiting = None
         if samples is not None and len(samples):
             windows += self._cut(*self._decided(samples, final))
@@ -297,19 +350,29 @@ class WindowCutter:
         time, settings = samples.time, self._settings
         phase = samples.phase.copy()
         original = samples.phase[starts]
-        before = np.concatenate([[-1 if self._phase_before is None else self._phase_before], original[:-1]])
+        before = np.concatenate(
+            [[-1 if self._phase_before is None else self._phase_before], original[:-1]]
+        )
         before[samples.after_gap[starts]] = -1
         decided = len(samples)
         for k, (start, stop) in enumerate(zip(starts, stops, strict=True)):
             is_open = k == len(starts) - 1 and not final
             length = time[stop - 1] - time[start]
-            needed = self._short_rest if original[k] == STILL else settings.spin_minimum + (settings.settling if before[k] >= 0 else 0.0)
+            needed = (
+                self._short_rest
+                if original[k] == STILL
+                else settings.spin_minimum + (settings.settling if before[k] >= 0 else 0.0)
+            )
             goes_on = before[k] == original[k]  # the part before was long enough already
             if original[k] == MOVING or goes_on or length > needed:
                 continue
             if is_open:
                 decided = start
-            elif original[k] == STEADY or (before[k] in (STEADY, MOVING) and k + 1 < len(original) and not samples.after_gap[stop]):
+            elif original[k] == STEADY or (
+                before[k] in (STEADY, MOVING)
+                and k + 1 < len(original)
+                and not samples.after_gap[stop]
+            ):
                 phase[start:stop] = MOVING
         if decided < len(samples):
             self._waiting = samples.select(slice(decided, None))
@@ -323,7 +386,10 @@ class WindowCutter:
         use = self._uses(samples, phase)
         if self._open is not None:
             before, use_before = self._open
-            samples, use = PhasedSamples.concatenate([before, samples]), np.append(np.full(len(before), use_before), use)
+            samples, use = (
+                PhasedSamples.concatenate([before, samples]),
+                np.append(np.full(len(before), use_before), use),
+            )
         windows = []
         for start, stop in _runs(use, samples.after_gap):
             cut_off, start = self._shed(samples, start, stop, use[start])
@@ -366,11 +432,17 @@ class WindowCutter:
     def _close(self, samples, use):
         """Return the windows of a complete run of one use, cut into equal pieces of at most the longest length."""
         pieces = max(1, ceil((samples.time[-1] - samples.time[0]) / self._longest(use)))
-        return [window for part in _equal_parts(samples, pieces) for window in self._finished(part, use)]
+        return [
+            window for part in _equal_parts(samples, pieces) for window in self._finished(part, use)
+        ]
 
     def _least(self, use):
         settings = self._settings
-        return {_STATIC: settings.static_minimum, _SPIN: settings.spin_minimum, _DYNAMIC: settings.dynamic_minimum}.get(use, 0.0)
+        return {
+            _STATIC: settings.static_minimum,
+            _SPIN: settings.spin_minimum,
+            _DYNAMIC: settings.dynamic_minimum,
+        }.get(use, 0.0)
 
     def _longest(self, use):
         # halves of a window slightly above the longest length must not be below the shortest
@@ -383,7 +455,9 @@ class WindowCutter:
             use = _REST_TOO_SHORT if use == _STATIC else _TOO_SHORT
         self.counts[_USES[use]] += n
         if use > _DYNAMIC:
-            return [make_window(samples, WindowKind.UNUSED, _USES[use])] if self._keep_unused else []
+            return (
+                [make_window(samples, WindowKind.UNUSED, _USES[use])] if self._keep_unused else []
+            )
         if use == _STATIC:
             self._wander.rested(samples)
         pieces = self._wander.pieces(samples) if use == _DYNAMIC else 1
@@ -392,7 +466,10 @@ class WindowCutter:
 
 def _equal_parts(samples, count):
     bounds = np.linspace(0, len(samples), count + 1).astype(int)
-    return [samples.select(slice(start, stop)) for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [
+        samples.select(slice(start, stop))
+        for start, stop in zip(bounds[:-1], bounds[1:], strict=True)
+    ]
 
 
 def _runs(value, broken):
@@ -406,4 +483,8 @@ ACCEPTED = (*_USES, 'edge of joints')
 
 def dropped(counts: dict[str | UnusedReason | WindowKind, int]) -> dict[str, int]:
     """Return the counts of samples that were lost or could not be used, reason -> count, without zeros."""
-    return {reason: int(count) for reason, count in sorted(counts.items()) if count and reason not in ACCEPTED}
+    return {
+        reason: int(count)
+        for reason, count in sorted(counts.items())
+        if count and reason not in ACCEPTED
+    }

@@ -14,7 +14,13 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import QuietFloor
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT, MotionChunks
 from imu_calibration.preprocessing.stream_cleaning import STREAMS, BlockCleaner, Watcher
-from imu_calibration.preprocessing.window import UnusedReason, Window, WindowKind, WindowSettings, all_samples
+from imu_calibration.preprocessing.window import (
+    UnusedReason,
+    Window,
+    WindowKind,
+    WindowSettings,
+    all_samples,
+)
 from imu_calibration.preprocessing.window_cutter import WindowCutter
 
 
@@ -38,8 +44,15 @@ class MotionGatherer:
 
     """
 
-    def __init__(self, table: Table, settings: WindowSettings = WindowSettings(), keep_unused: bool = False, *,
-                 nominal: NominalScaling | None = None, watchers: Sequence[Watcher] = ()):
+    def __init__(
+        self,
+        table: Table,
+        settings: WindowSettings = WindowSettings(),
+        keep_unused: bool = False,
+        *,
+        nominal: NominalScaling | None = None,
+        watchers: Sequence[Watcher] = (),
+    ):
         self.cleaner = BlockCleaner(() if table is None else table.joint_names, nominal, watchers)
         self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
         self._queue = {name: [] for name in STREAMS}
@@ -106,7 +119,9 @@ class MotionGatherer:
         """
         for name in ('chunk', 'overlap', 'turn_on'):
             if getattr(settings, name) != getattr(self._settings, name):
-                raise InputError(f"setting '{name}' must not change during a session; restart with it")
+                raise InputError(
+                    f"setting '{name}' must not change during a session; restart with it"
+                )
         self._settings = settings
         self._chunks.change(settings)
         self._cutter.change(settings, self._chunks.short_rest)
@@ -119,7 +134,12 @@ class MotionGatherer:
         """Queue samples by epoch."""
         for name in STREAMS:
             for epoch, samples in getattr(cleaned, name):
-                self._queue[name].append((epoch + self._epoch_shift[name], self._turns.unwrap(samples) if name == 'joints' else samples))
+                self._queue[name].append(
+                    (
+                        epoch + self._epoch_shift[name],
+                        self._turns.unwrap(samples) if name == 'joints' else samples,
+                    )
+                )
 
     def _work(self):
         """Process the samples of this epoch; advance to the next epoch when the streams have."""
@@ -127,12 +147,18 @@ class MotionGatherer:
         while True:
             for name in STREAMS:
                 for epoch, part in self._queue[name]:
-                    if epoch == self._epoch:  # remaining samples of an earlier epoch arrived after its end: late temperatures
+                    if (
+                        epoch == self._epoch
+                    ):  # remaining samples of an earlier epoch arrived after its end: late temperatures
                         self._chunks.add(**{name: part})
-                self._queue[name] = [(epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch]
+                self._queue[name] = [
+                    (epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch
+                ]
             windows += self._cut(self._chunks.take())
             if not self._epoch_is_over():
-                queue = self._queue['temperature']   # of an epoch that the other streams do not begin
+                queue = self._queue[
+                    'temperature'
+                ]  # of an epoch that the other streams do not begin
                 while len(queue) > 1 and _span(queue) > JOINT_WAIT:
                     del queue[0]
                 return windows
@@ -145,7 +171,10 @@ class MotionGatherer:
 
     def _next_epoch(self):
         windows = self._end_epoch()
-        old, self._chunks = self._chunks, MotionChunks(self._settings, self._noise_rad, self._floors)
+        old, self._chunks = (
+            self._chunks,
+            MotionChunks(self._settings, self._noise_rad, self._floors),
+        )
         self._chunks.time_origin = old.end_time + self._settings.gap
         self._lost_counts.update(old.counts)
         self._epoch += 1
@@ -186,7 +215,9 @@ class _Unwrapper:
         self._turns = turns[-1]
         if not turns.any():
             return joints
-        return JointSamples(joints.stamp_ns, joints.position - 2 * np.pi * turns, joints.velocity, joints.names)
+        return JointSamples(
+            joints.stamp_ns, joints.position - 2 * np.pi * turns, joints.velocity, joints.names
+        )
 
 
 def _span(queue):
@@ -198,6 +229,10 @@ def session_truth(blocks: Iterable[SampleBlock], table: Table) -> tuple[ImuSampl
     """Return the samples of a session with their reference from the table, where joints and IMU are both present."""
     windows = MotionGatherer(table, WindowSettings(), keep_unused=True).all_of(blocks)
     motion, _, rows = all_samples(windows)
-    stamp_ns, force_s, rate_s, time = (np.concatenate([getattr(window, name) for window in windows])
-                                       for name in ('stamp_ns', 'force_s', 'rate_s', 'time'))
-    return ImuSamples(stamp_ns, force_s, rate_s), replace(reference_motion(table, motion).select(rows), time=time)
+    stamp_ns, force_s, rate_s, time = (
+        np.concatenate([getattr(window, name) for window in windows])
+        for name in ('stamp_ns', 'force_s', 'rate_s', 'time')
+    )
+    return ImuSamples(stamp_ns, force_s, rate_s), replace(
+        reference_motion(table, motion).select(rows), time=time
+    )

@@ -7,7 +7,13 @@ import numpy as np
 from imu_calibration.allan.figures import NoiseFigures, bias_processes
 from imu_calibration.core.samples import NominalScaling
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.effects.sensor_model import DEFAULT_MODEL, SensorModel, parse_effects, parse_reference, with_common_arm
+from imu_calibration.effects.sensor_model import (
+    DEFAULT_MODEL,
+    SensorModel,
+    parse_effects,
+    parse_reference,
+    with_common_arm,
+)
 from imu_calibration.estimation.noise_model import BiasProcess
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
@@ -60,18 +66,38 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     """
     names = table.joint_names
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
-    chosen = {sensor: parse_effects(sensor, text or DEFAULT_MODEL[sensor], names, catalogue=options.catalogue)
-              for sensor, text in asked.items()}
-    model = SensorModel(chosen['accelerometer'], chosen['gyroscope'], reference=parse_reference(options.reference_model, table),
-                        joint_names=names, catalogue=options.catalogue)
+    chosen = {
+        sensor: parse_effects(
+            sensor, text or DEFAULT_MODEL[sensor], names, catalogue=options.catalogue
+        )
+        for sensor, text in asked.items()
+    }
+    model = SensorModel(
+        chosen['accelerometer'],
+        chosen['gyroscope'],
+        reference=parse_reference(options.reference_model, table),
+        joint_names=names,
+        catalogue=options.catalogue,
+    )
     model = with_common_arm(model) if table.mount_xyz is None else model
     for sensor, name in options.added:
         model = model if (sensor, name) in model.slices else model.with_effect(sensor, name)
-    return replace(model, point={**model.point,
-                                 **{name: value for name, value in options.point.items() if any(e.name == name for e in model.effects)}})
+    return replace(
+        model,
+        point={
+            **model.point,
+            **{
+                name: value
+                for name, value in options.point.items()
+                if any(e.name == name for e in model.effects)
+            },
+        },
+    )
 
 
-def settle_model(model: SensorModel, options: CalibrationOptions, gathered: SessionData) -> SensorModel:
+def settle_model(
+    model: SensorModel, options: CalibrationOptions, gathered: SessionData
+) -> SensorModel:
     """Return the model without the size effect if it was not requested and the recording has no rotation that determines it."""
     turns = any(gathered.accumulator.samples.get(kind) for kind in ('spin', 'dynamic'))
     return model if options.accelerometer_model is not None or turns else model.without_arms()

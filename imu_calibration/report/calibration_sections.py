@@ -15,7 +15,19 @@ from imu_calibration.document.decision import harmed
 from imu_calibration.document.trust import usage
 from imu_calibration.effects.base import PREFIXES, SENSORS, UNITS
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.report.figures import AFTER, AXIS_COLOURS, GREY, INK, MARKER, STATUS, Drawn, axis_legend, draw, lever_figure, log_axis
+from imu_calibration.report.figures import (
+    AFTER,
+    AXIS_COLOURS,
+    GREY,
+    INK,
+    MARKER,
+    STATUS,
+    Drawn,
+    axis_legend,
+    draw,
+    lever_figure,
+    log_axis,
+)
 from imu_calibration.report.navigation_section import navigation_section
 from imu_calibration.report.page import render
 
@@ -27,13 +39,31 @@ def observability_section(result: CalibrationResult) -> dict[str, Any]:
     """Return figures and weak directions."""
     calibration = result.calibration
     live = calibration.sd > 0
-    figures = {'bars': draw('bars', (8.6, 0.9 + ROW * live.sum()), _bars, result, live,
-                            label='Standard deviation over tolerance of every parameter'),
-               'correlation': draw('correlation', (7.2, 6.4), _heat_map, *_correlation(calibration, live),
-                                   label='Correlation between the parameters')}
+    figures = {
+        'bars': draw(
+            'bars',
+            (8.6, 0.9 + ROW * live.sum()),
+            _bars,
+            result,
+            live,
+            label='Standard deviation over tolerance of every parameter',
+        ),
+        'correlation': draw(
+            'correlation',
+            (7.2, 6.4),
+            _heat_map,
+            *_correlation(calibration, live),
+            label='Correlation between the parameters',
+        ),
+    }
     if len(result.singular_values):
-        figures['singular'] = draw('singular', (8.6, 2.5), _stems, result.singular_values,
-                                   label='Singular values of the design in units of the tolerances')
+        figures['singular'] = draw(
+            'singular',
+            (8.6, 2.5),
+            _stems,
+            result.singular_values,
+            label='Singular values of the design in units of the tolerances',
+        )
     return {**figures, 'strongest': strongest(calibration, live)}
 
 
@@ -47,7 +77,9 @@ def strongest(calibration: Calibration, live: np.ndarray) -> list[tuple[str, str
 
 def _correlation(calibration, live):
     sd = calibration.sd[live]
-    return calibration.covariance[np.ix_(live, live)] / np.outer(sd, sd), list(compress(calibration.param_names, live))
+    return calibration.covariance[np.ix_(live, live)] / np.outer(sd, sd), list(
+        compress(calibration.param_names, live)
+    )
 
 
 def short_name(name: str) -> str:
@@ -61,16 +93,30 @@ def _bars(figure, result, live):
     """One bar per parameter on a logarithmic axis, one at the tolerance."""
     calibration = result.calibration
     share = (calibration.sd / result.tolerances)[live]
-    names, colours = list(compress(calibration.param_names, live)), [STATUS[status] for status in compress(calibration.status, live)]
+    names, colours = (
+        list(compress(calibration.param_names, live)),
+        [STATUS[status] for status in compress(calibration.status, live)],
+    )
     axes = figure.subplots()
     place = np.arange(len(names))[::-1]
     low = min(1e-3, float(share.min()) / 2)
     axes.barh(place, share - low, left=low, height=0.68, color=colours)
     axes.axvline(1.0, color=INK, lw=1.0)
-    axes.annotate('tolerance', (1.0, len(names) - 0.2), ha='center', va='bottom', fontsize=8.5, color=INK, annotation_clip=False)
+    axes.annotate(
+        'tolerance',
+        (1.0, len(names) - 0.2),
+        ha='center',
+        va='bottom',
+        fontsize=8.5,
+        color=INK,
+        annotation_clip=False,
+    )
     log_axis(axes.xaxis)
-    axes.set(xlim=(low, max(10.0, 2 * float(share.max()))), ylim=(-0.8, len(names) - 0.2),
-             xlabel='standard deviation / tolerance (left is better)')
+    axes.set(
+        xlim=(low, max(10.0, 2 * float(share.max()))),
+        ylim=(-0.8, len(names) - 0.2),
+        xlabel='standard deviation / tolerance (left is better)',
+    )
     axes.set_yticks(place, [short_name(name) for name in names], fontsize=8)
     axes.tick_params(axis='y', length=0)
     axes.grid(axis='y', visible=False)
@@ -86,7 +132,11 @@ def _stems(figure, values):
     axes.scatter(place, values, s=14, c=colours, zorder=3)
     axes.axhline(1.0, color=INK, lw=1.0)
     log_axis(axes.yaxis)
-    axes.set(xlim=(0, len(place) + 1), xlabel='direction, best determined first', ylabel='tolerances per sd')
+    axes.set(
+        xlim=(0, len(place) + 1),
+        xlabel='direction, best determined first',
+        ylabel='tolerances per sd',
+    )
     axes.set_ylim(bottom=min(0.3, values.min() / 2))
     axes.grid(axis='x', visible=False)
 
@@ -111,7 +161,13 @@ def _heat_map(figure, matrix, names):
     figure.colorbar(image, ax=axes, shrink=0.6, pad=0.02).outline.set_visible(False)
 
 
-CAUSE_COLOURS = {'noise': '#1f66a8', 'levelling': '#c0561b', 'joint position': '#2b8a57', 'table rate': '#8a5aa8', 'gravity': '#b8860b'}
+CAUSE_COLOURS = {
+    'noise': '#1f66a8',
+    'levelling': '#c0561b',
+    'joint position': '#2b8a57',
+    'table rate': '#8a5aa8',
+    'gravity': '#b8860b',
+}
 MIN_DRAWN_SHARE = 1e-5
 """Shares of the tolerance below this are drawn at the edge."""
 
@@ -119,17 +175,38 @@ MIN_DRAWN_SHARE = 1e-5
 def budget_section(result: CalibrationResult) -> dict[str, Any]:
     """Return the figure, and the standard deviations of the parameters by cause and by term of the reported variances."""
     budget = result.error_budget()
-    terms = {name: np.sqrt(np.maximum(variance, 0.0)) for name, variance in result.calibration.covariance_terms.items()
-             if np.any(variance > 0)}
-    figure = draw('budget', (8.6, 0.9 + 0.26 * len(_effects(result))), _dots, result, budget,
-                  label='Error budget of each effect by cause, in tolerances')
-    return {'figure': figure, 'texts': budget.texts, 'effects': _effects(result), 'tolerances': result.tolerances,
-            'tables': (('cause', {**budget.causes, 'total': budget.total}), ('term', {**terms, 'total': result.calibration.sd}))}
+    terms = {
+        name: np.sqrt(np.maximum(variance, 0.0))
+        for name, variance in result.calibration.covariance_terms.items()
+        if np.any(variance > 0)
+    }
+    figure = draw(
+        'budget',
+        (8.6, 0.9 + 0.26 * len(_effects(result))),
+        _dots,
+        result,
+        budget,
+        label='Error budget of each effect by cause, in tolerances',
+    )
+    return {
+        'figure': figure,
+        'texts': budget.texts,
+        'effects': _effects(result),
+        'tolerances': result.tolerances,
+        'tables': (
+            ('cause', {**budget.causes, 'total': budget.total}),
+            ('term', {**terms, 'total': result.calibration.sd}),
+        ),
+    }
 
 
 def _effects(result):
     model = result.calibration.model
-    return [(e, model.slices[e.key]) for e in model.effects if np.any(result.calibration.sd[model.slices[e.key]] > 0)]
+    return [
+        (e, model.slices[e.key])
+        for e in model.effects
+        if np.any(result.calibration.sd[model.slices[e.key]] > 0)
+    ]
 
 
 def _dots(figure, result, budget):
@@ -141,15 +218,33 @@ def _dots(figure, result, budget):
         share = np.array([np.max(values[part] / result.tolerances[part]) for _, part in effects])
         highest = max(highest, share.max())
         shown = share > MIN_DRAWN_SHARE
-        axes.plot(share[shown], place[shown], 'o', color=CAUSE_COLOURS.get(cause, INK), label=cause, markersize=6, ls='none')
+        axes.plot(
+            share[shown],
+            place[shown],
+            'o',
+            color=CAUSE_COLOURS.get(cause, INK),
+            label=cause,
+            markersize=6,
+            ls='none',
+        )
     total = np.array([np.max(budget.total[part] / result.tolerances[part]) for _, part in effects])
     axes.plot(total, place, '|', color=INK, markersize=13, mew=1.6, label='total', ls='none')
     axes.axvline(1.0, color=INK, lw=1.0)
     log_axis(axes.xaxis)
-    axes.set(xlim=(MIN_DRAWN_SHARE, 3 * highest), ylim=(-0.7, len(effects) - 0.3), xlabel='largest standard deviation / tolerance')
+    axes.set(
+        xlim=(MIN_DRAWN_SHARE, 3 * highest),
+        ylim=(-0.7, len(effects) - 0.3),
+        xlabel='largest standard deviation / tolerance',
+    )
     axes.set_yticks(place, [short_name(f'{e.sensor}.{e.name}') for e, _ in effects])
     axes.tick_params(axis='y', length=0)
-    axes.legend(ncols=6, loc='lower center', bbox_to_anchor=(0.45, 1.0), columnspacing=1.2, handletextpad=0.1)
+    axes.legend(
+        ncols=6,
+        loc='lower center',
+        bbox_to_anchor=(0.45, 1.0),
+        columnspacing=1.2,
+        handletextpad=0.1,
+    )
 
 
 LEVEL_FORCE_SHARE = 0.02
@@ -186,8 +281,14 @@ class AxisReading:
         return abs(self.before_g - self.theoretical_g) / after if after > 0 else np.inf
 
 
-def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.ndarray, *, rate: np.ndarray,
-                  gravity: float) -> list[AxisReading]:
+def axis_readings(
+    measured: np.ndarray,
+    compensated: np.ndarray,
+    reference: np.ndarray,
+    *,
+    rate: np.ndarray,
+    gravity: float,
+) -> list[AxisReading]:
     """
     Return readings at +-1 g, at rest and in rotation, before and after compensation, as lines of Zhang's Tables 2 and 4.
 
@@ -206,7 +307,9 @@ def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.n
         At rest first, then by rate; three lines per position; empty when no window fits.
 
     """
-    measured, compensated, reference = (np.asarray(a, float).reshape(-1, 3) / gravity for a in (measured, compensated, reference))
+    measured, compensated, reference = (
+        np.asarray(a, float).reshape(-1, 3) / gravity for a in (measured, compensated, reference)
+    )
     rate_deg_s = np.abs(np.rad2deg(np.asarray(rate, float)))
     rate_deg_s = np.where(rate_deg_s < STILL_DEG_S, 0.0, np.maximum(np.round(rate_deg_s), 1.0))
     size = np.linalg.norm(reference, axis=1)
@@ -214,12 +317,25 @@ def axis_readings(measured: np.ndarray, compensated: np.ndarray, reference: np.n
     along = np.take_along_axis(reference, axis[:, None], axis=1)[:, 0] if len(reference) else size
     near = np.abs(along) >= np.cos(np.deg2rad(WITHIN_DEG)) * size
     lines = []
-    for key in sorted({(r, -int(np.sign(s)), int(a)) for r, s, a in zip(rate_deg_s[near], along[near], axis[near])}):
+    for key in sorted(
+        {
+            (r, -int(np.sign(s)), int(a))
+            for r, s, a in zip(rate_deg_s[near], along[near], axis[near])
+        }
+    ):
         chosen = near & (rate_deg_s == key[0]) & (np.sign(along) == -key[1]) & (axis == key[2])
         position = ('+' if key[1] < 0 else '-') + 'xyz'[key[2]]
         means = [np.mean(values[chosen], axis=0) for values in (reference, measured, compensated)]
-        lines += [AxisReading(position, float(key[0]), int(np.sum(chosen)), sensor, *(float(mean[i]) for mean in means))
-                  for i, sensor in enumerate('xyz')]
+        lines += [
+            AxisReading(
+                position,
+                float(key[0]),
+                int(np.sum(chosen)),
+                sensor,
+                *(float(mean[i]) for mean in means),
+            )
+            for i, sensor in enumerate('xyz')
+        ]
     return lines
 
 
@@ -227,10 +343,20 @@ def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list
     """Return the readings at rest (Table 2) and in rotation (Table 4), of three sensors in each position."""
     gravity = result.gravity
     true = errors.true['accelerometer']
-    chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL_FORCE_SHARE) & (errors.kind != 'dynamic')
-    readings = axis_readings(errors.measured['accelerometer'][chosen], (true + errors.after['accelerometer'])[chosen], true[chosen],
-                             rate=np.linalg.norm(errors.true['gyroscope'][chosen], axis=1), gravity=gravity)
-    return [[reading for reading in readings if (reading.rate_deg_s == 0) == at_rest] for at_rest in (True, False)]
+    chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL_FORCE_SHARE) & (
+        errors.kind != 'dynamic'
+    )
+    readings = axis_readings(
+        errors.measured['accelerometer'][chosen],
+        (true + errors.after['accelerometer'])[chosen],
+        true[chosen],
+        rate=np.linalg.norm(errors.true['gyroscope'][chosen], axis=1),
+        gravity=gravity,
+    )
+    return [
+        [reading for reading in readings if (reading.rate_deg_s == 0) == at_rest]
+        for at_rest in (True, False)
+    ]
 
 
 def calibration_report(result: CalibrationResult) -> str:
@@ -245,12 +371,24 @@ def calibration_report(result: CalibrationResult) -> str:
 
     """
     errors, windows = result.window_errors(), (result.options or CalibrationOptions()).windows
-    return render('calibration.html', title='IMU calibration', result=result, usage=usage(result.calibration), harmed=harmed,
-                  derived=[derive(result.calibration, sensor) for sensor in SENSORS], in_paper_units=in_paper_units, axis_pairs=AXIS_PAIRS,
-                  residuals=residual_figure(result), errors=[draw_windows(errors, sensor) for sensor in SENSORS],
-                  observability=observability_section(result), levers=lever_figure(result.calibration),
-                  navigation=navigation_section(result, errors), readings=reading_tables(result, errors), budget=budget_section(result),
-                  settings=[(item, getattr(windows, item.name)) for item in describe(windows)])
+    return render(
+        'calibration.html',
+        title='IMU calibration',
+        result=result,
+        usage=usage(result.calibration),
+        harmed=harmed,
+        derived=[derive(result.calibration, sensor) for sensor in SENSORS],
+        in_paper_units=in_paper_units,
+        axis_pairs=AXIS_PAIRS,
+        residuals=residual_figure(result),
+        errors=[draw_windows(errors, sensor) for sensor in SENSORS],
+        observability=observability_section(result),
+        levers=lever_figure(result.calibration),
+        navigation=navigation_section(result, errors),
+        readings=reading_tables(result, errors),
+        budget=budget_section(result),
+        settings=[(item, getattr(windows, item.name)) for item in describe(windows)],
+    )
 
 
 LAG_SECONDS = 2.0
@@ -262,7 +400,13 @@ def residual_figure(result: CalibrationResult) -> Drawn | None:
     """Return the autocorrelation of the residuals as SVG; None without moving windows."""
     if not (traces := autocorrelation(result)):
         return None
-    return draw('autocorrelation', (8.6, 2.7), _autocorrelations, traces, label='Autocorrelation of the residuals within moving windows')
+    return draw(
+        'autocorrelation',
+        (8.6, 2.7),
+        _autocorrelations,
+        traces,
+        label='Autocorrelation of the residuals within moving windows',
+    )
 
 
 def draw_windows(errors: WindowErrors, sensor: str) -> Drawn:
@@ -278,19 +422,38 @@ def _windows(figure, errors, sensor):
     _points(upper, errors.time, errors.before[sensor] * factor, hollow=True)
     floor = 2 * errors.floor[sensor].max(axis=1) * factor
     order = np.argsort(errors.time)
-    lower.fill_between(errors.time[order], -floor[order], floor[order], step='mid', color='#dfe5ec', lw=0, zorder=0.5)
+    lower.fill_between(
+        errors.time[order],
+        -floor[order],
+        floor[order],
+        step='mid',
+        color='#dfe5ec',
+        lw=0,
+        zorder=0.5,
+    )
     _points(lower, errors.time, errors.after[sensor] * factor)
     for axes, title in ((upper, f'{sensor}, raw'), (lower, 'corrected; grey: two sd of the noise')):
         axes.axhline(0, color=GREY, lw=0.6)
         axes.set(title=title, ylabel=unit)
     lower.set_xlabel('time, s')
-    axis_legend(upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1)   # visible on a narrow screen without scrolling
+    axis_legend(
+        upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1
+    )  # visible on a narrow screen without scrolling
 
 
 def _points(axes, time, values, hollow=False):
     for (name, colour), column in zip(AXIS_COLOURS.items(), values.T):
-        axes.plot(time, column, MARKER[name], color=colour, markersize=3.8, mfc='none' if hollow else colour, mew=0.8,
-                  alpha=0.9, label=name)
+        axes.plot(
+            time,
+            column,
+            MARKER[name],
+            color=colour,
+            markersize=3.8,
+            mfc='none' if hollow else colour,
+            mew=0.8,
+            alpha=0.9,
+            label=name,
+        )
 
 
 def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
@@ -311,14 +474,17 @@ def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np
         for sensor, rest in result.residuals_of(window).items():
             sums[sensor] += _lagged(rest - rest.mean(axis=0), n_lags)
     bound = 1.96 / np.sqrt(sum(len(w) for w in windows))
-    return {sensor: (np.arange(n_lags) * period, total / np.where(total[0] > 0, total[0], 1.0), bound) for sensor, total in sums.items()}
+    return {
+        sensor: (np.arange(n_lags) * period, total / np.where(total[0] > 0, total[0], 1.0), bound)
+        for sensor, total in sums.items()
+    }
 
 
 def _lagged(rest, n_lags):
     """Return sums of products at each lag, shape (n_lags, 3), by FFT."""
-    size = 2**int(np.ceil(np.log2(2 * len(rest))))
+    size = 2 ** int(np.ceil(np.log2(2 * len(rest))))
     spectrum = np.fft.rfft(rest, size, axis=0)
-    return np.fft.irfft(np.abs(spectrum)**2, size, axis=0)[:n_lags]
+    return np.fft.irfft(np.abs(spectrum) ** 2, size, axis=0)[:n_lags]
 
 
 def _autocorrelations(figure, traces):
@@ -327,7 +493,15 @@ def _autocorrelations(figure, traces):
     for axes, (sensor, (lags, values, bound)) in zip(panels, traces.items()):
         axes.axhspan(-bound, bound, color='#dfe5ec', lw=0, zorder=0.5)
         for (name, colour), column in zip(AXIS_COLOURS.items(), values[1:].T):
-            axes.plot(lags[1:], column, color=colour, lw=1.0, marker=MARKER[name], markersize=3, markevery=max(1, len(column) // 12))
+            axes.plot(
+                lags[1:],
+                column,
+                color=colour,
+                lw=1.0,
+                marker=MARKER[name],
+                markersize=3,
+                markevery=max(1, len(column) // 12),
+            )
         limit = max(0.15, 1.1 * float(np.max(np.abs(values[1:]))))
         axes.set(title=sensor, xlabel='lag, s', ylim=(-limit, limit))
     panels[0].set_ylabel('autocorrelation')

@@ -7,7 +7,11 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, formula_gain
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, beyond_lines, timing_lines
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
+    DiagnosisResult,
+    beyond_lines,
+    timing_lines,
+)
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import STANDARD_GRAVITY, for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
@@ -37,50 +41,105 @@ def diagnosis_report(result: DiagnosisResult) -> str:
     """
     diagnosis = result.diagnosis
     rests = {sensor: rest for sensor, rest in diagnosis.unexplained.items() if rest.significant}
-    word = 'bad' if any(rest.proposal is None for rest in rests.values()) else 'weak' if rests or diagnosis.findings else 'good'
-    return render('diagnosis.html', title='IMU diagnosis', word=word, result=result, diagnosis=diagnosis, rests=rests,
-                  draw_finding=draw_finding, draw_formula=draw_formula, formula_gain=formula_gain, unexplained_text=unexplained_text,
-                  overlay=overlay_section(diagnosis.traces, diagnosis.baseline.model.joint_names, _causes(diagnosis)),
-                  beyond=[*timing_lines(diagnosis), *(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)),
-                          *result.notes],
-                  spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
-                  reasons=[reason for reason in judge(result.calibration, result.tolerances).reasons
-                           if reason.word in (DECISION, PARAMETERS)])
+    word = (
+        'bad'
+        if any(rest.proposal is None for rest in rests.values())
+        else 'weak'
+        if rests or diagnosis.findings
+        else 'good'
+    )
+    return render(
+        'diagnosis.html',
+        title='IMU diagnosis',
+        word=word,
+        result=result,
+        diagnosis=diagnosis,
+        rests=rests,
+        draw_finding=draw_finding,
+        draw_formula=draw_formula,
+        formula_gain=formula_gain,
+        unexplained_text=unexplained_text,
+        overlay=overlay_section(
+            diagnosis.traces, diagnosis.baseline.model.joint_names, _causes(diagnosis)
+        ),
+        beyond=[
+            *timing_lines(diagnosis),
+            *(line for pair in diagnosis.unexplained.items() for line in beyond_lines(*pair)),
+            *result.notes,
+        ],
+        spectra=[drawn for pair in diagnosis.unexplained.items() if (drawn := draw_tones(*pair))],
+        reasons=[
+            reason
+            for reason in judge(result.calibration, result.tolerances).reasons
+            if reason.word in (DECISION, PARAMETERS)
+        ],
+    )
 
 
 def draw_finding(diagnosis: Diagnosis, finding: Finding, number: int) -> Drawn:
     """Return the residual against the cause of a finding, before and after, as SVG."""
     label = f'Residual against the cause, before and after: {finding.effect}'
-    return draw(f'finding-{number}', (8.6, 3.1), _against_cause, diagnosis, finding.gain.sensor, finding.against, label=label)
+    return draw(
+        f'finding-{number}',
+        (8.6, 3.1),
+        _against_cause,
+        diagnosis,
+        finding.gain.sensor,
+        finding.against,
+        label=label,
+    )
 
 
 def draw_formula(diagnosis: Diagnosis, proposal: Proposal) -> Drawn:
     """Return the residual against the variable of a proposed formula, before and after, as SVG."""
     against = tuple(kind for effect in proposal.effects for kind in effect.against)
-    return draw(f'formula-{proposal.sensor}', (8.6, 3.1), _against_cause, diagnosis, proposal.sensor, against,
-                label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}')
+    return draw(
+        f'formula-{proposal.sensor}',
+        (8.6, 3.1),
+        _against_cause,
+        diagnosis,
+        proposal.sensor,
+        against,
+        label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}',
+    )
 
 
 def draw_over_time(result: DiagnosisResult) -> Drawn:
     """Return the size of the residuals over time, before and after the extension, as SVG."""
-    return draw('traces', (8.6, 4.2), _over_time, result.diagnosis.traces, SPAN[result.observations],
-                label='Residuals over time before and after the extension')
+    return draw(
+        'traces',
+        (8.6, 4.2),
+        _over_time,
+        result.diagnosis.traces,
+        SPAN[result.observations],
+        label='Residuals over time before and after the extension',
+    )
 
 
 def _causes(diagnosis):
     """Return sensor -> label of the variable of its first finding, or of its formula."""
-    pairs = [(rest.proposal.sensor, [kind for effect in rest.proposal.effects for kind in effect.against])
-             for rest in diagnosis.unexplained.values() if rest.proposal is not None]
+    pairs = [
+        (
+            rest.proposal.sensor,
+            [kind for effect in rest.proposal.effects for kind in effect.against],
+        )
+        for rest in diagnosis.unexplained.values()
+        if rest.proposal is not None
+    ]
     pairs += [(finding.gain.sensor, finding.against) for finding in reversed(diagnosis.findings)]
     known = variables(diagnosis.traces, diagnosis.baseline.model.joint_names)
-    return {sensor: label for sensor, against in pairs if (label := cause_of(diagnosis, sensor, against)[1]) in known}
+    return {
+        sensor: label
+        for sensor, against in pairs
+        if (label := cause_of(diagnosis, sensor, against)[1]) in known
+    }
 
 
 def explained_share(values: np.ndarray, signal: np.ndarray) -> float:
     """Return the share of the variance of `signal` that its means over bins of `values` carry."""
     count, means = _binned(np.quantile(values, np.linspace(0, 1, BINS + 1)[1:-1]), values, signal)
-    total = np.sum((signal - signal.mean())**2)
-    return float(np.sum(count * (means - signal.mean())**2) / total) if total > 0 else 0.0
+    total = np.sum((signal - signal.mean()) ** 2)
+    return float(np.sum(count * (means - signal.mean()) ** 2) / total) if total > 0 else 0.0
 
 
 def _binned(edges, values, *signals):
@@ -90,15 +149,25 @@ def _binned(edges, values, *signals):
     return count, *(np.bincount(index, signal, BINS) / np.maximum(count, 1) for signal in signals)
 
 
-def cause_of(diagnosis: Diagnosis, sensor: str, against: Sequence[str]) -> tuple[int, str, np.ndarray]:
+def cause_of(
+    diagnosis: Diagnosis, sensor: str, against: Sequence[str]
+) -> tuple[int, str, np.ndarray]:
     """Return (axis, label, values): the axis of a sensor that changes most, and the variable of some kinds that its change follows."""
     traces = diagnosis.traces
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
-    kinds = against if len(signal) >= FEW else ()   # bins of few poses have uncertain means
-    best = max(((explained_share(values, signal[:, axis]), label, values)
-                for label, (kind, values) in variables(traces, diagnosis.baseline.model.joint_names).items() if kind in kinds),
-               default=(0.0, '', None), key=lambda entry: entry[0])
+    kinds = against if len(signal) >= FEW else ()  # bins of few poses have uncertain means
+    best = max(
+        (
+            (explained_share(values, signal[:, axis]), label, values)
+            for label, (kind, values) in variables(
+                traces, diagnosis.baseline.model.joint_names
+            ).items()
+            if kind in kinds
+        ),
+        default=(0.0, '', None),
+        key=lambda entry: entry[0],
+    )
     if best[2] is None or best[0] < MIN_DRAWN_FIT:
         factor, unit = for_people(UNITS[sensor])
         return axis, f'prediction of the effect, {unit}', signal[:, axis] * factor
@@ -110,11 +179,24 @@ def _against_cause(figure, diagnosis, sensor, against):
     traces = diagnosis.traces
     axis, label, values = cause_of(diagnosis, sensor, against)
     factor, unit = for_people(UNITS[sensor])
-    before, after = (residual[sensor][:, axis] * factor for residual in (traces.before, traces.after))
+    before, after = (
+        residual[sensor][:, axis] * factor for residual in (traces.before, traces.after)
+    )
     left, right = figure.subplots(1, 2, sharey=True)
     some = slice(None, None, max(1, len(values) // 2500))
-    for axes, residual, colour, title in ((left, before, BEFORE, 'before'), (right, after, AFTER, 'after')):
-        axes.plot(values[some], residual[some], '.', color=colour, markersize=_marker(values, 4), alpha=0.5, mew=0)
+    for axes, residual, colour, title in (
+        (left, before, BEFORE, 'before'),
+        (right, after, AFTER, 'after'),
+    ):
+        axes.plot(
+            values[some],
+            residual[some],
+            '.',
+            color=colour,
+            markersize=_marker(values, 4),
+            alpha=0.5,
+            mew=0,
+        )
         axes.axhline(0, color=GREY, lw=0.6)
         axes.set(title=title, xlabel=label)
     place, curve = _curve(values, before - after)
@@ -133,7 +215,9 @@ def _curve(values, signal):
     if len(values) < FEW:
         order = np.argsort(values)
         return values[order], signal[order]
-    count, *means = _binned(np.linspace(values.min(), values.max(), BINS + 1)[1:-1], values, values, signal)
+    count, *means = _binned(
+        np.linspace(values.min(), values.max(), BINS + 1)[1:-1], values, values, signal
+    )
     return tuple(mean[count >= max(3, 0.002 * len(values))] for mean in means)
 
 
@@ -142,9 +226,21 @@ def _over_time(figure, traces, over):
     for axes, sensor in zip(figure.subplots(2, 1, sharex=True), SENSORS):
         factor, unit = for_people(UNITS[sensor])
         some = slice(None, None, max(1, len(traces.time) // 3000))
-        for residual, colour, label in ((traces.before, BEFORE, 'before'), (traces.after, AFTER, 'after')):
-            size = np.sqrt((residual[sensor]**2).sum(axis=1)) * factor
-            axes.plot(traces.time[some], size[some], '.', color=colour, markersize=_marker(size, 3), alpha=0.5, mew=0, label=label)
+        for residual, colour, label in (
+            (traces.before, BEFORE, 'before'),
+            (traces.after, AFTER, 'after'),
+        ):
+            size = np.sqrt((residual[sensor] ** 2).sum(axis=1)) * factor
+            axes.plot(
+                traces.time[some],
+                size[some],
+                '.',
+                color=colour,
+                markersize=_marker(size, 3),
+                alpha=0.5,
+                mew=0,
+                label=label,
+            )
         axes.set_title(f'{sensor}, size of the residual {over}, {unit}')
         axes.set_ylim(bottom=0)
     axes.set_xlabel('time, s')
@@ -166,12 +262,14 @@ def variables(traces: Traces, joint_names: Sequence[str]) -> dict[str, tuple[str
         found[f'specific force {axis}, g'] = ('force', traces.force_s[:, k] / STANDARD_GRAVITY)
         found[f'rate {axis}, deg/s'] = ('rate', np.rad2deg(traces.rate_s[:, k]))
     found['speed, deg/s'] = ('speed', np.rad2deg(np.linalg.norm(traces.rate_s, axis=1)))
-    for name, angle in zip(joint_names, traces.position.T):   # by hand no joint is known
+    for name, angle in zip(joint_names, traces.position.T):  # by hand no joint is known
         found[f'angle of {name}, deg'] = ('angle', np.rad2deg(np.angle(np.exp(1j * angle))))
     return found
 
 
-def overlay_section(traces: Traces, joint_names: Sequence[str], causes: Mapping[str, str]) -> list[dict[str, Any]]:
+def overlay_section(
+    traces: Traces, joint_names: Sequence[str], causes: Mapping[str, str]
+) -> list[dict[str, Any]]:
     """
     Return for each sensor its name, table of bands and charts: signals, differences, residuals, spectra and histograms by axis.
 
@@ -192,27 +290,83 @@ def _sensor(traces, sensor, against, first):
     rows: list[dict[str, Any]] = []
 
     def row(title: str, chart: Callable[[int], dict[str, Any]], **more: Any) -> None:
-        rows.append({'title': title, 'charts': [json.dumps(chart(axis)) for axis in range(3)], 'variables': '', 'labels': (), **more})
+        rows.append(
+            {
+                'title': title,
+                'charts': [json.dumps(chart(axis)) for axis in range(3)],
+                'variables': '',
+                'labels': (),
+                **more,
+            }
+        )
+
     if segments := traces.segments.get(sensor):
-        row(f'Measured and simulated on the segment with the largest difference, {unit}',
-            lambda k: _chart(f'{sensor} {AXES[k]}', 'time, s', segments[k].time,
-                             {name: signal * factor for name, signal in segments[k].signals.items()}))
-        row(f'Measured minus simulated on that segment, {unit}',
-            lambda k: _chart(f'{sensor} {AXES[k]}', 'time, s', segments[k].time, {
-                when: (segments[k].signals['measured'] - segments[k].signals[f'simulated {when}']) * factor for when in WHEN}))
+        row(
+            f'Measured and simulated on the segment with the largest difference, {unit}',
+            lambda k: _chart(
+                f'{sensor} {AXES[k]}',
+                'time, s',
+                segments[k].time,
+                {name: signal * factor for name, signal in segments[k].signals.items()},
+            ),
+        )
+        row(
+            f'Measured minus simulated on that segment, {unit}',
+            lambda k: _chart(
+                f'{sensor} {AXES[k]}',
+                'time, s',
+                segments[k].time,
+                {
+                    when: (
+                        segments[k].signals['measured'] - segments[k].signals[f'simulated {when}']
+                    )
+                    * factor
+                    for when in WHEN
+                },
+            ),
+        )
     some = slice(None, None, -(-len(traces.time) // MOST_POINTS))
-    residuals = [{when: getattr(traces, when)[sensor][some, k] * factor for when in WHEN} for k in range(3)]
-    row(f'Residual, {unit}, against', lambda k: _chart(f'{sensor} {AXES[k]}', first, against[first][some], residuals[k], kind='points'),
-        variables=json.dumps({label: _plain(values[some]) for label, values in against.items()}), first=first, labels=list(against))
+    residuals = [
+        {when: getattr(traces, when)[sensor][some, k] * factor for when in WHEN} for k in range(3)
+    ]
+    row(
+        f'Residual, {unit}, against',
+        lambda k: _chart(
+            f'{sensor} {AXES[k]}', first, against[first][some], residuals[k], kind='points'
+        ),
+        variables=json.dumps({label: _plain(values[some]) for label, values in against.items()}),
+        first=first,
+        labels=list(against),
+    )
     if sensor in traces.distances:
         frequency, density, noise = traces.distances[sensor].density()
-        row(f'Spectrum of the residual, {unit}/√Hz, with the noise at rest',
-            lambda k: _chart(f'{sensor} {AXES[k]}', 'frequency, Hz', frequency, {
-                **{when: density[w, :, k] * factor for w, when in enumerate(WHEN)}, 'noise': noise[:, k] * factor}, kind='log'))
-    row(f'Histogram of the residual, {unit}', lambda k: _histogram(f'{sensor} {AXES[k]}', unit, {
-        when: getattr(traces, when)[sensor][:, k] * factor for when in WHEN}))
-    bands = [(name, rms.T * factor, float(np.sqrt(np.mean(noise**2))) * factor)
-             for name, rms, noise in (traces.distances[sensor].bands() if sensor in traces.distances else ())]
+        row(
+            f'Spectrum of the residual, {unit}/√Hz, with the noise at rest',
+            lambda k: _chart(
+                f'{sensor} {AXES[k]}',
+                'frequency, Hz',
+                frequency,
+                {
+                    **{when: density[w, :, k] * factor for w, when in enumerate(WHEN)},
+                    'noise': noise[:, k] * factor,
+                },
+                kind='log',
+            ),
+        )
+    row(
+        f'Histogram of the residual, {unit}',
+        lambda k: _histogram(
+            f'{sensor} {AXES[k]}',
+            unit,
+            {when: getattr(traces, when)[sensor][:, k] * factor for when in WHEN},
+        ),
+    )
+    bands = [
+        (name, rms.T * factor, float(np.sqrt(np.mean(noise**2))) * factor)
+        for name, rms, noise in (
+            traces.distances[sensor].bands() if sensor in traces.distances else ()
+        )
+    ]
     return {'sensor': sensor, 'unit': unit, 'bands': bands, 'rows': rows}
 
 
@@ -220,7 +374,9 @@ def histogram(residuals: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str
     """Return (middles of the bins, name -> counts) of residuals, shape (n,) each; the bins contain 99.9 % of each."""
     limit = max(float(np.quantile(np.abs(own), 0.999)) for own in residuals.values()) or 1.0
     edges = np.linspace(-limit, limit, HISTOGRAM_BINS + 1)
-    return edges[:-1] + edges[1] / 2 - edges[0] / 2, {name: np.histogram(own, edges)[0] for name, own in residuals.items()}
+    return edges[:-1] + edges[1] / 2 - edges[0] / 2, {
+        name: np.histogram(own, edges)[0] for name, own in residuals.items()
+    }
 
 
 def _histogram(title, unit, residuals):
@@ -231,8 +387,13 @@ def _histogram(title, unit, residuals):
 def _chart(title, x, values, series, kind='line'):
     if kind == 'log':
         series = {name: np.where(own > 0, own, np.nan) for name, own in series.items()}
-    return {'title': title, 'x': x, 'kind': kind, 'names': list(series),
-            'data': [_plain(values), *(_plain(own) for own in series.values())]}
+    return {
+        'title': title,
+        'x': x,
+        'kind': kind,
+        'names': list(series),
+        'data': [_plain(values), *(_plain(own) for own in series.values())],
+    }
 
 
 def _plain(values):

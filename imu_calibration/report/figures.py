@@ -48,7 +48,10 @@ class Drawn(str):
         """Write the figure as PDF, SVG or PNG, by the end of the name; raises InputError for others."""
         kind = Path(path).suffix.lower()
         if kind not in ('.pdf', '.svg', '.png'):
-            raise InputError(f'the name of a figure must end with .pdf, .svg or .png, got {path}; change it', code='figure_suffix')
+            raise InputError(
+                f'the name of a figure must end with .pdf, .svg or .png, got {path}; change it',
+                code='figure_suffix',
+            )
         if kind == '.svg':
             files.write_text(path, str(self))
         else:
@@ -57,14 +60,27 @@ class Drawn(str):
     def bytes_as(self, kind: str) -> bytes:
         """Return the figure as 'pdf', or as 'png' with 200 pixels per inch; the same input gives the same bytes."""
         whole = io.BytesIO()
-        self.figure.savefig(whole, format=kind, dpi=200, facecolor='white', metadata={'CreationDate': None} if kind == 'pdf' else None)
+        self.figure.savefig(
+            whole,
+            format=kind,
+            dpi=200,
+            facecolor='white',
+            metadata={'CreationDate': None} if kind == 'pdf' else None,
+        )
         return whole.getvalue()
 
     @property
     def data(self) -> list[dict[str, Any]]:
         """For each axes its title and labels, and 'lines': list of (label, x (n,), y (n,)) as arrays in the units of the labels."""
-        return [{'title': axes.get_title(loc='left'), 'x': axes.get_xlabel(), 'y': axes.get_ylabel(),
-                 'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()]} for axes in self.axes]
+        return [
+            {
+                'title': axes.get_title(loc='left'),
+                'x': axes.get_xlabel(),
+                'y': axes.get_ylabel(),
+                'lines': [(line.get_label(), *line.get_data()) for line in axes.get_lines()],
+            }
+            for axes in self.axes
+        ]
 
 
 INK, GREY, FAINT = '#1b2430', '#5c6877', '#98a2b0'
@@ -76,7 +92,9 @@ MARKER = {'x': 'o', 'y': 's', 'z': '^'}
 NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
 
 
-def draw(name: str, size: tuple[float, float], paint: Callable[..., None], *data: Any, label: str) -> Drawn:
+def draw(
+    name: str, size: tuple[float, float], paint: Callable[..., None], *data: Any, label: str
+) -> Drawn:
     """
     Return a figure as SVG for the page, with the matplotlib figure.
 
@@ -97,14 +115,19 @@ def draw(name: str, size: tuple[float, float], paint: Callable[..., None], *data
     import matplotlib
     from markupsafe import escape
     from matplotlib.figure import Figure
+
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_style() | {'svg.hashsalt': name})
         figure = Figure(figsize=size, layout='constrained')
         paint(figure, *data)
         canvas, text = _laid_out(figure), io.StringIO()
-        figure.dpi = matplotlib.rcParams['figure.dpi']   # of pictures inside, which the canvas lays out at 72
-        canvas.print_svg(text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None})
+        figure.dpi = matplotlib.rcParams[
+            'figure.dpi'
+        ]  # of pictures inside, which the canvas lays out at 72
+        canvas.print_svg(
+            text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None}
+        )
         return Drawn(_inside(text.getvalue(), str(escape(label))), figure)
 
 
@@ -112,12 +135,18 @@ def draw(name: str, size: tuple[float, float], paint: Callable[..., None], *data
 def _style():
     """Return the settings of matplotlib for figures of a page."""
     from matplotlib import rc_params_from_file
-    return dict(rc_params_from_file(Path(__file__).with_name('templates') / 'figure.mplstyle', use_default_template=False))
+
+    return dict(
+        rc_params_from_file(
+            Path(__file__).with_name('templates') / 'figure.mplstyle', use_default_template=False
+        )
+    )
 
 
 def _laid_out(figure):
     """Place the axes once and return the canvas; `savefig` would do it twice more, and draw once without need."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
+
     canvas = FigureCanvasSVG(figure)
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine('none')
@@ -126,18 +155,19 @@ def _laid_out(figure):
 
 def _inside(svg, label):
     """Return only the svg element: without prologue, metadata and the identifiers that repeat from figure to figure."""
-    svg = svg[svg.index('<svg'):]
+    svg = svg[svg.index('<svg') :]
     svg = re.sub(r'<metadata>.*?</metadata>', '', svg, flags=re.S)
     svg = re.sub(r' id="[A-Za-z0-9.]+_[0-9]+"', '', svg)
     head = rf'<svg {NAMESPACES} viewBox="\1" role="img" aria-label="{label}">'
     svg = re.sub(r'<svg [^>]*viewBox="([^"]+)"[^>]*>', head, svg, count=1)
     svg = re.sub(r'\n\s*', '\n', svg)
-    return re.sub(r"font: ([0-9.]+)px[^;\"]*", r'font-size: \1px', svg)
+    return re.sub(r'font: ([0-9.]+)px[^;\"]*', r'font-size: \1px', svg)
 
 
 def log_axis(axis: Any) -> None:
     """Make an axis logarithmic with decades only, written as plain text (mathtext uses most of the time of a page)."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
     axis.axes.set(**{f'{axis.axis_name}scale': 'log'})
     axis.set_major_locator(LogLocator(numticks=8))
     axis.set_minor_locator(NullLocator())
@@ -155,7 +185,11 @@ def decade(value: float) -> str:
 def axis_legend(axes: Any, where: str = 'upper right', **more: Any) -> None:
     """Draw the legend of the three sensor axes."""
     from matplotlib.lines import Line2D
-    handles = [Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=0, label=name) for name, colour in AXIS_COLOURS.items()]
+
+    handles = [
+        Line2D([], [], color=colour, marker=MARKER[name], markersize=4, lw=0, label=name)
+        for name, colour in AXIS_COLOURS.items()
+    ]
     axes.legend(handles=handles, loc=where, ncols=3, columnspacing=1.0, handletextpad=0.2, **more)
 
 
@@ -164,7 +198,9 @@ def draw_tones(sensor: str, rest: Unexplained) -> str:
     if not rest.tones:
         return ''
     label = f'Spectrum of the unexplained residual of the {sensor}'
-    return draw(f'tones-{sensor}', (8.6, 0.6 + 2.1 * len(rest.tones)), _spectra, rest.tones, label=label)
+    return draw(
+        f'tones-{sensor}', (8.6, 0.6 + 2.1 * len(rest.tones)), _spectra, rest.tones, label=label
+    )
 
 
 def _spectra(figure, tones):
@@ -174,8 +210,11 @@ def _spectra(figure, tones):
         axes.axhline(MIN_LINE_POWER, color=GREY, lw=0.6)
         axes.axvline(tone.frequency, color=INK, lw=0.8, ls=':')
         log_axis(axes.yaxis)
-        axes.set(title=f'{tone.sensor} {tone.axis}', ylabel='relative power',
-                 xlabel='frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}')
+        axes.set(
+            title=f'{tone.sensor} {tone.axis}',
+            ylabel='relative power',
+            xlabel='frequency, Hz' if tone.joint is None else f'cycles per turn of {tone.joint}',
+        )
 
 
 PLANES = ((0, 1), (0, 2), (1, 2))
@@ -186,8 +225,14 @@ def lever_figure(calibration: Calibration) -> Drawn | None:
     if calibration.of('accelerometer', Role.ARMS) is None:
         return None
     part = calibration.model.part('accelerometer', Role.ARMS)
-    return draw('lever-arms', (8.6, 3.15), _views, arms_of(calibration) * 1e3, calibration.covariance[part, part] * 1e6,
-                label='Sensitive points of the three accelerometers in three views')
+    return draw(
+        'lever-arms',
+        (8.6, 3.15),
+        _views,
+        arms_of(calibration) * 1e3,
+        calibration.covariance[part, part] * 1e6,
+        label='Sensitive points of the three accelerometers in three views',
+    )
 
 
 def _views(figure, arms, cov):
@@ -200,17 +245,38 @@ def _views(figure, arms, cov):
             index = [3 * element + across, 3 * element + up]
             _point(axes, arms.ravel()[index], cov[np.ix_(index, index)], 'xyz'[element], colour)
         axes.plot(0, 0, '+', color=INK, markersize=9, mew=1.3)
-        axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect='equal', xlabel=f'{"xyz"[across]}, mm', ylabel=f'{"xyz"[up]}, mm')
+        axes.set(
+            xlim=(-limit, limit),
+            ylim=(-limit, limit),
+            aspect='equal',
+            xlabel=f'{"xyz"[across]}, mm',
+            ylabel=f'{"xyz"[up]}, mm',
+        )
         axes.locator_params(nbins=5)
 
 
 def _point(axes, place, cov, name, colour):
     x, y = place
-    axes.annotate('', (x, y), (0, 0), arrowprops={'arrowstyle': '-', 'color': colour, 'lw': 1.1, 'alpha': 0.55})
+    axes.annotate(
+        '',
+        (x, y),
+        (0, 0),
+        arrowprops={'arrowstyle': '-', 'color': colour, 'lw': 1.1, 'alpha': 0.55},
+    )
     axes.plot(x, y, 'o', color=colour, markersize=5)
     values, vectors = np.linalg.eigh(cov)
     angle = np.linspace(0, 2 * np.pi, 61)
     ring = 2 * np.sqrt(np.maximum(values, 0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
     axes.plot(*(np.array([[x], [y]]) + vectors @ ring), color=colour, lw=0.9)
     away = 11 * np.array([x, y]) / max(np.hypot(x, y), 1e-9)
-    axes.annotate(name, (x, y), away, textcoords='offset points', color=colour, fontsize=10, fontweight='bold', ha='center', va='center')
+    axes.annotate(
+        name,
+        (x, y),
+        away,
+        textcoords='offset points',
+        color=colour,
+        fontsize=10,
+        fontweight='bold',
+        ha='center',
+        va='center',
+    )

@@ -42,16 +42,32 @@ class Growth:
 def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[str, Any]:
     """Return figures and end values of dead reckoning at rest and in motion, None without it."""
     before, moving = rest_growth(errors), motion_growth(result)
-    return {'rest': None if before is None else _shown('rest', before, *expected_growth(result, errors)),
-            'moving': None if moving is None else _shown('moving', *moving, {})}
+    return {
+        'rest': None
+        if before is None
+        else _shown('rest', before, *expected_growth(result, errors)),
+        'moving': None if moving is None else _shown('moving', *moving, {}),
+    }
 
 
 def _shown(name, before, after, parts):
     """Return the figure, and (velocity, position) at the end before, after and of each part of the error."""
-    return {'figure': draw(f'growth-{name}', (8.6, 2.9), _growths, before, after, parts,
-                           label='Growth of velocity and position errors, before and after calibration'),
-            'seconds': before.time[-1], 'runs': len(before.velocity), 'before': before.last(), 'after': after.last(),
-            'parts': {label: part.last() for label, part in parts.items()}}
+    return {
+        'figure': draw(
+            f'growth-{name}',
+            (8.6, 2.9),
+            _growths,
+            before,
+            after,
+            parts,
+            label='Growth of velocity and position errors, before and after calibration',
+        ),
+        'seconds': before.time[-1],
+        'runs': len(before.velocity),
+        'before': before.last(),
+        'after': after.last(),
+        'parts': {label: part.last() for label, part in parts.items()},
+    }
 
 
 def rest_growth(errors: WindowErrors) -> Growth | None:
@@ -65,15 +81,31 @@ def rest_growth(errors: WindowErrors) -> Growth | None:
         return None
     time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
     runs = []
-    for force, force_error, rate_error in zip(*(part[static] for part in (
-            errors.true['accelerometer'], errors.before['accelerometer'], errors.before['gyroscope']))):
+    for force, force_error, rate_error in zip(
+        *(
+            part[static]
+            for part in (
+                errors.true['accelerometer'],
+                errors.before['accelerometer'],
+                errors.before['gyroscope'],
+            )
+        )
+    ):
         gravity = float(np.linalg.norm(force))
-        readings = (np.tile(reading, (len(time), 1)) for reading in (force + force_error, rate_error))
-        runs.append(strapdown(time, *readings, gravity=gravity, mat_ns0=_attitudes(force[None] / gravity)[0].T))
+        readings = (
+            np.tile(reading, (len(time), 1)) for reading in (force + force_error, rate_error)
+        )
+        runs.append(
+            strapdown(
+                time, *readings, gravity=gravity, mat_ns0=_attitudes(force[None] / gravity)[0].T
+            )
+        )
     return Growth(time, *(np.linalg.norm(run, axis=-1) for run in zip(*runs)))
 
 
-def expected_growth(result: CalibrationResult, errors: WindowErrors) -> tuple[Growth, dict[str, Growth]]:
+def expected_growth(
+    result: CalibrationResult, errors: WindowErrors
+) -> tuple[Growth, dict[str, Growth]]:
     """
     Return the expected Growth (rms) at rest after calibration, and its parts: parameters, instability, noise.
 
@@ -87,14 +119,30 @@ def expected_growth(result: CalibrationResult, errors: WindowErrors) -> tuple[Gr
     gravity = float(np.median(np.linalg.norm(forces, axis=1)))
     uncertainty = Uncertainty(result.calibration)
     constants = np.array([_constant_variances(uncertainty, force) for force in forces])
-    scatter = [float(np.max(result.calibration.noise(sensor)[1])) for sensor in ('accelerometer', 'gyroscope')]
-    unstable = np.tile([3 * scatter[0]**2, 2 * scatter[1]**2], (len(static), 1))
+    scatter = [
+        float(np.max(result.calibration.noise(sensor)[1]))
+        for sensor in ('accelerometer', 'gyroscope')
+    ]
+    unstable = np.tile([3 * scatter[0] ** 2, 2 * scatter[1] ** 2], (len(static), 1))
     density = [d * np.sqrt(n) for d, n in zip(noise_densities(result), (3, 2))]
-    parts = {'parameters': _constant_growth(time, constants, gravity),
-             'instability of the biases': _constant_growth(time, unstable, gravity),
-             'noise': Growth(time, np.hypot(density[0] * time**0.5, gravity * density[1] * time**1.5 / np.sqrt(3))[None],
-                             np.hypot(density[0] * time**1.5 / np.sqrt(3), gravity * density[1] * time**2.5 / np.sqrt(20))[None])}
-    total = Growth(time, *(np.sqrt(sum(getattr(part, name)**2 for part in parts.values())) for name in ('velocity', 'position')))
+    parts = {
+        'parameters': _constant_growth(time, constants, gravity),
+        'instability of the biases': _constant_growth(time, unstable, gravity),
+        'noise': Growth(
+            time,
+            np.hypot(density[0] * time**0.5, gravity * density[1] * time**1.5 / np.sqrt(3))[None],
+            np.hypot(
+                density[0] * time**1.5 / np.sqrt(3), gravity * density[1] * time**2.5 / np.sqrt(20)
+            )[None],
+        ),
+    }
+    total = Growth(
+        time,
+        *(
+            np.sqrt(sum(getattr(part, name) ** 2 for part in parts.values()))
+            for name in ('velocity', 'position')
+        ),
+    )
     return total, parts
 
 
@@ -106,14 +154,25 @@ def _constant_variances(uncertainty, force):
 
 def _constant_growth(time, variances, gravity):
     force, rate = np.sqrt(np.maximum(variances, 0)).T[:, :, None]
-    return Growth(time, np.hypot(force * time, gravity * rate * time**2 / 2), np.hypot(force * time**2 / 2, gravity * rate * time**3 / 6))
+    return Growth(
+        time,
+        np.hypot(force * time, gravity * rate * time**2 / 2),
+        np.hypot(force * time**2 / 2, gravity * rate * time**3 / 6),
+    )
 
 
 def noise_densities(result: CalibrationResult) -> list[float]:
     """Return the densities of accelerometer and gyroscope noise at low frequency, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz)."""
     found = [result.calibration.statistics[sensor] for sensor in ('accelerometer', 'gyroscope')]
-    return [float(np.sqrt(np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0))) * result.period))
-            for f in found]
+    return [
+        float(
+            np.sqrt(
+                np.mean(np.square(f['noise_sd']) * np.asarray(f.get('low_frequency_factor', 1.0)))
+                * result.period
+            )
+        )
+        for f in found
+    ]
 
 
 def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:
@@ -122,14 +181,24 @@ def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:
 
     The truth is that of the table, carried to the origin that the calibration compensates to. Noise is included.
     """
-    windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= MIN_DRAWN_SECONDS][:MAX_RUNS]
+    windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= MIN_DRAWN_SECONDS][
+        :MAX_RUNS
+    ]
     if not windows:
         return None
     length = min(w.time[-1] - w.time[0] for w in windows)
     pairs = [_moving_runs(result, window, length) for window in windows]
     grid = np.linspace(0.0, length, RUN_INSTANTS)
-    before, after = (Growth(grid, *(np.array([getattr(pair[k], name) for pair in pairs]) for name in ('velocity', 'position')))
-                     for k in range(2))
+    before, after = (
+        Growth(
+            grid,
+            *(
+                np.array([getattr(pair[k], name) for pair in pairs])
+                for name in ('velocity', 'position')
+            ),
+        )
+        for k in range(2)
+    )
     return before, after
 
 
@@ -139,13 +208,34 @@ def _moving_runs(result, window, length):
     time, motion = window.time[some], window.motion.select(some)
     truth = _at_origin(result.calibration, reference_motion(result.table, motion))
     reference_c = result.calibration.model.temperature_ref_c
-    temperature = np.full(len(time), reference_c) if window.temperature_c is None else window.temperature_c[some]
-    corrected = compensate(result.calibration, window.force_s[some], window.rate_s[some], alpha_s=truth.alpha_s, temperature_c=temperature)
+    temperature = (
+        np.full(len(time), reference_c)
+        if window.temperature_c is None
+        else window.temperature_c[some]
+    )
+    corrected = compensate(
+        result.calibration,
+        window.force_s[some],
+        window.rate_s[some],
+        alpha_s=truth.alpha_s,
+        temperature_c=temperature,
+    )
     grid = np.linspace(0.0, length, RUN_INSTANTS)
     growths = []
-    for force, rate in ((window.force_s[some], window.rate_s[some]), (corrected.force, corrected.rate)):
+    for force, rate in (
+        (window.force_s[some], window.rate_s[some]),
+        (corrected.force, corrected.rate),
+    ):
         errors = dead_reckoning_errors(truth, force, rate)
-        growths.append(Growth(grid, *(np.interp(grid, time - time[0], np.linalg.norm(error, axis=1)) for error in errors)))
+        growths.append(
+            Growth(
+                grid,
+                *(
+                    np.interp(grid, time - time[0], np.linalg.norm(error, axis=1))
+                    for error in errors
+                ),
+            )
+        )
     return growths
 
 
@@ -162,7 +252,9 @@ def _growths(figure, before, after, parts):
     """Velocity and position, each with median and the range of the runs; parts of the expected error as thin lines."""
     for axes, name, unit in zip(figure.subplots(1, 2), ('velocity', 'position'), ('m/s', 'm')):
         for growth, colour, label in zip((before, after), (BEFORE, AFTER), ('before', 'after')):
-            low, middle, high = np.quantile(np.maximum(getattr(growth, name)[:, 1:], 1e-12), (0.1, 0.5, 0.9), axis=0)
+            low, middle, high = np.quantile(
+                np.maximum(getattr(growth, name)[:, 1:], 1e-12), (0.1, 0.5, 0.9), axis=0
+            )
             axes.fill_between(growth.time[1:], low, high, color=colour, alpha=0.16, lw=0)
             axes.plot(growth.time[1:], middle, color=colour, label=label)
         for (label, part), dash in zip(parts.items(), ('-', '--', ':')):

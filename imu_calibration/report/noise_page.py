@@ -17,12 +17,23 @@ from imu_calibration.report.page import render
 
 def draw_curve(result: NoiseIdentification, sensor: str) -> Drawn:
     """Return the Allan deviations of the axes of one sensor as SVG."""
-    return draw(f'allan-{sensor}', (8.6, 5.0), _curves, result, sensor, label=f'Allan deviation of the {sensor} against averaging time')
+    return draw(
+        f'allan-{sensor}',
+        (8.6, 5.0),
+        _curves,
+        result,
+        sensor,
+        label=f'Allan deviation of the {sensor} against averaging time',
+    )
 
 
 def _curves(figure, result, sensor):
     """Points with 95 % bands, the model's line, the contribution of the trends, and a slope for each process of the noisiest axis."""
-    axes, curve, (factor, unit) = figure.subplots(), result.record.curve, for_people(UNITS[sensor], NOISE_QUANTITY)
+    axes, curve, (factor, unit) = (
+        figure.subplots(),
+        result.record.curve,
+        for_people(UNITS[sensor], NOISE_QUANTITY),
+    )
     log_axis(axes.xaxis)
     log_axis(axes.yaxis)
     own = range(3 * SENSORS.index(sensor), 3 * SENSORS.index(sensor) + 3)
@@ -31,11 +42,17 @@ def _curves(figure, result, sensor):
     # The bands of single averages are much wider than the range of the measured values.
     shown = factor * np.sqrt(np.concatenate([curve.variance[:, own], curve.raw[:, own]]))
     axes.set_ylim(np.nanmin(shown[shown > 0]) / 2.5, np.nanmax(shown) * 2.0)
-    noisiest = max((result.axes[k].terms for k in own), key=lambda terms: terms[WHITE.name].interval[1])
+    noisiest = max(
+        (result.axes[k].terms for k in own), key=lambda terms: terms[WHITE.name].interval[1]
+    )
     _slopes(axes, curve.tau, noisiest, factor)
     axes.set(xlabel='averaging time τ, s', ylabel=f'Allan deviation, {unit}')
     from matplotlib.lines import Line2D
-    handles = [Line2D([], [], color=hue, marker=MARKER[name], markersize=4, lw=1.3, label=name) for name, hue in AXIS_COLOURS.items()]
+
+    handles = [
+        Line2D([], [], color=hue, marker=MARKER[name], markersize=4, lw=1.3, label=name)
+        for name, hue in AXIS_COLOURS.items()
+    ]
     if any(result.record.trends[k] for k in own):
         handles.append(Line2D([], [], color=GREY, ls=':', label='with its trends'))
     axes.legend(handles=handles, loc='upper right', ncols=len(handles))
@@ -58,9 +75,11 @@ def _axis(axes, result, k, factor, name):
 
 def _slopes(axes, tau, terms, factor):
     """Draw a straight line for every process of an axis, with the letter and the slope."""
-    lines = ((WHITE.name, 'N: slope −½', lambda c: c / np.sqrt(tau), 0.35),
-             (RANDOM_WALK.name, 'K: slope +½', lambda c: c * np.sqrt(tau / 3), 0.8),
-             (FLICKER.name, 'B: flat at 0.664 B', lambda c: c * FLATNESS + 0 * tau, 0.8))
+    lines = (
+        (WHITE.name, 'N: slope −½', lambda c: c / np.sqrt(tau), 0.35),
+        (RANDOM_WALK.name, 'K: slope +½', lambda c: c * np.sqrt(tau / 3), 0.8),
+        (FLICKER.name, 'B: flat at 0.664 B', lambda c: c * FLATNESS + 0 * tau, 0.8),
+    )
     for name, label, line, where in lines:
         term = terms.get(name)
         if term is None or term.value is None:
@@ -68,23 +87,48 @@ def _slopes(axes, tau, terms, factor):
         values = line(term.value) * factor
         axes.plot(tau, values, '--', color=FAINT, lw=0.9, zorder=1)
         at = min(int(where * len(tau)), len(tau) - 1)
-        axes.annotate(label, (tau[at], values[at]), (-6, -12), textcoords='offset points', color=GREY, fontsize=8, ha='right')
+        axes.annotate(
+            label,
+            (tau[at], values[at]),
+            (-6, -12),
+            textcoords='offset points',
+            color=GREY,
+            fontsize=8,
+            ha='right',
+        )
 
 
 RATES = (50.0, 100.0, 200.0, 400.0, 1000.0)
 """Rates for discrete figures in addition to the rate of the recording, Hz."""
 
 
-def noise_report(result: NoiseIdentification, figures: NoiseFigures, horizon: float = HORIZON) -> str:
+def noise_report(
+    result: NoiseIdentification, figures: NoiseFigures, horizon: float = HORIZON
+) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     found = document.counts(figures)
     tables = {sensor: {} for sensor in SENSORS}
     for row in document.rows(figures):
         tables[row.sensor].setdefault((row.title, row.unit), []).append(row)
-    return render('noise.html', title='Noise of an IMU', headline=f'{found[DETERMINED]} of {sum(found.values())} figures determined',
-                  word='weak' if found[WEAK] or found[HELD] else 'good', lines=document.lines(figures), figures=figures,
-                  tables=tables, curves={sensor: draw_curve(result, sensor) for sensor in SENSORS}, horizon=horizon,
-                  densities={sensor: figures.densities(sensor, horizon) for sensor in SENSORS}, basis=document.BASIS,
-                  rates=sorted({*RATES, round(figures.rate, 3)}), runs=document.position_budget(figures), duration=document.duration,
-                  left_out=[(f'{sensor} {letter}', axis.shortest) for sensor in SENSORS
-                            for letter, axis in zip(AXES, figures.sensor(sensor)) if axis.shortest * figures.rate > 1.5])
+    return render(
+        'noise.html',
+        title='Noise of an IMU',
+        headline=f'{found[DETERMINED]} of {sum(found.values())} figures determined',
+        word='weak' if found[WEAK] or found[HELD] else 'good',
+        lines=document.lines(figures),
+        figures=figures,
+        tables=tables,
+        curves={sensor: draw_curve(result, sensor) for sensor in SENSORS},
+        horizon=horizon,
+        densities={sensor: figures.densities(sensor, horizon) for sensor in SENSORS},
+        basis=document.BASIS,
+        rates=sorted({*RATES, round(figures.rate, 3)}),
+        runs=document.position_budget(figures),
+        duration=document.duration,
+        left_out=[
+            (f'{sensor} {letter}', axis.shortest)
+            for sensor in SENSORS
+            for letter, axis in zip(AXES, figures.sensor(sensor))
+            if axis.shortest * figures.rate > 1.5
+        ],
+    )

@@ -12,12 +12,32 @@ from imu_calibration.effects.base import UNITS
 def render(template: str, **content: Any) -> str:
     """Return the HTML of one of the package's templates; numbers are printed by the filters `number`, `fixed`, `in_unit` and `chance`."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
-    environment = Environment(loader=PackageLoader('imu_calibration.report', 'templates'), autoescape=True, undefined=StrictUndefined,
-                              trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {'number': text, 'fixed': fixed, 'in_unit': in_unit, 'chance': chance, 'printed': printed, 'in_type': in_type,
-                            'bar': bar_length}
-    environment.globals |= {'people': people, 'pair': pair, 'for_people': for_people, 'error_text': error_text, 'ratio_text': ratio_text,
-                            'UNITS': UNITS, 'DEG': DEG}
+
+    environment = Environment(
+        loader=PackageLoader('imu_calibration.report', 'templates'),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        'number': text,
+        'fixed': fixed,
+        'in_unit': in_unit,
+        'chance': chance,
+        'printed': printed,
+        'in_type': in_type,
+        'bar': bar_length,
+    }
+    environment.globals |= {
+        'people': people,
+        'pair': pair,
+        'for_people': for_people,
+        'error_text': error_text,
+        'ratio_text': ratio_text,
+        'UNITS': UNITS,
+        'DEG': DEG,
+    }
     return environment.get_template(template).render(**content)
 
 

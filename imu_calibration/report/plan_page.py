@@ -27,7 +27,14 @@ def draw_steps(steps: Sequence[HandStep]) -> str:
     """Return the steps as SVG, numbered in the order of time."""
     shown = list(steps)[:MAX_ATTITUDES]
     rows = max(1, -(-len(shown) // FIGURE_COLUMNS))
-    return draw('hand-steps', (8.6, 1.75 * rows), _paint, shown, rows, label='How to hold and to turn the IMU')
+    return draw(
+        'hand-steps',
+        (8.6, 1.75 * rows),
+        _paint,
+        shown,
+        rows,
+        label='How to hold and to turn the IMU',
+    )
 
 
 def _paint(figure, steps, rows):
@@ -36,7 +43,9 @@ def _paint(figure, steps, rows):
         axis.set_axis_off()
         if place < len(steps):
             _box(axis, steps[place].up)
-            axis.set_title(f'{place + 1}: {direction_words(steps[place].up)} up', fontsize=8, color=INK)
+            axis.set_title(
+                f'{place + 1}: {direction_words(steps[place].up)} up', fontsize=8, color=INK
+            )
             axis.set(aspect='equal', xlim=(-1.7, 1.7), ylim=(-1.5, 1.6))
 
 
@@ -48,30 +57,57 @@ def _box(axis, up):
         if (mat_ns @ normal) @ toward > 0:
             others = [i for i in range(3) if i != k]
             edges = np.diag(HALF_EDGES)
-            corners = [sign * edges[k] + a * edges[others[0]] + b * edges[others[1]] for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
-            axis.fill(*(VIEW @ mat_ns @ np.array(corners).T), facecolor='#f4f6f9', edgecolor=FAINT, lw=1.0)
+            corners = [
+                sign * edges[k] + a * edges[others[0]] + b * edges[others[1]]
+                for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
+            ]
+            axis.fill(
+                *(VIEW @ mat_ns @ np.array(corners).T), facecolor='#f4f6f9', edgecolor=FAINT, lw=1.0
+            )
     for k, (name, colour) in enumerate(AXIS_COLOURS.items()):
         tip = VIEW @ mat_ns @ (np.eye(3)[k] * (HALF_EDGES[k] + 0.55))
         axis.annotate('', tip, (0, 0), arrowprops={'arrowstyle': '->', 'color': colour, 'lw': 1.4})
         axis.text(*(1.12 * tip), name, color=colour, fontsize=8, ha='center', va='center')
-    axis.annotate('', (-1.55, 1.2), (-1.55, 0.4), arrowprops={'arrowstyle': '->', 'color': GREY, 'lw': 1.0})
+    axis.annotate(
+        '', (-1.55, 1.2), (-1.55, 0.4), arrowprops={'arrowstyle': '->', 'color': GREY, 'lw': 1.0}
+    )
     axis.text(-1.55, 0.2, 'up', color=GREY, fontsize=7, ha='center', va='center')
 
 
-KIND = {MotionKind.POSE: '#2b8a57', MotionKind.RETURN: '#7fbf9a', MotionKind.SPIN: '#1f66a8', MotionKind.SWING: '#d08a12',
-        MotionKind.TOGETHER: '#8a4fa8', MotionKind.MOVE: '#98a2b0'}
+KIND = {
+    MotionKind.POSE: '#2b8a57',
+    MotionKind.RETURN: '#7fbf9a',
+    MotionKind.SPIN: '#1f66a8',
+    MotionKind.SWING: '#d08a12',
+    MotionKind.TOGETHER: '#8a4fa8',
+    MotionKind.MOVE: '#98a2b0',
+}
 """Colours of the motions."""
-JOINT_COLOURS = tuple(AXIS_COLOURS.values()) + ('#8a4fa8', '#d08a12', '#555f6b', '#c0561b', '#1b2430')
+JOINT_COLOURS = tuple(AXIS_COLOURS.values()) + (
+    '#8a4fa8',
+    '#d08a12',
+    '#555f6b',
+    '#c0561b',
+    '#1b2430',
+)
 
 
 def draw_motion(plan: Plan) -> str:
     """Return the joints against time as SVG, the kinds of motion as a band above."""
-    return draw('plan-motion', (8.6, 3.6), _motion, plan, label='Positions of the joints against time')
+    return draw(
+        'plan-motion', (8.6, 3.6), _motion, plan, label='Positions of the joints against time'
+    )
 
 
 def draw_progress(plan: Plan) -> Drawn:
     """Return the standard deviations in tolerances against time as SVG, one line for each parameter."""
-    return draw('plan-progress', (8.6, 4.2), _progress, plan, label='Predicted standard deviations against time')
+    return draw(
+        'plan-progress',
+        (8.6, 4.2),
+        _progress,
+        plan,
+        label='Predicted standard deviations against time',
+    )
 
 
 def _motion(figure, plan):
@@ -85,12 +121,24 @@ def _motion(figure, plan):
         values = np.degrees(position[:, k]) if turns[k] else 1000 * position[:, k]
         wrapped = (values + 180.0) % 360.0 - 180.0 if turns[k] else values
         wrapped = np.where(np.abs(np.diff(wrapped, prepend=wrapped[0])) > 180.0, np.nan, wrapped)
-        axes.plot(time, wrapped, color=JOINT_COLOURS[k % len(JOINT_COLOURS)], lw=1.2, label=f'{name}, {"deg" if turns[k] else "mm"}')
+        axes.plot(
+            time,
+            wrapped,
+            color=JOINT_COLOURS[k % len(JOINT_COLOURS)],
+            lw=1.2,
+            label=f'{name}, {"deg" if turns[k] else "mm"}',
+        )
     top, bottom = axes.get_ylim()[1], axes.get_ylim()[0]
     begins, shown = np.concatenate([[0.0], plan.ends[:-1]]), set()
     for motion, begin, end in zip(plan.motions, begins, plan.ends, strict=True):
-        axes.fill_between([begin, end], top, top + 0.06 * (top - bottom), color=KIND[motion.kind], lw=0,
-                          label=None if motion.kind in shown else str(motion.kind))
+        axes.fill_between(
+            [begin, end],
+            top,
+            top + 0.06 * (top - bottom),
+            color=KIND[motion.kind],
+            lw=0,
+            label=None if motion.kind in shown else str(motion.kind),
+        )
         shown.add(motion.kind)
     axes.set(xlabel='time, s', ylabel='position')
     axes.legend(ncols=4, loc='upper center', bbox_to_anchor=(0.5, -0.16))
@@ -98,28 +146,64 @@ def _motion(figure, plan):
 
 def _progress(figure, plan):
     """Draw a line for each parameter, the worst of all, the tolerance, and the least time."""
-    axes, shown, time, history = figure.subplots(), set(), np.concatenate([[0.0], plan.ends]), plan.history
-    names = [name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted]
+    axes, shown, time, history = (
+        figure.subplots(),
+        set(),
+        np.concatenate([[0.0], plan.ends]),
+        plan.history,
+    )
+    names = [
+        name for name, wanted in zip(plan.model.param_names, plan.wanted, strict=True) if wanted
+    ]
     for name, values in zip(names, history.T, strict=True):
         sensor = name.split('.')[0]
         colour = AXIS_COLOURS['x'] if sensor == SENSORS[0] else AXIS_COLOURS['z']
-        axes.plot(time, np.maximum(values, 1e-3), color=colour, lw=0.9, alpha=0.6, label=None if sensor in shown else sensor)
+        axes.plot(
+            time,
+            np.maximum(values, 1e-3),
+            color=colour,
+            lw=0.9,
+            alpha=0.6,
+            label=None if sensor in shown else sensor,
+        )
         shown.add(sensor)
     axes.plot(time, history.max(axis=1), color=GREY, lw=2.2, label='worst of all')
     axes.axhline(1.0, color=FAINT, ls='--', lw=1.2)
-    axes.annotate('tolerance', (time[-1], 1.0), (-4, 4), textcoords='offset points', ha='right', color=GREY, fontsize=8)
+    axes.annotate(
+        'tolerance',
+        (time[-1], 1.0),
+        (-4, 4),
+        textcoords='offset points',
+        ha='right',
+        color=GREY,
+        fontsize=8,
+    )
     log_axis(axes.yaxis)
     axes.set(xlabel='time, s', ylabel='sd / tolerance')
     axes.legend(loc='upper right')
     if 0 < plan.lower_bound_seconds < np.inf and not plan.missing:
         axes.axvline(plan.lower_bound_seconds, color=FAINT, lw=1.2)
-        axes.annotate('least time', (plan.lower_bound_seconds, axes.get_ylim()[1]), (4, -10), textcoords='offset points', color=GREY,
-                      fontsize=8)
+        axes.annotate(
+            'least time',
+            (plan.lower_bound_seconds, axes.get_ylim()[1]),
+            (4, -10),
+            textcoords='offset points',
+            color=GREY,
+            fontsize=8,
+        )
 
 
 def plan_report(plan: Plan, provenance: dict[str, Any]) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     within = plan.sd <= plan.tolerances * (1 + 1e-6)
-    return render('plan.html', title='Plan of a calibration', plan=plan, within=within, met=int(within[plan.wanted].sum()),
-                  count=int(plan.wanted.sum()), provenance=provenance, progress=draw_progress(plan),
-                  motion=draw_steps(plan.motions) if plan.start is None else draw_motion(plan))
+    return render(
+        'plan.html',
+        title='Plan of a calibration',
+        plan=plan,
+        within=within,
+        met=int(within[plan.wanted].sum()),
+        count=int(plan.wanted.sum()),
+        provenance=provenance,
+        progress=draw_progress(plan),
+        motion=draw_steps(plan.motions) if plan.start is None else draw_motion(plan),
+    )

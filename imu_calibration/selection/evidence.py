@@ -9,7 +9,12 @@ import numpy as np
 from imu_calibration.core.distributions import chi2_sf, f_sf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.scaled_solve import inverse_normal, quadratic, solve_normal, solve_scaled
+from imu_calibration.estimation.scaled_solve import (
+    inverse_normal,
+    quadratic,
+    solve_normal,
+    solve_scaled,
+)
 from imu_calibration.estimation.solution import CONVENTION_SHARE
 from imu_calibration.selection.parameter_space import ParameterSpace, white_means, within_of_axis
 from imu_calibration.selection.reduced_recording import Recent
@@ -60,16 +65,29 @@ class Evidence:
 
     """
 
-    def __init__(self, total: np.ndarray, without: np.ndarray, *, prior_sd: np.ndarray, prior_mean: np.ndarray):
-        self.total, self.without, self._prior = total, without, {'prior_sd': prior_sd, 'prior_mean': prior_mean}
+    def __init__(
+        self,
+        total: np.ndarray,
+        without: np.ndarray,
+        *,
+        prior_sd: np.ndarray,
+        prior_mean: np.ndarray,
+    ):
+        self.total, self.without, self._prior = (
+            total,
+            without,
+            {'prior_sd': prior_sd, 'prior_mean': prior_mean},
+        )
         self._fits: dict[tuple, tuple] = Recent(MOST_FITS)
         self._losses: dict[tuple, float] = {}
         self._predictions: dict[tuple, np.ndarray] = Recent(MOST_FITS)
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (matrix, right side) of the normal equations of all parameters on all rows, with the prior."""
-        known = 1 / self._prior['prior_sd']**2
-        return self.total[:-1, :-1] + np.diag(known), self.total[:-1, -1] + known * self._prior['prior_mean']
+        known = 1 / self._prior['prior_sd'] ** 2
+        return self.total[:-1, :-1] + np.diag(known), self.total[:-1, -1] + known * self._prior[
+            'prior_mean'
+        ]
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the parameters `used`, fitted to all folds or to all but fold `number`."""
@@ -103,7 +121,9 @@ class Evidence:
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
-        return float(chi2_sf(max(self.loss(smaller) - self.loss(larger), 0.0), len(larger) - len(smaller)))
+        return float(
+            chi2_sf(max(self.loss(smaller) - self.loss(larger), 0.0), len(larger) - len(smaller))
+        )
 
     def left_by_others(self, used: Sequence[int]) -> np.ndarray:
         """Return the vectors that map rows of all parameters to residuals of the fit to all other folds, shape (n_folds, q + 1)."""
@@ -122,10 +142,13 @@ class Evidence:
     def _left_by_others(self, used):
         """Return for each fold the map from rows of `used`, sorted, to residuals of the fit to all other folds, shape (n_folds, n + 1)."""
         if used not in self._predictions:
-            at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)]**2
+            at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)] ** 2
             places = np.append(at, -1)
             normal = self.without[:, places[:, None], places]
-            values = solve_scaled(normal[:, :-1, :-1] + np.diag(known), normal[:, :-1, -1] + known * self._prior['prior_mean'][at])
+            values = solve_scaled(
+                normal[:, :-1, :-1] + np.diag(known),
+                normal[:, :-1, -1] + known * self._prior['prior_mean'][at],
+            )
             self._predictions[used] = np.pad(-values, ((0, 0), (0, 1)), constant_values=1.0)
         return self._predictions[used]
 
@@ -146,14 +169,35 @@ class WindowEvidence(Evidence):
 
     """
 
-    def __init__(self, space: ParameterSpace, noise: dict[str, NoiseModel], fold: np.ndarray, *,
-                 scatter: dict[str, np.ndarray] | None = None):
+    def __init__(
+        self,
+        space: ParameterSpace,
+        noise: dict[str, NoiseModel],
+        fold: np.ndarray,
+        *,
+        scatter: dict[str, np.ndarray] | None = None,
+    ):
         self.space, self.noise, self.fold = space, noise, fold
-        self._white = {sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor)) for sensor in SENSORS}
+        self._white = {
+            sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor))
+            for sensor in SENSORS
+        }
         folds = [fold == number for number in range(fold.max() + 1)]
-        self._of_axis = {sensor: [np.array([[rows[own].T @ rows[own] for own in folds],
-                                            [within_of_axis(space, noise[sensor], sensor, axis=axis, select=own) for own in folds]])
-                                  for axis, rows in enumerate(self._white[sensor])] for sensor in SENSORS}
+        self._of_axis = {
+            sensor: [
+                np.array(
+                    [
+                        [rows[own].T @ rows[own] for own in folds],
+                        [
+                            within_of_axis(space, noise[sensor], sensor, axis=axis, select=own)
+                            for own in folds
+                        ],
+                    ]
+                )
+                for axis, rows in enumerate(self._white[sensor])
+            ]
+            for sensor in SENSORS
+        }
         parts = np.sum([self._of_sensor(sensor) for sensor in SENSORS], axis=0)
         total = np.sum(parts, axis=0)
         super().__init__(total, total - parts, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
@@ -170,13 +214,21 @@ class WindowEvidence(Evidence):
         """Return the covariance of the parameters `used` from one sensor and the prior."""
         at = np.ix_(used, used)
         information = self._of_sensor(sensor).sum(axis=0)[at]
-        return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)]**2))
+        return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)] ** 2))
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """Return the loss of `heldout` by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
         left = self.left_by_others(used)
-        return {sensor: np.stack([_squares(parts, left[:, self.space.places(sensor, axis)]) for axis, parts in enumerate(axes)], axis=1)
-                for sensor, axes in self._of_axis.items()}
+        return {
+            sensor: np.stack(
+                [
+                    _squares(parts, left[:, self.space.places(sensor, axis)])
+                    for axis, parts in enumerate(axes)
+                ],
+                axis=1,
+            )
+            for sensor, axes in self._of_axis.items()
+        }
 
     def unpredicted(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
@@ -185,8 +237,12 @@ class WindowEvidence(Evidence):
         A slow bias process is correlated over folds: without this, the loss of a fold includes the uncertainty of the fit to
         the other folds. The effect of a drift within windows, which does not determine it, is predicted too.
         """
-        left, own, found = self.left_by_others(used), np.array(sorted(used)), self.heldout_parts(used)
-        others = self.without[:, own[:, None], own] + np.diag(1 / self._prior['prior_sd'][own]**2)
+        left, own, found = (
+            self.left_by_others(used),
+            np.array(sorted(used)),
+            self.heldout_parts(used),
+        )
+        others = self.without[:, own[:, None], own] + np.diag(1 / self._prior['prior_sd'][own] ** 2)
         for sensor, axes in self._of_axis.items():
             for axis, (means, _) in enumerate(axes):
                 places = self.space.places(sensor, axis)
@@ -195,15 +251,32 @@ class WindowEvidence(Evidence):
                 slopes[:, at] = np.einsum('fij,fj->fi', means[:, of], left[:, places])
                 known[:, at[:, None], at] += means[:, of[:, None], of]
                 found[sensor][0, axis] -= (slopes * solve_scaled(known, slopes)).sum()
-                found[sensor][1, axis] = _squares(self._within_whole[sensor][axis], left[:, places])[0]
+                found[sensor][1, axis] = _squares(
+                    self._within_whole[sensor][axis], left[:, places]
+                )[0]
         return found
 
     @cached_property
     def _within_whole(self):
         """Sensor -> part within the windows of each fold, for each axis, including effects that are smooth in time."""
-        whole, folds = replace(self.space, join_within=self.space.join), [self.fold == number for number in range(self.fold.max() + 1)]
-        return {sensor: [np.array([[within_of_axis(whole, self.noise[sensor], sensor, axis=axis, select=own) for own in folds]])
-                         for axis in range(3)] for sensor in SENSORS}
+        whole, folds = (
+            replace(self.space, join_within=self.space.join),
+            [self.fold == number for number in range(self.fold.max() + 1)],
+        )
+        return {
+            sensor: [
+                np.array(
+                    [
+                        [
+                            within_of_axis(whole, self.noise[sensor], sensor, axis=axis, select=own)
+                            for own in folds
+                        ]
+                    ]
+                )
+                for axis in range(3)
+            ]
+            for sensor in SENSORS
+        }
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """
@@ -214,24 +287,40 @@ class WindowEvidence(Evidence):
         process within them, and encoders where two joints turn fast, violate both (White 1980, Econometrica 48).
         """
         values, covariance = self.fit(used)
-        reduced, slopes = self.space.reduced(used, values), np.zeros((len(self.fold), self.space.size + 1))
+        reduced, slopes = (
+            self.space.reduced(used, values),
+            np.zeros((len(self.fold), self.space.size + 1)),
+        )
         kind = self.space.recording.kind
         for sensor in SENSORS:
             variance = {name: self.noise[sensor].row_variance(name) for name in np.unique(kind)}
             for axis, means in enumerate(self._white[sensor]):
                 at = self.space.places(sensor, axis)
-                within = self.space.slopes_within(sensor, axis, reduced[at]) / np.array([variance[name][axis] for name in kind])[:, None]
+                within = (
+                    self.space.slopes_within(sensor, axis, reduced[at])
+                    / np.array([variance[name][axis] for name in kind])[:, None]
+                )
                 slopes[:, at] += means * (means @ reduced[at])[:, None] + within
         places = [list(used).index(k) for k in parameters]
         sd = np.sqrt(np.diag(covariance)[places])
         moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
         sizes, directions = np.linalg.eigh(moved.T @ moved)
-        observable = sizes > CONVENTION_SHARE * sizes[-1]   # without unobservable directions: compliances in no pose, arms that cancel
+        observable = (
+            sizes > CONVENTION_SHARE * sizes[-1]
+        )  # without unobservable directions: compliances in no pose, arms that cancel
         n_windows, n_own = len(moved), int(observable.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0
-        t_squared = ((directions.T @ (values[places] / sd))[observable]**2 / sizes[observable]).sum()
-        return float(f_sf((n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared, n_own, n_windows - n_own))
+        t_squared = (
+            (directions.T @ (values[places] / sd))[observable] ** 2 / sizes[observable]
+        ).sum()
+        return float(
+            f_sf(
+                (n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared,
+                n_own,
+                n_windows - n_own,
+            )
+        )
 
 
 def _squares(parts, rows):
@@ -249,7 +338,11 @@ For halves of equal precision: values that differ by half of the joint estimate.
 """
 
 
-def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarray, np.ndarray], at: Sequence[int]) -> bool:
+def agree(
+    halves: Sequence[tuple[np.ndarray, np.ndarray]],
+    whole: tuple[np.ndarray, np.ndarray],
+    at: Sequence[int],
+) -> bool:
     """
     Return whether the estimates of some parameters from two halves agree within their precision.
 
@@ -266,7 +359,9 @@ def agree(halves: Sequence[tuple[np.ndarray, np.ndarray]], whole: tuple[np.ndarr
     """
     at = list(at)
     difference = (halves[0][0] - halves[1][0])[at]
-    apart = float(difference @ np.linalg.solve((halves[0][1] + halves[1][1])[np.ix_(at, at)], difference))
+    apart = float(
+        difference @ np.linalg.solve((halves[0][1] + halves[1][1])[np.ix_(at, at)], difference)
+    )
     value = whole[0][at]
     explained = float(value @ np.linalg.solve(whole[1][np.ix_(at, at)], value))
     return bool(chi2_sf(apart, len(at)) > DISAGREE or apart < MAX_HALVES_LOSS * explained)

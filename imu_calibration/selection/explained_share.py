@@ -39,13 +39,28 @@ class Explained:
 
     """
 
-    def __init__(self, search: Search, losses: Callable, numbers: Mapping[str, np.ndarray], *, least_part: float = SHOWS):
-        self.search, self.losses, self.numbers, self.least_part = search, losses, numbers, least_part
+    def __init__(
+        self,
+        search: Search,
+        losses: Callable,
+        numbers: Mapping[str, np.ndarray],
+        *,
+        least_part: float = SHOWS,
+    ):
+        self.search, self.losses, self.numbers, self.least_part = (
+            search,
+            losses,
+            numbers,
+            least_part,
+        )
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """Return sensor -> held-out loss minus its expectation from noise, of each part and axis, shape (n_parts, n_axes)."""
         losses = self.losses(self.search.indices(chosen))
-        return {sensor: parts - self.numbers[sensor][:, None] / parts.shape[1] for sensor, parts in losses.items()}
+        return {
+            sensor: parts - self.numbers[sensor][:, None] / parts.shape[1]
+            for sensor, parts in losses.items()
+        }
 
     def sigma(self, sensor: str, excess: np.ndarray) -> np.ndarray:
         """
@@ -59,11 +74,15 @@ class Explained:
     def _sigmas(self, sensor, excess):
         """Return the same of all axes together, shape (n_parts,), and of each axis, shape (n_parts, n_axes)."""
         sd = np.sqrt(2 * np.maximum(self.numbers[sensor], 1.0))
-        return excess.sum(axis=1) / sd, excess / (sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE)[:, None]
+        return excess.sum(axis=1) / sd, excess / (sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE)[
+            :, None
+        ]
 
     def rest(self, chosen: Sequence[Question]) -> float:
         """Return the excess that noise does not explain, of all sensors and parts in which it is significant."""
-        return float(sum(self._rest(sensor, excess).sum() for sensor, excess in self.excess(chosen).items()))
+        return float(
+            sum(self._rest(sensor, excess).sum() for sensor, excess in self.excess(chosen).items())
+        )
 
     def _rest(self, sensor, excess):
         """Return the same of each part, shape (n_parts,)."""
@@ -78,7 +97,13 @@ class Explained:
         In each sensor only the parts with the effect count (means of windows, within windows, or both): an unexplained excess in the other
         part does not hide it.
         """
-        return min((removed / (removed + rest) for removed, rest in self._where_it_shows(chosen, question)), default=0.0)
+        return min(
+            (
+                removed / (removed + rest)
+                for removed, rest in self._where_it_shows(chosen, question)
+            ),
+            default=0.0,
+        )
 
     def rest_beside(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the excess over noise of the choice, in the parts where the effect shows."""
@@ -86,13 +111,19 @@ class Explained:
 
     def _where_it_shows(self, chosen, question):
         """Return (removed by the effect, significant remaining excess) of each sensor, in the parts where the effect shows."""
-        with_it, without = self.excess(chosen), self.excess([q for q in chosen if q is not question])
+        with_it, without = (
+            self.excess(chosen),
+            self.excess([q for q in chosen if q is not question]),
+        )
         removed = {s: (without[s] - with_it[s]).sum(axis=1) for s in sensors_of(question.effect)}
         strongest = max(parts.sum() for parts in removed.values())
         # A cause in the table acts on both sensors; a sensor with a weak signal is no evidence.
         sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]
         shown = {s: removed[s] >= self.least_part * removed[s].max() for s in sensors}
-        return [(float(removed[s][shown[s]].sum()), float(self._rest(s, with_it[s])[shown[s]].sum())) for s in sensors]
+        return [
+            (float(removed[s][shown[s]].sum()), float(self._rest(s, with_it[s])[shown[s]].sum()))
+            for s in sensors
+        ]
 
 
 class ExplainedWindows(Explained):
@@ -112,13 +143,24 @@ class ExplainedWindows(Explained):
     def __init__(self, evidence: WindowEvidence, search: Search):
         recording = evidence.space.recording
         duration = float(np.ptp(recording.time))
-        noise = {sensor: own.at_rest_only(*plausible_processes(own, recording.period, sensor=sensor, duration=duration))
-                 for sensor, own in evidence.noise.items()}
+        noise = {
+            sensor: own.at_rest_only(
+                *plausible_processes(own, recording.period, sensor=sensor, duration=duration)
+            )
+            for sensor, own in evidence.noise.items()
+        }
         every = range(evidence.space.size)
         scatter = scatter_of_each(evidence.space, evidence.noise, evidence.fit(every)[0])
         self.floor = WindowEvidence(evidence.space, noise, evidence.fold, scatter=scatter)
-        self.n_means, self.n_within = 3.0 * len(recording.windows), 3.0 * (recording.count - 1)[recording.moving].sum()
-        super().__init__(search, self.floor.unpredicted, dict.fromkeys(SENSORS, np.array([self.n_means, self.n_within])))
+        self.n_means, self.n_within = (
+            3.0 * len(recording.windows),
+            3.0 * (recording.count - 1)[recording.moving].sum(),
+        )
+        super().__init__(
+            search,
+            self.floor.unpredicted,
+            dict.fromkeys(SENSORS, np.array([self.n_means, self.n_within])),
+        )
 
 
 def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
@@ -129,7 +171,7 @@ def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
         weakest = int(np.argmin(shares))
         if shares[weakest] >= 1.0:
             break
-        chosen = chosen[:weakest] + chosen[weakest + 1:]
+        chosen = chosen[:weakest] + chosen[weakest + 1 :]
     return chosen
 
 

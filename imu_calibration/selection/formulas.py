@@ -11,7 +11,14 @@ from scipy.linalg import svd
 
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.effects.base import AXES, TEMPERATURE_RISE
-from imu_calibration.effects.expressions import FUNCTIONS, PLACES, QUANTITY_OF, array_function, names_in, read
+from imu_calibration.effects.expressions import (
+    FUNCTIONS,
+    PLACES,
+    QUANTITY_OF,
+    array_function,
+    names_in,
+    read,
+)
 from imu_calibration.selection.residual_blocks import RestBlocks
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
@@ -22,7 +29,14 @@ CONSTANTS = (0.07, 0.2, 0.6)
 SOFT_SIGN = 'tanh({} / 0.005)'
 """The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise, and would shake the bias there."""
 TEMPERATURE_FACTOR = f'({TEMPERATURE_RISE})'
-UNIT_OF = {'force': 'm/s^2', 'rate': 'rad/s', 'angular acceleration': 'rad/s^2', 'temperature': 'K', 'joint rate': 'rad/s', 'time': 's'}
+UNIT_OF = {
+    'force': 'm/s^2',
+    'rate': 'rad/s',
+    'angular acceleration': 'rad/s^2',
+    'temperature': 'K',
+    'joint rate': 'rad/s',
+    'time': 's',
+}
 """Quantity -> unit of one factor of it; angles, attitudes and arguments of functions have none."""
 
 
@@ -40,8 +54,14 @@ class Formula:
     @property
     def family(self) -> frozenset[str]:
         """Quantities in it."""
-        texts = [text for column in self.columns for text in ((column,) if isinstance(column, str) else column)]
-        return frozenset(QUANTITY_OF[name] for text in texts for name in names_in(read(text))) - {'reference temperature'}
+        texts = [
+            text
+            for column in self.columns
+            for text in ((column,) if isinstance(column, str) else column)
+        ]
+        return frozenset(QUANTITY_OF[name] for text in texts for name in names_in(read(text))) - {
+            'reference temperature'
+        }
 
     @property
     def smooth(self) -> bool:
@@ -52,13 +72,17 @@ class Formula:
     def complexity(self) -> tuple[int, int]:
         """Measure of complexity: columns; factors and functions."""
         text = str(self.columns[0])
-        return len(self.columns), len(self.factors) + sum(text.count(f'{name}(') for name in FUNCTIONS)
+        return len(self.columns), len(self.factors) + sum(
+            text.count(f'{name}(') for name in FUNCTIONS
+        )
 
     def unit(self, output: str) -> str:
         """Return the unit of an amplitude, with `output` that of the sensor."""
         per = Counter(UNIT_OF[factor] for factor in self.factors if factor in UNIT_OF)
         powers = ((f'({unit})' if '/' in unit else unit, power) for unit, power in per.items())
-        return output + ''.join(f'/{unit}' if power == 1 else f'/{unit}^{power}' for unit, power in powers)
+        return output + ''.join(
+            f'/{unit}' if power == 1 else f'/{unit}^{power}' for unit, power in powers
+        )
 
 
 @lru_cache(maxsize=16)
@@ -80,8 +104,14 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
         Length of the recording, s, to two digits: texts hold time constants.
 
     """
-    found = [Formula((text,), factors) for text, factors in (*_of_motion(), *_slow(thermal, duration))]
-    found += [*_harmonics(n_joints, thermal), *_of_joint_rates(n_joints), *_with_the_table(n_joints, thermal)]
+    found = [
+        Formula((text,), factors) for text, factors in (*_of_motion(), *_slow(thermal, duration))
+    ]
+    found += [
+        *_harmonics(n_joints, thermal),
+        *_of_joint_rates(n_joints),
+        *_with_the_table(n_joints, thermal),
+    ]
     return tuple(found)
 
 
@@ -96,9 +126,14 @@ def _sense(text):
 
 def _times(*parts):
     """Return (text, factors) of a product, powers gathered."""
-    texts, factors = [text for text, _ in parts], tuple(factor for _, own in parts for factor in own)
+    texts, factors = (
+        [text for text, _ in parts],
+        tuple(factor for _, own in parts for factor in own),
+    )
     powers = {text: texts.count(text) for text in texts}
-    return ' * '.join(text if power == 1 else f'{text} ** {power}' for text, power in powers.items()), factors
+    return ' * '.join(
+        text if power == 1 else f'{text} ** {power}' for text, power in powers.items()
+    ), factors
 
 
 def _monomials(degree):
@@ -121,8 +156,14 @@ def _of_motion() -> Iterator:
 
 def _slow(thermal: bool, duration: float) -> Iterator:
     warm = [(TEMPERATURE_FACTOR, ('temperature',))] if thermal else []
-    settles = [(f'(1 - exp(-time / {share * duration:.3g}))', ()) for share in CONSTANTS] + [('time', ('time',))]
-    yield from ((f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power) for power in (2, 3) if thermal)
+    settles = [(f'(1 - exp(-time / {share * duration:.3g}))', ()) for share in CONSTANTS] + [
+        ('time', ('time',))
+    ]
+    yield from (
+        (f'{TEMPERATURE_FACTOR} ** {power}', ('temperature',) * power)
+        for power in (2, 3)
+        if thermal
+    )
     for slow in (*warm, *settles):
         yield from (_times(slow, entry) for degree in (1, 2) for entry in _monomials(degree))
         for text, own in _atoms('f', 'w'):
@@ -140,13 +181,17 @@ def _turn(joint, order, before=''):
 def _harmonics(n_joints, thermal):
     joints = range(1, n_joints + 1)
     for joint, order in product(joints, JOINT_ORDERS):
-        befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))] + [(f'{TEMPERATURE_FACTOR} * ', ('temperature',))] * thermal
+        befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))] + [
+            (f'{TEMPERATURE_FACTOR} * ', ('temperature',))
+        ] * thermal
         if order in FEW_ORDERS:
             befores += [(f'{text} * ', own) for text, own in _atoms('f', 'w')]
         for before, factors in befores:
             cosine, sine, phased = _turn(joint, order, before)
             yield Formula((cosine, sine), factors, phased)
-    for (first, second), orders in product(combinations(joints, 2), product(PAIR_ORDERS, PAIR_ORDERS)):
+    for (first, second), orders in product(
+        combinations(joints, 2), product(PAIR_ORDERS, PAIR_ORDERS)
+    ):
         halves = [_turn(joint, order)[:2] for joint, order in zip((first, second), orders)]
         yield Formula(tuple(f'{a} * {b}' for a, b in product(*halves)), ())
 
@@ -157,8 +202,11 @@ def _of_joint_rates(n_joints):
         yield Formula((f'abs({text})',), own)
         yield Formula((SOFT_SIGN.format(text),), ())
         yield Formula((f'{text} * abs({text})',), own * 2)
-    yield from (Formula((text,), own) for degree in (1, 2)
-                for text, own in (_times(*p) for p in combinations_with_replacement(rates, degree)))
+    yield from (
+        Formula((text,), own)
+        for degree in (1, 2)
+        for text, own in (_times(*p) for p in combinations_with_replacement(rates, degree))
+    )
 
 
 def _with_the_table(n_joints, thermal):
@@ -170,7 +218,10 @@ def _with_the_table(n_joints, thermal):
     for before, factors in befores:
         yield Formula(tuple(tuple(before + text for text in vector) for vector in vectors), factors)
     for vector, joint, order in product(vectors, joints, FEW_ORDERS):
-        yield Formula(tuple(tuple(f'{wave} * {text}' for text in vector) for wave in _turn(joint, order)[:2]), ())
+        yield Formula(
+            tuple(tuple(f'{wave} * {text}' for text in vector) for wave in _turn(joint, order)[:2]),
+            (),
+        )
 
 
 NEW = 1e-3
@@ -212,20 +263,36 @@ class FormulaSearch:
 
     """
 
-    def __init__(self, blocks: RestBlocks, formulas: Sequence[Formula], plausible: np.ndarray, *, reference_temperature: float):
+    def __init__(
+        self,
+        blocks: RestBlocks,
+        formulas: Sequence[Formula],
+        plausible: np.ndarray,
+        *,
+        reference_temperature: float,
+    ):
         self.blocks, self.formulas = blocks, formulas
-        self._place = {text: k for k, text in enumerate(dict.fromkeys(t for f in formulas for column in f.columns for t in _three(column)))}
+        self._place = {
+            text: k
+            for k, text in enumerate(
+                dict.fromkeys(t for f in formulas for column in f.columns for t in _three(column))
+            )
+        }
         self.means = self._worked_out(tuple(self._place), reference_temperature)
         whiten = blocks.white[0]
         every = whiten(np.concatenate([*blocks.design, self.means], axis=1))
         ends = np.cumsum([0, *(part.shape[1] for part in blocks.design)])
         self._rest, self._free, self.known = [], [], []
         for axis in range(3):
-            part = every[:, ends[axis]:ends[axis + 1]] / whiten.scale[axis]
-            left, sizes = svd(part[:, :-1] @ plausible[blocks.index[axis]], full_matrices=False, lapack_driver='gesdd')[:2]
+            part = every[:, ends[axis] : ends[axis + 1]] / whiten.scale[axis]
+            left, sizes = svd(
+                part[:, :-1] @ plausible[blocks.index[axis]],
+                full_matrices=False,
+                lapack_driver='gesdd',
+            )[:2]
             # Plausible contributions of the catalogue count as noise: a direction keeps the excess over its plausible size.
             basis, damped = left, (1.0 - 1.0 / np.sqrt(1.0 + sizes**2))[:, None]
-            columns = every[:, ends[3]:] / whiten.scale[axis]
+            columns = every[:, ends[3] :] / whiten.scale[axis]
             self._rest.append(part[:, -1] - basis @ (damped[:, 0] * (basis.T @ part[:, -1])))
             free = columns - basis @ (damped * (basis.T @ columns))
             size = np.einsum('bt,bt->t', columns, columns)
@@ -235,15 +302,23 @@ class FormulaSearch:
 
     def _worked_out(self, texts, reference_temperature):
         ref = self.blocks.ref
-        known = {name: (getattr(ref, field), index) for name, (field, *index) in PLACES.items() if field}
-        places = {name: values[:, *index] for name, (values, index) in known.items()
-                  if values is not None and (not index or index[-1] < values.shape[-1])} | {'temperature_ref_c': reference_temperature}
+        known = {
+            name: (getattr(ref, field), index) for name, (field, *index) in PLACES.items() if field
+        }
+        places = {
+            name: values[:, *index]
+            for name, (values, index) in known.items()
+            if values is not None and (not index or index[-1] < values.shape[-1])
+        } | {'temperature_ref_c': reference_temperature}
         means = np.empty((len(self.blocks.time), len(texts)))
         with np.errstate(all='ignore'):
             for first in range(0, len(texts), COLUMN_CHUNK):
-                worked = _function(texts[first:first + COLUMN_CHUNK])(places)
-                rows = np.stack([np.broadcast_to(np.asarray(column, float), len(ref)) for column in worked], axis=1)
-                means[:, first:first + len(worked)] = self.blocks.means(rows)
+                worked = _function(texts[first : first + COLUMN_CHUNK])(places)
+                rows = np.stack(
+                    [np.broadcast_to(np.asarray(column, float), len(ref)) for column in worked],
+                    axis=1,
+                )
+                means[:, first : first + len(worked)] = self.blocks.means(rows)
         return np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0)
 
     @property
@@ -258,15 +333,25 @@ class FormulaSearch:
         price = 2.0 * counts
         order = np.argsort(price - gains)
         likeliest = order[0]
-        p_value = min(1.0, float(chi2_sf(gains[likeliest], max(counts[likeliest], 1))) * len(self.formulas))
+        p_value = min(
+            1.0, float(chi2_sf(gains[likeliest], max(counts[likeliest], 1))) * len(self.formulas)
+        )
         if p_value > FAMILY_WISE or gains[likeliest] <= price[likeliest]:
             return None
         dof = max(3 * len(self._rest[0]) - sum(self.known), 1)
         left = max((sum(float(rest @ rest) for rest in self._rest) - gains[likeliest]) / dof, 1.0)
-        near = [k for k in order[:200] if (gains - price)[likeliest] - (gains - price)[k] < 2 * TIE * left and counts[k]]
+        near = [
+            k
+            for k in order[:200]
+            if (gains - price)[likeliest] - (gains - price)[k] < 2 * TIE * left and counts[k]
+        ]
         chosen = min(near, key=lambda k: (self.formulas[k].complexity, price[k] - gains[k]))
-        return FormulaChoice(self.formulas[chosen], self.columns_of(self.formulas[chosen]), p_value,
-                      tuple(self.formulas[k] for k in near if k != chosen))
+        return FormulaChoice(
+            self.formulas[chosen],
+            self.columns_of(self.formulas[chosen]),
+            p_value,
+            tuple(self.formulas[k] for k in near if k != chosen),
+        )
 
     def columns_of(self, formula: Formula) -> np.ndarray:
         """Return the means of a formula's columns, shape (b, k, 3)."""
@@ -275,7 +360,9 @@ class FormulaSearch:
     def take(self, choice: FormulaChoice) -> None:
         """Project a choice out, so that the next is tested conditional on it."""
         for axis in range(3):
-            columns = self._free[axis][:, [self._at(column)[axis] for column in choice.formula.columns]]
+            columns = self._free[axis][
+                :, [self._at(column)[axis] for column in choice.formula.columns]
+            ]
             basis, sizes = svd(columns, full_matrices=False)[:2]
             basis = basis[:, sizes > 1e-9 * max(sizes.max(), 1e-300)]
             self._rest[axis] = self._rest[axis] - basis @ (basis.T @ self._rest[axis])
@@ -291,18 +378,27 @@ class FormulaSearch:
         for width in {len(formula.columns) for formula in self.formulas}:
             chosen = [k for k, formula in enumerate(self.formulas) if len(formula.columns) == width]
             for axis in range(3):
-                at = np.array([[self._at(column)[axis] for column in self.formulas[k].columns] for k in chosen])
+                at = np.array(
+                    [
+                        [self._at(column)[axis] for column in self.formulas[k].columns]
+                        for k in chosen
+                    ]
+                )
                 free = self._free[axis]
                 size = np.sqrt(np.maximum(np.einsum('bt,bt->t', free, free), 1e-300))
                 slopes = (free.T @ self._rest[axis]) / size
                 gram = np.eye(width) * np.ones((len(chosen), 1, 1))
                 for i in range(width):
                     for j in range(i):
-                        inner = np.einsum('bg,bg->g', free[:, at[:, i]], free[:, at[:, j]]) / (size[at[:, i]] * size[at[:, j]])
+                        inner = np.einsum('bg,bg->g', free[:, at[:, i]], free[:, at[:, j]]) / (
+                            size[at[:, i]] * size[at[:, j]]
+                        )
                         gram[:, i, j] = gram[:, j, i] = np.clip(inner, -1.0, 1.0)
                 gram += 1e-6 * np.eye(width)
                 right = slopes[at]
-                gains[chosen] += np.einsum('gk,gk->g', right, np.linalg.solve(gram, right[..., None])[..., 0])
+                gains[chosen] += np.einsum(
+                    'gk,gk->g', right, np.linalg.solve(gram, right[..., None])[..., 0]
+                )
                 counts[chosen] += (size[at] > 1e-100).sum(axis=1)
         return gains, counts
 

@@ -49,10 +49,20 @@ class Gain:
     @property
     def reduction(self) -> float:
         """1 - after / before."""
-        return 1.0 - self.heldout_rms_after / self.heldout_rms_before if self.heldout_rms_before > 0 else 0.0
+        return (
+            1.0 - self.heldout_rms_after / self.heldout_rms_before
+            if self.heldout_rms_before > 0
+            else 0.0
+        )
 
 
-def heldout_gain(problem: LinearisedProblem, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
+def heldout_gain(
+    problem: LinearisedProblem,
+    before: Sequence[Question],
+    after: Sequence[Question],
+    *,
+    sensors: Sequence[str],
+) -> Gain:
     """
     Return the Gain of the choice `after` over the choice `before` on the locked windows, which are used only here.
 
@@ -69,10 +79,20 @@ def heldout_gain(problem: LinearisedProblem, before: Sequence[Question], after: 
     gain = gain_in_turn(problem, before, after, sensors=sensors)
     used = map(problem.search.indices, (before, after))
     values = [problem.space.reduced(some, problem.evidence.fit(some)[0])[None] for some in used]
-    return gain_of(gain.sensor, gain.measure, [_squares(problem.locked_samples, each, gain.sensor)[gain.measure] for each in values])
+    return gain_of(
+        gain.sensor,
+        gain.measure,
+        [_squares(problem.locked_samples, each, gain.sensor)[gain.measure] for each in values],
+    )
 
 
-def gain_in_turn(problem: LinearisedProblem, before: Sequence[Question], after: Sequence[Question], *, sensors: Sequence[str]) -> Gain:
+def gain_in_turn(
+    problem: LinearisedProblem,
+    before: Sequence[Question],
+    after: Sequence[Question],
+    *,
+    sensors: Sequence[str],
+) -> Gain:
     """
     Return the same Gain on the selection windows by cross-validation.
 
@@ -83,19 +103,32 @@ def gain_in_turn(problem: LinearisedProblem, before: Sequence[Question], after: 
     for sensor in sensors:
         pair = []
         for used in map(problem.search.indices, (before, after)):
-            values = np.array([problem.space.reduced(used, problem.evidence.fit(used, number)[0]) for number in range(fold.max() + 1)])
+            values = np.array(
+                [
+                    problem.space.reduced(used, problem.evidence.fit(used, number)[0])
+                    for number in range(fold.max() + 1)
+                ]
+            )
             pair.append(_squares(problem.all_samples, values[fold], sensor))
         of = {measure: [squares[measure] for squares in pair] for measure in MEASURES}
-        found += [(gain_of(sensor, measure, each), _certainty(each)) for measure, each in of.items()]
-    most = max((gain for gain, _ in found if gain.measure != REST_MEASURE), key=lambda gain: gain.least)
+        found += [
+            (gain_of(sensor, measure, each), _certainty(each)) for measure, each in of.items()
+        ]
+    most = max(
+        (gain for gain, _ in found if gain.measure != REST_MEASURE), key=lambda gain: gain.least
+    )
     if most.least > 0:
         return most
     return max(found, key=lambda entry: (not np.isinf(entry[0].least), entry[1]))[0]
 
 
-def gain_of(sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]], *, of: str = OF_MODEL) -> Gain:
+def gain_of(
+    sensor: str, measure: str, pair: Sequence[tuple[np.ndarray, np.ndarray]], *, of: str = OF_MODEL
+) -> Gain:
     """Return the Gain from (sums of squares, numbers) of each group of rows, before and after."""
-    before, after = (float(np.sqrt(squares.sum() / max(number.sum(), 1))) for squares, number in pair)
+    before, after = (
+        float(np.sqrt(squares.sum() / max(number.sum(), 1))) for squares, number in pair
+    )
     return Gain(sensor, measure, before, after, reduction_interval(pair), len(pair[0][0]), of)
 
 
@@ -104,15 +137,29 @@ def _squares(space, values, sensor):
     recording = space.recording
     means, within = np.zeros(len(recording.windows)), np.zeros(len(recording.windows))
     for axis in range(3):
-        weights = np.broadcast_to(values[:, space.places(sensor, axis)], (len(means), len(space.places(sensor, axis))))
-        means += np.einsum('kq,kq->k', space.mean[sensor][axis], weights)**2
+        weights = np.broadcast_to(
+            values[:, space.places(sensor, axis)], (len(means), len(space.places(sensor, axis)))
+        )
+        means += np.einsum('kq,kq->k', space.mean[sensor][axis], weights) ** 2
         within += space.squares_within(sensor, axis, weights)
     rest = ~recording.moving
-    at_rest = np.array([window.sensors[sensor].noise_variance.sum() for window in recording.windows])
+    at_rest = np.array(
+        [window.sensors[sensor].noise_variance.sum() for window in recording.windows]
+    )
     within[rest] = at_rest[rest] * (recording.count[rest] - 1)
     three = np.full(len(means), 3.0)
     every = (within + recording.count * means, 3 * recording.count)
-    return dict(zip(MEASURES, (every, (means, three), (within, 3 * (recording.count - 1)), (means[rest], three[rest]))))
+    return dict(
+        zip(
+            MEASURES,
+            (
+                every,
+                (means, three),
+                (within, 3 * (recording.count - 1)),
+                (means[rest], three[rest]),
+            ),
+        )
+    )
 
 
 def _certainty(pair):
@@ -127,6 +174,8 @@ def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[f
     if n_windows < 3:
         return (float('nan'), float('nan'))
     draw = np.random.default_rng(1).integers(0, n_windows, (WINDOW_RESAMPLES, n_windows))
-    rms = [np.sqrt(squares[draw].sum(axis=1) / number[draw].sum(axis=1)) for squares, number in pair]
+    rms = [
+        np.sqrt(squares[draw].sum(axis=1) / number[draw].sum(axis=1)) for squares, number in pair
+    ]
     low, high = np.quantile(1 - rms[1] / rms[0], (0.025, 0.975))
     return (float(low), float(high))

@@ -18,8 +18,19 @@ from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import lag_explanations
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.onset import Onset, find_onset
-from imu_calibration.selection.questions import Question, point_with, testable_effects, without_saturation
-from imu_calibration.selection.rivals import Rival, best_pairs, same_questions, settle_rivals, simpler
+from imu_calibration.selection.questions import (
+    Question,
+    point_with,
+    testable_effects,
+    without_saturation,
+)
+from imu_calibration.selection.rivals import (
+    Rival,
+    best_pairs,
+    same_questions,
+    settle_rivals,
+    simpler,
+)
 from imu_calibration.selection.saturation import Saturation, windows_at, without_clipping
 from imu_calibration.selection.search import SelectedEffects
 
@@ -59,7 +70,13 @@ class Investigation(SelectedEffects):
     """Parameters that change at one moment: the other results are those of the longer part of the recording."""
 
 
-def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> Investigation:
+def investigate(
+    windows: Sequence[Window],
+    table: Table,
+    model: SensorModel,
+    *,
+    bias_processes: dict | None = None,
+) -> Investigation:
     """
     Test every effect that a model lacks on held-out windows.
 
@@ -89,43 +106,80 @@ def investigate(windows: Sequence[Window], table: Table, model: SensorModel, *, 
     used, locked, limits = without_clipping(used, table, model)
     effects, not_testable = testable_effects(model, table, windows_at(used, ~locked))
     asked = without_saturation(effects)
-    linearised_at = partial(LinearisedProblem, used, table, model, effects=asked, locked=locked, bias_processes=bias_processes)
+    linearised_at = partial(
+        LinearisedProblem,
+        used,
+        table,
+        model,
+        effects=asked,
+        locked=locked,
+        bias_processes=bias_processes,
+    )
     problem = linearised_at()
     outcome, rivals, again = _explained(problem, linearised_at)
-    onset = find_onset(outcome.problem, outcome.explained, outcome.named, windows=used, table=table) if outcome.rest else None
+    onset = (
+        find_onset(outcome.problem, outcome.explained, outcome.named, windows=used, table=table)
+        if outcome.rest
+        else None
+    )
     step = next((effect for effect in effects if effect.located), None)
     if onset is not None and onset.what == CLOCK and step is not None:
         stepped = partial(linearised_at, effects=[*asked, step])
-        (name, before), = onset.before.items()
-        values = {name: before, **dict(zip(step.param_names(), (onset.after[name] - before, onset.time)))}
+        ((name, before),) = onset.before.items()
+        values = {
+            name: before,
+            **dict(zip(step.param_names(), (onset.after[name] - before, onset.time))),
+        }
         there = stepped(point=point_with(model, [*asked, step], values))
-        other, others, beside = _explained(there, stepped, [question for question in there.questions if question.name == step.name])
+        other, others, beside = _explained(
+            there, stepped, [question for question in there.questions if question.name == step.name]
+        )
         if other.rest < LEFT * outcome.rest:
             outcome, rivals, again, onset = other, others, beside, None
     if onset is not None:
-        longer = max([w for w in used if w.time[-1] < onset.time], [w for w in used if w.time[0] >= onset.time], key=len)
-        return replace(investigate(longer, table, model, bias_processes=bias_processes), onset=onset)
+        longer = max(
+            [w for w in used if w.time[-1] < onset.time],
+            [w for w in used if w.time[0] >= onset.time],
+            key=len,
+        )
+        return replace(
+            investigate(longer, table, model, bias_processes=bias_processes), onset=onset
+        )
     linearised_at = again
     tried = {_labels(outcome.chosen)}
     for any_size in (False, True):
         outcome = _looked_again(outcome, partial(linearised_at, any_size=any_size), any_size, tried)
     problem, named, unstable = outcome.problem, outcome.named, outcome.unstable
     names = {question.name for question in named}
-    rivals = [rival for rival in rivals if rival.question.name in names and rival.other.name not in names]
+    rivals = [
+        rival for rival in rivals if rival.question.name in names and rival.other.name not in names
+    ]
     rejected = [question for question in outcome.chosen if question not in (*named, *unstable)]
-    return Investigation(used, problem, outcome.explained, named, limits, not_testable, unstable, rejected, rivals)
+    return Investigation(
+        used, problem, outcome.explained, named, limits, not_testable, unstable, rejected, rivals
+    )
 
 
 def _explained(problem, linearised_at, start=()):
     """Return (the _Outcome of a search, rivals of its findings, `linearised_at` with the lags resolved if there are any)."""
     chosen = problem.search.run(start)
-    chosen = [question for question in chosen if question.name not in FAMILY or problem.windows_agree(chosen, question)]
-    explanations = lag_explanations(problem, [*chosen, *problem.search.early(chosen)], linearised_at)
+    chosen = [
+        question
+        for question in chosen
+        if question.name not in FAMILY or problem.windows_agree(chosen, question)
+    ]
+    explanations = lag_explanations(
+        problem, [*chosen, *problem.search.early(chosen)], linearised_at
+    )
     if explanations is not None:
         linearised_at = partial(linearised_at, resolved=FAMILY)
         return *_with_lags(explanations, linearised_at), linearised_at
     settled, rivals = settle_rivals(problem, chosen, linearised_at)
-    return _settled(linearised_at, settled, chosen if settled is problem else settled.search.run()), rivals, linearised_at
+    return (
+        _settled(linearised_at, settled, chosen if settled is problem else settled.search.run()),
+        rivals,
+        linearised_at,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +210,10 @@ class _Trial:
     @property
     def rank(self):
         """Numbers of its lags that are named and chosen, then the order of the trials."""
-        named, chosen = (len(self.lags & {question.name for question in some}) for some in (self.outcome.named, self.outcome.chosen))
+        named, chosen = (
+            len(self.lags & {question.name for question in some})
+            for some in (self.outcome.named, self.outcome.chosen)
+        )
         return named, chosen, -self.number
 
     @property
@@ -166,7 +223,9 @@ class _Trial:
 
     def finished(self, linearised_at):
         """Return the trial relinearised at its choice, without the lags that are not named."""
-        return replace(self, outcome=_settled(linearised_at, self.outcome.problem, self.outcome.chosen))
+        return replace(
+            self, outcome=_settled(linearised_at, self.outcome.problem, self.outcome.chosen)
+        )
 
 
 def _with_lags(explanations, linearised_at):
@@ -222,8 +281,11 @@ def _looked_again(outcome, linearised_at, any_size, tried):
     lags = _resolved(problem, outcome.chosen)
     found = [search.run([*lags, *start]) for start in ((), *best_pairs(search))]
     best = min(found, key=search.cost)
-    if _labels(best) in tried or outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest or \
-            (not any_size and search.cost(best) >= search.cost(outcome.chosen)):
+    if (
+        _labels(best) in tried
+        or outcome.explained.rest(best) >= LEFT_BEFORE * outcome.rest
+        or (not any_size and search.cost(best) >= search.cost(outcome.chosen))
+    ):
         return outcome
     tried.add(_labels(best))
     other = _settled(linearised_at, problem, best)
@@ -251,7 +313,12 @@ def _outcome(problem, chosen):
     chosen = [question for question in chosen if '@' not in question.label]
     explained = ExplainedWindows(problem.evidence, problem.search)
     first = simpler(problem, explained, pruned(chosen, explained.share))
-    return _Outcome(problem, explained, chosen, *_agreed(problem, explained, _that_help(problem, explained, first)))
+    return _Outcome(
+        problem,
+        explained,
+        chosen,
+        *_agreed(problem, explained, _that_help(problem, explained, first)),
+    )
 
 
 def _without_unnamed(outcome, linearised_at):
@@ -261,8 +328,17 @@ def _without_unnamed(outcome, linearised_at):
             break
         problem = linearised_at(point=outcome.problem.point(outcome.named))
         explained = ExplainedWindows(problem.evidence, problem.search)
-        named, unstable, chosen = (same_questions(problem, some) for some in (outcome.named, outcome.unstable, outcome.chosen))
-        outcome = _Outcome(problem, explained, chosen, _that_help(problem, explained, pruned(named, explained.share)), unstable)
+        named, unstable, chosen = (
+            same_questions(problem, some)
+            for some in (outcome.named, outcome.unstable, outcome.chosen)
+        )
+        outcome = _Outcome(
+            problem,
+            explained,
+            chosen,
+            _that_help(problem, explained, pruned(named, explained.share)),
+            unstable,
+        )
     return outcome
 
 
@@ -272,21 +348,27 @@ def _searched(problem, chosen):
 
 
 def _resolved(problem, chosen):
-    return same_questions(problem, [question for question in chosen if question.name in problem.search.resolved])
+    return same_questions(
+        problem, [question for question in chosen if question.name in problem.search.resolved]
+    )
 
 
 def too_few_windows(count: int) -> NotObservableError:
     """Return the error of a recording with so few windows that none can be held out."""
-    return NotObservableError(f'a diagnosis needs at least {MIN_FOLD_WINDOWS} windows, so that some can be held out, '
-                              f'{count} were found; rest in more poses, or spin and swing the table',
-                              code='too_few_windows')
+    return NotObservableError(
+        f'a diagnosis needs at least {MIN_FOLD_WINDOWS} windows, so that some can be held out, '
+        f'{count} were found; rest in more poses, or spin and swing the table',
+        code='too_few_windows',
+    )
 
 
 def _agreed(problem, explained, named):
     """Return (findings on which both halves agree and that hold without the other ones, findings on which the halves disagree)."""
     unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
     kept = [question for question in named if question not in unstable]
-    return problem.search.drop_insignificant(_that_help(problem, explained, kept) if unstable else kept), unstable
+    return problem.search.drop_insignificant(
+        _that_help(problem, explained, kept) if unstable else kept
+    ), unstable
 
 
 def _that_help(problem, explained, named):
@@ -297,10 +379,17 @@ def _that_help(problem, explained, named):
     evidence for any effect that correlates with it. So the unweighted residual must decrease too. The locked windows are not
     used: their later gain would be biased.
     """
-    kept = [question for question in named if problem.search.allowed(named, question) and problem.windows_agree(named, question)]
+    kept = [
+        question
+        for question in named
+        if problem.search.allowed(named, question) and problem.windows_agree(named, question)
+    ]
     while kept:
         least = [_sure_reduction(problem, kept, each) for each in kept]
-        short = [not paid > _needed_reduction(problem, explained, kept, each) for paid, each in zip(least, kept)]   # nan is not sure
+        short = [
+            not paid > _needed_reduction(problem, explained, kept, each)
+            for paid, each in zip(least, kept)
+        ]  # nan is not sure
         if not any(short):
             break
         del kept[int(np.argmin(np.where(short, np.nan_to_num(least, nan=-np.inf), np.inf)))]
@@ -319,4 +408,9 @@ def _needed_reduction(problem, explained, chosen, question):
 
 def _sure_reduction(problem, chosen, question):
     """Return the lower end of the interval of an effect's reduction of the cross-validated residual."""
-    return gain_in_turn(problem, [q for q in chosen if q is not question], chosen, sensors=sensors_of(question.effect)).ci95[0]
+    return gain_in_turn(
+        problem,
+        [q for q in chosen if q is not question],
+        chosen,
+        sensors=sensors_of(question.effect),
+    ).ci95[0]

@@ -48,8 +48,15 @@ class LagHypothesis:
     def values(self) -> dict[str, float]:
         """Parameter of the baseline, of the lags and of clocks that change -> value."""
         lags = FAMILY | CLOCKS
-        names = {*self.problem.baseline.param_names, *(name for q in self.chosen if q.name in lags for name in q.effect.param_names())}
-        return {name: value for name, value in zip(self.problem.space.names, self.problem.values(self.chosen)) if name in names}
+        names = {
+            *self.problem.baseline.param_names,
+            *(name for q in self.chosen if q.name in lags for name in q.effect.param_names()),
+        }
+        return {
+            name: value
+            for name, value in zip(self.problem.space.names, self.problem.values(self.chosen))
+            if name in names
+        }
 
     def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the lags of one sensor, in the order of the kind."""
@@ -79,7 +86,12 @@ class Explanation:
     def rank(self) -> tuple:
         """Sort key of simplicity."""
         kinds = [name.rpartition('_')[2] for name in self.lags]
-        return len(self.lags), CLOCK not in self.lags, sum(map(('delay', 'offset', 'bandwidth', 'filter').index, kinds)), self.cost
+        return (
+            len(self.lags),
+            CLOCK not in self.lags,
+            sum(map(('delay', 'offset', 'bandwidth', 'filter').index, kinds)),
+            self.cost,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,26 +106,43 @@ class LagExplanations:
     silent: float | None
     """Held-out cost without any lag, nats, without rests; None where rests determine the noise."""
 
-    def others(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> list[Explanation]:
+    def others(
+        self, most: int | None = None, refused: Sequence[Explanation] = ()
+    ) -> list[Explanation]:
         """Return the explanations with at most so many effects, without given ones and without those of the same columns and cost."""
         costs = {each.cost for each in refused}
-        return [each for each in self.explanations if (most is None or len(each.lags) <= most) and each.cost not in costs]
+        return [
+            each
+            for each in self.explanations
+            if (most is None or len(each.lags) <= most) and each.cost not in costs
+        ]
 
     def select(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
         """Return the simplest explanation of `others`."""
         return simplest(self.others(most, refused), self.silent)
 
-    def settled(self, selected: Explanation, linearised_at: Callable) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
+    def settled(
+        self, selected: Explanation, linearised_at: Callable
+    ) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
         """Return (the LinearisedProblem at an explanation, the choice with it, alternatives to its members that fit nearly as well)."""
         names = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
         values = selected.values | {names[name]: value for name, value in selected.lags.items()}
         there = linearised_at(point=point_with(self.problem.baseline, self.problem.effects, values))
-        lags = [next(question for question in there.questions if question.name == name) for name in selected.lags]
-        near = [explanation for explanation in self.explanations if explanation.cost < selected.cost + TIE]
+        lags = [
+            next(question for question in there.questions if question.name == name)
+            for name in selected.lags
+        ]
+        near = [
+            explanation
+            for explanation in self.explanations
+            if explanation.cost < selected.cost + TIE
+        ]
         return there, [*lags, *same_questions(there, self.rest)], _rivals(there, selected, near)
 
 
-def lag_explanations(problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable) -> LagExplanations | None:
+def lag_explanations(
+    problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable
+) -> LagExplanations | None:
     """
     Return the LagExplanations of a choice; None where it has no lag, no lag explains the data, or some of the family cannot be tested.
 
@@ -126,12 +155,19 @@ def lag_explanations(problem: LinearisedProblem, chosen: Sequence[Question], lin
         ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, with some of the effects.
 
     """
-    rest = [question for question in chosen if question.name not in FAMILY and '@' not in question.label]
+    rest = [
+        question for question in chosen if question.name not in FAMILY and '@' not in question.label
+    ]
     effects = {effect.name: effect for effect in problem.effects}
     if not {question.name for question in chosen} & FAMILY or not FAMILY <= set(effects):
         return None
-    values, clocks = problem.values(chosen), [question for question in chosen if question.name in CLOCKS]
-    of_clocks = {problem.space.names[k]: float(values[k]) for question in clocks for k in question.parameters}
+    values, clocks = (
+        problem.values(chosen),
+        [question for question in chosen if question.name in CLOCKS],
+    )
+    of_clocks = {
+        problem.space.names[k]: float(values[k]) for question in clocks for k in question.parameters
+    }
     # Lags are nonlinear at a clock of zero where a clock changes.
     described = _described(problem, linearised_at, effects, rest=rest, clocks=of_clocks or None)
     judges = [each.problem for each in described]
@@ -140,7 +176,11 @@ def lag_explanations(problem: LinearisedProblem, chosen: Sequence[Question], lin
     if not explanations:
         return None
     without = [question for question in described[0].chosen if question.name not in FAMILY]
-    silent = sum(_cost(described[0], without, judges, sensor) for sensor in SENSORS) if problem.recording.moving.all() else None
+    silent = (
+        sum(_cost(described[0], without, judges, sensor) for sensor in SENSORS)
+        if problem.recording.moving.all()
+        else None
+    )
     return LagExplanations(problem, explanations, rest, silent)
 
 
@@ -157,24 +197,46 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
 
     """
     best = min(explanation.cost for explanation in explanations)
-    selected = min((explanation for explanation in explanations if explanation.cost < best + TIE), key=lambda explanation: explanation.rank)
+    selected = min(
+        (explanation for explanation in explanations if explanation.cost < best + TIE),
+        key=lambda explanation: explanation.rank,
+    )
     if silent is None or len(selected.lags) < 2 or CLOCK in selected.lags:
         return selected
-    common = [explanation for explanation in explanations if CLOCK in explanation.lags and len(explanation.lags) == len(selected.lags)
-              and explanation.cost < best + TIE + MAX_CLOCK_LOSS * (silent - best)]
+    common = [
+        explanation
+        for explanation in explanations
+        if CLOCK in explanation.lags
+        and len(explanation.lags) == len(selected.lags)
+        and explanation.cost < best + TIE + MAX_CLOCK_LOSS * (silent - best)
+    ]
     return simplest(common) if common else selected
 
 
 def _described(problem, linearised_at, effects, *, rest, clocks):
     """Return the description of each kind; only the first if no curvature is observable."""
+
     def at(kind, values=clocks):
-        asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [question.effect for question in rest]
-        there = linearised_at(effects=asked, point=None if values is None else point_with(problem.baseline, asked, values))
-        lags = [q for ending in kind for sensor in SENSORS for q in there.questions if q.name == lag_name(sensor, ending)]
+        asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [
+            question.effect for question in rest
+        ]
+        there = linearised_at(
+            effects=asked,
+            point=None if values is None else point_with(problem.baseline, asked, values),
+        )
+        lags = [
+            q
+            for ending in kind
+            for sensor in SENSORS
+            for q in there.questions
+            if q.name == lag_name(sensor, ending)
+        ]
         return LagHypothesis(kind, there, [*lags, *same_questions(there, rest)])
 
     first = at(DELAY)
-    shown = max(first.problem.curvature_shows(first.chosen, q) for q in first.chosen if q.name in FAMILY)
+    shown = max(
+        first.problem.curvature_shows(first.chosen, q) for q in first.chosen if q.name in FAMILY
+    )
     if shown < MIN_CURVATURE_NATS:
         return [first]
     first = at(DELAY, first.values)
@@ -182,8 +244,15 @@ def _described(problem, linearised_at, effects, *, rest, clocks):
     for kind in LAG_KINDS[1:]:
         values = dict(first.values)
         for sensor, delay in delays.items():
-            own = [delay - FIRST_SHARE * abs(delay), FIRST_SHARE * abs(delay)] if len(kind) == 2 else [delay]
-            values |= {effects[lag_name(sensor, ending)].param_names()[0]: value for ending, value in zip(kind, own)}
+            own = (
+                [delay - FIRST_SHARE * abs(delay), FIRST_SHARE * abs(delay)]
+                if len(kind) == 2
+                else [delay]
+            )
+            values |= {
+                effects[lag_name(sensor, ending)].param_names()[0]: value
+                for ending, value in zip(kind, own)
+            }
         hypothesis = at(kind, values)
         for _ in range(DELAY_LINEARISATIONS - 1 if len(kind) > 1 else 0):
             hypothesis = at(kind, hypothesis.values)
@@ -193,11 +262,24 @@ def _described(problem, linearised_at, effects, *, rest, clocks):
 
 def _explanations(described, judges, names):
     """Return every Explanation that the descriptions of each sensor make together, and that is better than none."""
-    options = {sensor: [_none(described[0], judges, sensor), *(_option(each, judges, sensor) for each in described)] for sensor in SENSORS}
-    if len(described) == 1:   # without curvature the kinds are one column
+    options = {
+        sensor: [
+            _none(described[0], judges, sensor),
+            *(_option(each, judges, sensor) for each in described),
+        ]
+        for sensor in SENSORS
+    }
+    if len(described) == 1:  # without curvature the kinds are one column
         for some in options.values():
-            some += [replace(some[1], kind=(ending,), alike=True) for ending in ('bandwidth', 'filter')]
-    found = [each for one, two in product(*options.values()) if one.kind or two.kind for each in _described_together(one, two, names)]
+            some += [
+                replace(some[1], kind=(ending,), alike=True) for ending in ('bandwidth', 'filter')
+            ]
+    found = [
+        each
+        for one, two in product(*options.values())
+        if one.kind or two.kind
+        for each in _described_together(one, two, names)
+    ]
     return [each for each in found if each.cost < sum(none.cost for none, *_ in options.values())]
 
 
@@ -215,7 +297,9 @@ class _Option:
     """Whether its columns equal those of a delay."""
 
     def own(self, lags):
-        return {lag_name(self.sensor, ending): float(value) for ending, value in zip(self.kind, lags)}
+        return {
+            lag_name(self.sensor, ending): float(value) for ending, value in zip(self.kind, lags)
+        }
 
     def with_delay(self, delay):
         """Return the lags with the first one given, the remaining ones shifted accordingly."""
@@ -230,15 +314,25 @@ def _option(hypothesis, judges, sensor):
 def _none(hypothesis, judges, sensor):
     left = hypothesis.without(sensor)
     values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(left)))
-    return _Option(sensor, (), _cost(hypothesis, left, judges, sensor), np.zeros(0), np.zeros((0, 0)), values)
+    return _Option(
+        sensor, (), _cost(hypothesis, left, judges, sensor), np.zeros(0), np.zeros((0, 0)), values
+    )
 
 
 def _cost(hypothesis, chosen, judges, sensor):
     """Return the held-out cost of one sensor's windows, nats, judged with the noise and the band of each linearisation in turn."""
     used, losses = hypothesis.problem.search.indices(chosen), []
     for judge in judges:
-        space = replace(hypothesis.problem.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
-        losses.append(WindowEvidence(space, judge.noise, hypothesis.problem.evidence.fold).heldout_parts(used)[sensor].sum())
+        space = replace(
+            hypothesis.problem.evidence.space,
+            slow_only=judge.space.slow_only,
+            slow_variance=judge.space.slow_variance,
+        )
+        losses.append(
+            WindowEvidence(space, judge.noise, hypothesis.problem.evidence.fold)
+            .heldout_parts(used)[sensor]
+            .sum()
+        )
     return 0.5 * float(np.mean(losses))
 
 
@@ -261,20 +355,32 @@ def _described_together(one, two, names):
         beside = one.own(one.with_delay(shared)) | two.own(two.with_delay(shared))
         beside = {name: value for name, value in beside.items() if not name.endswith('delay')}
         if all(value > 0 for value in beside.values()):
-            yield Explanation({CLOCK: shared} | beside, cost - PENALTY + 0.5 * apart**2 / float(variances.sum()), values)
+            yield Explanation(
+                {CLOCK: shared} | beside,
+                cost - PENALTY + 0.5 * apart**2 / float(variances.sum()),
+                values,
+            )
 
 
 def _rivals(settled, selected, near):
     """Return the alternatives to a member of an explanation that fit nearly as well: members of explanations with no more effects."""
     asked, found = {question.name: question for question in settled.questions}, {}
     for other in sorted(near, key=lambda explanation: explanation.cost):
-        gone, come = sorted(set(selected.lags) - set(other.lags)), sorted(set(other.lags) - set(selected.lags))
+        gone, come = (
+            sorted(set(selected.lags) - set(other.lags)),
+            sorted(set(other.lags) - set(selected.lags)),
+        )
         if len(other.lags) > len(selected.lags) or not gone:
             continue
         moves = {name: other.values[name] - selected.values[name] for name in selected.values}
         for name in come:
-            place = next((each for each in gone if asked[each].sensor == asked[name].sensor), CLOCK if CLOCK in gone else gone[0])
+            place = next(
+                (each for each in gone if asked[each].sensor == asked[name].sensor),
+                CLOCK if CLOCK in gone else gone[0],
+            )
             if name not in found:
                 first = place not in {rival.question.name for rival in found.values()}
-                found[name] = Rival(asked[place], asked[name], other.cost - selected.cost, moves if first else {})
+                found[name] = Rival(
+                    asked[place], asked[name], other.cost - selected.cost, moves if first else {}
+                )
     return list(found.values())

@@ -14,7 +14,11 @@ from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import WindowEvidence, agree, folds_of
-from imu_calibration.selection.noise_beside_effects import first_noise, in_trusted_band, noise_beside_effects
+from imu_calibration.selection.noise_beside_effects import (
+    first_noise,
+    in_trusted_band,
+    noise_beside_effects,
+)
 from imu_calibration.selection.parameter_space import (
     ParameterSpace,
     counted_from_values,
@@ -24,7 +28,12 @@ from imu_calibration.selection.parameter_space import (
     smooth_parameters,
 )
 from imu_calibration.selection.questions import Question, extended_model, time_constants
-from imu_calibration.selection.reduced_recording import ReducedRecording, make_bank, mean_arms, reduce_recording
+from imu_calibration.selection.reduced_recording import (
+    ReducedRecording,
+    make_bank,
+    mean_arms,
+    reduce_recording,
+)
 from imu_calibration.selection.search import FAMILY_WISE, Search
 
 DELAY_FREQUENCY = 2 * np.pi * 3.0
@@ -61,15 +70,31 @@ class LinearisedProblem:
 
     """
 
-    def __init__(self, windows: Sequence[Window], table: Table, baseline: SensorModel, *, effects: Sequence[Effect], locked: np.ndarray,
-                 point: tuple[SensorModel, np.ndarray] | None = None, bias_processes: dict | None = None,
-                 any_size: bool = False, resolved: AbstractSet[str] = frozenset()):
+    def __init__(
+        self,
+        windows: Sequence[Window],
+        table: Table,
+        baseline: SensorModel,
+        *,
+        effects: Sequence[Effect],
+        locked: np.ndarray,
+        point: tuple[SensorModel, np.ndarray] | None = None,
+        bias_processes: dict | None = None,
+        any_size: bool = False,
+        resolved: AbstractSet[str] = frozenset(),
+    ):
         self.baseline, self.effects, self.locked = baseline, effects, locked
         self.duration = max(float(window.time[-1]) for window in windows)
         self.constants = time_constants(self.duration)
         model, values = point or _start(baseline, effects)
         model = replace(model, folded_arms=mean_arms(model, values))
-        recording = reduce_recording(windows, table, model, values=values, bank=make_bank(effects, self.constants, model, values=values))
+        recording = reduce_recording(
+            windows,
+            table,
+            model,
+            values=values,
+            bank=make_bank(effects, self.constants, model, values=values),
+        )
         used = tuple(k for e in baseline.effects for k in range(len(values))[model.slices[e.key]])
         judged = recording.select(~locked)
         if point is None:
@@ -81,8 +106,14 @@ class LinearisedProblem:
         self.questions = questions(judged, effects)
         self.noise = noise_beside_effects(judged, smooth_parameters(self.questions), bias_processes)
         self.evidence = WindowEvidence(judged, self.noise, folds_of(judged.recording.kind))
-        self.search = Search(self.evidence, used, self.questions, encoder_step=judged.recording.encoder_step, any_size=any_size,
-                             resolved=resolved)
+        self.search = Search(
+            self.evidence,
+            used,
+            self.questions,
+            encoder_step=judged.recording.encoder_step,
+            any_size=any_size,
+            resolved=resolved,
+        )
 
     def asking_any_size(self) -> 'LinearisedProblem':
         """Return the same, asking about sizes that are known of no instrument too."""
@@ -108,18 +139,24 @@ class LinearisedProblem:
         """Return parameters of the whole space in full, from those that count from the linearisation, shape (q,)."""
         values = np.array(values)
         change = counted_from_values(self.recording.model, self.baseline)
-        values[:len(change)] += np.where(change, self.recording.values, 0.0)
+        values[: len(change)] += np.where(change, self.recording.values, 0.0)
         return values
 
     def needs_another(self, chosen: Sequence[Question]) -> bool:
         """Return whether the linearisation is too coarse for the choice: curvature times evidence."""
-        return any('@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE for question in chosen)
+        return any(
+            '@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE
+            for question in chosen
+        )
 
     def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
         """Return the evidence of an effect's curvature, nats: its separability from its first derivative."""
         without = self.search.indices([q for q in chosen if q is not question])
         weight = self.evidence.loss(without) - self.evidence.loss(self.search.indices(chosen))
-        return weight * _curvature(question, self.values(chosen), self.recording.model, self.duration)**2
+        return (
+            weight
+            * _curvature(question, self.values(chosen), self.recording.model, self.duration) ** 2
+        )
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -131,7 +168,12 @@ class LinearisedProblem:
             return True
         used = self.search.indices(chosen)
         at = [used.index(k) for k in question.parameters]
-        fits = [solve_normal(normal, np.asarray(used), self.space.prior_sd, prior_mean=self.space.prior_mean) for normal in self._halves]
+        fits = [
+            solve_normal(
+                normal, np.asarray(used), self.space.prior_sd, prior_mean=self.space.prior_mean
+            )
+            for normal in self._halves
+        ]
         return agree(fits, self.evidence.fit(used), at)
 
     def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
@@ -150,7 +192,10 @@ class LinearisedProblem:
         """Return whether the point of linearisation has a lag, delay or error of the table that is not among the chosen effects."""
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         model = self.recording.model
-        return any(e.warp is not None and e.key not in kept and np.any(model.point_of(e)) for e in model.effects)
+        return any(
+            e.warp is not None and e.key not in kept and np.any(model.point_of(e))
+            for e in model.effects
+        )
 
     def point(self, chosen: Sequence[Question]) -> tuple[SensorModel, np.ndarray]:
         """Return the point of linearisation (model, values) for this choice."""
@@ -164,16 +209,20 @@ class LinearisedProblem:
             known = self.recording.model.slices.get(effect.key)
             if known is not None:
                 start[model.slices[effect.key]] = values[known]
-                if effect.time_constant:   # a straight line may lead beyond zero
+                if effect.time_constant:  # a straight line may lead beyond zero
                     last = model.slices[effect.key].stop - 1
-                    start[last] = np.clip(start[last], 0.25 * self.constants[0], 4.0 * self.constants[-1])
+                    start[last] = np.clip(
+                        start[last], 0.25 * self.constants[0], 4.0 * self.constants[-1]
+                    )
         for question in chosen:
             if '@' in question.label:
-                start[model.slices[question.sensor, question.name]] = self._warm_up(chosen, question, values)
+                start[model.slices[question.sensor, question.name]] = self._warm_up(
+                    chosen, question, values
+                )
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         for effect in model.effects:
             if effect.key not in kept:
-                start[model.slices[effect.key]][:effect.n_amplitudes] = 0.0
+                start[model.slices[effect.key]][: effect.n_amplitudes] = 0.0
         return model.at(start), start
 
     def _warm_up(self, chosen, question, values):
@@ -184,12 +233,20 @@ class LinearisedProblem:
         losses = []
         for k in near:
             other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
-            losses.append(self.evidence.loss(self.search.indices(chosen[:place] + [other] + chosen[place + 1:])))
+            losses.append(
+                self.evidence.loss(
+                    self.search.indices(chosen[:place] + [other] + chosen[place + 1 :])
+                )
+            )
         logs = np.log(self.constants[near])
         if len(near) < 3:
             return np.append(values[list(question.parameters)], self.constants[number])
         curve = np.polyfit(logs - logs[1], losses, 2)
-        shift = np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1]) if curve[0] > 0 else 0.0
+        shift = (
+            np.clip(-curve[1] / (2 * curve[0]), logs[0] - logs[1], logs[2] - logs[1])
+            if curve[0] > 0
+            else 0.0
+        )
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
 
 
@@ -204,7 +261,12 @@ def _at_baseline(recording, baseline, used):
     for _ in range(2 if baseline.arms else 1):
         space = in_trusted_band(parameter_space(recording, baseline))
         values = recording.values.copy()
-        values[list(used)] += solve_normal(normal_matrix(space, first_noise(space)), used, space.prior_sd, prior_mean=space.prior_mean)[0]
+        values[list(used)] += solve_normal(
+            normal_matrix(space, first_noise(space)),
+            used,
+            space.prior_sd,
+            prior_mean=space.prior_mean,
+        )[0]
         recording = recording.rebased(values)
     return recording
 
@@ -215,7 +277,9 @@ def _curvature(question, values, model, duration):
     value = values[list(question.parameters)]
     if effect.warp is not None:
         moved = np.max(np.abs(value - model.point_of(effect)))
-        return moved * {'s': DELAY_FREQUENCY, 's/s': DELAY_FREQUENCY * duration}.get(effect.unit, 1.0)
+        return moved * {'s': DELAY_FREQUENCY, 's/s': DELAY_FREQUENCY * duration}.get(
+            effect.unit, 1.0
+        )
     if effect.time_constant:
         return abs(np.log(max(value[-1], 1e-3) / model.point_of(effect)[-1]))
     return BILINEAR

@@ -5,10 +5,26 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise
-from imu_calibration.estimation.noise_search import CORRELATION_TIMES, NATURAL, BiasProcessSearch, NoiseLikelihood
+from imu_calibration.estimation.noise_model import (
+    BiasProcess,
+    MovingFactors,
+    NoiseModel,
+    ReferenceNoise,
+)
+from imu_calibration.estimation.noise_search import (
+    CORRELATION_TIMES,
+    NATURAL,
+    BiasProcessSearch,
+    NoiseLikelihood,
+)
 from imu_calibration.estimation.scaled_solve import solve_normal
-from imu_calibration.estimation.session_noise import band_misfit, least_misfit, misfit_along, shaken_means, white_noise
+from imu_calibration.estimation.session_noise import (
+    band_misfit,
+    least_misfit,
+    misfit_along,
+    shaken_means,
+    white_noise,
+)
 from imu_calibration.selection.parameter_space import ParameterSpace, normal_matrix, within_matrix
 
 
@@ -28,8 +44,10 @@ def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
         at_rest = np.zeros(3) if rest is None else rest[0] * np.maximum(rest[1], 1.0)
         slow_only[sensor], slow_variance[sensor] = np.zeros(3, bool), np.zeros(3)
         for axis in range(3):
-            (left, rank), (left_slow,
-                           rank_slow) = (least_misfit(space.within_sum(sensor, axis, moving, part=part)) for part in ('within', 'slow'))
+            (left, rank), (left_slow, rank_slow) = (
+                least_misfit(space.within_sum(sensor, axis, moving, part=part))
+                for part in ('within', 'slow')
+            )
             dofs = (recording.count[moving] - 1).sum() - rank, n_slow[moving].sum() - rank_slow
             found = band_misfit(np.full(3, left), dofs[0], np.full(3, left_slow), dof_slow=dofs[1])
             if found.apart[0] and found.fast[0] >= 2.0 * at_rest[axis]:
@@ -64,8 +82,11 @@ LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
 
 
-def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int, ...]]],
-                         known: dict[str, tuple[BiasProcess, ...]] | None = None) -> dict[str, NoiseModel]:
+def noise_beside_effects(
+    space: ParameterSpace,
+    smooth: dict[str, list[tuple[int, ...]]],
+    known: dict[str, tuple[BiasProcess, ...]] | None = None,
+) -> dict[str, NoiseModel]:
     """
     Return sensor -> NoiseModel, estimated together with a model of all candidate effects.
 
@@ -83,19 +104,32 @@ def noise_beside_effects(space: ParameterSpace, smooth: dict[str, list[tuple[int
 
     """
     noise, every = first_noise(space), np.arange(space.size)
-    noise = {sensor: replace(own, known=(known or {}).get(sensor, ())) for sensor, own in noise.items()}
+    noise = {
+        sensor: replace(own, known=(known or {}).get(sensor, ())) for sensor, own in noise.items()
+    }
     for look_along in (False, True):
-        values = solve_normal(normal_matrix(space, noise), every, space.prior_sd, prior_mean=space.prior_mean)[0]
-        noise = {sensor: _with_moving_factors(space, sensor, noise[sensor], values, look_along) for sensor in SENSORS}
+        values = solve_normal(
+            normal_matrix(space, noise), every, space.prior_sd, prior_mean=space.prior_mean
+        )[0]
+        noise = {
+            sensor: _with_moving_factors(space, sensor, noise[sensor], values, look_along)
+            for sensor in SENSORS
+        }
     return {sensor: _with_bias_process(space, sensor, noise, smooth[sensor]) for sensor in SENSORS}
 
 
 def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
     """Return the least bias processes: the known ones, else from the white noise of the sensor and the time between samples, s."""
-    return noise.known or (BiasProcess(NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), CORRELATION_TIMES[0]),)
+    return noise.known or (
+        BiasProcess(
+            NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), CORRELATION_TIMES[0]
+        ),
+    )
 
 
-def plausible_processes(noise: NoiseModel, period: float, *, sensor: str, duration: float) -> tuple[BiasProcess, ...]:
+def plausible_processes(
+    noise: NoiseModel, period: float, *, sensor: str, duration: float
+) -> tuple[BiasProcess, ...]:
     """
     Return the bias processes up to a size that is plausible as noise.
 
@@ -104,7 +138,7 @@ def plausible_processes(noise: NoiseModel, period: float, *, sensor: str, durati
     natural = natural_processes(noise, period)
     if noise.known or not noise.bias_processes:
         return natural
-    seen = float(np.sqrt(sum(process.within(duration)**2 for process in noise.bias_processes)))
+    seen = float(np.sqrt(sum(process.within(duration) ** 2 for process in noise.bias_processes)))
     most = PLAUSIBLE * max(natural[0].sd, STABLE[sensor])
     alike = MAX_MIDDLE_RATIO * noise.middle_wander * seen / float(np.sqrt(noise.bias_variance))
     share = min(1.0, float(np.clip(alike, most, MAX_WANDER_RATIO * most)) / seen)
@@ -115,16 +149,28 @@ def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel before anything is fitted: the noise at rest."""
     found = {}
     for sensor in SENSORS:
-        white, inflation = white_noise(space.recording.windows, sensor) or (_white_without_rest(space, sensor), np.ones(3))
-        found[sensor] = NoiseModel(white, inflation, reference=ReferenceNoise.of_steps(space.recording.encoder_step, sensor),
-                                   shaken=shaken_means(space.recording.windows, sensor))
+        white, inflation = white_noise(space.recording.windows, sensor) or (
+            _white_without_rest(space, sensor),
+            np.ones(3),
+        )
+        found[sensor] = NoiseModel(
+            white,
+            inflation,
+            reference=ReferenceNoise.of_steps(space.recording.encoder_step, sensor),
+            shaken=shaken_means(space.recording.windows, sensor),
+        )
     return found
 
 
 def _white_without_rest(space, sensor):
     moving = space.recording.moving
     dof = max((space.recording.count[moving] - 1).sum(), 1)
-    return np.array([max(least_misfit(space.within_sum(sensor, axis, moving))[0] / dof, 1e-30) for axis in range(3)])
+    return np.array(
+        [
+            max(least_misfit(space.within_sum(sensor, axis, moving))[0] / dof, 1e-30)
+            for axis in range(3)
+        ]
+    )
 
 
 def _with_moving_factors(space, sensor, noise, values, look_along):
@@ -154,21 +200,41 @@ def _with_moving_factors(space, sensor, noise, values, look_along):
 
 def _with_bias_process(space, sensor, noise, smooth):
     """Return the noise of a sensor with window offsets and bias process, estimated with all effects but the superfluous smooth ones."""
-    recording, superfluous = space.recording, sorted({k for parameters in smooth for k in parameters})
+    recording, superfluous = (
+        space.recording,
+        sorted({k for parameters in smooth for k in parameters}),
+    )
     structural = np.setdiff1d(np.concatenate(space.index[sensor]), superfluous)
     own = np.append(structural, superfluous).astype(int)
     place = {parameter: k for k, parameter in enumerate(own)}
     rows = np.zeros((len(recording.windows), 3, len(own) + 1))
     for axis in range(3):
-        rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = space.mean[sensor][axis]
-    white = noise[sensor].mean_variance(recording.kind, recording.count, recording.duration, keys=recording.keys)
-    likelihood = NoiseLikelihood(rows, white, recording.time, sessions=recording.sessions,
-                                 information=_known_otherwise(space, sensor, noise, own),
-                                 known=noise[sensor].known, durations=recording.duration, common=len(structural))
-    natural = float(np.sqrt(sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))))
+        rows[:, axis, [*(place[parameter] for parameter in space.index[sensor][axis]), -1]] = (
+            space.mean[sensor][axis]
+        )
+    white = noise[sensor].mean_variance(
+        recording.kind, recording.count, recording.duration, keys=recording.keys
+    )
+    likelihood = NoiseLikelihood(
+        rows,
+        white,
+        recording.time,
+        sessions=recording.sessions,
+        information=_known_otherwise(space, sensor, noise, own),
+        known=noise[sensor].known,
+        durations=recording.duration,
+        common=len(structural),
+    )
+    natural = float(
+        np.sqrt(
+            sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))
+        )
+    )
     search = BiasProcessSearch(likelihood, 0.0 if noise[sensor].known else natural, STABLE[sensor])
     options = [[place[k] - len(structural) for k in parameters] for parameters in smooth]
-    prior_sd = drift_prior(rows[:, :, len(structural):-1], space.prior_sd[superfluous], max(natural, STABLE[sensor]))
+    prior_sd = drift_prior(
+        rows[:, :, len(structural) : -1], space.prior_sd[superfluous], max(natural, STABLE[sensor])
+    )
     used = _needed_smooth(search, options, prior_sd=prior_sd)
     shape = search.best(used)[0]
     middle = search.of_middle_axis(shape, used) if shape[1] > PLAUSIBLE * search.usual else 0.0
@@ -203,7 +269,9 @@ def _needed_smooth(search, options, *, prior_sd):
     is underestimated, and noise of 15 s resembles a drift.
     """
     losses = [search.best([])[1]]
-    losses += [search.best(option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options]
+    losses += [
+        search.best(option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options
+    ]
     return ([[]] + options)[int(np.argmin(losses))]
 
 
@@ -211,7 +279,7 @@ def _known_otherwise(space, sensor, noise, own):
     """Return the information on the parameters `own` from priors and from within windows (normal matrix)."""
     at = np.append(own, space.size)
     information = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
-    prior = 1 / space.prior_sd[own]**2
+    prior = 1 / space.prior_sd[own] ** 2
     information[:-1, :-1] += np.diag(prior)
     information[:-1, -1] += space.prior_mean[own] * prior
     information[-1, :-1] = information[:-1, -1]

@@ -9,7 +9,11 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
-from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE, SIGNIFICANT_REST, ExplainedWindows
+from imu_calibration.selection.explained_share import (
+    MIN_EXPLAINED_SHARE,
+    SIGNIFICANT_REST,
+    ExplainedWindows,
+)
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.parameter_space import matrix_of_each
 from imu_calibration.selection.questions import Question
@@ -50,13 +54,32 @@ class Onset:
 
     def to_mapping(self) -> dict:
         """Return the onset as plain data."""
-        return {'time': self.time, 'time_sd': self.time_sd, 'what': self.what, 'share': self.share, 'axes': list(self.axes),
-                'parameters': {name: {'before': value, 'after': self.after[name], 'sd': self.sd[name], 'unit': self.units[name]}
-                               for name, value in self.before.items()}}
+        return {
+            'time': self.time,
+            'time_sd': self.time_sd,
+            'what': self.what,
+            'share': self.share,
+            'axes': list(self.axes),
+            'parameters': {
+                name: {
+                    'before': value,
+                    'after': self.after[name],
+                    'sd': self.sd[name],
+                    'unit': self.units[name],
+                }
+                for name, value in self.before.items()
+            },
+        }
 
 
-def find_onset(problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question], *, windows: Sequence[Window],
-               table: Table) -> Onset | None:
+def find_onset(
+    problem: LinearisedProblem,
+    explained: ExplainedWindows,
+    chosen: Sequence[Question],
+    *,
+    windows: Sequence[Window],
+    table: Table,
+) -> Onset | None:
     """
     Return the Onset that explains the residual of a choice, None without one.
 
@@ -65,14 +88,20 @@ def find_onset(problem: LinearisedProblem, explained: ExplainedWindows, chosen: 
     linear change of the same parameters with time. The moment is then refined to the sample at which the residuals of both states are
     least.
     """
-    used, space, groups = problem.search.indices(chosen), problem.evidence.space, _groups(problem.recording.model)
+    used, space, groups = (
+        problem.search.indices(chosen),
+        problem.evidence.space,
+        _groups(problem.recording.model),
+    )
     every = np.array(list(dict.fromkeys([*used, *(k for group in groups.values() for k in group)])))
     small, time = space.restricted(every), space.recording.time - space.recording.time.mean()
     each = matrix_of_each(small, explained.floor.noise)
     total, count = each.sum(axis=0), explained.n_means + explained.n_within
     base, noise = np.arange(len(used)), SIGNIFICANT_REST * np.sqrt(2 * count)
     moving = np.cumsum(space.recording.moving)
-    allowed = np.flatnonzero((moving >= MIN_ONSET_WINDOWS) & (moving[-1] - moving >= MIN_ONSET_WINDOWS))
+    allowed = np.flatnonzero(
+        (moving >= MIN_ONSET_WINDOWS) & (moving[-1] - moving >= MIN_ONSET_WINDOWS)
+    )
     single = _fit(total, base, small)[0] - count
     if single < noise or not len(allowed):
         return None
@@ -85,23 +114,57 @@ def find_onset(problem: LinearisedProblem, explained: ExplainedWindows, chosen: 
         fits = [_fit(total, own, small, (matrix, matrix, at)) for matrix in after]
         losses = np.array([loss for loss, *_ in fits])
         best, likely = int(np.argmin(losses)), allowed[losses < losses.min() + LIKELY]
-        excess, gradual = fits[best][0] - count, _fit(total, own, small, (slope, curve, at))[0] - count
+        excess, gradual = (
+            fits[best][0] - count,
+            _fit(total, own, small, (slope, curve, at))[0] - count,
+        )
         if excess < (1 - MIN_EXPLAINED_SHARE) * single and excess < SUDDEN * gradual:
-            found.append((len(group), excess, name, likely[[0, -1]] + (0, 1), group, every[own], fits[best][1:]))
+            found.append(
+                (
+                    len(group),
+                    excess,
+                    name,
+                    likely[[0, -1]] + (0, 1),
+                    group,
+                    every[own],
+                    fits[best][1:],
+                )
+            )
     if not found:
         return None
     most = SIMPLER * max(min(excess for _, excess, *_ in found), noise)
-    _, excess, name, ends, group, own, (values, change, sd) = min(entry for entry in found if entry[1] <= most)
+    _, excess, name, ends, group, own, (values, change, sd) = min(
+        entry for entry in found if entry[1] <= most
+    )
     full, changed = np.zeros(problem.space.size), np.zeros(problem.space.size)
     full[own], changed[group] = values, change
     states = [problem.absolute(full), problem.absolute(full) + changed]
     model, names = problem.recording.model, [problem.space.names[k] for k in group]
-    units = {label: effect.unit_of(k) for effect in model.effects for k, label in enumerate(effect.param_names())}
-    moment, moment_sd = _refined(windows, table, model, states=states, between=space.recording.time[ends])
+    units = {
+        label: effect.unit_of(k)
+        for effect in model.effects
+        for k, label in enumerate(effect.param_names())
+    }
+    moment, moment_sd = _refined(
+        windows, table, model, states=states, between=space.recording.time[ends]
+    )
     before, after = (dict(zip(names, state[group].tolist())) for state in states)
-    axes = () if name in _of_reference(model) else largest_axes(np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2)))
-    return Onset(moment, moment_sd, name, before, after, dict(zip(names, sd.tolist())), {label: units[label] for label in names},
-                 1 - max(excess, 0.0) / single, axes)
+    axes = (
+        ()
+        if name in _of_reference(model)
+        else largest_axes(np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2)))
+    )
+    return Onset(
+        moment,
+        moment_sd,
+        name,
+        before,
+        after,
+        dict(zip(names, sd.tolist())),
+        {label: units[label] for label in names},
+        1 - max(excess, 0.0) / single,
+        axes,
+    )
 
 
 def _groups(model):
@@ -109,7 +172,11 @@ def _groups(model):
     numbers = np.arange(len(model.param_names))
     matrices = {sensor: numbers[model.part(sensor, Role.LINEAR)] for sensor in SENSORS}
     of_reference = {name: numbers[part] for name, part in _of_reference(model).items()}
-    return {**of_reference, **matrices, ' and '.join(SENSORS): np.concatenate(list(matrices.values()))}
+    return {
+        **of_reference,
+        **matrices,
+        ' and '.join(SENSORS): np.concatenate(list(matrices.values())),
+    }
 
 
 def _of_reference(model):
@@ -118,16 +185,23 @@ def _of_reference(model):
 
 def _fit(total, own, small, changed=None):
     """Return (loss, values, changes, sds of the changes) of the parameters `own`; `changed`: (cross products, products, places)."""
-    known = 1 / small.prior_sd[own]**2
-    normal, right = total[np.ix_(own, own)] + np.diag(known), total[own, -1] + small.prior_mean[own] * known
+    known = 1 / small.prior_sd[own] ** 2
+    normal, right = (
+        total[np.ix_(own, own)] + np.diag(known),
+        total[own, -1] + small.prior_mean[own] * known,
+    )
     if changed is not None:
         cross, squares, at = changed
-        normal = np.block([[normal, cross[np.ix_(own, at)]], [cross[np.ix_(at, own)], squares[np.ix_(at, at)]]])
+        normal = np.block(
+            [[normal, cross[np.ix_(own, at)]], [cross[np.ix_(at, own)], squares[np.ix_(at, at)]]]
+        )
         right = np.append(right, cross[at, -1])
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
+    inverse = np.linalg.pinv(
+        normal / np.outer(scale, scale), rcond=1e-12, hermitian=True
+    ) / np.outer(scale, scale)
     values, count = inverse @ right, len(own)
-    loss = total[-1, -1] + (small.prior_mean[own]**2 * known).sum() - right @ values
+    loss = total[-1, -1] + (small.prior_mean[own] ** 2 * known).sum() - right @ values
     return float(loss), values[:count], values[count:], np.sqrt(np.diag(inverse)[count:])
 
 
@@ -139,10 +213,15 @@ def _refined(windows, table, model, *, states, between):
     """
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
     noise = np.median([w.noise_sd for w in near], axis=0)
-    found = [residuals(near, table, model, values=state[:len(model.param_names)]) for state in states]
-    squares = [sum(((rest[sensor] / sd)**2).sum(axis=1) for sensor, sd in zip(SENSORS, noise)) for rest in found]
+    found = [
+        residuals(near, table, model, values=state[: len(model.param_names)]) for state in states
+    ]
+    squares = [
+        sum(((rest[sensor] / sd) ** 2).sum(axis=1) for sensor, sd in zip(SENSORS, noise))
+        for rest in found
+    ]
     time, cost = np.concatenate([w.time for w in near]), np.cumsum(squares[0] - squares[1])[:-1]
     gap, weight = np.diff(time), np.exp((cost.min() - cost) / 2) * np.diff(time)
     middle = time[:-1] + gap / 2
     mean = weight @ middle / weight.sum()
-    return float(mean), float(np.sqrt(weight @ ((middle - mean)**2 + gap**2 / 12) / weight.sum()))
+    return float(mean), float(np.sqrt(weight @ ((middle - mean) ** 2 + gap**2 / 12) / weight.sum()))

@@ -43,9 +43,13 @@ class ParameterSpace:
     The same for the part within windows: zero for effects that are smooth in time, since the bias varies there too and the noise within
     is modelled as white.
     """
-    slow_only: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3, bool) for sensor in SENSORS})
+    slow_only: dict[str, np.ndarray] = field(
+        default_factory=lambda: {sensor: np.zeros(3, bool) for sensor in SENSORS}
+    )
     """Sensor -> whether only the slow part of the centred rows is compared, shape (3,)."""
-    slow_variance: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.zeros(3) for sensor in SENSORS})
+    slow_variance: dict[str, np.ndarray] = field(
+        default_factory=lambda: {sensor: np.zeros(3) for sensor in SENSORS}
+    )
     """Sensor -> variance of the white noise that then replaces the fast part, shape (3,)."""
 
     @property
@@ -69,16 +73,37 @@ class ParameterSpace:
         own = {sensor: [np.isin(index, kept) for index in self.index[sensor]] for sensor in SENSORS}
 
         def cut(joins):
-            return {sensor: [join[:, np.append(mask, True)] for join, mask in zip(joins[sensor], own[sensor])] for sensor in SENSORS}
-        index = {sensor: [order[np.searchsorted(kept, index[mask], sorter=order)] for index, mask in zip(self.index[sensor], own[sensor])]
-                 for sensor in SENSORS}
-        return replace(self, names=tuple(self.names[k] for k in kept), prior_sd=self.prior_sd[kept], prior_mean=self.prior_mean[kept],
-                       index=index, join=cut(self.join), join_within=cut(self.join_within))
+            return {
+                sensor: [
+                    join[:, np.append(mask, True)] for join, mask in zip(joins[sensor], own[sensor])
+                ]
+                for sensor in SENSORS
+            }
+
+        index = {
+            sensor: [
+                order[np.searchsorted(kept, index[mask], sorter=order)]
+                for index, mask in zip(self.index[sensor], own[sensor])
+            ]
+            for sensor in SENSORS
+        }
+        return replace(
+            self,
+            names=tuple(self.names[k] for k in kept),
+            prior_sd=self.prior_sd[kept],
+            prior_mean=self.prior_mean[kept],
+            index=index,
+            join=cut(self.join),
+            join_within=cut(self.join_within),
+        )
 
     @cached_property
     def mean(self) -> dict[str, list[np.ndarray]]:
         """Sensor -> mean rows of the windows for each axis, shape (k, q_a + 1)."""
-        return {sensor: [self.recording.mean(sensor) @ join for join in self.join[sensor]] for sensor in SENSORS}
+        return {
+            sensor: [self.recording.mean(sensor) @ join for join in self.join[sensor]]
+            for sensor in SENSORS
+        }
 
     def within_each(self, sensor: str, axis: int, rows: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the products of the centred rows of the windows `rows` (mask), some windows at a time, shape (m, q_a + 1, q_a + 1)."""
@@ -88,14 +113,20 @@ class ParameterSpace:
             found[:, -1, -1] += missing[some]
             yield found
 
-    def within_sum(self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None) -> np.ndarray:
+    def within_sum(
+        self, sensor: str, axis: int, rows: np.ndarray, *, part: str | None = None
+    ) -> np.ndarray:
         """
         Return the sum of `within_each`, shape (q_a + 1, q_a + 1).
 
         `part` 'within' or 'slow'; default: the part that is compared on this axis.
         """
         join = self.join_within[sensor][axis]
-        found = join.T @ self.recording.product_sum(sensor, part or self._compared(sensor, axis), rows) @ join
+        found = (
+            join.T
+            @ self.recording.product_sum(sensor, part or self._compared(sensor, axis), rows)
+            @ join
+        )
         if part is None:
             found[-1, -1] += self._missing(sensor, axis)[rows].sum()
         return found
@@ -104,7 +135,9 @@ class ParameterSpace:
         """Return the products of the centred rows of each window with themselves times `weights` (q_a + 1,), shape (k, q_a + 1)."""
         join, recording = self.join_within[sensor][axis], self.recording
         found = np.zeros((len(recording.kind), join.shape[1]))
-        for some, factors in recording.factors_of(sensor, self._compared(sensor, axis), recording.moving):
+        for some, factors in recording.factors_of(
+            sensor, self._compared(sensor, axis), recording.moving
+        ):
             found[some] = ((factors @ (join @ weights))[:, None] @ factors)[:, 0] @ join
         return found
 
@@ -113,7 +146,7 @@ class ParameterSpace:
         columns, recording = weights @ self.join[sensor][axis].T, self.recording
         found = np.zeros(len(columns))
         for some, factors in recording.factors_of(sensor, 'within', recording.moving):
-            found[some] = ((factors @ columns[some, :, None])**2).sum(axis=(1, 2))
+            found[some] = ((factors @ columns[some, :, None]) ** 2).sum(axis=(1, 2))
         return found
 
     def _compared(self, sensor, axis):
@@ -124,7 +157,9 @@ class ParameterSpace:
         """Return the squares that replace the fast part of each window, zero where that part is compared, shape (k,)."""
         if not self.slow_only[sensor][axis]:
             return np.zeros(len(self.recording.count))
-        return self.slow_variance[sensor][axis] * np.maximum(self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0)
+        return self.slow_variance[sensor][axis] * np.maximum(
+            self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0
+        )
 
 
 def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> ParameterSpace:
@@ -150,21 +185,37 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
     shift = np.where(in_baseline, prior - recording.values, prior)
     removed = np.where(in_baseline, 0.0, recording.values)
     names = [*model.param_names, *(name for entry in bank for name in entry.param_names)]
-    smooth = np.concatenate([*(np.full(e.size, e.smooth) for e in model.effects),
-                             *(np.full(len(entry.param_names), entry.effect.smooth) for entry in bank)])
+    smooth = np.concatenate(
+        [
+            *(np.full(e.size, e.smooth) for e in model.effects),
+            *(np.full(len(entry.param_names), entry.effect.smooth) for entry in bank),
+        ]
+    )
     index, join, join_within = {}, {}, {}
     for sensor in SENSORS:
         jacobian = coefficient_jacobian(model, sensor, recording.values)
-        parts = [_join(jacobian[:, axis], sensor, axis, recording, removed, smooth) for axis in range(3)]
+        parts = [
+            _join(jacobian[:, axis], sensor, axis, recording, removed, smooth) for axis in range(3)
+        ]
         index[sensor], join[sensor], join_within[sensor] = map(list, zip(*parts))
     sd = np.concatenate([sd, *(entry.prior_sd for entry in bank)])
-    return ParameterSpace(recording, tuple(names), sd, np.pad(shift, (0, len(names) - len(shift))), index, join, join_within)
+    return ParameterSpace(
+        recording,
+        tuple(names),
+        sd,
+        np.pad(shift, (0, len(names) - len(shift))),
+        index,
+        join,
+        join_within,
+    )
 
 
 def bank_places(recording: ReducedRecording) -> dict[str, slice]:
     """Return label -> parameters of each entry of the banks."""
     entries = [entry for sensor in SENSORS for entry in recording.bank[sensor]]
-    ends = np.cumsum([len(recording.model.param_names), *(len(entry.param_names) for entry in entries)])
+    ends = np.cumsum(
+        [len(recording.model.param_names), *(len(entry.param_names) for entry in entries)]
+    )
     return {entry.label: slice(a, b) for entry, a, b in zip(entries, ends, ends[1:])}
 
 
@@ -201,8 +252,15 @@ def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Ques
         if effect.key in model.slices:
             found = {effect.name: model.slices[effect.key]}
         else:
-            found = {entry.label: places[entry.label] for entry in space.recording.bank.get(effect.sensor, ()) if entry.effect is effect}
-        asked += [Question(effect, tuple(range(part.start, part.stop)), effect.size, label) for label, part in found.items()]
+            found = {
+                entry.label: places[entry.label]
+                for entry in space.recording.bank.get(effect.sensor, ())
+                if entry.effect is effect
+            }
+        asked += [
+            Question(effect, tuple(range(part.start, part.stop)), effect.size, label)
+            for label, part in found.items()
+        ]
     return asked
 
 
@@ -212,7 +270,9 @@ def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ..
     return {sensor: [q.parameters for q in smooth if q.sensor == sensor] for sensor in SENSORS}
 
 
-def normal_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None) -> np.ndarray:
+def normal_matrix(
+    space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None
+) -> np.ndarray:
     """Return the normal matrix of the windows `select` (mask; all where not given), shape (q + 1, q + 1)."""
     of_means = np.zeros((space.size + 1, space.size + 1))
     for sensor in SENSORS:
@@ -222,23 +282,39 @@ def normal_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: n
     return within_matrix(space, noise, select) + of_means
 
 
-def within_matrix(space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None, *,
-                  sensors: Sequence[str] = SENSORS) -> np.ndarray:
+def within_matrix(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    select: np.ndarray | None = None,
+    *,
+    sensors: Sequence[str] = SENSORS,
+) -> np.ndarray:
     """Return the part of the normal matrix from within the windows."""
     total = np.zeros((space.size + 1, space.size + 1))
     for sensor in sensors:
         for axis in range(3):
             at = space.places(sensor, axis)
-            total[np.ix_(at, at)] += within_of_axis(space, noise[sensor], sensor, axis=axis, select=select)
+            total[np.ix_(at, at)] += within_of_axis(
+                space, noise[sensor], sensor, axis=axis, select=select
+            )
     return total
 
 
-def within_of_axis(space: ParameterSpace, noise: NoiseModel, sensor: str, *, axis: int, select: np.ndarray | None = None) -> np.ndarray:
+def within_of_axis(
+    space: ParameterSpace,
+    noise: NoiseModel,
+    sensor: str,
+    *,
+    axis: int,
+    select: np.ndarray | None = None,
+) -> np.ndarray:
     """Return the same of one axis over its own columns, ``space.places(sensor, axis)``."""
     total, kind = np.zeros((len(space.places(sensor, axis)),) * 2), space.recording.kind
     chosen = space.recording.moving if select is None else select & space.recording.moving
     for name in np.unique(kind[chosen]):
-        total += space.within_sum(sensor, axis, chosen & (kind == name)) / noise.row_variance(name)[axis]
+        total += (
+            space.within_sum(sensor, axis, chosen & (kind == name)) / noise.row_variance(name)[axis]
+        )
     return total
 
 
@@ -247,35 +323,66 @@ def matrix_of_each(space: ParameterSpace, noise: dict[str, NoiseModel]) -> np.nd
     moving, kind = space.recording.moving, space.recording.kind
     total = np.zeros((len(kind), space.size + 1, space.size + 1))
     for sensor in SENSORS:
-        variance = np.array([noise[sensor].row_variance(name) for name in kind[moving]]).reshape(-1, 3)
+        variance = np.array([noise[sensor].row_variance(name) for name in kind[moving]]).reshape(
+            -1, 3
+        )
         for axis, rows in enumerate(white_means(space, noise, sensor)):
             at = space.places(sensor, axis)
             own = rows[:, :, None] * rows[:, None, :]
-            own[moving] += np.concatenate(list(space.within_each(sensor, axis, moving))) / variance[:, axis, None, None]
+            own[moving] += (
+                np.concatenate(list(space.within_each(sensor, axis, moving)))
+                / variance[:, axis, None, None]
+            )
             total[:, at[:, None], at] += own
     return total
 
 
-def scatter_of_each(space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray) -> dict[str, np.ndarray]:
+def scatter_of_each(
+    space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return sensor -> factor of each window's scatter within, at parameters (q,), over its kind, shape (k, 3)."""
     recording, found, reduced = space.recording, {}, space.reduced(range(space.size), values)
     for sensor in SENSORS:
-        usual = np.array([noise[sensor].row_variance(name) for name in recording.kind]) * np.maximum(recording.count - 1, 1)[:, None]
+        usual = (
+            np.array([noise[sensor].row_variance(name) for name in recording.kind])
+            * np.maximum(recording.count - 1, 1)[:, None]
+        )
         at = [space.places(sensor, axis) for axis in range(3)]
-        own = [space.slopes_within(sensor, axis, reduced[at[axis]]) @ reduced[at[axis]] for axis in range(3)]
+        own = [
+            space.slopes_within(sensor, axis, reduced[at[axis]]) @ reduced[at[axis]]
+            for axis in range(3)
+        ]
         found[sensor] = np.maximum(np.stack(own, axis=1) / usual, 1.0)
     return found
 
 
-def white_means(space: ParameterSpace, noise: dict[str, NoiseModel], sensor: str, *, scatter: np.ndarray | None = None) -> list[np.ndarray]:
+def white_means(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    sensor: str,
+    *,
+    scatter: np.ndarray | None = None,
+) -> list[np.ndarray]:
     """
     Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1).
 
     `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
     """
     recording, own = space.recording, noise[sensor]
-    variance = own.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys) + own.offset_sd**2
+    variance = (
+        own.variance_beside_bias(
+            recording.kind, recording.count, recording.duration, keys=recording.keys
+        )
+        + own.offset_sd**2
+    )
     if scatter is not None:
         variance = variance + (scatter - 1) * own.mean_variance(recording.kind, recording.count)
-    return [Whitening(variance[:, axis:axis + 1], recording.time, recording.sessions, processes=own.bias_processes)(rows[:, None])[:, 0]
-            for axis, rows in enumerate(space.mean[sensor])]
+    return [
+        Whitening(
+            variance[:, axis : axis + 1],
+            recording.time,
+            recording.sessions,
+            processes=own.bias_processes,
+        )(rows[:, None])[:, 0]
+        for axis, rows in enumerate(space.mean[sensor])
+    ]

@@ -12,7 +12,13 @@ from imu_calibration.estimation.observability import ALL_MOTIONS
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
 from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch, grammar
 from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.residual_blocks import BlockFit, BlockFits, RestBlocks, share_interval, share_removed
+from imu_calibration.selection.residual_blocks import (
+    BlockFit,
+    BlockFits,
+    RestBlocks,
+    share_interval,
+    share_removed,
+)
 
 MIN_FORMULA_SHARE = 0.6
 """Share of the excess that a formula removes from held-out windows at least."""
@@ -75,26 +81,52 @@ class Proposal:
     @property
     def relation(self) -> str:
         """Description of the proposal."""
-        parts = [f'{_size(effect, value, sd)}' for effect, value, sd in zip(self.effects, self.values, self.sds)]
-        text = (f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
-                + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts)))
+        parts = [
+            f'{_size(effect, value, sd)}'
+            for effect, value, sd in zip(self.effects, self.values, self.sds)
+        ]
+        text = (
+            f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
+            + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts))
+        )
         if self.nearest is not None:
-            text += (f'; it is not in the catalogue: {self.nearest[0]}, the closest effect, '
-                     f'would remove {100 * max(self.nearest[1], 0.0):.0f} %')
-            text += ' here, but the remaining axes or sensor contradict it' * (self.nearest[1] > MIN_FORMULA_SHARE)
+            text += (
+                f'; it is not in the catalogue: {self.nearest[0]}, the closest effect, '
+                f'would remove {100 * max(self.nearest[1], 0.0):.0f} %'
+            )
+            text += ' here, but the remaining axes or sensor contradict it' * (
+                self.nearest[1] > MIN_FORMULA_SHARE
+            )
         if self.alike:
             text += f'; collinear in this recording: {" or ".join(self.alike)}'
         return text
 
     def to_mapping(self) -> dict:
         """Return the proposal as plain data."""
-        terms = [{'name': effect.name, 'definition': effect.definition, 'value': value.tolist(), 'sd': sd.tolist(), 'rms': size}
-                 for effect, value, sd, size in zip(self.effects, self.values, self.sds, self.sizes)]
-        return {'terms': terms, 'axes': list(self.axes), 'share_of_unexplained': self.share, 'ci95': list(self.ci95),
-                'rms_reduction': self.reduction,
-                'p_value': self.p_value, 'indistinguishable_from': list(self.alike),
-                'nearest_of_the_catalogue': None if self.nearest is None else {'effect': self.nearest[0], 'share': self.nearest[1]},
-                'confirming_motion': self.motion, 'sentence': self.sentence}
+        terms = [
+            {
+                'name': effect.name,
+                'definition': effect.definition,
+                'value': value.tolist(),
+                'sd': sd.tolist(),
+                'rms': size,
+            }
+            for effect, value, sd, size in zip(self.effects, self.values, self.sds, self.sizes)
+        ]
+        return {
+            'terms': terms,
+            'axes': list(self.axes),
+            'share_of_unexplained': self.share,
+            'ci95': list(self.ci95),
+            'rms_reduction': self.reduction,
+            'p_value': self.p_value,
+            'indistinguishable_from': list(self.alike),
+            'nearest_of_the_catalogue': None
+            if self.nearest is None
+            else {'effect': self.nearest[0], 'share': self.nearest[1]},
+            'confirming_motion': self.motion,
+            'sentence': self.sentence,
+        }
 
 
 def find_formulas(blocks: RestBlocks, problem: LinearisedProblem) -> list[FormulaChoice]:
@@ -103,8 +135,12 @@ def find_formulas(blocks: RestBlocks, problem: LinearisedProblem) -> list[Formul
 
     They are chosen on the selection windows, with all plausible contributions of the catalogue projected out.
     """
-    search = FormulaSearch(blocks, _grammar(blocks), _plausible(blocks.sensor, problem),
-                           reference_temperature=problem.recording.model.temperature_ref_c)
+    search = FormulaSearch(
+        blocks,
+        _grammar(blocks),
+        _plausible(blocks.sensor, problem),
+        reference_temperature=problem.recording.model.temperature_ref_c,
+    )
     found: list[FormulaChoice] = []
     while len(found) < MOST_TERMS:
         if found:
@@ -116,7 +152,13 @@ def find_formulas(blocks: RestBlocks, problem: LinearisedProblem) -> list[Formul
     return found
 
 
-def propose(blocks: RestBlocks, problem: LinearisedProblem, fits: BlockFits, *, formulas: Sequence[FormulaChoice]) -> Proposal | None:
+def propose(
+    blocks: RestBlocks,
+    problem: LinearisedProblem,
+    fits: BlockFits,
+    *,
+    formulas: Sequence[FormulaChoice],
+) -> Proposal | None:
     """
     Return a Proposal for the residual of a sensor with the chosen effects, or None where no formula removes most of it.
 
@@ -135,7 +177,9 @@ def propose(blocks: RestBlocks, problem: LinearisedProblem, fits: BlockFits, *, 
         if choices and grown < share + WORTH_A_SECOND:
             break
         choices, share = [*choices, found], grown
-    needed = MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
+    needed = (
+        MIN_SMOOTH_SHARE if any(choice.formula.smooth for choice in choices) else MIN_FORMULA_SHARE
+    )
     if not choices or share < needed:
         return None
     return _proposal_of(blocks, problem, fits, plain, choices)
@@ -150,9 +194,15 @@ def _plausible(sensor, problem):
     plausible = np.diag(problem.space.prior_sd)
     other = next(each for each in SENSORS if each != sensor)
     for question in problem.questions:
-        if question.sensor not in SENSORS and other in question.effect.acts_on and len(question.effect.acts_on) > 1:
+        if (
+            question.sensor not in SENSORS
+            and other in question.effect.acts_on
+            and len(question.effect.acts_on) > 1
+        ):
             own = list(question.parameters)
-            known = problem.evidence.known_from(other, [*problem.search.baseline, *own])[-len(own):, -len(own):]
+            known = problem.evidence.known_from(other, [*problem.search.baseline, *own])[
+                -len(own) :, -len(own) :
+            ]
             plausible[np.ix_(own, own)] = OTHER_SENSOR * np.linalg.cholesky(known)
     return plausible
 
@@ -180,20 +230,40 @@ def _proposal_of(blocks, problem, fits, plain, choices):
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)
     share = share_removed(plain, after)
-    alike = [_joined_text(f.columns[0]) + ' in any phase' * (len(f.columns) > 1) for f in choices[0].alike[:SHOWN_ALIKE]]
+    alike = [
+        _joined_text(f.columns[0]) + ' in any phase' * (len(f.columns) > 1)
+        for f in choices[0].alike[:SHOWN_ALIKE]
+    ]
     taken = {name for _, name in problem.baseline.catalogue.effects(problem.baseline.joint_names)}
-    effects = tuple(_effect(blocks.sensor, number, text, formula, after.amplitudes[number], taken)
-                    for number, (_, text, formula) in enumerate(terms))
+    effects = tuple(
+        _effect(blocks.sensor, number, text, formula, after.amplitudes[number], taken)
+        for number, (_, text, formula) in enumerate(terms)
+    )
     seen = np.abs(after.amplitudes) > CONCERNED_SDS * after.sd
     rms = np.sqrt((columns**2).mean(axis=0))
     strong = (np.abs(after.amplitudes) * rms).sum(axis=0)
-    axes = tuple(axis for k, axis in enumerate(AXES) if seen[:, k].any() and strong[k] > 0.1 * strong.max())
+    axes = tuple(
+        axis for k, axis in enumerate(AXES) if seen[:, k].any() and strong[k] > 0.1 * strong.max()
+    )
     return Proposal(
-        blocks.sensor, effects, tuple(after.amplitudes), tuple(after.sd), frozenset().union(*(formula.family for _, _, formula in terms)),
+        blocks.sensor,
+        effects,
+        tuple(after.amplitudes),
+        tuple(after.sd),
+        frozenset().union(*(formula.family for _, _, formula in terms)),
         axes,
-        share, share_interval(plain, after, np.random.default_rng(1)), 1.0 - float(np.sqrt(max(1.0 - share, 0.0))), choices[0].p_value,
-        tuple(alike), _nearest(fits, plain, problem), _motion(effects),
-        tuple(float(np.sqrt((rms[k]**2 * amplitude**2).sum())) for k, amplitude in enumerate(after.amplitudes)))
+        share,
+        share_interval(plain, after, np.random.default_rng(1)),
+        1.0 - float(np.sqrt(max(1.0 - share, 0.0))),
+        choices[0].p_value,
+        tuple(alike),
+        _nearest(fits, plain, problem),
+        _motion(effects),
+        tuple(
+            float(np.sqrt((rms[k] ** 2 * amplitude**2).sum()))
+            for k, amplitude in enumerate(after.amplitudes)
+        ),
+    )
 
 
 def _shapes(fits, choices, choice):
@@ -201,20 +271,26 @@ def _shapes(fits, choices, choice):
     formula, columns = choice.formula, choice.columns
     if len(formula.columns) == 1:
         return [(columns, formula.columns[0], formula)]
-    first = sum(other.columns.shape[1] for other in choices[:choices.index(choice)])
-    amplitudes = fits.fit(_joined(choices)).amplitudes[first:first + columns.shape[1]]
+    first = sum(other.columns.shape[1] for other in choices[: choices.index(choice)])
+    amplitudes = fits.fit(_joined(choices)).amplitudes[first : first + columns.shape[1]]
     scale = np.sqrt((columns**2).mean(axis=(0, 2)))
     left, sizes = np.linalg.svd(amplitudes * scale[:, None])[:2]
-    count = 1 if sizes[0]**2 > ONE_SHAPE * (sizes**2).sum() else 2
+    count = 1 if sizes[0] ** 2 > ONE_SHAPE * (sizes**2).sum() else 2
     found = []
     for weights in (left[:, :count] / scale[:, None]).T:
         weights = weights / weights[np.argmax(np.abs(weights))]
         if formula.phased:
             phase = float(f'{np.arctan2(weights[1], weights[0]):.4g}')
-            weights, text = np.array([np.cos(phase), np.sin(phase)]), formula.phased.format(phase=phase).replace('- -', '+ ')
+            weights, text = (
+                np.array([np.cos(phase), np.sin(phase)]),
+                formula.phased.format(phase=phase).replace('- -', '+ '),
+            )
         else:
-            weights = np.where(np.abs(weights) * scale > 0.03 * np.max(np.abs(weights) * scale),
-                               np.array([float(f'{w:.4g}') for w in weights]), 0.0)
+            weights = np.where(
+                np.abs(weights) * scale > 0.03 * np.max(np.abs(weights) * scale),
+                np.array([float(f'{w:.4g}') for w in weights]),
+                0.0,
+            )
             text = _summed(formula.columns, weights)
         found.append((np.einsum('bka,k->ba', columns, weights)[:, None], text, formula))
     return found
@@ -224,7 +300,11 @@ def _summed(columns, weights):
     """Return the text, or three texts, of a weighted sum of columns."""
     if not isinstance(columns[0], str):
         return tuple(_summed([column[axis] for column in columns], weights) for axis in range(3))
-    return ' + '.join(f'{weight:g} * {column}' if weight != 1.0 else column for column, weight in zip(columns, weights) if weight)
+    return ' + '.join(
+        f'{weight:g} * {column}' if weight != 1.0 else column
+        for column, weight in zip(columns, weights)
+        if weight
+    )
 
 
 def _effect(sensor, number, text, formula, values, taken):
@@ -232,9 +312,17 @@ def _effect(sensor, number, text, formula, values, taken):
     largest = float(np.abs(values).max())
     names = (f'{PREFIXES[sensor]}_proposed_{k}' for k in range(1, 100))
     free = [name for name in names if name not in taken][number]
-    return term(free, sensor=sensor, column=text if isinstance(text, str) else list(text), unit=unit, tolerance=_digits(0.1 * largest),
-                tolerance_reason='a tenth of the estimate', prior_sd=_digits(10 * largest), largest=_digits(3 * largest),
-                text=f'The {sensor} output follows {_joined_text(text)}: a formula that a diagnosis proposed, its cause is not known.')
+    return term(
+        free,
+        sensor=sensor,
+        column=text if isinstance(text, str) else list(text),
+        unit=unit,
+        tolerance=_digits(0.1 * largest),
+        tolerance_reason='a tenth of the estimate',
+        prior_sd=_digits(10 * largest),
+        largest=_digits(3 * largest),
+        text=f'The {sensor} output follows {_joined_text(text)}: a formula that a diagnosis proposed, its cause is not known.',
+    )
 
 
 def _digits(value):
@@ -253,18 +341,29 @@ def _text_of(effect):
 def _size(effect, values, sd):
     k = int(np.argmax(np.abs(values)))
     factor, unit = for_people(effect.unit_of(k), effect.sensor)
-    return f"{' ± '.join(with_sd(values[k] * factor, sd[k] * factor))} {unit} on {AXES[k]}"
+    return f'{" ± ".join(with_sd(values[k] * factor, sd[k] * factor))} {unit} on {AXES[k]}'
 
 
 def _motion(effects):
-    return '; '.join(dict.fromkeys(ALL_MOTIONS[name] for effect in effects for name in effect.motion[:1] if name in ALL_MOTIONS))
+    return '; '.join(
+        dict.fromkeys(
+            ALL_MOTIONS[name]
+            for effect in effects
+            for name in effect.motion[:1]
+            if name in ALL_MOTIONS
+        )
+    )
 
 
-def _nearest(fits: BlockFits, plain: BlockFit, problem: LinearisedProblem) -> tuple[str, float] | None:
+def _nearest(
+    fits: BlockFits, plain: BlockFit, problem: LinearisedProblem
+) -> tuple[str, float] | None:
     """Return (effect, share removed) of the best fit in the catalogue."""
     best: tuple[str, float] | None = None
     for question in problem.questions:
-        if set(question.parameters) <= fits.used or not any(np.isin(question.parameters, index).any() for index in fits.blocks.index):
+        if set(question.parameters) <= fits.used or not any(
+            np.isin(question.parameters, index).any() for index in fits.blocks.index
+        ):
             continue
         share = share_removed(plain, fits.fit(more=question.parameters))
         if best is None or share > best[1]:

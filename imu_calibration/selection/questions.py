@@ -50,7 +50,9 @@ class Question:
         return self.effect.sensor
 
 
-def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]) -> tuple[list[Effect], list[dict]]:
+def testable_effects(
+    model: SensorModel, table: Table, windows: Sequence[Window]
+) -> tuple[list[Effect], list[dict]]:
     """
     Return (testable effects, list of {'effect', 'why', 'needs'} for all other ones).
 
@@ -65,12 +67,28 @@ def testable_effects(model: SensorModel, table: Table, windows: Sequence[Window]
 
     """
     kinds = {window.kind for window in windows}
-    means = [float(np.mean(window.temperature_c)) for window in windows if window.temperature_c is not None]
+    means = [
+        float(np.mean(window.temperature_c))
+        for window in windows
+        if window.temperature_c is not None
+    ]
     span = max(means) - min(means) if means and len(means) == len(windows) else None
     have = {e.key for e in model.effects}
-    branches = [float(window.motion.thermal_branch.mean()) for window in windows if window.motion.thermal_branch is not None]
-    turned, shaken = bool(branches) and max(branches) - min(branches) >= BRANCHES_APART, _vibrates(windows)
-    return sort_effects(model, lambda effect: _why_not(effect, have, table, kinds=kinds, span=span, turned=turned, shaken=shaken))
+    branches = [
+        float(window.motion.thermal_branch.mean())
+        for window in windows
+        if window.motion.thermal_branch is not None
+    ]
+    turned, shaken = (
+        bool(branches) and max(branches) - min(branches) >= BRANCHES_APART,
+        _vibrates(windows),
+    )
+    return sort_effects(
+        model,
+        lambda effect: _why_not(
+            effect, have, table, kinds=kinds, span=span, turned=turned, shaken=shaken
+        ),
+    )
 
 
 def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
@@ -95,7 +113,12 @@ def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], l
 def _vibrates(windows):
     """Return whether vibration differs between rests."""
     rests = [window for window in windows if window.kind == 'static' and len(window) > 3]
-    variances = np.array([max(window.noise_sd[0] @ window.noise_sd[0], least_variance(window.force_s)) for window in rests])
+    variances = np.array(
+        [
+            max(window.noise_sd[0] @ window.noise_sd[0], least_variance(window.force_s))
+            for window in rests
+        ]
+    )
     return np.count_nonzero(variances > VIBRATES * variances.min(initial=np.inf)) >= SHAKEN_RESTS
 
 
@@ -104,19 +127,31 @@ def _why_not(effect, have, table, *, kinds, span, turned, shaken):
     if 'temperature' in effect.needs and span is None:
         return 'no temperature was recorded with all windows', 'record imu/temperature'
     if 'temperature' in effect.needs and span < TEMPERATURE_SPAN:
-        return f'the temperature changed by {span:.2f} K only', 'record while the sensor warms up by at least some kelvins'
+        return (
+            f'the temperature changed by {span:.2f} K only',
+            'record while the sensor warms up by at least some kelvins',
+        )
     if 'rotation' in effect.needs and not moving:
         return 'the recording has no rotation', 'spin and swing the table'
     if 'dynamic' in effect.needs and not moving:
         return 'the recording has no motion', 'swing the table at several frequencies'
     if (effect.sensor, effect.contained_in) in have:
-        return f'the {effect.contained_in} of the model contains it', f'omit {effect.contained_in} in the model'
+        return (
+            f'the {effect.contained_in} of the model contains it',
+            f'omit {effect.contained_in} in the model',
+        )
     if effect.moot and (why := effect.moot(table)):
         return why
     if 'cooling' in effect.needs and not turned:
-        return 'the temperature did not reverse: one branch only', f'record while it warms up and while it cools, by {TURN:g} K'
+        return (
+            'the temperature did not reverse: one branch only',
+            f'record while it warms up and while it cools, by {TURN:g} K',
+        )
     if 'vibration' in effect.needs and not shaken:
-        return 'it did not vibrate now more, now less at rest', f'record {SHAKEN_RESTS} rests and more while a machine on the table runs'
+        return (
+            'it did not vibrate now more, now less at rest',
+            f'record {SHAKEN_RESTS} rests and more while a machine on the table runs',
+        )
     return None
 
 
@@ -129,13 +164,19 @@ def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel
     """Return the model with all these effects, except those that are tested differently (warm-ups, saturation)."""
     kept = [e for e in effects if e.warp is not None or not special(e)]
     added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SECTIONS}
-    return replace(model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()})
+    return replace(
+        model, **{sensor: getattr(model, sensor) + names for sensor, names in added.items()}
+    )
 
 
-def point_with(model: SensorModel, effects: Sequence[Effect], values: dict[str, float]) -> tuple[SensorModel, np.ndarray]:
+def point_with(
+    model: SensorModel, effects: Sequence[Effect], values: dict[str, float]
+) -> tuple[SensorModel, np.ndarray]:
     """Return (the model with all these effects linearised there, its parameters) at the given values, else at the prior."""
     wide = extended_model(model, effects)
-    start = np.array([values.get(name, known) for name, known in zip(wide.param_names, wide.start())])
+    start = np.array(
+        [values.get(name, known) for name, known in zip(wide.param_names, wide.start())]
+    )
     start = np.where(np.isfinite(start), start, 0.0)
     return wide.at(start), start
 
@@ -171,8 +212,10 @@ def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | Non
 
 def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> list[SensorModel]:
     """Return the model with the columns of a warm-up at each of several time constants that a recording of `duration` s can show."""
-    return [replace(model, point={**model.point, effect.name: effect.at_time_constant(constant)})
-            for constant in time_constants(duration, STARTS)]
+    return [
+        replace(model, point={**model.point, effect.name: effect.at_time_constant(constant)})
+        for constant in time_constants(duration, STARTS)
+    ]
 
 
 def _cautious(solution):
@@ -187,7 +230,10 @@ def _cautious(solution):
     for effect in model.relinearised:
         if effect.warp is not None:
             part = model.slices[effect.key]
-            move[part], pull[part] = values[part] - model.point_of(effect), (LINEAR_STEPS * effect.step)**-2
+            move[part], pull[part] = (
+                values[part] - model.point_of(effect),
+                (LINEAR_STEPS * effect.step) ** -2,
+            )
     moving = np.flatnonzero(pull)
     if not len(moving):
         return values

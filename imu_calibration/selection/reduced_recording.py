@@ -9,7 +9,13 @@ import numpy as np
 
 from imu_calibration.core.progress import report
 from imu_calibration.effects.base import SENSORS, Effect
-from imu_calibration.effects.forward_equations import References, all_arms, coefficients, columns, effect_slopes
+from imu_calibration.effects.forward_equations import (
+    References,
+    all_arms,
+    coefficients,
+    columns,
+    effect_slopes,
+)
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restricted_window, selected_columns
 from imu_calibration.estimation.noise_model import sessions_of
@@ -69,7 +75,10 @@ class BankEntry:
     @property
     def param_names(self) -> list[str]:
         """Names of the amplitudes."""
-        return [f'{self.label}.{component}' for component in self.effect.amplitudes(self.effect.components)]
+        return [
+            f'{self.label}.{component}'
+            for component in self.effect.amplitudes(self.effect.components)
+        ]
 
     @property
     def prior_sd(self) -> np.ndarray:
@@ -78,31 +87,55 @@ class BankEntry:
 
     def columns(self, ref: Reference) -> np.ndarray:
         """Return the columns that the amplitudes multiply, shape (n, n_columns)."""
-        return np.concatenate([group.columns(ref, self.point)[:, rows] for group, rows in self.used], axis=1)
+        return np.concatenate(
+            [group.columns(ref, self.point)[:, rows] for group, rows in self.used], axis=1
+        )
 
 
-def make_bank(effects: Sequence[Effect], constants: np.ndarray, model: SensorModel, *, values: np.ndarray) -> dict[str, list[BankEntry]]:
+def make_bank(
+    effects: Sequence[Effect], constants: np.ndarray, model: SensorModel, *, values: np.ndarray
+) -> dict[str, list[BankEntry]]:
     """Return sensor -> list of BankEntry for the `effects` that have a time constant, at `values` of a model for the rest of the sensor."""
     bank = {sensor: [] for sensor in SENSORS}
     for effect in effects:
         if effect.time_constant:
-            bank[effect.sensor] += [_entry(effect, number, constant, model, values) for number, constant in enumerate(constants)]
+            bank[effect.sensor] += [
+                _entry(effect, number, constant, model, values)
+                for number, constant in enumerate(constants)
+            ]
     return bank
 
 
-def columns_with_bank(references: References, sensor: str, bank: dict[str, list[BankEntry]]) -> np.ndarray:
+def columns_with_bank(
+    references: References, sensor: str, bank: dict[str, list[BankEntry]]
+) -> np.ndarray:
     """Return the columns of `sensor` in the model of `references`, and those of the bank."""
-    return np.concatenate([columns(references, sensor), *(entry.columns(references.at(sensor)) for entry in bank[sensor])], axis=1)
+    return np.concatenate(
+        [
+            columns(references, sensor),
+            *(entry.columns(references.at(sensor)) for entry in bank[sensor]),
+        ],
+        axis=1,
+    )
 
 
 def _entry(effect, number, constant, model, values):
     own = effect.at_time_constant(constant)
     point = {**model.full_point(), effect.name: own}
-    slopes = effect_slopes(effect, {**model.values_of(effect.sensor, values), effect.name: own}, point)[1]
-    amplitudes = {name: effect.amplitudes(np.moveaxis(block, -1, 0)) for name, block in slopes.items()}
-    used = [(group, np.flatnonzero(np.any(amplitudes[group.name] != 0, axis=(0, 2)))) for group in effect.groups]
+    slopes = effect_slopes(
+        effect, {**model.values_of(effect.sensor, values), effect.name: own}, point
+    )[1]
+    amplitudes = {
+        name: effect.amplitudes(np.moveaxis(block, -1, 0)) for name, block in slopes.items()
+    }
+    used = [
+        (group, np.flatnonzero(np.any(amplitudes[group.name] != 0, axis=(0, 2))))
+        for group in effect.groups
+    ]
     joined = np.concatenate([amplitudes[group.name][:, rows] for group, rows in used], axis=1)
-    return BankEntry(effect, number, point, tuple(used), np.moveaxis(joined, 0, -1), f'{effect.name}@{number}')
+    return BankEntry(
+        effect, number, point, tuple(used), np.moveaxis(joined, 0, -1), f'{effect.name}@{number}'
+    )
 
 
 PARTS = ('within', 'slow')
@@ -175,13 +208,19 @@ class ReducedRecording:
     @property
     def period(self) -> float:
         """Typical time from sample to sample, s."""
-        return float(np.median([max(window.duration, 1e-3) / window.count for window in self.windows]))
+        return float(
+            np.median([max(window.duration, 1e-3) / window.count for window in self.windows])
+        )
 
     def mean(self, sensor: str) -> np.ndarray:
         """Return the mean rows ``[columns | residual]``, shape (k, p + 3)."""
-        return self._with_residual(sensor, np.array([window.sensors[sensor].mean for window in self.windows]))
+        return self._with_residual(
+            sensor, np.array([window.sensors[sensor].mean for window in self.windows])
+        )
 
-    def factors_of(self, sensor: str, part: str, rows: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def factors_of(
+        self, sensor: str, part: str, rows: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
         Yield the triangular factors of the centred rows ``[columns | residual]``, of some windows at a time.
 
@@ -203,8 +242,14 @@ class ReducedRecording:
         """
         chosen = np.flatnonzero(rows & self.moving)
         for at in range(0, len(chosen), UNPACKED_WINDOWS):
-            some = chosen[at:at + UNPACKED_WINDOWS]
-            yield some, self._with_residual(sensor, unpacked([self.factors[sensor, part][k] for k in some], self._width(sensor)))
+            some = chosen[at : at + UNPACKED_WINDOWS]
+            yield (
+                some,
+                self._with_residual(
+                    sensor,
+                    unpacked([self.factors[sensor, part][k] for k in some], self._width(sensor)),
+                ),
+            )
 
     def product_sum(self, sensor: str, part: str, rows: np.ndarray) -> np.ndarray:
         """Return the products of the centred rows ``[columns | residual]`` of the windows `rows` (mask), summed, shape (p + 3, p + 3)."""
@@ -235,7 +280,7 @@ class ReducedRecording:
 
     def _with_residual(self, sensor, rows):
         own = self._coefficients[sensor]
-        rows[..., -3:] -= rows[..., :len(own)] @ own
+        rows[..., -3:] -= rows[..., : len(own)] @ own
         return rows
 
     def rebased(self, values: np.ndarray) -> 'ReducedRecording':
@@ -245,9 +290,12 @@ class ReducedRecording:
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
         """Return the recording of the windows `rows` (mask) alone."""
         chosen = np.flatnonzero(rows)
-        return replace(self, windows=tuple(self.windows[k] for k in chosen),
-                       factors={key: [factors[k] for k in chosen] for key, factors in self.factors.items()},
-                       describe={name: values[rows] for name, values in self.describe.items()})
+        return replace(
+            self,
+            windows=tuple(self.windows[k] for k in chosen),
+            factors={key: [factors[k] for k in chosen] for key, factors in self.factors.items()},
+            describe={name: values[rows] for name, values in self.describe.items()},
+        )
 
     def accumulated(self, model: SensorModel) -> Accumulator:
         """Return the Accumulator of a model; its columns are a subset of this recording's."""
@@ -259,13 +307,27 @@ class ReducedRecording:
 
     def _with_factors(self, k):
         """Return a window with its triangular factors."""
-        sensors = {sensor: replace(known, **{part: unpacked([self.factors[sensor, part][k]], self._width(sensor))[0] for part in PARTS})
-                   for sensor, known in self.windows[k].sensors.items()}
+        sensors = {
+            sensor: replace(
+                known,
+                **{
+                    part: unpacked([self.factors[sensor, part][k]], self._width(sensor))[0]
+                    for part in PARTS
+                },
+            )
+            for sensor, known in self.windows[k].sensors.items()
+        }
         return replace(self.windows[k], sensors=sensors)
 
 
-def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray,
-                     bank: dict[str, list[BankEntry]]) -> ReducedRecording:
+def reduce_recording(
+    windows: Sequence[Window],
+    table: Table,
+    model: SensorModel,
+    *,
+    values: np.ndarray,
+    bank: dict[str, list[BankEntry]],
+) -> ReducedRecording:
     """
     Reduce windows with the columns of a model and a bank of time constants.
 
@@ -282,25 +344,47 @@ def reduce_recording(windows: Sequence[Window], table: Table, model: SensorModel
 
     """
     reduced = []
-    factors: dict[tuple[str, str], list[np.ndarray]] = {(sensor, part): [] for sensor in SENSORS for part in PARTS}
+    factors: dict[tuple[str, str], list[np.ndarray]] = {
+        (sensor, part): [] for sensor in SENSORS for part in PARTS
+    }
     for some in chunks(windows):
-        for window in reduce_windows(some, model, table, column_function=partial(columns_with_bank, bank=bank)):
+        for window in reduce_windows(
+            some, model, table, column_function=partial(columns_with_bank, bank=bank)
+        ):
             for (sensor, part), kept in factors.items():
                 factor = getattr(window.sensors[sensor], part)
                 kept.append(np.zeros(0) if factor is None else packed(factor))
-            reduced.append(replace(window, sensors={sensor: replace(known, within=known.within[:0].copy(), slow=None)
-                                                    for sensor, known in window.sensors.items()}))
+            reduced.append(
+                replace(
+                    window,
+                    sensors={
+                        sensor: replace(known, within=known.within[:0].copy(), slow=None)
+                        for sensor, known in window.sensors.items()
+                    },
+                )
+            )
         report(REDUCING, len(reduced), len(windows))
     descriptions = [_describe(window) for window in windows]
-    return ReducedRecording(model, values, bank, tuple(reduced), factors,
-                            {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]})
+    return ReducedRecording(
+        model,
+        values,
+        bank,
+        tuple(reduced),
+        factors,
+        {name: np.array([d[name] for d in descriptions]) for name in descriptions[0]},
+    )
 
 
 def _describe(window):
     motion = window.motion
-    found = {'time': float(window.time.mean()), 'specific force': float(np.linalg.norm(window.force_s.mean(axis=0))),
-             'temperature': np.nan if window.temperature_c is None else float(window.temperature_c.mean()),
-             'rate': float(np.sqrt((motion.rate**2).sum(axis=1).mean()))}
+    found = {
+        'time': float(window.time.mean()),
+        'specific force': float(np.linalg.norm(window.force_s.mean(axis=0))),
+        'temperature': np.nan
+        if window.temperature_c is None
+        else float(window.temperature_c.mean()),
+        'rate': float(np.sqrt((motion.rate**2).sum(axis=1).mean())),
+    }
     for joint in range(motion.position.shape[1]):
         found[f'angle{joint}'] = float(motion.position[:, joint].mean())
         found[f'span{joint}'] = float(np.ptp(motion.position[:, joint]))

@@ -45,8 +45,12 @@ class Variable:
     def ranges(self) -> np.ndarray:
         """Ranges of neighbouring bins, 1 in each bin of a range, the shortest first, shape (r, k)."""
         count, places = int(self.bins.max()) + 1, np.arange(int(self.bins.max()) + 1)
-        parts = [(places - first) % count < length for length in range(1, count) for first in range(count)
-                 if self.cyclic or first + length <= count]
+        parts = [
+            (places - first) % count < length
+            for length in range(1, count)
+            for first in range(count)
+            if self.cyclic or first + length <= count
+        ]
         return np.array(parts, float).reshape(-1, count)
 
     @property
@@ -58,24 +62,35 @@ class Variable:
             turns = np.arange(1, SMOOTH_ORDER + 1) * (self.values * DEG)[:, None]
             return block_means(np.concatenate([np.cos(turns), np.sin(turns)], axis=1), self.starts)
         low, high = self.values.min(), self.values.max()
-        return block_means(np.polynomial.legendre.legvander(2 * (self.values - low) / (high - low) - 1, SMOOTH_ORDER)[:, 1:], self.starts)
+        return block_means(
+            np.polynomial.legendre.legvander(
+                2 * (self.values - low) / (high - low) - 1, SMOOTH_ORDER
+            )[:, 1:],
+            self.starts,
+        )
 
     def chosen(self, member: np.ndarray) -> list[int]:
         """Return the bins of a range, in order."""
         bins = np.flatnonzero(member)
-        gap = np.flatnonzero(np.diff(bins) > 1)   # a cyclic range may begin beyond where it ends
+        gap = np.flatnonzero(np.diff(bins) > 1)  # a cyclic range may begin beyond where it ends
         return np.roll(bins, -gap[0] - 1).tolist() if len(gap) else bins.tolist()
 
     def bounds(self, chosen: Sequence[int]) -> tuple[float, float] | None:
         """Return where a range of bins begins and ends, or None for classes."""
-        return (float(self.edges[chosen[0]]), float(self.edges[chosen[-1] + 1])) if len(self.edges) else None
+        return (
+            (float(self.edges[chosen[0]]), float(self.edges[chosen[-1] + 1]))
+            if len(self.edges)
+            else None
+        )
 
     def inside(self, low: float, high: float) -> np.ndarray:
         """Return the share of each block between two bounds, the first and the last range open at their ends, shape (b,)."""
         if self.cyclic:
             rows = (self.values - low) % 360.0 < ((high - low) % 360.0 or 360.0)
         else:
-            rows = ((self.values >= low) | (low <= self.edges[0])) & ((self.values < high) | (high >= self.edges[-1]))
+            rows = ((self.values >= low) | (low <= self.edges[0])) & (
+                (self.values < high) | (high >= self.edges[-1])
+            )
         return block_means(rows.astype(float), self.starts)
 
     def near(self, chosen: Sequence[int], end: int) -> list[float]:
@@ -83,11 +98,23 @@ class Variable:
         first = chosen[0] if end == 0 else chosen[-1] + 1
         if not self.cyclic and first in (0, len(self.edges) - 1):
             return []
-        places = np.sort((self.values - self.edges[first] + 180.0) % 360.0 - 180.0 if self.cyclic else self.values - self.edges[first])
-        low, high = ((-360.0 / N_BINS, 360.0 / N_BINS) if self.cyclic else self.edges[[first - 1, first + 1]] - self.edges[first])
+        places = np.sort(
+            (self.values - self.edges[first] + 180.0) % 360.0 - 180.0
+            if self.cyclic
+            else self.values - self.edges[first]
+        )
+        low, high = (
+            (-360.0 / N_BINS, 360.0 / N_BINS)
+            if self.cyclic
+            else self.edges[[first - 1, first + 1]] - self.edges[first]
+        )
         between = np.unique(0.5 * (places[1:] + places[:-1]))
         between = between[(between > low) & (between < high)]
-        some = between[np.unique(np.linspace(0, len(between) - 1, MOST_BOUNDS).round().astype(int))] if len(between) else between
+        some = (
+            between[np.unique(np.linspace(0, len(between) - 1, MOST_BOUNDS).round().astype(int))]
+            if len(between)
+            else between
+        )
         return [*(self.edges[first] + some), float(self.edges[first])]
 
 
@@ -102,7 +129,9 @@ def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variabl
         found += each(f'speed of {name}', np.abs(ref.joint_rate[:, k]) / DEG, 'deg/s')
         found += _before_rest(name, ref.joint_rate[:, k], starts)
     speed = np.linalg.norm(ref.rate_s, axis=1)
-    found += each('speed', speed / DEG, 'deg/s') + each('specific force', np.linalg.norm(ref.force_s, axis=1), 'm/s^2', least=0.5)
+    found += each('speed', speed / DEG, 'deg/s') + each(
+        'specific force', np.linalg.norm(ref.force_s, axis=1), 'm/s^2', least=0.5
+    )
     for k, axis in enumerate(AXES):
         found += each(f'rate about {axis}', ref.rate_s[:, k] / DEG, 'deg/s')
         found += each(f'specific force along {axis}', ref.force_s[:, k], 'm/s^2', least=0.5)
@@ -110,12 +139,16 @@ def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variabl
     if blocks.warms and ref.temperature_c is not None:
         warm = ref.temperature_c
         found += each('temperature', warm, 'C', least=0.5)
-        slope = np.gradient(np.polynomial.Chebyshev.fit(ref.time, warm, min(12, len(warm) // 10))(ref.time))
+        slope = np.gradient(
+            np.polynomial.Chebyshev.fit(ref.time, warm, min(12, len(warm) // 10))(ref.time)
+        )
         found += _classes('temperature', slope > 0, ('while it cools', 'while it warms up'), starts)
     moving = speed > DEG
     found += _classes('kind', moving, ('at rest', 'while it moves'), starts)
     last = np.maximum.accumulate(np.where(moving, ref.time, -np.inf))
-    return found + each('time since motion', np.where(np.isfinite(last), np.minimum(ref.time - last, 1e3), 1e3), 's')
+    return found + each(
+        'time since motion', np.where(np.isfinite(last), np.minimum(ref.time - last, 1e3), 1e3), 's'
+    )
 
 
 def _before_rest(name, rate, starts):
@@ -126,7 +159,12 @@ def _before_rest(name, rate, starts):
     came = np.where(place >= 0, side[np.maximum(place, 0)], 0.0)
     if min((came > 0).sum(), (came < 0).sum()) < FEWEST:
         return []
-    return _classes(f'approach of {name}', came > 0, (f'after {name} turned backwards', f'after {name} turned forwards'), starts)
+    return _classes(
+        f'approach of {name}',
+        came > 0,
+        (f'after {name} turned backwards', f'after {name} turned forwards'),
+        starts,
+    )
 
 
 def _cyclic(name, degrees, starts):
@@ -135,13 +173,18 @@ def _cyclic(name, degrees, starts):
     def words(_, bounds):
         low, high = (round(bound % 360.0) % 360 if bound != 360.0 else 360 for bound in bounds)
         return f'while the {name} is {low} to {high} deg'
+
     bins = np.minimum((degrees % 360.0 / 360.0 * N_BINS).astype(int), N_BINS - 1)
     return Variable(name, bins, edges, True, words, degrees % 360.0, starts)
 
 
-def ranged(name: str, values: np.ndarray, unit: str, *, starts: np.ndarray, least: float = 1e-3) -> list[Variable]:
+def ranged(
+    name: str, values: np.ndarray, unit: str, *, starts: np.ndarray, least: float = 1e-3
+) -> list[Variable]:
     """Return the variable of a value at each row in bins of equal numbers of blocks, or none where it hardly changes."""
-    edges = np.unique(np.round(np.quantile(block_means(values, starts), np.linspace(0.0, 1.0, N_BINS + 1)), 3))
+    edges = np.unique(
+        np.round(np.quantile(block_means(values, starts), np.linspace(0.0, 1.0, N_BINS + 1)), 3)
+    )
     if len(edges) < 4 or np.ptp(edges) < least:
         return []
 
@@ -149,8 +192,13 @@ def ranged(name: str, values: np.ndarray, unit: str, *, starts: np.ndarray, leas
         low, high = bounds
         if chosen[0] == 0:
             return f'while the {name} is below {high:.3g} {unit}'
-        span = f'{low:.3g} {unit} or more' if chosen[-1] == len(edges) - 2 else f'{low:.3g} to {high:.3g} {unit}'
+        span = (
+            f'{low:.3g} {unit} or more'
+            if chosen[-1] == len(edges) - 2
+            else f'{low:.3g} to {high:.3g} {unit}'
+        )
         return f'while the {name} is {span}'
+
     bins = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
     return [Variable(name, bins, edges, False, words, values, starts)]
 
@@ -158,4 +206,14 @@ def ranged(name: str, values: np.ndarray, unit: str, *, starts: np.ndarray, leas
 def _classes(name, mask, words, starts):
     if not FEWEST <= block_means(mask.astype(float), starts).sum() <= len(starts) - FEWEST:
         return []
-    return [Variable(name, mask.astype(int), np.zeros(0), False, lambda chosen, _: words[chosen[0]], mask.astype(float), starts)]
+    return [
+        Variable(
+            name,
+            mask.astype(int),
+            np.zeros(0),
+            False,
+            lambda chosen, _: words[chosen[0]],
+            mask.astype(float),
+            starts,
+        )
+    ]

@@ -69,12 +69,26 @@ class RestRegime:
 
     def to_mapping(self) -> dict:
         """Return the regime as plain data."""
-        return {'axis': self.axis, 'variable': self.variable, 'text': self.text, 'share': self.share, 'p_value': self.p_value,
-                'size': self.size, 'bounds': None if self.bounds is None else list(self.bounds)}
+        return {
+            'axis': self.axis,
+            'variable': self.variable,
+            'text': self.text,
+            'share': self.share,
+            'p_value': self.p_value,
+            'size': self.size,
+            'bounds': None if self.bounds is None else list(self.bounds),
+        }
 
 
-def find_regimes(blocks: RestBlocks, problem: LinearisedProblem, used: Sequence[int], *, joint_names: Sequence[str],
-                 axes: Sequence[str] = AXES, formula: np.ndarray | None = None) -> list[RestRegime]:
+def find_regimes(
+    blocks: RestBlocks,
+    problem: LinearisedProblem,
+    used: Sequence[int],
+    *,
+    joint_names: Sequence[str],
+    axes: Sequence[str] = AXES,
+    formula: np.ndarray | None = None,
+) -> list[RestRegime]:
     """
     Return the regimes of a sensor's axes, the likeliest of each axis first.
 
@@ -91,8 +105,17 @@ def find_regimes(blocks: RestBlocks, problem: LinearisedProblem, used: Sequence[
         Columns of a formula for the residual, which a regime must exceed.
 
     """
-    exchange = exchanges(blocks.window, problem.recording.kind[blocks.window], np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1))
-    search, level = RegimeSearch(blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange), REGIME_LEVEL / len(AXES)
+    exchange = exchanges(
+        blocks.window,
+        problem.recording.kind[blocks.window],
+        np.linalg.norm(blocks.means(blocks.ref.rate_s), axis=1),
+    )
+    search, level = (
+        RegimeSearch(
+            blocks.sensor, blocks.time, variables_of(blocks, joint_names), exchange=exchange
+        ),
+        REGIME_LEVEL / len(AXES),
+    )
     white, found = None, []
     for axis, name in enumerate(AXES):
         offsets = []
@@ -100,10 +123,18 @@ def find_regimes(blocks: RestBlocks, problem: LinearisedProblem, used: Sequence[
             white = white or BlockWhitener(blocks, np.ones(len(blocks.time), bool))
             at = np.flatnonzero(np.isin(blocks.index[axis], list(used)))
             own, scaled = blocks.index[axis][at], partial(white, axis=axis)
-            prior = 1 / problem.space.prior_sd[own]**2, problem.space.prior_mean[own]
+            prior = 1 / problem.space.prior_sd[own] ** 2, problem.space.prior_mean[own]
             rest = AxisResidual(scaled(blocks.design[axis][:, [*at, -1]]), *prior)
-            offsets = search.offsets(name, rest, scaled, level=level / 2, formula=None if formula is None else formula[:, :, axis])
-        found += offsets or search.scatters(name, blocks.rough[:, axis], blocks.freedom, level=level / 2)
+            offsets = search.offsets(
+                name,
+                rest,
+                scaled,
+                level=level / 2,
+                formula=None if formula is None else formula[:, :, axis],
+            )
+        found += offsets or search.scatters(
+            name, blocks.rough[:, axis], blocks.freedom, level=level / 2
+        )
     return found
 
 
@@ -130,7 +161,9 @@ def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np
 
     """
     rng = np.random.default_rng(0)
-    _, starts, place, count = np.unique(window, return_index=True, return_inverse=True, return_counts=True)
+    _, starts, place, count = np.unique(
+        window, return_index=True, return_inverse=True, return_counts=True
+    )
     speed = np.sqrt(np.add.reduceat(intensity**2, starts) / count)
     partner = np.tile(np.arange(len(starts)), (PERMUTED, 1))
     for each in np.unique(kind):
@@ -159,7 +192,9 @@ class AxisResidual:
     def __init__(self, rows: np.ndarray, information: np.ndarray, mean: np.ndarray):
         self.design = rows[:, :-1]
         self._inverse = np.linalg.inv(self.design.T @ self.design + np.diag(information + TINY))
-        self.values = rows[:, -1] - self.design @ (self._inverse @ (self.design.T @ rows[:, -1] + information * mean))
+        self.values = rows[:, -1] - self.design @ (
+            self._inverse @ (self.design.T @ rows[:, -1] + information * mean)
+        )
 
     def free(self, columns: np.ndarray) -> np.ndarray:
         """Return columns without the part that the model imitates, shape of the columns."""
@@ -167,15 +202,22 @@ class AxisResidual:
 
     def offsets(self, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (amplitude, residual sum of squares) with each one of some columns in the model, both shape (k,)."""
-        size, product = np.maximum((marks * self.free(marks)).sum(axis=0), TINY), marks.T @ self.values
+        size, product = (
+            np.maximum((marks * self.free(marks)).sum(axis=0), TINY),
+            marks.T @ self.values,
+        )
         return product / size, self.values @ self.values - product**2 / size
 
     def energy(self, columns: np.ndarray) -> float:
         """Return the residual sum of squares with more columns in the model."""
         norm = np.sqrt((columns**2).sum(axis=0)) + TINY
         free = self.free(columns / norm)
-        amplitudes = np.linalg.lstsq((columns / norm).T @ free + TINY * np.eye(len(norm)), (columns / norm).T @ self.values, rcond=1e-10)[0]
-        return float(((self.values - free @ amplitudes)**2).sum())
+        amplitudes = np.linalg.lstsq(
+            (columns / norm).T @ free + TINY * np.eye(len(norm)),
+            (columns / norm).T @ self.values,
+            rcond=1e-10,
+        )[0]
+        return float(((self.values - free @ amplitudes) ** 2).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,17 +246,28 @@ class RegimeSearch:
 
     """
 
-    def __init__(self, sensor: str, time: np.ndarray, variables: Sequence[Variable], *, exchange: np.ndarray):
+    def __init__(
+        self, sensor: str, time: np.ndarray, variables: Sequence[Variable], *, exchange: np.ndarray
+    ):
         self.sensor, self.time, self._exchange, self._ranges = sensor, time, exchange, []
         for variable in variables:
             marks, member = variable.marks, variable.ranges
             inside = member @ marks.sum(axis=0)
-            allowed = (inside >= min(FEWEST, len(marks) / 8)) & (inside <= MAX_REGIME_SHARE * len(marks))
+            allowed = (inside >= min(FEWEST, len(marks) / 8)) & (
+                inside <= MAX_REGIME_SHARE * len(marks)
+            )
             if allowed.any():
                 self._ranges.append(_Ranges(variable, marks, member[allowed]))
 
-    def offsets(self, axis: str, rest: AxisResidual, white: Callable, *, level: float,
-                formula: np.ndarray | None = None) -> list[RestRegime]:
+    def offsets(
+        self,
+        axis: str,
+        rest: AxisResidual,
+        white: Callable,
+        *,
+        level: float,
+        formula: np.ndarray | None = None,
+    ) -> list[RestRegime]:
         """
         Return the ranges with another offset, the likeliest first, without those that a smooth curve or a formula describes as well.
 
@@ -237,19 +290,44 @@ class RegimeSearch:
         for each in self._ranges:
             marks = white(each.marks)
             size = np.einsum('rk,kl,rl->r', each.member, marks.T @ rest.free(marks), each.member)
-            shares.append((each.member @ (marks.T @ exchanged))**2 / np.maximum(size, TINY)[:, None] / energy)
+            shares.append(
+                (each.member @ (marks.T @ exchanged)) ** 2
+                / np.maximum(size, TINY)[:, None]
+                / energy
+            )
         p_value, likely = self._tested(shares)
         if p_value > level:
             return []
-        curves = [each.variable.curves for each in self._ranges if len(each.variable.edges)] + ([] if formula is None else [formula])
-        limit = _cost(min([energy[0], *(rest.energy(white(columns)) for columns in curves)]), len(self.time)) - SURE
+        curves = [each.variable.curves for each in self._ranges if len(each.variable.edges)] + (
+            [] if formula is None else [formula]
+        )
+        limit = (
+            _cost(
+                min([energy[0], *(rest.energy(white(columns)) for columns in curves)]),
+                len(self.time),
+            )
+            - SURE
+        )
         found = []
         for each, number in likely:
             mark, bounds, words, size, after = self._refined(rest, white, each, number)
             share = 1.0 - max(after - len(mark), 0.0) / max(energy[0] - len(mark), TINY)
             if share >= MOST_OF_IT and _cost(after, len(mark)) < limit:
-                found.append(RestRegime(self.sensor, axis, each.variable.name, words + ', by another offset', float(share), p_value,
-                                        float(size), mark > 0.5, self.time, True, bounds))
+                found.append(
+                    RestRegime(
+                        self.sensor,
+                        axis,
+                        each.variable.name,
+                        words + ', by another offset',
+                        float(share),
+                        p_value,
+                        float(size),
+                        mark > 0.5,
+                        self.time,
+                        True,
+                        bounds,
+                    )
+                )
         return _largest_share_first(found)
 
     def _refined(self, rest, white, each, number):
@@ -257,7 +335,10 @@ class RegimeSearch:
         variable, chosen = each.variable, each.variable.chosen(each.member[number])
         bounds, mark = variable.bounds(chosen), each.marks[:, chosen].sum(axis=1)
         for end in (0, 1) if bounds else ():
-            options = [(place, bounds[1]) if end == 0 else (bounds[0], place) for place in variable.near(chosen, end)]
+            options = [
+                (place, bounds[1]) if end == 0 else (bounds[0], place)
+                for place in variable.near(chosen, end)
+            ]
             if options:
                 tried = np.stack([variable.inside(*option) for option in options], axis=1)
                 best = int(np.argmin(rest.offsets(white(tried))[1]))
@@ -265,7 +346,9 @@ class RegimeSearch:
         (size,), (after,) = rest.offsets(white(mark[:, None]))
         return mark, bounds, variable.words(chosen, bounds), size, after
 
-    def scatters(self, axis: str, rough: np.ndarray, weight: np.ndarray, *, level: float) -> list[RestRegime]:
+    def scatters(
+        self, axis: str, rough: np.ndarray, weight: np.ndarray, *, level: float
+    ) -> list[RestRegime]:
         """
         Return the ranges with a larger variance within blocks, the likeliest first; arguments as `offsets`, and:
 
@@ -283,26 +366,55 @@ class RegimeSearch:
 
         """
         usual = float(np.median(rough))
-        if usual <= 0 or not any(gain.any() for gain in self._falls(rough[:, None] / usual, weight)):
+        if usual <= 0 or not any(
+            gain.any() for gain in self._falls(rough[:, None] / usual, weight)
+        ):
             return []
         rough = rough / usual
-        p_value, likely = self._tested(self._falls(np.column_stack([rough, rough[self._exchange].T]), weight))
+        p_value, likely = self._tested(
+            self._falls(np.column_stack([rough, rough[self._exchange].T]), weight)
+        )
         if p_value > level:
             return []
-        smooth = [_smooth_scatter(each.variable.curves, rough, weight) for each in self._ranges if len(each.variable.edges)]
-        (limit, dispersion), found = min(smooth, default=(_cost(weight @ rough, weight.sum()), 1.0)), []
+        smooth = [
+            _smooth_scatter(each.variable.curves, rough, weight)
+            for each in self._ranges
+            if len(each.variable.edges)
+        ]
+        (limit, dispersion), found = (
+            min(smooth, default=(_cost(weight @ rough, weight.sum()), 1.0)),
+            [],
+        )
         for each, number in likely:
             variable = each.variable
-            chosen = _tightened(variable.chosen(each.member[number]), np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0))
+            chosen = _tightened(
+                variable.chosen(each.member[number]),
+                np.maximum(each.marks.T @ (weight * (rough - 1.0)), 0.0),
+            )
             mark = each.marks[:, chosen].sum(axis=1)
-            energy, count = (np.array([(mark * part).sum(), ((1.0 - mark) * part).sum()]) for part in (weight * rough, weight))
+            energy, count = (
+                np.array([(mark * part).sum(), ((1.0 - mark) * part).sum()])
+                for part in (weight * rough, weight)
+            )
             excess, means = np.maximum(energy - count, 0.0), energy / np.maximum(count, 1.0)
             share = excess[0] / max(excess.sum(), TINY)
             if share >= MOST_OF_IT and _cost(energy, count).sum() < limit - SURE * dispersion:
                 bounds = variable.bounds(chosen)
-                found.append(RestRegime(self.sensor, axis, variable.name, variable.words(chosen, bounds) + ', by larger scatter',
-                                        float(share), p_value, float(np.sqrt(usual * max(means[0] - means[1], 0.0))), mark > 0.5,
-                                        self.time, False, bounds))
+                found.append(
+                    RestRegime(
+                        self.sensor,
+                        axis,
+                        variable.name,
+                        variable.words(chosen, bounds) + ', by larger scatter',
+                        float(share),
+                        p_value,
+                        float(np.sqrt(usual * max(means[0] - means[1], 0.0))),
+                        mark > 0.5,
+                        self.time,
+                        False,
+                        bounds,
+                    )
+                )
         return _largest_share_first(found)
 
     def _falls(self, rough, weight):
@@ -310,12 +422,20 @@ class RegimeSearch:
         squares, count, gains = rough * weight[:, None], weight.sum(), []
         energy = squares.sum(axis=0)
         for each in self._ranges:
-            inside, within = (each.member @ (each.marks.T @ weight))[:, None], each.member @ (each.marks.T @ squares)
-            louder = within * (count - inside) > LOUDER * np.maximum(energy - within, count - inside) * inside
+            inside, within = (
+                (each.member @ (each.marks.T @ weight))[:, None],
+                each.member @ (each.marks.T @ squares),
+            )
+            louder = (
+                within * (count - inside)
+                > LOUDER * np.maximum(energy - within, count - inside) * inside
+            )
             row, column = np.nonzero(louder)
             own, part, whole = inside[row, 0], within[louder], energy[column]
             gains.append(np.zeros(within.shape))
-            gains[-1][louder] = _cost(whole, count) - _cost(part, own) - _cost(whole - part, count - own)
+            gains[-1][louder] = (
+                _cost(whole, count) - _cost(part, own) - _cost(whole - part, count - own)
+            )
         return gains
 
     def _tested(self, gains):
@@ -324,7 +444,9 @@ class RegimeSearch:
             return 1.0, []
         largest = np.max([each.max(axis=0) for each in gains], axis=0)
         order = np.argsort([-each[:, 0].max() for each in gains], kind='stable')[:REPORTED]
-        return float((largest >= largest[0]).mean()), [(self._ranges[k], int(np.argmax(gains[k][:, 0]))) for k in sorted(order)]
+        return float((largest >= largest[0]).mean()), [
+            (self._ranges[k], int(np.argmax(gains[k][:, 0]))) for k in sorted(order)
+        ]
 
 
 def _largest_share_first(found):
@@ -336,8 +458,12 @@ def _largest_share_first(found):
 def _tightened(chosen, excess):
     """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
     sums = np.append(0.0, np.cumsum(excess[chosen]))
-    parts = [(first, last) for first in range(len(chosen)) for last in range(first + 1, len(chosen) + 1)
-             if sums[last] - sums[first] >= NEARLY_ALL * sums[-1]]
+    parts = [
+        (first, last)
+        for first in range(len(chosen))
+        for last in range(first + 1, len(chosen) + 1)
+        if sums[last] - sums[first] >= NEARLY_ALL * sums[-1]
+    ]
     first, last = min(parts, key=lambda part: (part[1] - part[0], sums[part[0]] - sums[part[1]]))
     return chosen[first:last]
 
@@ -358,7 +484,11 @@ def _smooth_scatter(columns, variance, weight):
     values = np.zeros(design.shape[1])
     for _ in range(SCORINGS):
         ratio = np.minimum(variance * np.exp(-np.maximum(design @ values, 0.0)), MAX_VARIANCE_RATIO)
-        values = values + np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]
+        values = (
+            values + np.linalg.lstsq(root[:, None] * design, root * (ratio - 1.0), rcond=1e-9)[0]
+        )
     logs = np.maximum(design @ values, 0.0)
     ratio = variance * np.exp(-logs)
-    return float((weight * (logs + ratio)).sum()), max(float((weight * (ratio - 1.0)**2).mean()) / 2, 1.0)
+    return float((weight * (logs + ratio)).sum()), max(
+        float((weight * (ratio - 1.0) ** 2).mean()) / 2, 1.0
+    )

@@ -40,13 +40,22 @@ class ResidualAnalysis(Investigation):
     @classmethod
     def of(cls, found: Investigation, table: Table) -> 'ResidualAnalysis':
         """Return an Investigation as a ResidualAnalysis; a ResidualAnalysis is returned unchanged."""
-        return found if isinstance(found, cls) else cls(**{each.name: getattr(found, each.name) for each in fields(found)}, table=table)
+        return (
+            found
+            if isinstance(found, cls)
+            else cls(
+                **{each.name: getattr(found, each.name) for each in fields(found)}, table=table
+            )
+        )
 
     @cached_property
     def rests(self) -> dict[str, Unexplained]:
         """Sensor -> Unexplained, with the axes that carry it where it is significant."""
         found = unexplained(self.problem, self.explained, self.named)
-        return {sensor: replace(rest, axes=self.fits(sensor).axes()) if rest.significant else rest for sensor, rest in found.items()}
+        return {
+            sensor: replace(rest, axes=self.fits(sensor).axes()) if rest.significant else rest
+            for sensor, rest in found.items()
+        }
 
     @cached_property
     def blocks(self) -> dict[str, RestBlocks]:
@@ -55,16 +64,35 @@ class ResidualAnalysis(Investigation):
 
     def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:
         """Return the fits of a choice, of the findings where not given, to the blocks of a sensor."""
-        space, used = self.problem.space, tuple(self.search.indices(self.named if chosen is None else chosen))
+        space, used = (
+            self.problem.space,
+            tuple(self.search.indices(self.named if chosen is None else chosen)),
+        )
         if (sensor, used) not in self._fits:
-            self._fits[sensor, used] = BlockFits(self.blocks[sensor], used, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
+            self._fits[sensor, used] = BlockFits(
+                self.blocks[sensor], used, prior_sd=space.prior_sd, prior_mean=space.prior_mean
+            )
         return self._fits[sensor, used]
 
-    def regimes(self, sensor: str, chosen: Sequence[Question] | None = None, formula: np.ndarray | None = None) -> list[RestRegime]:
+    def regimes(
+        self,
+        sensor: str,
+        chosen: Sequence[Question] | None = None,
+        formula: np.ndarray | None = None,
+    ) -> list[RestRegime]:
         """Return the regimes of a sensor's residual with a choice in the model, the findings where not given (`find_regimes`)."""
-        fits, offsets = self.fits(sensor, chosen), chosen is not None or self.rests[sensor].significant or formula is not None
-        return find_regimes(self.blocks[sensor], self.problem, sorted(fits.used), joint_names=self.table.joint_names,
-                            axes=fits.axes() if offsets else (), formula=formula)
+        fits, offsets = (
+            self.fits(sensor, chosen),
+            chosen is not None or self.rests[sensor].significant or formula is not None,
+        )
+        return find_regimes(
+            self.blocks[sensor],
+            self.problem,
+            sorted(fits.used),
+            joint_names=self.table.joint_names,
+            axes=fits.axes() if offsets else (),
+            formula=formula,
+        )
 
     def formulas(self, sensor: str) -> list[FormulaChoice]:
         """Return the likeliest formulas for the residual of a sensor, for any choice of effects (`find_formulas`)."""
@@ -84,8 +112,12 @@ class ResidualAnalysis(Investigation):
         Variation within moving windows is modelled as noise; a formula that explains it shows that it is deterministic.
         """
         fits = {sensor: self.fits(sensor) for sensor in self.rests}
-        return {sensor: self.proposed(sensor, fits[sensor]) if rest.significant or fits[sensor].sigma > MIN_FORMULA_SDS else None
-                for sensor, rest in self.rests.items()}
+        return {
+            sensor: self.proposed(sensor, fits[sensor])
+            if rest.significant or fits[sensor].sigma > MIN_FORMULA_SDS
+            else None
+            for sensor, rest in self.rests.items()
+        }
 
     def columns(self, sensor: str, proposal: Proposal | None) -> np.ndarray | None:
         """Return the columns of the formulas of a proposal over the blocks of a sensor, shape (b, k, 3), or None without one."""
@@ -101,8 +133,15 @@ class ResidualAnalysis(Investigation):
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
         report('analysing the residual')
-        tones = find_tones(self, self.table, [proposal for proposal in self.proposals.values() if proposal is not None])
-        return {sensor: self._unexplained(sensor, replace(rest, tones=tones[sensor])) for sensor, rest in self.rests.items()}
+        tones = find_tones(
+            self,
+            self.table,
+            [proposal for proposal in self.proposals.values() if proposal is not None],
+        )
+        return {
+            sensor: self._unexplained(sensor, replace(rest, tones=tones[sensor]))
+            for sensor, rest in self.rests.items()
+        }
 
     @cached_property
     def stamp_jitter(self) -> StampJitter:
@@ -116,11 +155,19 @@ class ResidualAnalysis(Investigation):
         if not rest.significant and proposal is None and not first:
             return beyond_noise(self.problem, sensor, rest)
         axes = rest.axes or (self.fits(sensor).axes() if proposal is not None else tuple(first))
-        found = replace(rest, regimes=tuple(first[axis] for axis in axes if axis in first), proposal=proposal,
-                        axes=axes if proposal is None else proposal.axes)
+        found = replace(
+            rest,
+            regimes=tuple(first[axis] for axis in axes if axis in first),
+            proposal=proposal,
+            axes=axes if proposal is None else proposal.axes,
+        )
         if rest.significant:
             return found
-        sizes = proposal.sizes if proposal is not None else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
+        sizes = (
+            proposal.sizes
+            if proposal is not None
+            else [regime.size * np.sqrt(regime.inside.mean()) for regime in first.values()]
+        )
         return replace(found, significant=True, rms=float(np.hypot.reduce(sizes)))
 
     def released(self) -> dict[str, Unexplained]:
@@ -133,14 +180,24 @@ class ResidualAnalysis(Investigation):
     def without(self, gone: Sequence[Question]) -> 'ResidualAnalysis':
         """Return the ResidualAnalysis without some findings; they become rejected, and widen the uncertainty of all other ones."""
         names = {question.name for question in gone}
-        other = replace(self, named=[question for question in self.named if question not in gone], rejected=[*self.rejected, *gone],
-                        rivals=[rival for rival in self.rivals if rival.question.name not in names])
+        other = replace(
+            self,
+            named=[question for question in self.named if question not in gone],
+            rejected=[*self.rejected, *gone],
+            rivals=[rival for rival in self.rivals if rival.question.name not in names],
+        )
         other.__dict__['blocks'] = self.blocks
         other._formulas.update(self._formulas)
         return other
 
 
-def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, bias_processes: dict | None = None) -> ResidualAnalysis:
+def inquire(
+    windows: Sequence[Window],
+    table: Table,
+    model: SensorModel,
+    *,
+    bias_processes: dict | None = None,
+) -> ResidualAnalysis:
     """
     Test every effect that a model lacks (`investigate`), and withdraw findings that a formula or a regime replaces.
 
@@ -155,7 +212,11 @@ def inquire(windows: Sequence[Window], table: Table, model: SensorModel, *, bias
         As `investigate`.
 
     """
-    return without_superseded(ResidualAnalysis.of(investigate(windows, table, model, bias_processes=bias_processes), table))
+    return without_superseded(
+        ResidualAnalysis.of(
+            investigate(windows, table, model, bias_processes=bias_processes), table
+        )
+    )
 
 
 def without_superseded(found: ResidualAnalysis) -> ResidualAnalysis:
@@ -182,20 +243,32 @@ def _done_without(found, question):
     """Return whether a finding hardly reduces the residual of its sensors with a substitute in some of them."""
     sensors = sensors_of(question.effect)
     warm = 'temperature' in question.effect.needs
-    asked = [sensor for sensor in sensors if warm or found.rests[sensor].significant or found.proposals[sensor]]
+    asked = [
+        sensor
+        for sensor in sensors
+        if warm or found.rests[sensor].significant or found.proposals[sensor]
+    ]
     if not asked:
         return False
     others = [other for other in found.named if other is not question]
-    kept, left_out = ({sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others))
-    alone = {sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors}
-    for stand_in in (lambda sensor: found.columns(sensor, found.proposals[sensor]),
-                     lambda sensor: found.columns(sensor, found.proposed(sensor, left_out[sensor])),
-                     lambda sensor: _places(found, sensor, others)):
+    kept, left_out = (
+        {sensor: found.fits(sensor, some) for sensor in sensors} for some in (found.named, others)
+    )
+    alone = {
+        sensor: left_out[sensor].fit().excess - kept[sensor].fit().excess for sensor in sensors
+    }
+    for stand_in in (
+        lambda sensor: found.columns(sensor, found.proposals[sensor]),
+        lambda sensor: found.columns(sensor, found.proposed(sensor, left_out[sensor])),
+        lambda sensor: _places(found, sensor, others),
+    ):
         beside = dict(alone)
         for sensor in asked:
             columns = stand_in(sensor)
             if columns is not None:
-                beside[sensor] = left_out[sensor].fit(columns).excess - kept[sensor].fit(columns).excess
+                beside[sensor] = (
+                    left_out[sensor].fit(columns).excess - kept[sensor].fit(columns).excess
+                )
         if sum(beside.values()) < NOT_NEEDED * sum(alone.values()):
             return True
     return False
@@ -206,4 +279,8 @@ def _places(found, sensor, chosen):
     offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset]
     first = {regime.axis: regime.inside for regime in reversed(offsets)}
     nowhere = np.zeros(len(found.blocks[sensor].time))
-    return np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float) if first else None
+    return (
+        np.stack([first.get(axis, nowhere) for axis in AXES], axis=1)[:, None].astype(float)
+        if first
+        else None
+    )

@@ -76,7 +76,9 @@ class RestBlocks:
     @property
     def warms(self) -> bool:
         """Whether the temperature is known and changes by as much as a thermal effect needs to show."""
-        return self.ref.temperature_c is not None and bool(np.ptp(self.ref.temperature_c) >= TEMPERATURE_SPAN)
+        return self.ref.temperature_c is not None and bool(
+            np.ptp(self.ref.temperature_c) >= TEMPERATURE_SPAN
+        )
 
     def means(self, rows: np.ndarray) -> np.ndarray:
         """Return means over the blocks of something known at the rows, shape (b, ...)."""
@@ -95,11 +97,16 @@ class BlockWhitener:
         variance, time = blocks.variance[select], blocks.time[select]
         self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
         covariance = np.diag(variance.mean(axis=1))
-        for rows in np.array_split(np.arange(len(time)), COVARIANCE_PARTS):   # intermediate arrays of a part, not of the matrix
+        for rows in np.array_split(
+            np.arange(len(time)), COVARIANCE_PARTS
+        ):  # intermediate arrays of a part, not of the matrix
             apart = np.abs(time[rows, None] - time[None, :])
             for process in blocks.processes:
                 covariance[rows] += process.sd**2 * np.exp(-apart / process.time)
-        self._factor, self._select = cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False), select
+        self._factor, self._select = (
+            cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False),
+            select,
+        )
 
     def __call__(self, rows: np.ndarray, axis: int | None = None) -> np.ndarray:
         """Return whitened rows of an axis, shape of the selection; of all axes, still to be divided by ``scale[axis]``, without `axis`."""
@@ -107,8 +114,13 @@ class BlockWhitener:
         return white if axis is None else white / self.scale[axis]
 
 
-def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProblem, *,
-                explained: ExplainedWindows) -> dict[str, RestBlocks]:
+def rest_blocks(
+    windows: Sequence[Window],
+    table: Table,
+    problem: LinearisedProblem,
+    *,
+    explained: ExplainedWindows,
+) -> dict[str, RestBlocks]:
     """
     Return sensor -> RestBlocks of the windows of the reduced recording.
 
@@ -123,45 +135,81 @@ def rest_blocks(windows: Sequence[Window], table: Table, problem: LinearisedProb
         Expected loss from noise.
 
     """
-    length = max(MIN_BLOCK_SECONDS, sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MAX_RESIDUAL_BLOCKS)
+    length = max(
+        MIN_BLOCK_SECONDS,
+        sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MAX_RESIDUAL_BLOCKS,
+    )
     which = _some(windows, length)
     windows = [windows[k] for k in which]
     starts_of, rows_of, per_block = zip(*(_cut(window, length) for window in windows))
-    motion = JointMotion.concatenate(window.motion.select(rows) for window, rows in zip(windows, rows_of))
-    warm = [w.temperature_c[rows] if len(rows) > 1 else w.temperature_c.mean(keepdims=True) for w, rows in zip(windows, rows_of)
-            if w.temperature_c is not None]
+    motion = JointMotion.concatenate(
+        window.motion.select(rows) for window, rows in zip(windows, rows_of)
+    )
+    warm = [
+        w.temperature_c[rows] if len(rows) > 1 else w.temperature_c.mean(keepdims=True)
+        for w, rows in zip(windows, rows_of)
+        if w.temperature_c is not None
+    ]
     temperature = np.concatenate(warm) if len(warm) == len(windows) else None
     place = np.repeat(np.arange(len(windows)), [len(starts) for starts in starts_of])
-    edges = np.concatenate([starts + first for starts, first in zip(starts_of, np.cumsum([0, *map(len, windows[:-1])]))])
+    edges = np.concatenate(
+        [
+            starts + first
+            for starts, first in zip(starts_of, np.cumsum([0, *map(len, windows[:-1])]))
+        ]
+    )
     count = np.diff(edges, append=sum(map(len, windows))).astype(float)
-    common = {'starts': np.cumsum([0, *np.concatenate(per_block)[:-1]]),
-              'time': block_means(np.concatenate([window.time for window in windows]), edges),
-              'window': which[place], 'locked': problem.locked[which[place]]}
+    common = {
+        'starts': np.cumsum([0, *np.concatenate(per_block)[:-1]]),
+        'time': block_means(np.concatenate([window.time for window in windows]), edges),
+        'window': which[place],
+        'locked': problem.locked[which[place]],
+    }
     references = References(problem.recording.model, table, motion, temperature_c=temperature)
     columns_of = _block_means(problem, table, motion, temperature, common['starts'])
     left = residuals(windows, table, problem.recording.model, values=problem.recording.values)
     inner = _inner(windows)
     number = np.add.reduceat(inner, edges)
-    rough = {sensor: _roughness(residual, inner, edges, number=number, least=LEAST_NOISE[sensor]) for sensor, residual in left.items()}
+    rough = {
+        sensor: _roughness(residual, inner, edges, number=number, least=LEAST_NOISE[sensor])
+        for sensor, residual in left.items()
+    }
     slope = {sensor: _slope(residual, windows, edges, sensor) for sensor, residual in left.items()}
     freedom = number / PER_FREEDOM
     jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
     louder = {sensor: jitter_ratio(rough[sensor], slope[sensor], jitter.sd) for sensor in left}
     kinds = problem.recording.kind[common['window']]
     of_kind = {str(kind): kinds == kind for kind in np.unique(kinds) if kind != 'static'}
-    jitter = replace(jitter, ratio={sensor: {kind: float(louder[sensor][own].mean()) for kind, own in of_kind.items()} for sensor in left})
+    jitter = replace(
+        jitter,
+        ratio={
+            sensor: {kind: float(louder[sensor][own].mean()) for kind, own in of_kind.items()}
+            for sensor in left
+        },
+    )
     found = {}
     for sensor, residual in left.items():
         floor = explained.floor.noise[sensor]
-        busier = _busier(windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which])
+        busier = _busier(
+            windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which]
+        )
         variance = floor.low_variance * busier[place] / count[:, None]
         # An estimated bias process would absorb a step or a warm-up; regimes are searched with the least bias processes.
         processes = natural_processes(floor, problem.recording.period)
         rows = np.concatenate([columns_of[sensor], block_means(residual, edges)], axis=1)
         design = tuple(rows @ join for join in problem.space.join[sensor])
-        found[sensor] = RestBlocks(sensor, references.at(sensor), **common, design=design, index=tuple(problem.space.index[sensor]),
-                                   variance=variance, processes=processes, freedom=freedom,
-                                   rough=rough[sensor] / louder[sensor], jitter=jitter)
+        found[sensor] = RestBlocks(
+            sensor,
+            references.at(sensor),
+            **common,
+            design=design,
+            index=tuple(problem.space.index[sensor]),
+            variance=variance,
+            processes=processes,
+            freedom=freedom,
+            rough=rough[sensor] / louder[sensor],
+            jitter=jitter,
+        )
     return found
 
 
@@ -185,16 +233,25 @@ def _slope(residual, windows, edges, sensor):
     for window, first in zip(windows, ends):
         if len(window) > 2:
             part = slice(first, first + len(window))
-            squares[part] = np.gradient(measured(window, sensor) - residual[part], window.time, axis=0)**2
+            squares[part] = (
+                np.gradient(measured(window, sensor) - residual[part], window.time, axis=0) ** 2
+            )
     return block_means(squares, edges)
 
 
 def _some(windows, length):
     """Return the numbers of the windows in use: all, or a random part of a long recording, in order."""
-    blocks = sum(1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length)) for w in windows)
+    blocks = sum(
+        1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length))
+        for w in windows
+    )
     if blocks <= 2 * MAX_RESIDUAL_BLOCKS:
         return np.arange(len(windows))
-    return np.sort(np.random.default_rng(0).permutation(len(windows))[:len(windows) * 2 * MAX_RESIDUAL_BLOCKS // blocks])
+    return np.sort(
+        np.random.default_rng(0).permutation(len(windows))[
+            : len(windows) * 2 * MAX_RESIDUAL_BLOCKS // blocks
+        ]
+    )
 
 
 def _busier(windows, sensor, floor, kinds, judged):
@@ -206,32 +263,58 @@ def _busier(windows, sensor, floor, kinds, judged):
     """
     place = SENSORS.index(sensor)
     found = np.ones((len(windows), 3))
-    own = np.array([window.noise_sd[place]**2 if len(window) > 8 else np.full(3, np.nan) for window in windows])
-    still = np.nanmedian(own[judged & (kinds == 'static')], axis=0) if np.any(judged & (kinds == 'static')) else floor.white_variance
-    still = np.maximum(still, LEAST_NOISE[sensor]**2)
+    own = np.array(
+        [
+            window.noise_sd[place] ** 2 if len(window) > 8 else np.full(3, np.nan)
+            for window in windows
+        ]
+    )
+    still = (
+        np.nanmedian(own[judged & (kinds == 'static')], axis=0)
+        if np.any(judged & (kinds == 'static'))
+        else floor.white_variance
+    )
+    still = np.maximum(still, LEAST_NOISE[sensor] ** 2)
     for kind in np.unique(kinds[kinds != 'static']):
         most = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
-        found[kinds == kind] = np.clip(np.nanmedian(own[judged & (kinds == kind)], axis=0) / still, 1.0, most)
+        found[kinds == kind] = np.clip(
+            np.nanmedian(own[judged & (kinds == kind)], axis=0) / still, 1.0, most
+        )
     return found
 
 
-def residuals(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
+def residuals(
+    windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse."""
-    predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]   # columns need much memory
-    return {sensor: np.concatenate([measured(window, sensor) for window in windows]) - np.concatenate([part[sensor] for part in predicted])
-            for sensor in SENSORS}
+    predicted = [
+        predict_windows(group, table, model, values=values) for group in chunks(windows)
+    ]  # columns need much memory
+    return {
+        sensor: np.concatenate([measured(window, sensor) for window in windows])
+        - np.concatenate([part[sensor] for part in predicted])
+        for sensor in SENSORS
+    }
 
 
 def _block_means(problem, table, motion, temperature, starts):
     """Return sensor -> means of all columns over the blocks, shape (b, p): some blocks at a time, as their columns need much memory."""
-    recording, found, edges = problem.recording, {sensor: [] for sensor in SENSORS}, np.append(starts, len(motion))
+    recording, found, edges = (
+        problem.recording,
+        {sensor: [] for sensor in SENSORS},
+        np.append(starts, len(motion)),
+    )
     for first in range(0, len(starts), AT_A_TIME):
-        own = edges[first:first + AT_A_TIME + 1]
+        own = edges[first : first + AT_A_TIME + 1]
         rows = slice(own[0], own[-1])
         warmth = None if temperature is None else temperature[rows]
         references = References(recording.model, table, motion.select(rows), temperature_c=warmth)
         for sensor in SENSORS:
-            found[sensor].append(block_means(columns_with_bank(references, sensor, recording.bank), own[:-1] - own[0]))
+            found[sensor].append(
+                block_means(
+                    columns_with_bank(references, sensor, recording.bank), own[:-1] - own[0]
+                )
+            )
     return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
 
 
@@ -247,7 +330,10 @@ def _cut(window, length):
         return np.array([0]), np.array([0]), np.array([1])
     count = max(1, round((window.time[-1] - window.time[0]) / length))
     edges = np.unique(np.linspace(0, len(window), count + 1).round().astype(int))
-    rows = [np.unique((a + (np.arange(WITHIN) + 0.5) / WITHIN * (b - a)).astype(int)) for a, b in zip(edges, edges[1:])]
+    rows = [
+        np.unique((a + (np.arange(WITHIN) + 0.5) / WITHIN * (b - a)).astype(int))
+        for a, b in zip(edges, edges[1:])
+    ]
     return edges[:-1], np.concatenate(rows), np.array([len(part) for part in rows])
 
 
@@ -287,12 +373,27 @@ class BlockFit:
 class BlockFits:
     """Fits of the blocks of one sensor, whitened once."""
 
-    def __init__(self, blocks: RestBlocks, used: Sequence[int], *, prior_sd: np.ndarray, prior_mean: np.ndarray):
+    def __init__(
+        self,
+        blocks: RestBlocks,
+        used: Sequence[int],
+        *,
+        prior_sd: np.ndarray,
+        prior_mean: np.ndarray,
+    ):
         self.blocks, self.used, self._prior = blocks, frozenset(used), (prior_sd, prior_mean)
-        self._design = [[white(part, axis) for axis, part in enumerate(blocks.design)] for white in blocks.white]
+        self._design = [
+            [white(part, axis) for axis, part in enumerate(blocks.design)] for white in blocks.white
+        ]
         self._at = [np.flatnonzero(np.isin(index, list(used))) for index in blocks.index]
 
-    def fit(self, columns: np.ndarray | None = None, *, more: Sequence[int] = (), half: int | None = None) -> BlockFit:
+    def fit(
+        self,
+        columns: np.ndarray | None = None,
+        *,
+        more: Sequence[int] = (),
+        half: int | None = None,
+    ) -> BlockFit:
         """
         Return the BlockFit of the model with further columns.
 
@@ -308,20 +409,31 @@ class BlockFits:
         count = 0 if columns is None else columns.shape[1]
         amplitudes, sds, rests = np.zeros((count, 3)), np.zeros((count, 3)), []
         for axis in range(3):
-            at = np.union1d(self._at[axis], np.flatnonzero(np.isin(self.blocks.index[axis], list(more)))).astype(int)
+            at = np.union1d(
+                self._at[axis], np.flatnonzero(np.isin(self.blocks.index[axis], list(more)))
+            ).astype(int)
             values, covariance, left = self._solved(axis, at, columns, half)
             misfit = max(float(left @ left) / max(len(left) - len(values), 1), 1.0)
-            amplitudes[:, axis], sds[:, axis] = values[len(at):], np.sqrt(misfit * np.diag(covariance)[len(at):])
+            amplitudes[:, axis], sds[:, axis] = (
+                values[len(at) :],
+                np.sqrt(misfit * np.diag(covariance)[len(at) :]),
+            )
             locked = self._rows(1, axis, at, columns)
             rests.append(locked[:, -1] - locked[:, :-1] @ values)
-        return BlockFit(amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked])
+        return BlockFit(
+            amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked]
+        )
 
     def axes(self) -> tuple[str, ...]:
         """Return the axes with an excess in the selection windows, in order of unweighted squares, the largest first."""
         excess = self._excess()
         noise = ABOVE_NOISE * np.sqrt(2.0 * (~self.blocks.locked).sum())
         squares = excess * np.median(self.blocks.variance[~self.blocks.locked], axis=0)
-        return tuple(axis for axis in largest_axes(squares) if excess[AXES.index(axis)] > min(noise, 0.99 * excess.max()))
+        return tuple(
+            axis
+            for axis in largest_axes(squares)
+            if excess[AXES.index(axis)] > min(noise, 0.99 * excess.max())
+        )
 
     @property
     def sigma(self) -> float:
@@ -342,9 +454,12 @@ class BlockFits:
         if half is not None:
             time = self.blocks.time[~self.blocks.locked]
             rows = rows[(time > np.median(time)) == half]
-        scale = np.sqrt(np.maximum((rows[:, len(at):-1]**2).sum(axis=0), 1e-60))
+        scale = np.sqrt(np.maximum((rows[:, len(at) : -1] ** 2).sum(axis=0), 1e-60))
         own = self.blocks.index[axis][at]
-        sd, mean = np.append(self._prior[0][own], AMPLITUDE_PRIOR_SD / scale), np.append(self._prior[1][own], np.zeros_like(scale))
+        sd, mean = (
+            np.append(self._prior[0][own], AMPLITUDE_PRIOR_SD / scale),
+            np.append(self._prior[1][own], np.zeros_like(scale)),
+        )
         values, covariance = solve_normal(rows.T @ rows, np.arange(len(sd)), sd, prior_mean=mean)
         return values, covariance, rows[:, -1] - rows[:, :-1] @ values
 
@@ -359,10 +474,17 @@ def share_removed(before: BlockFit, after: BlockFit) -> float:
     return 1.0 - max(after.excess, 0.0) / before.excess if before.excess > 0 else 0.0
 
 
-def share_interval(before: BlockFit, after: BlockFit, rng: np.random.Generator) -> tuple[float, float]:
+def share_interval(
+    before: BlockFit, after: BlockFit, rng: np.random.Generator
+) -> tuple[float, float]:
     """Return the 95 % interval of `share_removed`, by resampling locked windows."""
     windows = np.unique(before.window)
-    sums = np.array([[(fit.rest[before.window == w]**2 - 1.0).sum() for w in windows] for fit in (before, after)])
+    sums = np.array(
+        [
+            [(fit.rest[before.window == w] ** 2 - 1.0).sum() for w in windows]
+            for fit in (before, after)
+        ]
+    )
     drawn = sums[:, rng.integers(len(windows), size=(SHARE_RESAMPLES, len(windows)))].sum(axis=2)
     shares = 1.0 - np.maximum(drawn[1], 0.0) / np.maximum(drawn[0], 1e-300)
     low, high = np.quantile(shares, (0.025, 0.975))

@@ -40,7 +40,9 @@ class Rival:
         return float(1.0 / (1.0 + np.exp(min(self.behind, 700.0))))
 
 
-def settle_rivals(problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable) -> tuple[LinearisedProblem, list[Rival]]:
+def settle_rivals(
+    problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable
+) -> tuple[LinearisedProblem, list[Rival]]:
     """
     Return (the LinearisedProblem at the best of a choice and its rivals, the rivals close to it).
 
@@ -61,19 +63,33 @@ def settle_rivals(problem: LinearisedProblem, chosen: Sequence[Question], linear
     choices = [chosen, *_swapped(problem, chosen)]
     if len(choices) == 1:
         return problem, []
-    few = partial(linearised_at, effects=list({question.name: question.effect for choice in choices for question in choice}.values()))
+    few = partial(
+        linearised_at,
+        effects=list(
+            {question.name: question.effect for choice in choices for question in choice}.values()
+        ),
+    )
     start = few()
     attempts = [few(point=start.point(same_questions(start, choice))) for choice in choices]
     choices = [same_questions(there, choice) for there, choice in zip(attempts, choices)]
-    costs = np.mean([[_cost(*each, judge) for each in zip(attempts, choices)] for judge in attempts], axis=0)
+    costs = np.mean(
+        [[_cost(*each, judge) for each in zip(attempts, choices)] for judge in attempts], axis=0
+    )
     best = int(np.argmin(costs))
-    values = [dict(zip(there.space.names, there.values(choice))) for there, choice in zip(attempts, choices)]
+    values = [
+        dict(zip(there.space.names, there.values(choice)))
+        for there, choice in zip(attempts, choices)
+    ]
     near = [k for k in range(len(choices)) if k != best and costs[k] - costs[best] < TIE]
     settled, found = linearised_at(point=problem.point(same_questions(problem, choices[best]))), []
     for k in near:
-        different = next(pair for pair in zip(choices[best], choices[k]) if pair[0].name != pair[1].name)
+        different = next(
+            pair for pair in zip(choices[best], choices[k]) if pair[0].name != pair[1].name
+        )
         taken, other = same_questions(settled, different)
-        moves = {name: values[k][name] - values[best][name] for name in problem.baseline.param_names}
+        moves = {
+            name: values[k][name] - values[best][name] for name in problem.baseline.param_names
+        }
         found.append(Rival(taken, other, float(costs[k] - costs[best]), moves))
     return settled, found
 
@@ -84,29 +100,54 @@ def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> li
     for each in chosen:
         asked = [question for question in problem.questions if question.name == each.name]
         same = [question for question in asked if question.label == each.label]
-        found.append((same or [min(asked, key=lambda question: problem.evidence.loss(problem.search.indices([question])))])[0])
+        found.append(
+            (
+                same
+                or [
+                    min(
+                        asked,
+                        key=lambda question: problem.evidence.loss(
+                            problem.search.indices([question])
+                        ),
+                    )
+                ]
+            )[0]
+        )
     return found
 
 
 def _swapped(problem, chosen):
     """Return the choices with an effect replaced by one that only curvature separates from it, where the curvature is observable."""
-    return [[other if each is question else each for each in chosen] for question in chosen
-            if question.effect.warp is not None and problem.curvature_shows(chosen, question) > MIN_CURVATURE_NATS
-            for other, _ in problem.search.confounded(chosen, question, most=None) if other.effect.warp is not None]
+    return [
+        [other if each is question else each for each in chosen]
+        for question in chosen
+        if question.effect.warp is not None
+        and problem.curvature_shows(chosen, question) > MIN_CURVATURE_NATS
+        for other, _ in problem.search.confounded(chosen, question, most=None)
+        if other.effect.warp is not None
+    ]
 
 
 def _cost(problem, chosen, judge):
     """Return the held-out cost of a choice at its own linearisation, judged with the noise and the band of another attempt."""
-    space = replace(problem.evidence.space, slow_only=judge.space.slow_only, slow_variance=judge.space.slow_variance)
+    space = replace(
+        problem.evidence.space,
+        slow_only=judge.space.slow_only,
+        slow_variance=judge.space.slow_variance,
+    )
     evidence = WindowEvidence(space, judge.noise, problem.evidence.fold)
-    return 0.5 * evidence.heldout(problem.search.indices(chosen)) + PENALTY * sum(question.penalty for question in chosen)
+    return 0.5 * evidence.heldout(problem.search.indices(chosen)) + PENALTY * sum(
+        question.penalty for question in chosen
+    )
 
 
 AS_MUCH = 0.5
 """Share of the held-out likelihood of an effect that a simpler one must reach to be tested as its replacement."""
 
 
-def simpler(problem: LinearisedProblem, explained: Explained, named: Sequence[Question]) -> Sequence[Question]:
+def simpler(
+    problem: LinearisedProblem, explained: Explained, named: Sequence[Question]
+) -> Sequence[Question]:
     """
     Return findings with no more parameters than the held-out residual supports.
 
@@ -119,9 +160,15 @@ def simpler(problem: LinearisedProblem, explained: Explained, named: Sequence[Qu
         if not explained.rest_beside(kept, question):
             continue
         for other in _fewer(problem.search, kept, question):
-            instead = [*kept[:place], other, *kept[place + 1:]]
-            if (problem.search.allowed(instead, other) and explained.share(instead, other) >= needed_share(other)
-                    and gain_in_turn(problem, instead, kept, sensors=sensors_of(question.effect)).ci95[0] <= LEAST_REDUCTION):
+            instead = [*kept[:place], other, *kept[place + 1 :]]
+            if (
+                problem.search.allowed(instead, other)
+                and explained.share(instead, other) >= needed_share(other)
+                and gain_in_turn(problem, instead, kept, sensors=sensors_of(question.effect)).ci95[
+                    0
+                ]
+                <= LEAST_REDUCTION
+            ):
                 kept = instead
                 break
     return kept
@@ -131,10 +178,18 @@ def _fewer(search, kept, question):
     """Return effects of the same sensors with fewer parameters that explain about as much in the place of a finding, fewest first."""
     beside = [each for each in kept if each is not question]
     enough = AS_MUCH * search.score(beside, question).gain
-    fewer = [other for other in search.others(kept) if other.penalty < question.penalty and '@' not in other.label
-             and sensors_of(other.effect) == sensors_of(question.effect)]
+    fewer = [
+        other
+        for other in search.others(kept)
+        if other.penalty < question.penalty
+        and '@' not in other.label
+        and sensors_of(other.effect) == sensors_of(question.effect)
+    ]
     scores = [search.score(beside, other) for other in fewer]
-    return sorted((score.question for score in scores if score.significant and score.gain >= enough), key=lambda other: other.penalty)
+    return sorted(
+        (score.question for score in scores if score.significant and score.gain >= enough),
+        key=lambda other: other.penalty,
+    )
 
 
 MIN_UNIQUE_SHARE = 0.05
@@ -161,7 +216,9 @@ def best_pairs(search: Search) -> list[list[Question]]:
     best = []
     for _, one, two in sorted(scored, reverse=True):
         pair = [search.questions[one], search.questions[two]]
-        if {q.name for q in pair} not in [{q.name for q in known} for known in best] and all(search.allowed(pair, each) for each in pair):
+        if {q.name for q in pair} not in [{q.name for q in known} for known in best] and all(
+            search.allowed(pair, each) for each in pair
+        ):
             best.append(pair)
         if len(best) == TRIED:
             break
@@ -173,7 +230,10 @@ class _Blocks:
 
     def __init__(self, search):
         self.questions, (information, right) = search.questions, search.evidence.equations()
-        base, free = list(search.baseline), [k for question in search.questions for k in question.parameters]
+        base, free = (
+            list(search.baseline),
+            [k for question in search.questions for k in question.parameters],
+        )
         factor = scipy.linalg.cho_factor(information[np.ix_(base, base)])
         cross = information[np.ix_(base, free)]
         matrix = information[np.ix_(free, free)] - cross.T @ scipy.linalg.cho_solve(factor, cross)
@@ -195,14 +255,34 @@ class _Blocks:
 
     def score(self, pairs: Sequence[tuple[int, int]]):
         """Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape with members that are not collinear."""
-        places = np.array([[*range(*self.at[a].indices(len(self.right))), *range(*self.at[b].indices(len(self.right)))] for a, b in pairs])
+        places = np.array(
+            [
+                [
+                    *range(*self.at[a].indices(len(self.right))),
+                    *range(*self.at[b].indices(len(self.right))),
+                ]
+                for a, b in pairs
+            ]
+        )
         n_first = self.size(pairs[0][0])
-        systems = self.matrix[places[:, :, None], places[:, None, :]] + 1e4 * JITTER * np.eye(places.shape[1])
+        systems = self.matrix[places[:, :, None], places[:, None, :]] + 1e4 * JITTER * np.eye(
+            places.shape[1]
+        )
         values = np.linalg.solve(systems, self.right[places][:, :, None])[:, :, 0]
         fall = np.einsum('ki,ki->k', values, self.right[places])
         cross, parts = systems[:, :n_first, n_first:], (values[:, :n_first], values[:, n_first:])
-        shared = [np.einsum('kij,ki->kj', cross, parts[0]), np.einsum('kij,kj->ki', cross, parts[1])]
+        shared = [
+            np.einsum('kij,ki->kj', cross, parts[0]),
+            np.einsum('kij,kj->ki', cross, parts[1]),
+        ]
         for k, (one, two) in enumerate(pairs):
-            unique = [1 - (other[k] @ other[k]) / max(part[k] @ part[k], 1e-300) for part, other in zip(parts, shared)]
+            unique = [
+                1 - (other[k] @ other[k]) / max(part[k] @ part[k], 1e-300)
+                for part, other in zip(parts, shared)
+            ]
             if min(unique) > MIN_UNIQUE_SHARE:
-                yield 0.5 * fall[k] - PENALTY * sum(self.questions[q].penalty for q in (one, two)), one, two
+                yield (
+                    0.5 * fall[k] - PENALTY * sum(self.questions[q].penalty for q in (one, two)),
+                    one,
+                    two,
+                )

@@ -52,7 +52,9 @@ class Saturation:
         return float(np.exp(-self.n_expected))
 
 
-def predictions(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def predictions(
+    windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return (force, rate) that the model predicts, a list of pairs (n or 1, 3) per window."""
     references = references_of(windows, model, table)
     edges = np.cumsum([len(window.motion) for window in windows])[:-1]
@@ -69,9 +71,20 @@ def noise_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
     """Return the sd of samples in static windows, at least that of rounding (without any: of second differences), shape (3,)."""
     rest = [w for w in windows if w.kind == 'static' and len(w.time) > 8]
     if rest:
-        rounding = np.sqrt(rounding_variance(np.concatenate([measured(w, sensor) for w in windows])))
-        return np.maximum(np.median([measured(w, sensor).std(axis=0) for w in rest], axis=0), rounding)
-    return np.median([np.diff(measured(w, sensor), 2, axis=0).std(axis=0) / np.sqrt(6) for w in windows if len(w.time) > 8], axis=0)
+        rounding = np.sqrt(
+            rounding_variance(np.concatenate([measured(w, sensor) for w in windows]))
+        )
+        return np.maximum(
+            np.median([measured(w, sensor).std(axis=0) for w in rest], axis=0), rounding
+        )
+    return np.median(
+        [
+            np.diff(measured(w, sensor), 2, axis=0).std(axis=0) / np.sqrt(6)
+            for w in windows
+            if len(w.time) > 8
+        ],
+        axis=0,
+    )
 
 
 def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> np.ndarray:
@@ -84,11 +97,21 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     for sensor in SENSORS:
         design = columns(references, sensor)
         outputs = [measured(w, sensor) for w in picked]
-        output = np.concatenate([o.mean(axis=0, keepdims=True) if w.kind == 'static' else o for w, o in zip(picked, outputs)])
-        base, slope = coefficients(model, sensor, values), coefficient_jacobian(model, sensor, values)
-        weight = 1 / noise_at_rest(windows, sensor)**2
+        output = np.concatenate(
+            [
+                o.mean(axis=0, keepdims=True) if w.kind == 'static' else o
+                for w, o in zip(picked, outputs)
+            ]
+        )
+        base, slope = (
+            coefficients(model, sensor, values),
+            coefficient_jacobian(model, sensor, values),
+        )
+        weight = 1 / noise_at_rest(windows, sensor) ** 2
         for axis in range(3):
-            rows = np.column_stack([design @ slope[:, axis], output[:, axis] - design @ base[:, axis]])
+            rows = np.column_stack(
+                [design @ slope[:, axis], output[:, axis] - design @ base[:, axis]]
+            )
             normal += weight[axis] * rows.T @ rows
     return values + solve_normal(normal, np.arange(len(values)), sd, prior_mean=prior - values)[0]
 
@@ -107,11 +130,15 @@ def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
     if at < MIN_CLIPPED_SAMPLES or level == 0:
         return False
     # A coarse output repeats all its values, most of all the step at gravity; the values just below the largest show how often.
-    _, repeats = np.unique(size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)], return_counts=True)
+    _, repeats = np.unique(
+        size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)], return_counts=True
+    )
     return bool(at > 3 * repeats[-5:].max(initial=1))
 
 
-def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.ndarray, *, sensor: str) -> Saturation | None:
+def find_saturation(
+    windows: Sequence[Window], predicted: list, noise_sd: np.ndarray, *, sensor: str
+) -> Saturation | None:
     """
     Return the `Saturation` of a sensor, or None.
 
@@ -127,21 +154,36 @@ def find_saturation(windows: Sequence[Window], predicted: list, noise_sd: np.nda
     if not may_be_clipped(windows, sensor):
         return None
     output = np.concatenate([measured(w, sensor) for w in windows])
-    expected = np.concatenate([np.broadcast_to(p[SENSORS.index(sensor)], measured(w, sensor).shape) for w, p in zip(windows, predicted)])
+    expected = np.concatenate(
+        [
+            np.broadcast_to(p[SENSORS.index(sensor)], measured(w, sensor).shape)
+            for w, p in zip(windows, predicted)
+        ]
+    )
     level = np.abs(output).max()
     clipped = np.abs(output) >= level * (1 - 1e-12)
     beyond = norm_sf((level - np.abs(expected)) / noise_sd)
     n_expected = float(beyond.sum())
-    if n_expected < MIN_CLIPPED_SAMPLES or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected:
+    if (
+        n_expected < MIN_CLIPPED_SAMPLES
+        or beyond[clipped].sum() < AGREEMENT * clipped.sum() * (beyond**2).sum() / n_expected
+    ):
         return None
     far = np.abs(expected) > level
     before, after = output - expected, output - np.clip(expected, -level, level)
-    rms = [float(np.sqrt(np.mean(e[far]**2))) if far.any() else 0.0 for e in (before, after)]
-    return Saturation(sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms)
+    rms = [float(np.sqrt(np.mean(e[far] ** 2))) if far.any() else 0.0 for e in (before, after)]
+    return Saturation(
+        sensor, float(level), float(1e-4 * level), int(clipped.any(axis=1).sum()), n_expected, *rms
+    )
 
 
-def without_clipped(windows: Sequence[Window], predicted: list, levels: dict[str, float], *,
-                    noise_sd: dict[str, np.ndarray]) -> list[Window]:
+def without_clipped(
+    windows: Sequence[Window],
+    predicted: list,
+    levels: dict[str, float],
+    *,
+    noise_sd: dict[str, np.ndarray],
+) -> list[Window]:
     """
     Return the windows without samples that are clipped, or predicted within a few standard deviations of the limit.
 
@@ -172,7 +214,9 @@ def windows_at(windows: Sequence[Window], rows: np.ndarray) -> list[Window]:
     return [window for window, taken in zip(windows, rows) if taken]
 
 
-def without_clipping(windows: list[Window], table: Table, model: SensorModel) -> tuple[list[Window], np.ndarray, list[Saturation]]:
+def without_clipping(
+    windows: list[Window], table: Table, model: SensorModel
+) -> tuple[list[Window], np.ndarray, list[Saturation]]:
     """
     Return (windows without samples corrupted by a limit, mask of the locked ones, limits estimated from all other windows).
 
@@ -186,10 +230,20 @@ def without_clipping(windows: list[Window], table: Table, model: SensorModel) ->
     levels, kept = {limit.sensor: limit.level for limit in limits}, []
     for rows in (~locked, locked):
         part = windows_at(windows, rows)
-        kept.append(without_clipped(part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd))
-    entries = [(window.time[0], number, window) for number, part in enumerate(kept) for window in part]
+        kept.append(
+            without_clipped(
+                part, predictions(part, table, model, values=values), levels, noise_sd=noise_sd
+            )
+        )
+    entries = [
+        (window.time[0], number, window) for number, part in enumerate(kept) for window in part
+    ]
     in_order = sorted(entries, key=lambda entry: entry[:2])
-    return [window for *_, window in in_order], np.array([number == 1 for _, number, _ in in_order]), limits
+    return (
+        [window for *_, window in in_order],
+        np.array([number == 1 for _, number, _ in in_order]),
+        limits,
+    )
 
 
 def _piled(windows):
@@ -208,15 +262,25 @@ def _limits(windows, table, model):
     suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
     if not suspects:
         return nothing
-    limits = {sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows)) for sensor in suspects}
+    limits = {
+        sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows))
+        for sensor in suspects
+    }
     noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
     kept = windows
     for _ in range(2):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))
         kept = without_clipped(windows, predicted, limits, noise_sd=noise_sd)
         if len(kept) < MIN_FOLD_WINDOWS:
-            return nothing   # output that is always at or near its limit does not determine it
+            return nothing  # output that is always at or near its limit does not determine it
     values = simple_fit(kept, table, model)
     predicted = predictions(windows, table, model, values=values)
-    found = [limit for limit in (find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor) for sensor in suspects) if limit]
+    found = [
+        limit
+        for limit in (
+            find_saturation(windows, predicted, noise_sd[sensor], sensor=sensor)
+            for sensor in suspects
+        )
+        if limit
+    ]
     return found, noise_sd, values

@@ -58,7 +58,12 @@ class Score:
     @property
     def significant(self) -> bool:
         """Return whether the effect may be named."""
-        return self.allowed and self.p_value < FAMILY_WISE and self.net > 0 and self.gain > MIN_GAIN_NATS
+        return (
+            self.allowed
+            and self.p_value < FAMILY_WISE
+            and self.net > 0
+            and self.gain > MIN_GAIN_NATS
+        )
 
 
 class Search:
@@ -80,14 +85,29 @@ class Search:
 
     """
 
-    def __init__(self, evidence: Evidence, baseline: Sequence[int], questions: Sequence[Question], *, encoder_step: float = 0.0,
-                 any_size: bool = False, resolved: AbstractSet[str] = frozenset()):
+    def __init__(
+        self,
+        evidence: Evidence,
+        baseline: Sequence[int],
+        questions: Sequence[Question],
+        *,
+        encoder_step: float = 0.0,
+        any_size: bool = False,
+        resolved: AbstractSet[str] = frozenset(),
+    ):
         self.evidence, self.baseline, self.questions = evidence, tuple(baseline), questions
         self.encoder_step, self.any_size, self.resolved = encoder_step, any_size, resolved
 
     def asking_any_size(self) -> 'Search':
         """Return a search that allows sizes that are known of no instrument too."""
-        return Search(self.evidence, self.baseline, self.questions, encoder_step=self.encoder_step, any_size=True, resolved=self.resolved)
+        return Search(
+            self.evidence,
+            self.baseline,
+            self.questions,
+            encoder_step=self.encoder_step,
+            any_size=True,
+            resolved=self.resolved,
+        )
 
     def indices(self, chosen: Sequence[Question]) -> tuple[int, ...]:
         """Return the parameters of the baseline and of the chosen effects."""
@@ -100,8 +120,14 @@ class Search:
 
     def cost(self, chosen: Sequence[Question], most: float = np.inf) -> float:
         """Return the held-out cost of a choice, nats, penalties included; above `most` without the penalty for implausible sizes."""
-        cost = 0.5 * self.evidence.heldout(self.indices(chosen)) + PENALTY * sum(q.penalty for q in chosen)
-        return cost if cost > most else cost + IMPLAUSIBLE * sum(self.implausible(chosen, q) for q in chosen)
+        cost = 0.5 * self.evidence.heldout(self.indices(chosen)) + PENALTY * sum(
+            q.penalty for q in chosen
+        )
+        return (
+            cost
+            if cost > most
+            else cost + IMPLAUSIBLE * sum(self.implausible(chosen, q) for q in chosen)
+        )
 
     def score(self, chosen: Sequence[Question], question: Question) -> Score:
         """Return the Score of one more effect."""
@@ -110,7 +136,13 @@ class Search:
         gain = 0.5 * (self.evidence.heldout(smaller) - self.evidence.heldout(larger))
         p_value = min(1.0, self.evidence.p_value(smaller, larger) * len(self.questions))
         asked = p_value < FAMILY_WISE and gain > 0
-        return Score(question, gain, p_value, asked and self.allowed(beside, question), asked and self.implausible(beside, question))
+        return Score(
+            question,
+            gain,
+            p_value,
+            asked and self.allowed(beside, question),
+            asked and self.implausible(beside, question),
+        )
 
     def allowed(self, chosen: Sequence[Question], question: Question) -> bool:
         """
@@ -125,11 +157,17 @@ class Search:
             return False
         if question.effect.known_size and np.any(np.abs(value) - 3 * sd >= question.effect.largest):
             return False
-        return (self.any_size or not self.implausible(chosen, question)) and self.shows_alike(chosen, question)
+        return (self.any_size or not self.implausible(chosen, question)) and self.shows_alike(
+            chosen, question
+        )
 
     def early(self, chosen: Sequence[Question]) -> list[Question]:
         """Return the lags that would be significant if they were not negative: an early clock with a late sensor."""
-        scores = [self.score(chosen, q) for q in self.others(chosen) if q.effect.nonnegative and self.estimate([*chosen, q], q)[0][0] < 0]
+        scores = [
+            self.score(chosen, q)
+            for q in self.others(chosen)
+            if q.effect.nonnegative and self.estimate([*chosen, q], q)[0][0] < 0
+        ]
         return [score.question for score in scores if replace(score, allowed=True).significant]
 
     def implausible(self, chosen: Sequence[Question], question: Question) -> bool:
@@ -144,18 +182,22 @@ class Search:
         values[list(used)] = self.evidence.fit(used)[0]
         return values
 
-    def estimate(self, chosen: Sequence[Question], question: Question) -> tuple[np.ndarray, np.ndarray]:
+    def estimate(
+        self, chosen: Sequence[Question], question: Question
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, standard deviations) of the parameters of a chosen effect."""
         used = self.indices(chosen)
         values, covariance = self.evidence.fit(used)
         places = [used.index(k) for k in question.parameters]
         return values[places], np.sqrt(np.diag(covariance)[places])
 
-    def moved_by(self, chosen: Sequence[Question], question: Question, names: Sequence[str]) -> dict[str, float]:
+    def moved_by(
+        self, chosen: Sequence[Question], question: Question, names: Sequence[str]
+    ) -> dict[str, float]:
         """Return parameter -> its change, of the baseline and of the other choices among `names`, when an effect joins them."""
         others = [q for q in chosen if q is not question]
         smaller, larger = self.indices(others), self.indices([*others, question])
-        moved = self.evidence.fit(larger)[0][:len(smaller)] - self.evidence.fit(smaller)[0]
+        moved = self.evidence.fit(larger)[0][: len(smaller)] - self.evidence.fit(smaller)[0]
         return {names[k]: float(change) for k, change in zip(smaller, moved) if k < len(names)}
 
     def shows_alike(self, chosen: Sequence[Question], question: Question) -> bool:
@@ -168,14 +210,19 @@ class Search:
             return True
         rest = [q for q in chosen if q is not question]
         before, after = (self.evidence.heldout_parts(self.indices(some)) for some in (rest, chosen))
-        return all((after[sensor] - before[sensor]).sum() < 2 * MIN_GAIN_NATS for sensor in question.effect.acts_on)
+        return all(
+            (after[sensor] - before[sensor]).sum() < 2 * MIN_GAIN_NATS
+            for sensor in question.effect.acts_on
+        )
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
         """Return the chosen questions in the order in which they were found, from none or from a first choice."""
         chosen = self.reconsidered(list(start)) if start else []
         for _ in range(2 * MOST_FINDINGS):
             others = self.others(chosen)
-            scores = [self.score(chosen, q) for q in reported('testing effects', others, len(others))]
+            scores = [
+                self.score(chosen, q) for q in reported('testing effects', others, len(others))
+            ]
             good = [s for s in scores if s.significant]
             if not good or len(chosen) >= MOST_FINDINGS:
                 break
@@ -209,15 +256,21 @@ class Search:
     def _replaced(self, chosen):
         best, cost = None, self.cost(chosen) - MIN_REPLACEMENT_NATS
         for place, question in enumerate(chosen):
-            if question.name in self.resolved:   # it could not be added again, and an effect that cancels it may be in the model
+            if (
+                question.name in self.resolved
+            ):  # it could not be added again, and an effect that cancels it may be in the model
                 continue
-            rest = chosen[:place] + chosen[place + 1:]
+            rest = chosen[:place] + chosen[place + 1 :]
             for other in self.others(rest):
                 if other is question:
                     continue
-                trial = [*chosen[:place], other, *chosen[place + 1:]]
+                trial = [*chosen[:place], other, *chosen[place + 1 :]]
                 value = self.cost(trial, cost)
-                if value < cost and all(self.allowed(trial, each) for each in trial) and self.score(rest, other).significant:
+                if (
+                    value < cost
+                    and all(self.allowed(trial, each) for each in trial)
+                    and self.score(rest, other).significant
+                ):
                     best, cost = trial, value
         return best
 
@@ -227,15 +280,19 @@ class Search:
             chosen = smaller
         return chosen
 
-    def confounded(self, chosen: Sequence[Question], question: Question, *,
-                    most: int | None = CLASS_SIZE - 1) -> list[tuple[Question, float]]:
+    def confounded(
+        self, chosen: Sequence[Question], question: Question, *, most: int | None = CLASS_SIZE - 1
+    ) -> list[tuple[Question, float]]:
         """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most `most`."""
         place, cost = chosen.index(question), self.cost(chosen)
         found, alike = {}, TIE
         if question.effect.smooth:
-            alike = max(TIE, COLLINEAR * (self.cost([each for each in chosen if each is not question]) - cost))
+            alike = max(
+                TIE,
+                COLLINEAR * (self.cost([each for each in chosen if each is not question]) - cost),
+            )
         for other in self.others(chosen):
-            trial = [*chosen[:place], other, *chosen[place + 1:]]
+            trial = [*chosen[:place], other, *chosen[place + 1 :]]
             tie = alike if other.effect.smooth else TIE
             difference = self.cost(trial, cost + tie) - cost
             if question.effect.contained_in == other.name:
@@ -270,7 +327,9 @@ class SelectedEffects:
     @property
     def implausible(self) -> list[Question]:
         """Findings with sizes above those of any known instrument: reported, but added to a model only on request."""
-        return [question for question in self.named if self.search.implausible(self.named, question)]
+        return [
+            question for question in self.named if self.search.implausible(self.named, question)
+        ]
 
     @property
     def adopted(self) -> list[Question]:

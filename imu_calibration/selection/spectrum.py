@@ -69,30 +69,46 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
 
     """
     order = np.arange(LOWEST_ORDER, HIGHEST_ORDER + 1)
-    pieces = [(number, *_projected(rest, time, angle, order)) for number, rest, time, angle in _pieces(windows, rests, joint)]
+    pieces = [
+        (number, *_projected(rest, time, angle, order))
+        for number, rest, time, angle in _pieces(windows, rests, joint)
+    ]
     if not pieces:
         return None
-    number, sums, weight = (np.stack(part) for part in zip(*pieces))   # (p,), (p, k, m), (p, k)
+    number, sums, weight = (np.stack(part) for part in zip(*pieces))  # (p,), (p, k, m), (p, k)
     seen = weight > 0
     enough = seen.sum(axis=0) >= MIN_SPECTRUM_PIECES
     if not enough.any():
         return None
-    order, sums, weight, count = order[enough], sums[:, enough], weight[:, enough], seen.sum(axis=0)[enough]
+    order, sums, weight, count = (
+        order[enough],
+        sums[:, enough],
+        weight[:, enough],
+        seen.sum(axis=0)[enough],
+    )
     scaled = sums / np.sqrt(np.where(weight > 0, weight, np.inf))[..., None]
-    parts = np.stack([scaled.real, scaled.imag], axis=-1)   # (p, k, m, 2)
+    parts = np.stack([scaled.real, scaled.imag], axis=-1)  # (p, k, m, 2)
     mean = parts.sum(axis=0) / count[:, None, None]
-    about = np.einsum('pkxi,pkxj->kxij', parts, parts) - count[:, None, None, None] * np.einsum('kxi,kxj->kxij', mean, mean)
+    about = np.einsum('pkxi,pkxj->kxij', parts, parts) - count[:, None, None, None] * np.einsum(
+        'kxi,kxj->kxij', mean, mean
+    )
     scatter = about / (count - 1)[:, None, None, None]
     spread = np.trace(scatter, axis1=-2, axis2=-1)
-    known = (spread > REPEATED * (mean**2).sum(axis=-1)) & (np.linalg.det(scatter) > REPEATED * spread**2)   # repeated data have no scatter
+    known = (spread > REPEATED * (mean**2).sum(axis=-1)) & (
+        np.linalg.det(scatter) > REPEATED * spread**2
+    )  # repeated data have no scatter
     scatter[~known], mean[~known] = np.eye(2), 0.0
-    t_squared = count[:, None] * np.einsum('kxi,kxi->kx', mean, np.linalg.solve(scatter, mean[..., None])[..., 0])
+    t_squared = count[:, None] * np.einsum(
+        'kxi,kxi->kx', mean, np.linalg.solve(scatter, mean[..., None])[..., 0]
+    )
     degrees = (count - 2)[:, None]
     p_value = f_sf(t_squared * degrees / (2 * (count - 1)[:, None]), 2, degrees)
     wave = sums.sum(axis=0) / weight.sum(axis=0)[:, None]
-    power = np.abs(wave)**2
+    power = np.abs(wave) ** 2
     usual = np.maximum(np.median(power, axis=0), np.finfo(float).tiny)
-    return Orders(order, 2 * np.abs(wave), p_value, power / usual, _alike(number, sums, weight, wave))
+    return Orders(
+        order, 2 * np.abs(wave), p_value, power / usual, _alike(number, sums, weight, wave)
+    )
 
 
 def _alike(number, sums, weight, wave):
@@ -103,7 +119,9 @@ def _alike(number, sums, weight, wave):
     return (in_phase & known[..., None]).sum(axis=0) / known.sum(axis=0)[:, None]
 
 
-def long_enough(windows: Sequence[Window], rests: Sequence[np.ndarray], *, with_joints: bool) -> Iterator[tuple[int, Window, np.ndarray]]:
+def long_enough(
+    windows: Sequence[Window], rests: Sequence[np.ndarray], *, with_joints: bool
+) -> Iterator[tuple[int, Window, np.ndarray]]:
     """Yield (number, window, rest) of the windows that have enough samples for a spectrum, optionally with the joints at each of them."""
     for place, (window, rest) in enumerate(zip(windows, rests)):
         if len(window) >= FEWEST_SAMPLES and (not with_joints or len(window.motion) == len(window)):
@@ -114,21 +132,29 @@ def _pieces(windows, rests, joint) -> Iterator[tuple[int, np.ndarray, np.ndarray
     """Yield (number of the window, rest, time, angle) of pieces of moving windows."""
     for place, window, rest in long_enough(windows, rests, with_joints=True):
         number = max(1, round((window.time[-1] - window.time[0]) / PIECE_S))
-        yield from zip([place] * number, np.array_split(rest, number), np.array_split(window.time, number),
-                       np.array_split(window.motion.position[:, joint], number))
+        yield from zip(
+            [place] * number,
+            np.array_split(rest, number),
+            np.array_split(window.time, number),
+            np.array_split(window.motion.position[:, joint], number),
+        )
 
 
 def _projected(rest, time, angle, order):
     """Return (sum of the rest against each order, shape (k, m), weight, shape (k,)); zero where a piece does not show an order."""
     turned = np.ptp(angle)
-    shown = (turned * order > 2 * np.pi * CYCLES_OF_ORDER) & (2 * np.pi > SHORTEST_CYCLE * order * np.abs(np.diff(angle)).max())
+    shown = (turned * order > 2 * np.pi * CYCLES_OF_ORDER) & (
+        2 * np.pi > SHORTEST_CYCLE * order * np.abs(np.diff(angle)).max()
+    )
     sums, weight = np.zeros((len(order), rest.shape[1]), complex), np.zeros(len(order))
     if shown.any():
         middle = (angle - angle.mean()) / turned
-        smooth = np.linalg.qr(np.column_stack([np.ones(len(time)), time - time.mean(), middle, middle**2]))[0]
+        smooth = np.linalg.qr(
+            np.column_stack([np.ones(len(time)), time - time.mean(), middle, middle**2])
+        )[0]
         waves = np.exp(-1j * np.outer(angle, order[shown]))
         waves -= smooth @ (smooth.T @ waves)
-        sums[shown], weight[shown] = waves.T @ rest, (np.abs(waves)**2).sum(axis=0)
+        sums[shown], weight[shown] = waves.T @ rest, (np.abs(waves) ** 2).sum(axis=0)
     return sums, weight
 
 
@@ -187,11 +213,20 @@ class Tone:
 
     def to_mapping(self) -> dict:
         """Return the tone as plain data."""
-        return {'axis': self.axis, 'joint': self.joint, 'frequency': self.frequency, 'amplitude': self.amplitude, 'p_value': self.p_value,
-                'share': self.share, 'text': self.text}
+        return {
+            'axis': self.axis,
+            'joint': self.joint,
+            'frequency': self.frequency,
+            'amplitude': self.amplitude,
+            'p_value': self.p_value,
+            'share': self.share,
+            'text': self.text,
+        }
 
 
-def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] = ()) -> dict[str, tuple[Tone, ...]]:
+def find_tones(
+    found: Investigation, table: Table, formulas: Sequence[Proposal] = ()
+) -> dict[str, tuple[Tone, ...]]:
     """
     Return sensor -> the tones in the residual of the findings and of some formulas, the most significant first.
 
@@ -202,40 +237,65 @@ def find_tones(found: Investigation, table: Table, formulas: Sequence[Proposal] 
     removed before multiples of a speed are searched.
     """
     model = found.problem.recording.model
-    values = found.problem.values(found.named)[:len(model.param_names)]
+    values = found.problem.values(found.named)[: len(model.param_names)]
     for formula in formulas:
         for effect, size in zip(formula.effects, formula.values):
             known = replace(model, catalogue=model.catalogue.with_effects(effect))
             model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
     left = residuals(found.used, table, model, values=values)
-    edges, tests = np.cumsum([len(window) for window in found.used])[:-1], 1 + len(table.joint_names)
+    edges, tests = (
+        np.cumsum([len(window) for window in found.used])[:-1],
+        1 + len(table.joint_names),
+    )
     parts = {sensor: np.split(rest, edges) for sensor, rest in left.items()}
     tones = {}
     for sensor, own in parts.items():
-        tones[sensor] = _significant(of_stretches(sensor, _stretches(found.used, own, None), None), tests)
-        for tone in tones[sensor].values():   # sampled at equal angles, a fixed frequency would be a multiple of some speeds
+        tones[sensor] = _significant(
+            of_stretches(sensor, _stretches(found.used, own, None), None), tests
+        )
+        for tone in tones[
+            sensor
+        ].values():  # sampled at equal angles, a fixed frequency would be a multiple of some speeds
             for window, part in zip(found.used, own):
-                part[:, AXES.index(tone.axis)] = _without(tone.frequency, window.time, part[:, AXES.index(tone.axis)])
+                part[:, AXES.index(tone.axis)] = _without(
+                    tone.frequency, window.time, part[:, AXES.index(tone.axis)]
+                )
     both = [np.concatenate(pair, axis=1) for pair in zip(*parts.values())]
     orders = [orders_of(found.used, both, joint) for joint in range(len(table.joint_names))]
     for sensor, own in parts.items():
-        turning = (tone for joint, name in enumerate(table.joint_names)
-                   for tone in (*of_stretches(sensor, _stretches(found.used, own, joint), name), *_whole(sensor, orders[joint], name)))
+        turning = (
+            tone
+            for joint, name in enumerate(table.joint_names)
+            for tone in (
+                *of_stretches(sensor, _stretches(found.used, own, joint), name),
+                *_whole(sensor, orders[joint], name),
+            )
+        )
         tones[sensor] |= _significant(turning, tests)
-    return {sensor: tuple(sorted(every.values(), key=lambda tone: tone.p_value)) for sensor, every in tones.items()}
+    return {
+        sensor: tuple(sorted(every.values(), key=lambda tone: tone.p_value))
+        for sensor, every in tones.items()
+    }
 
 
 def _significant(tones, tests):
     """Return (axis, joint) -> the most significant tone, its p-value times the number of tests and axes."""
-    corrected, first = [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones], {}
-    for tone in sorted((tone for tone in corrected if tone.p_value < TONE_P_VALUE), key=lambda tone: tone.p_value):
+    corrected, first = (
+        [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones],
+        {},
+    )
+    for tone in sorted(
+        (tone for tone in corrected if tone.p_value < TONE_P_VALUE), key=lambda tone: tone.p_value
+    ):
         first.setdefault((tone.axis, tone.joint), tone)
     return first
 
 
 def _without(frequency, time, values):
     """Return values without the waves about a frequency, to the resolution of their duration."""
-    waves = np.exp(2j * np.pi * np.outer(time - time[0], frequency + 0.5 * np.arange(-2, 3) / np.ptp(time)))
+    waves = np.exp(
+        2j * np.pi * np.outer(time - time[0], frequency + 0.5 * np.arange(-2, 3) / np.ptp(time))
+    )
     basis = np.linalg.qr(np.column_stack([waves.real, waves.imag]))[0]
     return values - basis @ (basis.T @ values)
 
@@ -249,28 +309,48 @@ def _whole(sensor, orders, joint) -> Iterator[Tone]:
         out = (orders.power[:, column] > OUT) & (orders.share[:, column] > MIN_ORDER_SHARE)
         if out.any():
             best = int(np.argmin(np.where(out, orders.p_value[:, column], np.inf)))
-            yield Tone(sensor, AXES[axis], joint, float(orders.order[best]), float(orders.amplitude[best, column]),
-                       float(orders.p_value[best, column] * len(orders.order)), float(orders.share[best, column]), orders.order,
-                       orders.power[:, column])
+            yield Tone(
+                sensor,
+                AXES[axis],
+                joint,
+                float(orders.order[best]),
+                float(orders.amplitude[best, column]),
+                float(orders.p_value[best, column] * len(orders.order)),
+                float(orders.share[best, column]),
+                orders.order,
+                orders.power[:, column],
+            )
 
 
-def _stretches(windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None) -> Iterator[tuple[np.ndarray, float, float]]:
+def _stretches(
+    windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None
+) -> Iterator[tuple[np.ndarray, float, float]]:
     """Yield (rest at equal steps, shape (n, 3), step in seconds or turns, highest frequency) of stretches that can show a tone."""
     for _, window, rest in long_enough(windows, parts, with_joints=joint is not None):
         step = float(np.median(np.diff(window.time)))
         if joint is None:
             # Samples that are missing are few: a tone keeps its frequency but for the stretch that they are in.
-            yield from ((piece, step, MAX_FREQUENCY_SHARE / step) for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step))))
-        elif (rate := window.motion.rate[:, joint]).min() > MIN_ORDER_RATE or rate.max() < -MIN_ORDER_RATE:
+            yield from (
+                (piece, step, MAX_FREQUENCY_SHARE / step)
+                for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step)))
+            )
+        elif (
+            rate := window.motion.rate[:, joint]
+        ).min() > MIN_ORDER_RATE or rate.max() < -MIN_ORDER_RATE:
             turns = window.motion.position[:, joint] / (2 * np.pi)
             order = slice(None, None, int(np.sign(turns[-1] - turns[0])))
             even = np.arange(turns[order][0], turns[order][-1], 1 / ANGLES_PER_TURN)
             if len(even) < FEWEST_SAMPLES:
                 continue
-            taken = np.stack([np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1)
+            taken = np.stack(
+                [np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1
+            )
             fastest = float(np.abs(rate).max()) * step / (2 * np.pi)
             highest = min(MAX_FREQUENCY_SHARE / fastest, MAX_FREQUENCY_SHARE * ANGLES_PER_TURN)
-            yield from ((piece, 1 / ANGLES_PER_TURN, highest) for piece in _cut(taken, round(ANGLES_PER_TURN / FREQUENCY_STEP)))
+            yield from (
+                (piece, 1 / ANGLES_PER_TURN, highest)
+                for piece in _cut(taken, round(ANGLES_PER_TURN / FREQUENCY_STEP))
+            )
 
 
 def _cut(rest, longest):
@@ -278,7 +358,9 @@ def _cut(rest, longest):
     return np.array_split(rest, -(-len(rest) // longest))
 
 
-def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float]], joint: str | None) -> Iterator[Tone]:
+def of_stretches(
+    sensor: str, stretches: Iterable[tuple[np.ndarray, float, float]], joint: str | None
+) -> Iterator[Tone]:
     """Yield the most significant Tone of each axis, if any; its p-value counts frequencies only."""
     every = list(stretches)
     if not every:
@@ -294,18 +376,38 @@ def of_stretches(sensor: str, stretches: Iterable[tuple[np.ndarray, float, float
         hits[at] += power[at] > MIN_LINE_POWER * around[at]
         ratios[at] += power[at] / around[at]
         plain[at] += power[at] / np.maximum(np.median(power, axis=0), 1e-300)
-        excess[at] += np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))   # of a line under a Hann window
+        excess[at] += (
+            np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))
+        )  # of a line under a Hann window
     if not count.any():
         return
-    chance = np.where(hits > MOSTLY * count[:, None], binom_sf(hits - 1, count[:, None], LINE_CHANCE) * np.count_nonzero(count), 1.0)
+    chance = np.where(
+        hits > MOSTLY * count[:, None],
+        binom_sf(hits - 1, count[:, None], LINE_CHANCE) * np.count_nonzero(count),
+        1.0,
+    )
     for axis in range(3):
         mean = ratios[:, axis] / np.maximum(count, 1)
         # The highest significant peak: the surroundings are known by octaves only.
-        best = int(np.argmax(np.where(chance[:, axis] < TONE_P_VALUE, plain[:, axis] / np.maximum(count, 1), -1.0)))
+        best = int(
+            np.argmax(
+                np.where(
+                    chance[:, axis] < TONE_P_VALUE, plain[:, axis] / np.maximum(count, 1), -1.0
+                )
+            )
+        )
         if chance[best, axis] < TONE_P_VALUE:
-            yield Tone(sensor, AXES[axis], joint, float(grid[best]), float(np.sqrt(excess[best, axis] / count[best])),
-                       float(chance[best, axis]),
-                       float(hits[best, axis] / count[best]), grid[count > 0], mean[count > 0])
+            yield Tone(
+                sensor,
+                AXES[axis],
+                joint,
+                float(grid[best]),
+                float(np.sqrt(excess[best, axis] / count[best])),
+                float(chance[best, axis]),
+                float(hits[best, axis] / count[best]),
+                grid[count > 0],
+                mean[count > 0],
+            )
 
 
 def _powers(rest, size, inside):
@@ -313,7 +415,7 @@ def _powers(rest, size, inside):
     window, line = np.hanning(len(rest)), np.linspace(-1.0, 1.0, len(rest))[:, None]
     level = rest - rest.mean(axis=0)
     level -= line * (line * level).sum(axis=0) / (line**2).sum()
-    power = np.abs(np.fft.rfft(level * window[:, None], size, axis=0))**2 / (window**2).sum()
+    power = np.abs(np.fft.rfft(level * window[:, None], size, axis=0)) ** 2 / (window**2).sum()
     around, inside = np.ones_like(power), inside.copy()
     octave = np.zeros(len(power), int)
     octave[1:] = np.log2(np.arange(1, len(power))).astype(int)

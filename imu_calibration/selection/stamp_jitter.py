@@ -48,7 +48,9 @@ def jitter_text(sd: float) -> str:
     return f'the stamps have independent errors of {1e6 * sd:.0f} us (1 sd), which explain scatter of both sensors in motion'
 
 
-def stamp_jitter(rough: Sequence[np.ndarray], slope: Sequence[np.ndarray], freedom: np.ndarray) -> StampJitter:
+def stamp_jitter(
+    rough: Sequence[np.ndarray], slope: Sequence[np.ndarray], freedom: np.ndarray
+) -> StampJitter:
     """
     Return the errors of the stamps from the scatter in motion.
 
@@ -67,11 +69,15 @@ def stamp_jitter(rough: Sequence[np.ndarray], slope: Sequence[np.ndarray], freed
         Degrees of freedom of the variances.
 
     """
-    value, sd = np.array([_variance(own, steep, freedom) for own, steep in zip(rough, slope, strict=True)]).T
+    value, sd = np.array(
+        [_variance(own, steep, freedom) for own, steep in zip(rough, slope, strict=True)]
+    ).T
     variance = max(min(np.average(value, weights=1 / sd**2), *(value + BOUND_SDS * sd)), 0.0)
     apart = np.abs(value - variance)
     alike = (apart < BOUND_SDS * sd) | (apart < ALIKE_VARIANCES * variance)
-    return StampJitter(float(np.sqrt(variance)), bool(np.all(value > CLEAR_SDS * sd) and alike.all()))
+    return StampJitter(
+        float(np.sqrt(variance)), bool(np.all(value > CLEAR_SDS * sd) and alike.all())
+    )
 
 
 def jitter_ratio(rough: np.ndarray, slope: np.ndarray, jitter: float) -> np.ndarray:
@@ -92,7 +98,7 @@ def _variance(rough, slope, freedom):
 
     The median of chi-square over its degrees of freedom f is ``(1 - 2 / (9 f))^3`` (Wilson and Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
     """
-    variance, rough = 0.0, rough / (1.0 - 2.0 / (9.0 * np.maximum(freedom, 1.0)))[:, None]**3
+    variance, rough = 0.0, rough / (1.0 - 2.0 / (9.0 * np.maximum(freedom, 1.0)))[:, None] ** 3
     for _ in range(JITTER_STEPS):
         noise = _noise(rough, slope, variance)
         ratio = ((rough - noise) / np.maximum(slope, np.finfo(float).tiny)).ravel()

@@ -63,10 +63,14 @@ class Unexplained:
     @property
     def entry(self) -> dict[str, Any]:
         """Entry of a calibration document."""
-        return {'rms': self.rms, 'axes': list(self.axes)} | ({'unit': self.unit} if self.unit else {})
+        return {'rms': self.rms, 'axes': list(self.axes)} | (
+            {'unit': self.unit} if self.unit else {}
+        )
 
 
-def unexplained(problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]) -> dict[str, Unexplained]:
+def unexplained(
+    problem: LinearisedProblem, explained: ExplainedWindows, chosen: Sequence[Question]
+) -> dict[str, Unexplained]:
     """Return sensor -> Unexplained for a choice of effects."""
     excess, used = explained.excess(chosen), problem.search.indices(chosen)
     values = problem.space.reduced(used, problem.evidence.fit(used)[0])
@@ -83,8 +87,13 @@ def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> 
             squares[axis] += mean_square
     if not squares.any():
         return rest
-    return replace(rest, significant=True, rms=float(np.sqrt(squares.mean())), axes=largest_axes(squares, 0.0),
-                   correlates_with=IN_MOTION if scatter.any() else None)
+    return replace(
+        rest,
+        significant=True,
+        rms=float(np.sqrt(squares.mean())),
+        axes=largest_axes(squares, 0.0),
+        correlates_with=IN_MOTION if scatter.any() else None,
+    )
 
 
 def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
@@ -97,8 +106,14 @@ def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
     if not len(kinds):
         return np.zeros(3)
-    excess = np.maximum(np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts) - noise.low_variance, 0.0)
-    return np.where(excess > MUCH_SCATTER * np.maximum(np.median(excess), noise.low_variance), excess, 0.0)
+    excess = np.maximum(
+        np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts)
+        - noise.low_variance,
+        0.0,
+    )
+    return np.where(
+        excess > MUCH_SCATTER * np.maximum(np.median(excess), noise.low_variance), excess, 0.0
+    )
 
 
 def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
@@ -119,22 +134,40 @@ def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dic
 
 def _rest(problem, explained, sensor, excess, values):
     space, recording = problem.space, problem.recording
-    residual = np.stack([space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1)
+    residual = np.stack(
+        [space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1
+    )
     floor = explained.floor.noise[sensor]
-    white = floor.variance_beside_bias(recording.kind, recording.count, recording.duration, keys=recording.keys)
+    white = floor.variance_beside_bias(
+        recording.kind, recording.count, recording.duration, keys=recording.keys
+    )
     noise_sd = np.sqrt(white + floor.bias_variance)
     sigma_means, sigma_within = explained.sigma(sensor, excess)
     # Quiet axes dilute the excess of one.
     means, within = np.maximum(excess.sum(axis=1), excess.max(axis=1))
-    sigma = max(sigma_means, sigma_within) if within > WITHIN_SHARE * explained.n_within else sigma_means
+    sigma = (
+        max(sigma_means, sigma_within)
+        if within > WITHIN_SHARE * explained.n_within
+        else sigma_means
+    )
     rms = float(np.sqrt(max(np.mean(residual**2 - noise_sd**2), 0.0)))
     significant = bool(sigma > SIGNIFICANT_SDS and explained.n_means >= 3 * MIN_EXPLAINED_WINDOWS)
     if not significant:
         return Unexplained(False, rms, float(sigma), None, 0.0, residual, noise_sd)
     if sigma_means <= SIGNIFICANT_SDS:
-        inside = np.mean([floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])])
-        return Unexplained(True, float(np.sqrt(inside * within / explained.n_within)), float(sigma), None, 0.0, residual, noise_sd)
-    if rms == 0:   # less than biases may wander, and more than neighbours may differ
+        inside = np.mean(
+            [floor.row_variance(kind) for kind in np.unique(recording.kind[recording.moving])]
+        )
+        return Unexplained(
+            True,
+            float(np.sqrt(inside * within / explained.n_within)),
+            float(sigma),
+            None,
+            0.0,
+            residual,
+            noise_sd,
+        )
+    if rms == 0:  # less than biases may wander, and more than neighbours may differ
         rms = float(np.sqrt(np.mean(white) * means / explained.n_means))
     name, share = correlate(_explanations(recording), residual / noise_sd)
     return Unexplained(True, rms, float(sigma), name, share, residual, noise_sd)
@@ -153,11 +186,13 @@ def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None,
         design = np.column_stack([np.ones(rows.sum()), columns[rows]])
         left = residual[rows]
         fitted = design @ np.linalg.lstsq(design, left, rcond=1e-9)[0]
-        total, rest = ((left - left.mean(axis=0))**2).sum(), ((left - fitted)**2).sum()
+        total, rest = ((left - left.mean(axis=0)) ** 2).sum(), ((left - fitted) ** 2).sum()
         k, n = columns.shape[1], rows.sum()
         share = 1 - (rest / (n - k - 1)) / (total / (n - 1))
         layers = residual.shape[1]
-        p_value = f_sf((total - rest) / k / max(rest / (n - k - 1), 1e-300), layers * k, layers * (n - k - 1))
+        p_value = f_sf(
+            (total - rest) / k / max(rest / (n - k - 1), 1e-300), layers * k, layers * (n - k - 1)
+        )
         if p_value < ALPHA and share > max(best[1], 0.15):
             best = (name, float(share))
     return best
@@ -167,23 +202,31 @@ def _explanations(recording):
     """Yield (name, columns (k, m), windows where they are known)."""
     describe, every = recording.describe, np.ones(len(recording.kind), bool)
     yield from slow_explanations(describe['time'], describe['temperature'])
-    yield 'rate', np.stack([describe['rate'], describe['rate']**2], axis=1), every
+    yield 'rate', np.stack([describe['rate'], describe['rate'] ** 2], axis=1), every
     yield 'specific force', (describe['specific force'] - 9.8)[:, None], every
     for name in describe:
         if name.startswith('angle'):
-            number = name[len('angle'):]
+            number = name[len('angle') :]
             angle, known = describe[name], describe['span' + number] < 0.7
             turns = np.stack([w(m * angle) for m in (1, 2, 3) for w in (np.cos, np.sin)], axis=1)
             yield f'angle of {recording.model.joint_names[int(number)]}', turns, known
     yield IN_MOTION, recording.moving[:, None].astype(float), every
 
 
-def slow_explanations(time: np.ndarray, temperature: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+def slow_explanations(
+    time: np.ndarray, temperature: np.ndarray
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield (name, columns, mask) of time, steps in time, and temperature where it is known and changes."""
     every = np.ones(len(time), bool)
     time = (time - time.mean()) / max(np.ptp(time), 1e-9)
     yield 'time', np.stack([time, time**2, time**3], axis=1), every
-    yield 'time', np.stack([time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1).astype(float), every
+    yield (
+        'time',
+        np.stack(
+            [time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1
+        ).astype(float),
+        every,
+    )
     if np.all(np.isfinite(temperature)) and np.ptp(temperature) > 0.5:
         warm = (temperature - temperature.mean()) / np.ptp(temperature)
         yield 'temperature', np.stack([warm, warm**2], axis=1), every

@@ -76,23 +76,35 @@ class Segment:
 
     def _add_steps(self, motion, time):
         part = time / self.duration
-        for steps, gain, power in ((_RATE_STEP, self.rate_to - self.rate_from, 1), (_POSITION_STEP, self.shift, 0)):
+        for steps, gain, power in (
+            (_RATE_STEP, self.rate_to - self.rate_from, 1),
+            (_POSITION_STEP, self.shift, 0),
+        ):
             if gain.any():
                 for order in range(4):
-                    motion[order] += np.outer(steps[order](part), gain * self.duration ** (power - order))
+                    motion[order] += np.outer(
+                        steps[order](part), gain * self.duration ** (power - order)
+                    )
 
     def _add_sines(self, motion, time):
         rise = np.clip(time / self.fade, 0.0, 1.0)
         fall = np.clip((time - self.duration) / self.fade + 1.0, 0.0, 1.0)
-        envelope = [(step(rise) - step(fall)) * self.fade ** -order for order, step in enumerate(_POSITION_STEP)]
-        for amplitude, frequency, phase in zip(self.amplitude, self.frequency, self.phase, strict=True):
+        envelope = [
+            (step(rise) - step(fall)) * self.fade**-order
+            for order, step in enumerate(_POSITION_STEP)
+        ]
+        for amplitude, frequency, phase in zip(
+            self.amplitude, self.frequency, self.phase, strict=True
+        ):
             omega = 2.0 * np.pi * frequency
             angle = np.outer(time, omega) + phase
             sine, cosine = amplitude * np.sin(angle), amplitude * np.cos(angle) * omega
             waves = [sine, cosine, -sine * omega**2, -cosine * omega**2]
             for order in range(4):
                 for inner in range(order + 1):
-                    motion[order] += _BINOMIAL[order][inner] * envelope[order - inner][:, None] * waves[inner]
+                    motion[order] += (
+                        _BINOMIAL[order][inner] * envelope[order - inner][:, None] * waves[inner]
+                    )
 
 
 _BINOMIAL = ((1,), (1, 1), (1, 2, 1), (1, 3, 3, 1))
@@ -145,7 +157,9 @@ class Profile:
         ordered = time if order is None else time[order]
         motion = np.empty((4, len(time), len(self.segments[0].start)))
         cuts = np.searchsorted(ordered, edges[1:-1])
-        for segment, start, low, high in zip(self.segments, edges, [0, *cuts], [*cuts, len(time)], strict=False):
+        for segment, start, low, high in zip(
+            self.segments, edges, [0, *cuts], [*cuts, len(time)], strict=False
+        ):
             if high > low:
                 motion[:, low:high] = segment.at(ordered[low:high] - start)
         if order is None:
@@ -157,7 +171,9 @@ class Profile:
     def find(self, kind: str) -> np.ndarray:
         """Return (start, end) of every segment of a kind, s, shape (n, 2)."""
         edges = self.edges
-        return np.array([(edges[i], edges[i + 1]) for i, s in enumerate(self.segments) if s.kind == kind]).reshape(-1, 2)
+        return np.array(
+            [(edges[i], edges[i + 1]) for i, s in enumerate(self.segments) if s.kind == kind]
+        ).reshape(-1, 2)
 
 
 class MotionBuilder:
@@ -168,7 +184,14 @@ class MotionBuilder:
     builder, so that calls can be chained.
     """
 
-    def __init__(self, n_joints: int, dwell: float = 1.0, limits: MotionLimits | None = None, *, start: np.ndarray | None = None):
+    def __init__(
+        self,
+        n_joints: int,
+        dwell: float = 1.0,
+        limits: MotionLimits | None = None,
+        *,
+        start: np.ndarray | None = None,
+    ):
         """
         Start at rest at zero, or at the positions `start`.
 
@@ -195,7 +218,9 @@ class MotionBuilder:
 
     def move(self, angles_deg: ArrayLike, shortest: bool = True) -> Self:
         """Move to the joint angles (NaN: do not move that joint), each by less than half a turn when `shortest`."""
-        return self.move_to(np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest)
+        return self.move_to(
+            np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest
+        )
 
     def move_to(self, target: np.ndarray, shortest: bool = True) -> Self:
         """Move to joint positions in rad and m; endless joints by less than half a turn when `shortest`."""
@@ -203,7 +228,11 @@ class MotionBuilder:
         if shortest:
             shift = np.where(self.limits.endless, (shift + np.pi) % (2.0 * np.pi) - np.pi, shift)
         distance = np.abs(shift)
-        return self if np.max(distance) < 1e-9 else self._append('move', move_time(distance, self.limits), shift=shift)
+        return (
+            self
+            if np.max(distance) < 1e-9
+            else self._append('move', move_time(distance, self.limits), shift=shift)
+        )
 
     def spin(self, rates_deg: ArrayLike, duration: float) -> Self:
         """Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints), for `duration` times dwell, then stop."""
@@ -214,25 +243,53 @@ class MotionBuilder:
             last = rate
         return self._ramp(last, np.zeros(self.n_joints))
 
-    def oscillate(self, amplitude_deg: ArrayLike, frequency: ArrayLike, duration: float, *,
-                  phase: ArrayLike = 0.0, fade: float | None = None) -> Self:
+    def oscillate(
+        self,
+        amplitude_deg: ArrayLike,
+        frequency: ArrayLike,
+        duration: float,
+        *,
+        phase: ArrayLike = 0.0,
+        fade: float | None = None,
+    ) -> Self:
         """Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,), for `duration` times dwell."""
         return self.swing(np.radians(amplitude_deg), frequency, duration, phase=phase, fade=fade)
 
-    def swing(self, amplitude: np.ndarray, frequency: ArrayLike, duration: float, *, phase: ArrayLike = 0.0,
-              fade: float | None = None) -> Self:
+    def swing(
+        self,
+        amplitude: np.ndarray,
+        frequency: ArrayLike,
+        duration: float,
+        *,
+        phase: ArrayLike = 0.0,
+        fade: float | None = None,
+    ) -> Self:
         """Do the same with amplitudes in rad and m."""
         amplitude = np.atleast_2d(np.asarray(amplitude, float))
-        frequency, phase = (np.broadcast_to(np.asarray(value, float), amplitude.shape) for value in (frequency, phase))
+        frequency, phase = (
+            np.broadcast_to(np.asarray(value, float), amplitude.shape)
+            for value in (frequency, phase)
+        )
         duration = duration * self.dwell
-        fade = min(0.5 * duration, 1.0 / np.min(frequency[amplitude != 0.0]) if fade is None else fade)
-        return self._append('oscillation', duration, amplitude=amplitude, frequency=frequency, phase=phase, fade=fade)
+        fade = min(
+            0.5 * duration, 1.0 / np.min(frequency[amplitude != 0.0]) if fade is None else fade
+        )
+        return self._append(
+            'oscillation',
+            duration,
+            amplitude=amplitude,
+            frequency=frequency,
+            phase=phase,
+            fade=fade,
+        )
 
     def _ramp(self, rate_from, rate_to):
         change = np.max(np.abs(rate_to - rate_from) / self.limits.acceleration)
         if change == 0.0:
             return self
-        return self._append('ramp', max(SHORTEST_MOVE, PEAK_ACCELERATION_OF_RAMP * change), rate_from, rate_to)
+        return self._append(
+            'ramp', max(SHORTEST_MOVE, PEAK_ACCELERATION_OF_RAMP * change), rate_from, rate_to
+        )
 
     def _append(self, kind, duration, rate_from=None, rate_to=None, shift=None, **sines):
         zero = np.zeros(self.n_joints)
@@ -246,7 +303,13 @@ class MotionBuilder:
 def move_time(distance: np.ndarray, limits: MotionLimits) -> float:
     """Return the duration of a move of all joints by `distance`, shape (n_joints,), within the limits, s."""
     rate = np.max(PEAK_RATE_OF_MOVE * distance / limits.speed)
-    return float(max(SHORTEST_MOVE, rate, np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration))))
+    return float(
+        max(
+            SHORTEST_MOVE,
+            rate,
+            np.sqrt(np.max(PEAK_ACCELERATION_OF_MOVE * distance / limits.acceleration)),
+        )
+    )
 
 
 def stretch(build: Callable, duration: float) -> tuple[Segment, ...]:
@@ -262,6 +325,8 @@ def stretch(build: Callable, duration: float) -> tuple[Segment, ...]:
     length = [sum(segment.duration for segment in build(dwell)) for dwell in (1.0, 2.0)]
     change = length[1] - length[0]
     if duration < (shortest := length[0] - (1.0 - SHORTEST_DWELL) * change) - 1e-6:
-        raise InputError(f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s; choose more or another profile',
-                         code='too_short')
+        raise InputError(
+            f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s; choose more or another profile',
+            code='too_short',
+        )
     return build(1.0 + (duration - length[0]) / change)

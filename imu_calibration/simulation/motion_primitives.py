@@ -39,21 +39,37 @@ def spin_vertical(up_b: np.ndarray, speeds_deg: ArrayLike, dwell: float) -> Task
 def spin_joint(joint: int, at_deg: ArrayLike, speeds_deg: ArrayLike, *, dwell: float) -> Task:
     """Turn one joint both ways at each speed."""
     rates_deg = np.multiply.outer(speeds_deg, (1, -1)).reshape(-1, 1)
-    return lambda builder: builder.move(at_deg).spin(np.where(np.arange(builder.n_joints) == joint, rates_deg, 0.0), dwell)
+    return lambda builder: builder.move(at_deg).spin(
+        np.where(np.arange(builder.n_joints) == joint, rates_deg, 0.0), dwell
+    )
 
 
 def swing(axis: int, amplitude_deg: float, frequency: float, *, duration: float) -> Task:
     """Swing about sensor axis 0, 1 or 2: the inner joint, the middle one, or the middle one with the inner a quarter turn on."""
     at_deg, joint = (([0, 0, 0], 2), ([0, 0, 0], 1), ([0, 0, 90], 1))[axis]
-    return swing_at(np.radians(at_deg), np.radians(amplitude_deg * np.eye(3)[joint]), frequency, duration=duration)
+    return swing_at(
+        np.radians(at_deg),
+        np.radians(amplitude_deg * np.eye(3)[joint]),
+        frequency,
+        duration=duration,
+    )
 
 
-def swing_at(position: np.ndarray, amplitude: np.ndarray, frequency: ArrayLike, *, duration: float, settle: bool = True) -> Task:
+def swing_at(
+    position: np.ndarray,
+    amplitude: np.ndarray,
+    frequency: ArrayLike,
+    *,
+    duration: float,
+    settle: bool = True,
+) -> Task:
     """Swing about joint positions (rad, m), with a rest before and, to `settle`, after it."""
+
     def task(builder):
         builder.move_to(position).rest(1.0).swing(amplitude, frequency, duration)
         if settle:
             builder.rest(1.0)
+
     return task
 
 
@@ -62,7 +78,13 @@ def two_axes(at_deg: Sequence[float] | np.ndarray, rates_deg: ArrayLike, dwell: 
     return lambda builder: builder.move(at_deg).spin(np.multiply.outer((1, -1), rates_deg), dwell)
 
 
-def run(builder: MotionBuilder, rng: np.random.Generator, tasks: Sequence[Task], *, reference_every: int = 12) -> None:
+def run(
+    builder: MotionBuilder,
+    rng: np.random.Generator,
+    tasks: Sequence[Task],
+    *,
+    reference_every: int = 12,
+) -> None:
     """Run tasks in a random order, with returns to the reference pose, so that drift is separable from other effects."""
     builder.rest_at_home(8.0)
     for count, index in enumerate(rng.permutation(len(tasks)), start=1):
@@ -77,16 +99,30 @@ def poses(directions: Sequence[np.ndarray] | np.ndarray, dwell: float) -> list[T
     return [pose(up_b, GOLDEN_ANGLE_DEG * k, dwell) for k, up_b in enumerate(directions)]
 
 
-def swings(amplitudes_and_frequencies: tuple[tuple[float, float], ...], duration: float) -> list[Task]:
+def swings(
+    amplitudes_and_frequencies: tuple[tuple[float, float], ...], duration: float
+) -> list[Task]:
     """Return the tasks of swinging about each sensor axis at each amplitude (deg) and frequency (Hz)."""
-    return [swing(axis, *cycle, duration=duration) for axis in range(3) for cycle in amplitudes_and_frequencies]
+    return [
+        swing(axis, *cycle, duration=duration)
+        for axis in range(3)
+        for cycle in amplitudes_and_frequencies
+    ]
 
 
 def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> list[Task]:
     """Outer and inner, outer and middle (about y, about z), middle and inner: turns about two axes at a time."""
     a, b = speeds_deg
-    return [two_axes(at, rates, dwell) for at, rates in (
-        ([0, 0, 0], [a, 0, b]), ([0, 0, 0], [a, b, 0]), ([0, 0, 90], [a, -b, 0]), ([0, 45, 0], [a, 0, -b]), ([0, 0, 30], [0, b, a]))]
+    return [
+        two_axes(at, rates, dwell)
+        for at, rates in (
+            ([0, 0, 0], [a, 0, b]),
+            ([0, 0, 0], [a, b, 0]),
+            ([0, 0, 90], [a, -b, 0]),
+            ([0, 45, 0], [a, 0, -b]),
+            ([0, 0, 30], [0, b, a]),
+        )
+    ]
 
 
 AXIS_ORDERS = ('XYX', 'XYZ', 'XZX', 'XZY', 'YXY', 'YXZ', 'YZX', 'YZY', 'ZXY', 'ZXZ', 'ZYX', 'ZYZ')
@@ -100,7 +136,14 @@ def _table(axes, up=(0.0, 0.0, 1.0), latitude=50.45, rpy_deg=(0.0, 0.0, 0.0)):
     names = ('outer', 'middle', 'inner') if len(axes) == 3 else ('turn',)
     joints = [{'name': name, 'axis': list(axis)} for name, axis in zip(names, axes, strict=True)]
     mount = {'rpy_deg': list(rpy_deg), 'xyz': None}
-    return {'joints': joints, 'up': list(up), 'latitude': latitude, 'height': 170.0, 'azimuth_deg': 0.0, 'mount': mount}
+    return {
+        'joints': joints,
+        'up': list(up),
+        'latitude': latitude,
+        'height': 170.0,
+        'azimuth_deg': 0.0,
+        'mount': mount,
+    }
 
 
 GIMBALS = _table([AXIS_VECTORS[axis] for axis in 'ZYX'])
@@ -126,7 +169,9 @@ def _body_rates(builder, _rng, sample):
     """Each row as one turn of the vertical joint: the inner two hold the wanted direction of the rate upright."""
     for rates in avrutov_rates_deg(sample):
         speed = np.linalg.norm(rates)
-        builder.move(pose_deg(rates if speed else [0, 0, 1], np.nan)).rest(2.0).spin([[speed, 0.0, 0.0]], 10.0)
+        builder.move(pose_deg(rates if speed else [0, 0, 1], np.nan)).rest(2.0).spin(
+            [[speed, 0.0, 0.0]], 10.0
+        )
 
 
 def _gimbal_rates(builder, _rng, sample):
@@ -158,27 +203,87 @@ def _zhang_oscillations(builder, _rng):
 def _zhang_mixed(builder, _rng):
     _six_faces(builder)
     tasks = [spin_vertical(axis, 200.0, 6.0) for axis in np.eye(3)] + swings(((10.0, 1.0),), 12.0)
-    for task in [*tasks, *(two_axes(at_deg, rates, 6.0) for at_deg, rates in (
-            ([0, 0, 0], [200, 0, 200]), ([0, 0, 0], [200, 200, 0]), ([0, 0, 90], [200, 200, 0])))]:
+    for task in [
+        *tasks,
+        *(
+            two_axes(at_deg, rates, 6.0)
+            for at_deg, rates in (
+                ([0, 0, 0], [200, 0, 200]),
+                ([0, 0, 0], [200, 200, 0]),
+                ([0, 0, 90], [200, 200, 0]),
+            )
+        ),
+    ]:
         task(builder)
 
 
-SKEW_60_RPY_DEG = Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_euler('xyz', degrees=True).tolist()
+SKEW_60_RPY_DEG = (
+    Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_euler('xyz', degrees=True).tolist()
+)
 """A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three sensor axes."""
 
 REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
-    **{f'avrutov_{order}{suffix}': (f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn '
-                                    'gravity', _equal_angles, _table([AXIS_VECTORS[axis] for axis in order], up), 3)
-       for order in AXIS_ORDERS for suffix, up in (('', AXIS_VECTORS['Z']), ('_up_x', AXIS_VECTORS['X']), ('_up_y', AXIS_VECTORS['Y']))},
-    'avrutov_111': ("the literal reading of 'around three axes simultaneously': one turn about (1, 1, 1)", _equal_angles,
-                    _table([[1.0, 1.0, 1.0]]), 1),
-    **{f'avrutov_rates_{sample}': (f'gyroscope series of sample {sample} as body rates: one turn about a fixed axis for each row',
-                                   partial(_body_rates, sample=sample), GIMBALS, 3) for sample in (3, 4)},
-    **{f'avrutov_gimbals_{sample}': (f'gyroscope series of sample {sample} commanded to the gimbals, which are not body rates',
-                                     partial(_gimbal_rates, sample=sample), GIMBALS, 3) for sample in (3, 4)},
-    'zhang_z0': ('six faces, spins about the sensor axes at 100, 150, 200 deg/s', _zhang_spins, GIMBALS, 3),
-    'zhang_z60': ('the same with a fixture skewed by 60 deg about (1, 1, 1)', _zhang_spins,
-                  _table([AXIS_VECTORS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG), 3),
-    'zhang_o': ('six faces, swings about the sensor axes: 10 deg 1 Hz, 5 deg 2 Hz, 90 deg 0.5 Hz', _zhang_oscillations, GIMBALS, 3),
-    'zhang_m': ('six faces, three spins, three swings, three simultaneous turns', _zhang_mixed, GIMBALS, 3),
+    **{
+        f'avrutov_{order}{suffix}': (
+            f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn '
+            'gravity',
+            _equal_angles,
+            _table([AXIS_VECTORS[axis] for axis in order], up),
+            3,
+        )
+        for order in AXIS_ORDERS
+        for suffix, up in (
+            ('', AXIS_VECTORS['Z']),
+            ('_up_x', AXIS_VECTORS['X']),
+            ('_up_y', AXIS_VECTORS['Y']),
+        )
+    },
+    'avrutov_111': (
+        "the literal reading of 'around three axes simultaneously': one turn about (1, 1, 1)",
+        _equal_angles,
+        _table([[1.0, 1.0, 1.0]]),
+        1,
+    ),
+    **{
+        f'avrutov_rates_{sample}': (
+            f'gyroscope series of sample {sample} as body rates: one turn about a fixed axis for each row',
+            partial(_body_rates, sample=sample),
+            GIMBALS,
+            3,
+        )
+        for sample in (3, 4)
+    },
+    **{
+        f'avrutov_gimbals_{sample}': (
+            f'gyroscope series of sample {sample} commanded to the gimbals, which are not body rates',
+            partial(_gimbal_rates, sample=sample),
+            GIMBALS,
+            3,
+        )
+        for sample in (3, 4)
+    },
+    'zhang_z0': (
+        'six faces, spins about the sensor axes at 100, 150, 200 deg/s',
+        _zhang_spins,
+        GIMBALS,
+        3,
+    ),
+    'zhang_z60': (
+        'the same with a fixture skewed by 60 deg about (1, 1, 1)',
+        _zhang_spins,
+        _table([AXIS_VECTORS[a] for a in 'ZYX'], rpy_deg=SKEW_60_RPY_DEG),
+        3,
+    ),
+    'zhang_o': (
+        'six faces, swings about the sensor axes: 10 deg 1 Hz, 5 deg 2 Hz, 90 deg 0.5 Hz',
+        _zhang_oscillations,
+        GIMBALS,
+        3,
+    ),
+    'zhang_m': (
+        'six faces, three spins, three swings, three simultaneous turns',
+        _zhang_mixed,
+        GIMBALS,
+        3,
+    ),
 }

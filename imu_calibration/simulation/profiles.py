@@ -25,47 +25,82 @@ from imu_calibration.simulation.motion_primitives import (
     two_axes,
 )
 
-EDGES = np.array([[a, b, 0] for a in (1, -1) for b in (1, -1)] + [[a, 0, b] for a in (1, -1) for b in (1, -1)]
-                 + [[0, a, b] for a in (1, -1) for b in (1, -1)]) / np.sqrt(2)
+EDGES = np.array(
+    [[a, b, 0] for a in (1, -1) for b in (1, -1)]
+    + [[a, 0, b] for a in (1, -1) for b in (1, -1)]
+    + [[0, a, b] for a in (1, -1) for b in (1, -1)]
+) / np.sqrt(2)
 CORNERS = np.array([[a, b, c] for a in (1, -1) for b in (1, -1) for c in (1, -1)]) / np.sqrt(3)
 
 MAX_PROFILE_SWING = 0.5
 """Amplitude of a swing at most, rad or m."""
 
 
-def within_limits(builder: MotionBuilder, rng: np.random.Generator, n_poses: int = 24, *, frequencies: Sequence[float] = (0.25, 0.5, 1.0),
-                  swing_time: float = 5.0, n_other: int = 20) -> None:
+def within_limits(
+    builder: MotionBuilder,
+    rng: np.random.Generator,
+    n_poses: int = 24,
+    *,
+    frequencies: Sequence[float] = (0.25, 0.5, 1.0),
+    swing_time: float = 5.0,
+    n_other: int = 20,
+) -> None:
     """Poses, swings of one joint and of two at once (with at most `n_other` other joints) and, where a joint has no end, spins."""
     limits, count = builder.limits, builder.n_joints
-    lower, upper = np.where(limits.endless, -np.pi, limits.lower), np.where(limits.endless, np.pi, limits.upper)
+    lower, upper = (
+        np.where(limits.endless, -np.pi, limits.lower),
+        np.where(limits.endless, np.pi, limits.upper),
+    )
     moving = np.flatnonzero(upper > lower)
 
     def places(n):
         """Spread positions over the range of every joint, each value once."""
-        return lower + (upper - lower) * (rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T + 0.5) / n
+        return (
+            lower
+            + (upper - lower)
+            * (rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T + 0.5)
+            / n
+        )
 
     def swing(at, frequency):
         """Swing the joints in which `frequency` is not zero, up to the limits of range, speed and acceleration."""
         omega = 2 * np.pi * np.maximum(frequency, 1e-9)
-        reach = [0.3 * (upper - lower), limits.speed / omega, limits.acceleration / omega**2, np.full(count, MAX_PROFILE_SWING)]
+        reach = [
+            0.3 * (upper - lower),
+            limits.speed / omega,
+            limits.acceleration / omega**2,
+            np.full(count, MAX_PROFILE_SWING),
+        ]
         amplitude = np.where(frequency > 0, 0.7 * np.minimum.reduce(reach), 0.0)
-        middle = np.where(limits.endless, at, np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude))
+        middle = np.where(
+            limits.endless, at, np.clip(at, lower + 1.1 * amplitude, upper - 1.1 * amplitude)
+        )
         return swing_at(middle, amplitude, np.maximum(frequency, 0.1), duration=swing_time)
 
     tasks, only = [_rest_at(position) for position in places(n_poses)], np.eye(count)
     for joint in moving.tolist():
-        tasks += [swing(at, frequency * only[joint]) for at, frequency in zip(places(len(frequencies)), frequencies, strict=True)]
+        tasks += [
+            swing(at, frequency * only[joint])
+            for at, frequency in zip(places(len(frequencies)), frequencies, strict=True)
+        ]
         others = moving[moving < joint][-n_other:]
-        tasks += [swing(at, 0.3 * only[joint] + 0.45 * only[other]) for other, at in zip(others, places(max(len(others), 1)), strict=False)]
+        tasks += [
+            swing(at, 0.3 * only[joint] + 0.45 * only[other])
+            for other, at in zip(others, places(max(len(others), 1)), strict=False)
+        ]
         if limits.endless[joint]:
             shares = 0.9 * np.linspace(0.3, 1.0, len(frequencies))
             speeds = shares * np.degrees(limits.speed[joint])
-            tasks += [spin_joint(joint, np.where(limits.turns, np.degrees(at), np.nan), speed, dwell=4.0)
-                      for at, speed in zip(places(len(shares)), speeds, strict=True)]
+            tasks += [
+                spin_joint(joint, np.where(limits.turns, np.degrees(at), np.nan), speed, dwell=4.0)
+                for at, speed in zip(places(len(shares)), speeds, strict=True)
+            ]
     run(builder, rng, tasks)
 
 
-within_limits_short = partial(within_limits, n_poses=10, frequencies=(0.5,), swing_time=4.0, n_other=1)
+within_limits_short = partial(
+    within_limits, n_poses=10, frequencies=(0.5,), swing_time=4.0, n_other=1
+)
 
 
 def _rest_at(position):
@@ -94,7 +129,13 @@ def profile_names() -> dict[str, str]:
     return {name: entry.description for name, entry in _REGISTRY.items() if '_up_' not in name}
 
 
-def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None = None, *, duration: float | None = None) -> Profile:
+def make_profile(
+    name: str,
+    seed: int = 0,
+    table: dict[str, Any] | Table | None = None,
+    *,
+    duration: float | None = None,
+) -> Profile:
     """
     Return the motion called `name`.
 
@@ -118,16 +159,31 @@ def make_profile(name: str, seed: int = 0, table: dict[str, Any] | Table | None 
 
     """
     if name not in _REGISTRY:
-        raise InputError(f"profile '{name}' is unknown{did_you_mean(name, profile_names())}; "
-                         f"the profiles are {', '.join(profile_names())}", code='profile_unknown')
+        raise InputError(
+            f"profile '{name}' is unknown{did_you_mean(name, profile_names())}; "
+            f'the profiles are {", ".join(profile_names())}',
+            code='profile_unknown',
+        )
     entry = _REGISTRY[name]
     joint_names = _joint_names(entry, table)
     fits = entry.n_joints in (None, len(joint_names))
     if not (fits or entry.adapts):
-        raise InputError(f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'",
-                         code='joint_count')
-    limits = limits_of(table) if isinstance(table, Table) and entry.table is None else free_limits(len(joint_names))
-    build = within_limits if entry.adapts and not limits.endless.all() else entry.build if fits else _any_table
+        raise InputError(
+            f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'",
+            code='joint_count',
+        )
+    limits = (
+        limits_of(table)
+        if isinstance(table, Table) and entry.table is None
+        else free_limits(len(joint_names))
+    )
+    build = (
+        within_limits
+        if entry.adapts and not limits.endless.all()
+        else entry.build
+        if fits
+        else _any_table
+    )
 
     def segments(dwell):
         builder = MotionBuilder(len(joint_names), dwell, limits)
@@ -144,14 +200,22 @@ def _require_within(profile, limits):
     """Refuse a motion that exceeds the range of a joint."""
     if limits.endless.all():
         return
-    position = profile.at(np.linspace(0.0, profile.duration, int(20 * profile.duration) + 1)).position
+    position = profile.at(
+        np.linspace(0.0, profile.duration, int(20 * profile.duration) + 1)
+    ).position
     for column, name in enumerate(profile.joint_names):
         reached = np.array([position[:, column].min(), position[:, column].max()])
         if reached[0] < limits.lower[column] - 1e-6 or reached[1] > limits.upper[column] + 1e-6:
             unit, factor = ('deg', np.degrees(1.0)) if limits.turns[column] else ('m', 1.0)
-            lower, upper, least, most = (f'{factor * end:.4g}' for end in (limits.lower[column], limits.upper[column], *reached))
-            raise InputError(f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}] {unit}, it would move from "
-                             f"{least} to {most}; choose 'within_limits'", code='joint_range')
+            lower, upper, least, most = (
+                f'{factor * end:.4g}'
+                for end in (limits.lower[column], limits.upper[column], *reached)
+            )
+            raise InputError(
+                f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}] {unit}, it would move from "
+                f"{least} to {most}; choose 'within_limits'",
+                code='joint_range',
+            )
 
 
 def _joint_names(entry, table):
@@ -169,26 +233,51 @@ def _spins(directions, speeds_deg, dwell):
 
 
 def _calibration(builder, rng):
-    run(builder, rng, [
-        *poses(np.concatenate([FACES, EDGES, CORNERS]), 5.0),
-        *_spins(np.eye(3), SPEEDS_DEG, 4.0), *_spins(CORNERS[:4], SPEEDS_DEG[2], 4.0),
-        *(spin_joint(2, [90 * k, 0, 0], speed, dwell=5.0) for k, speed in enumerate(SPEEDS_DEG)),
-        *(spin_joint(1, [30, 0, inner], SPEEDS_DEG[1], dwell=5.0) for inner in (0, 90)),
-        *swings(((30.0, 0.5), (10.0, 1.0), (5.0, 2.0)), 6.0), *simultaneous((150.0, 100.0), 6.0)])
+    run(
+        builder,
+        rng,
+        [
+            *poses(np.concatenate([FACES, EDGES, CORNERS]), 5.0),
+            *_spins(np.eye(3), SPEEDS_DEG, 4.0),
+            *_spins(CORNERS[:4], SPEEDS_DEG[2], 4.0),
+            *(
+                spin_joint(2, [90 * k, 0, 0], speed, dwell=5.0)
+                for k, speed in enumerate(SPEEDS_DEG)
+            ),
+            *(spin_joint(1, [30, 0, inner], SPEEDS_DEG[1], dwell=5.0) for inner in (0, 90)),
+            *swings(((30.0, 0.5), (10.0, 1.0), (5.0, 2.0)), 6.0),
+            *simultaneous((150.0, 100.0), 6.0),
+        ],
+    )
 
 
 def _short(builder, rng):
-    run(builder, rng, [
-        *poses(np.concatenate([FACES, EDGES]), 4.0),
-        *_spins(np.eye(3), SPEEDS_DEG, 2.0), *_spins(CORNERS[:2], SPEEDS_DEG[2], 2.0), spin_joint(2, [0, 0, 0], SPEEDS_DEG[1], dwell=3.0),
-        *swings(((20.0, 0.5), (10.0, 1.0)), 4.0), *simultaneous((150.0, 100.0), 2.0)[:4]])
+    run(
+        builder,
+        rng,
+        [
+            *poses(np.concatenate([FACES, EDGES]), 4.0),
+            *_spins(np.eye(3), SPEEDS_DEG, 2.0),
+            *_spins(CORNERS[:2], SPEEDS_DEG[2], 2.0),
+            spin_joint(2, [0, 0, 0], SPEEDS_DEG[1], dwell=3.0),
+            *swings(((20.0, 0.5), (10.0, 1.0)), 4.0),
+            *simultaneous((150.0, 100.0), 2.0)[:4],
+        ],
+    )
 
 
 def _quick(builder, rng):
-    run(builder, rng, [
-        *poses(np.concatenate([FACES, EDGES[::2], CORNERS[::2]]), 2.0),
-        *(spin_vertical(axis, speed, 2.0) for axis, speed in zip(np.eye(3), SPEEDS_DEG)),
-        *swings(((10.0, 1.0),), 3.0), *simultaneous((150.0, 100.0), 2.0)[:3]], reference_every=100)
+    run(
+        builder,
+        rng,
+        [
+            *poses(np.concatenate([FACES, EDGES[::2], CORNERS[::2]]), 2.0),
+            *(spin_vertical(axis, speed, 2.0) for axis, speed in zip(np.eye(3), SPEEDS_DEG)),
+            *swings(((10.0, 1.0),), 3.0),
+            *simultaneous((150.0, 100.0), 2.0)[:3],
+        ],
+        reference_every=100,
+    )
 
 
 def _six_faces(builder, _rng):
@@ -203,24 +292,55 @@ def _static_only(builder, rng):
     run(builder, rng, poses(np.concatenate([FACES, EDGES, CORNERS]), 8.0))
 
 
-def _separating(builder, rng, n_angles=16, n_oblique=4, cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)), swing_time=4.0):
+def _separating(
+    builder,
+    rng,
+    n_angles=16,
+    n_oblique=4,
+    cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)),
+    swing_time=4.0,
+):
     """Many angles, three speeds both ways, swings at several frequencies: separates similar effects."""
     angles = 2 * np.pi * (np.arange(n_angles) + 0.25) / n_angles
-    rings = [direction for c, s in zip(np.cos(angles), np.sin(angles)) for direction in ([c, s, 0.0], [0.0, c, s], [s, 0.0, c])]
-    run(builder, rng, [
-        *poses(rings, 2.2), *_spins(np.eye(3), (60.0, 150.0, 300.0), 2.0), *_spins(CORNERS[:n_oblique], (150.0, 300.0), 2.0),
-        spin_joint(2, [0, 0, 0], (30.0, 120.0), dwell=4.0), *(spin_joint(1, [90, 0, inner], (40.0, 100.0), dwell=4.0) for inner in (0, 90)),
-        *swings(cycles, swing_time), *simultaneous((250.0, 100.0), 2.5)], reference_every=20)
+    rings = [
+        direction
+        for c, s in zip(np.cos(angles), np.sin(angles))
+        for direction in ([c, s, 0.0], [0.0, c, s], [s, 0.0, c])
+    ]
+    run(
+        builder,
+        rng,
+        [
+            *poses(rings, 2.2),
+            *_spins(np.eye(3), (60.0, 150.0, 300.0), 2.0),
+            *_spins(CORNERS[:n_oblique], (150.0, 300.0), 2.0),
+            spin_joint(2, [0, 0, 0], (30.0, 120.0), dwell=4.0),
+            *(spin_joint(1, [90, 0, inner], (40.0, 100.0), dwell=4.0) for inner in (0, 90)),
+            *swings(cycles, swing_time),
+            *simultaneous((250.0, 100.0), 2.5),
+        ],
+        reference_every=20,
+    )
 
 
-_separating_short = partial(_separating, n_angles=8, n_oblique=1, cycles=((20.0, 0.5), (5.0, 1.5), (2.0, 4.0)), swing_time=3.0)
+_separating_short = partial(
+    _separating,
+    n_angles=8,
+    n_oblique=1,
+    cycles=((20.0, 0.5), (5.0, 1.5), (2.0, 4.0)),
+    swing_time=3.0,
+)
 
 
 def _thermal(builder, _rng):
     """The same short round again and again, so that only time and temperature differ between rounds."""
     builder.rest_at_home(20.0)
     for turn in range(6):
-        for task in [*poses(FACES, 5.0), *_spins(np.eye(3), SPEEDS_DEG[1], 3.0), *swings(((10.0, 1.0),), 3.0)]:
+        for task in [
+            *poses(FACES, 5.0),
+            *_spins(np.eye(3), SPEEDS_DEG[1], 3.0),
+            *swings(((10.0, 1.0),), 3.0),
+        ]:
             task(builder)
         builder.move([90.0 * turn, 0.0, 0.0]).rest(15.0)
 
@@ -229,27 +349,52 @@ def _tumbling(builder, _rng, rest, parts):
     """Rest, then swing all joints at once from zero, for each part (deg, Hz, s, s of the rest after it)."""
     builder.rest(rest)
     for amplitude_deg, frequency, duration, rest_after in parts:
-        builder.move([0, 0, 0]).oscillate(amplitude_deg, frequency, duration, phase=[0.3, 1.1, 2.0], fade=2.0).rest(rest_after)
+        builder.move([0, 0, 0]).oscillate(
+            amplitude_deg, frequency, duration, phase=[0.3, 1.1, 2.0], fade=2.0
+        ).rest(rest_after)
 
 
-def _random(builder, rng, directions=np.concatenate([FACES, CORNERS]), speed_ranges=((40, 80), (100, 150), (170, 220)), n_oblique=2,
-            n_swings=2, n_simultaneous=4):
+def _random(
+    builder,
+    rng,
+    directions=np.concatenate([FACES, CORNERS]),
+    speed_ranges=((40, 80), (100, 150), (170, 220)),
+    n_oblique=2,
+    n_swings=2,
+    n_simultaneous=4,
+):
     """Drawn poses, spins both ways at every speed, swings and two-axis turns."""
     tasks = poses([_near(rng, up_b, 0.25) for up_b in directions], 2.6)
     speeds = np.array([rng.uniform(*limits, 3) for limits in speed_ranges])
-    tasks += [spin_vertical(_near(rng, axis, 0.2), speeds[:, k], 2.0) for k, axis in enumerate(np.eye(3))]
-    tasks += [spin_vertical(_near(rng, rng.choice(CORNERS), 0.3), rng.uniform(120, 220), 2.0) for _ in range(n_oblique)]
-    tasks += [spin_joint(joint, rng.uniform(-180, 180, 3), rng.uniform(50, 120), dwell=3.0) for joint in (1, 2)]
+    tasks += [
+        spin_vertical(_near(rng, axis, 0.2), speeds[:, k], 2.0) for k, axis in enumerate(np.eye(3))
+    ]
+    tasks += [
+        spin_vertical(_near(rng, rng.choice(CORNERS), 0.3), rng.uniform(120, 220), 2.0)
+        for _ in range(n_oblique)
+    ]
+    tasks += [
+        spin_joint(joint, rng.uniform(-180, 180, 3), rng.uniform(50, 120), dwell=3.0)
+        for joint in (1, 2)
+    ]
     for axis in range(3):
-        tasks += [swing(axis, rng.uniform(7, 14) / frequency, frequency, duration=3.5)
-                  for frequency in (rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0))[:n_swings]]
+        tasks += [
+            swing(axis, rng.uniform(7, 14) / frequency, frequency, duration=3.5)
+            for frequency in (rng.uniform(1.5, 3.0), rng.uniform(0.5, 1.0))[:n_swings]
+        ]
     rates = rng.uniform(80, 180, (n_simultaneous, 2)) * rng.choice([-1, 1], (n_simultaneous, 2))
     tasks += [simultaneous(pair, 2.0)[k] for k, pair in zip(rng.permutation(5), rates)]
     run(builder, rng, tasks, reference_every=15)
 
 
-_random_short = partial(_random, directions=np.concatenate([FACES, CORNERS[::2]]), speed_ranges=((60, 90), (150, 210)), n_oblique=1,
-                        n_swings=1, n_simultaneous=3)
+_random_short = partial(
+    _random,
+    directions=np.concatenate([FACES, CORNERS[::2]]),
+    speed_ranges=((60, 90), (150, 210)),
+    n_oblique=1,
+    n_swings=1,
+    n_simultaneous=3,
+)
 
 
 def _near(rng, direction, spread):
@@ -263,39 +408,105 @@ def _any_table(builder, rng):
     angles = rng.permuted(np.tile(np.arange(24) * 15.0, (count, 1)), axis=1).T
     tasks, only = [_rest_at(np.radians(row)) for row in angles], np.eye(count)
     for joint in range(count):
-        tasks += [spin_joint(joint, rng.uniform(-180, 180, count), speed, dwell=4.0) for speed in SPEEDS_DEG]
-        tasks += [swing_at(np.radians(rng.uniform(-180, 180, count)), np.radians(10.0 / cycles * only[joint]), cycles, duration=4.0,
-                           settle=False) for cycles in (0.5, 1.0, 2.0)]
-        tasks += [two_axes(at_deg, 120.0 * only[joint] + 80.0 * only[other], 5.0)
-                  for other in range(joint) for at_deg in rng.uniform(-180, 180, (3, count))]
+        tasks += [
+            spin_joint(joint, rng.uniform(-180, 180, count), speed, dwell=4.0)
+            for speed in SPEEDS_DEG
+        ]
+        tasks += [
+            swing_at(
+                np.radians(rng.uniform(-180, 180, count)),
+                np.radians(10.0 / cycles * only[joint]),
+                cycles,
+                duration=4.0,
+                settle=False,
+            )
+            for cycles in (0.5, 1.0, 2.0)
+        ]
+        tasks += [
+            two_axes(at_deg, 120.0 * only[joint] + 80.0 * only[other], 5.0)
+            for other in range(joint)
+            for at_deg in rng.uniform(-180, 180, (3, count))
+        ]
     run(builder, rng, tasks)
 
 
-_ON_ARM = {**motion_primitives.GIMBALS, 'mount': {'rpy_deg': [0.0, 0.0, 0.0], 'xyz': [0.2, 0.15, 0.1]}}
+_ON_ARM = {
+    **motion_primitives.GIMBALS,
+    'mount': {'rpy_deg': [0.0, 0.0, 0.0], 'xyz': [0.2, 0.15, 0.1]},
+}
 
 _REGISTRY = {
-    'calibration': _Entry('full session on a three-axis table, about 11 min: poses, spins, swings, two axes at once', _calibration,
-                          n_joints=3, adapts=True),
+    'calibration': _Entry(
+        'full session on a three-axis table, about 11 min: poses, spins, swings, two axes at once',
+        _calibration,
+        n_joints=3,
+        adapts=True,
+    ),
     'short': _Entry('the same in about 5 min', _short, n_joints=3, adapts=True),
-    'quick': _Entry('the shortest that determines all parameters, about 2 min', _quick, n_joints=3, adapts=True),
-    'six_faces': _Entry('every axis up and down, and turned both ways at one speed, about 1 min: similar effects are collinear', _six_faces,
-                        n_joints=3, adapts=True),
+    'quick': _Entry(
+        'the shortest that determines all parameters, about 2 min', _quick, n_joints=3, adapts=True
+    ),
+    'six_faces': _Entry(
+        'every axis up and down, and turned both ways at one speed, about 1 min: similar effects are collinear',
+        _six_faces,
+        n_joints=3,
+        adapts=True,
+    ),
     'static_only': _Entry('26 poses, no deliberate rotation', _static_only, n_joints=3),
-    'random': _Entry('poses, spins, swings and two-axis turns drawn from the seed, about 5 min', _random, n_joints=3, adapts=True),
-    'random_short': _Entry('the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True),
-    'separating': _Entry('many angles, three speeds both ways, four frequencies: separates similar effects', _separating,
-                         n_joints=3, adapts=True),
-    'separating_short': _Entry('the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True),
-    'separating_arm': _Entry('separating with the sensor on an arm of 0.27 m, so that spins exceed 1 g', _separating, _ON_ARM, 3),
-    'thermal': _Entry('the same round six times while the temperature changes', _thermal, n_joints=3),
-    'navigation': _Entry('rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling',
-                         partial(_tumbling, rest=10.0, parts=(([70.0, 50.0, 60.0], [0.11, 0.17, 0.13], 50.0, 10.0),
-                                                              ([40.0, 25.0, 20.0], [0.31, 0.53, 0.71], 50.0, 5.0))), n_joints=3),
-    'tumbling': _Entry('60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)',
-                       partial(_tumbling, rest=5.0, parts=(([60.0, 45.0, 30.0], [0.7, 0.9, 1.1], 60.0, 5.0),)), n_joints=3),
-    'two_axis': _Entry('poses, spins, swings and simultaneous turns of a two-axis table', _any_table, n_joints=2),
-    'within_limits': _Entry('poses, swings and, where a joint has no end, spins, within the limits of every joint', within_limits),
+    'random': _Entry(
+        'poses, spins, swings and two-axis turns drawn from the seed, about 5 min',
+        _random,
+        n_joints=3,
+        adapts=True,
+    ),
+    'random_short': _Entry(
+        'the same in about 3 min, with two speeds', _random_short, n_joints=3, adapts=True
+    ),
+    'separating': _Entry(
+        'many angles, three speeds both ways, four frequencies: separates similar effects',
+        _separating,
+        n_joints=3,
+        adapts=True,
+    ),
+    'separating_short': _Entry(
+        'the same with fewer angles, about 6 min', _separating_short, n_joints=3, adapts=True
+    ),
+    'separating_arm': _Entry(
+        'separating with the sensor on an arm of 0.27 m, so that spins exceed 1 g',
+        _separating,
+        _ON_ARM,
+        3,
+    ),
+    'thermal': _Entry(
+        'the same round six times while the temperature changes', _thermal, n_joints=3
+    ),
+    'navigation': _Entry(
+        'rest, 50 s of slow tumbling, rest, 50 s of livelier tumbling',
+        partial(
+            _tumbling,
+            rest=10.0,
+            parts=(
+                ([70.0, 50.0, 60.0], [0.11, 0.17, 0.13], 50.0, 10.0),
+                ([40.0, 25.0, 20.0], [0.31, 0.53, 0.71], 50.0, 5.0),
+            ),
+        ),
+        n_joints=3,
+    ),
+    'tumbling': _Entry(
+        '60 s of three-axis sinusoids (60, 45, 30 deg at 0.7, 0.9, 1.1 Hz)',
+        partial(_tumbling, rest=5.0, parts=(([60.0, 45.0, 30.0], [0.7, 0.9, 1.1], 60.0, 5.0),)),
+        n_joints=3,
+    ),
+    'two_axis': _Entry(
+        'poses, spins, swings and simultaneous turns of a two-axis table', _any_table, n_joints=2
+    ),
+    'within_limits': _Entry(
+        'poses, swings and, where a joint has no end, spins, within the limits of every joint',
+        within_limits,
+    ),
     'within_limits_short': _Entry('the same with fewer of them', within_limits_short),
-    'any_table': _Entry('poses, spins, swings and simultaneous turns of all joints of the table', _any_table),
+    'any_table': _Entry(
+        'poses, spins, swings and simultaneous turns of all joints of the table', _any_table
+    ),
     **{name: _Entry(*entry) for name, entry in motion_primitives.REGISTRY.items()},
 }

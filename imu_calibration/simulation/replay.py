@@ -32,12 +32,18 @@ class ReplayNoise(NamedTuple):
     """Correlation time of the bias process, s."""
 
 
-def predict_windows(windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray) -> dict[str, np.ndarray]:
+def predict_windows(
+    windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return sensor -> output of a model without noise at the samples of some windows, m/s^2 and rad/s, shape (n, 3)."""
     motion, temperature, rows = all_samples(windows)
     if temperature is None and model.needs_temperature:
-        raise InputError('a model with thermal effects requires the temperature of every sample, the recording has none for some; '
-                         'name the temperature topic', key='temperature_topic', code='temperature_missing')
+        raise InputError(
+            'a model with thermal effects requires the temperature of every sample, the recording has none for some; '
+            'name the temperature topic',
+            key='temperature_topic',
+            code='temperature_missing',
+        )
     outputs = predict(model, values, table, motion=motion, temperature_c=temperature)
     return {sensor: output[rows] for sensor, output in zip(SENSORS, outputs)}
 
@@ -54,13 +60,27 @@ def noise_at_rest(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
     """
     found = [window.noise_sd for window in windows if window.kind is WindowKind.STATIC]
     if not found:
-        raise InputError('the noise must be in the statistics of the calibration, or a rest in the recording; both are missing; '
-                         'calibrate from a recording with rests', key='calibration', code='noise_unknown')
-    return {sensor: ReplayNoise(white, np.zeros(3)) for sensor, white in zip(SENSORS, np.median(found, axis=0))}
+        raise InputError(
+            'the noise must be in the statistics of the calibration, or a rest in the recording; both are missing; '
+            'calibrate from a recording with rests',
+            key='calibration',
+            code='noise_unknown',
+        )
+    return {
+        sensor: ReplayNoise(white, np.zeros(3))
+        for sensor, white in zip(SENSORS, np.median(found, axis=0))
+    }
 
 
-def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, values: np.ndarray,
-           noise: Mapping[str, ReplayNoise] | None = None, seed: int = 0) -> tuple[SampleBlock, int]:
+def replay(
+    blocks: Iterable[SampleBlock],
+    table: Table,
+    model: SensorModel,
+    *,
+    values: np.ndarray,
+    noise: Mapping[str, ReplayNoise] | None = None,
+    seed: int = 0,
+) -> tuple[SampleBlock, int]:
     """
     Return (the recording with simulated readings, number of its samples without known motion, which are left out).
 
@@ -86,15 +106,20 @@ def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, v
     blocks = list(blocks)
     windows = MotionGatherer(table, keep_unused=True).all_of(blocks)
     if not windows:
-        raise InputError('a replay requires IMU samples between joint states of the table, none was found; check the topics and the stamps',
-                         code='no_motion')
+        raise InputError(
+            'a replay requires IMU samples between joint states of the table, none was found; check the topics and the stamps',
+            code='no_motion',
+        )
     outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
     stamps = np.concatenate([window.stamp_ns for window in windows])
     period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
     noise, rng = noise or noise_at_rest(windows), np.random.default_rng([seed, 3])
     exact = {sensor: np.concatenate([output[sensor] for output in outputs]) for sensor in SENSORS}
-    if model.uses('vibration'):   # biases follow the vibration of the readings
-        known = [np.asarray(motion.vibration)[rows] for motion, _, rows in map(all_samples, chunks(windows))]
+    if model.uses('vibration'):  # biases follow the vibration of the readings
+        known = [
+            np.asarray(motion.vibration)[rows]
+            for motion, _, rows in map(all_samples, chunks(windows))
+        ]
         variance = np.concatenate(known)
         unit = unit_hum(period * np.arange(len(variance)), 1.0 / period)
         exact['accelerometer'] += unit * np.sqrt(variance / BandVariance().of(period, unit)[-1])
@@ -105,9 +130,13 @@ def replay(blocks: Iterable[SampleBlock], table: Table, model: SensorModel, *, v
         noisy += gauss_markov(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
         readings.append(clip(model, sensor, values, output=noisy))
     frame = next(block.imu.frame_id for block in blocks if block.imu is not None and len(block.imu))
-    joints, temperature = (_joined([getattr(block, name) for block in blocks]) for name in ('joints', 'temperature'))
+    joints, temperature = (
+        _joined([getattr(block, name) for block in blocks]) for name in ('joints', 'temperature')
+    )
     lost = sum(len(block.imu) for block in blocks if block.imu is not None) - len(stamps)
-    return SampleBlock(ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature), lost
+    return SampleBlock(
+        ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature
+    ), lost
 
 
 def _joined(parts):

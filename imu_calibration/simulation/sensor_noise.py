@@ -44,7 +44,6 @@ class SimulatedNoise:
     """Step of the joint positions, rad; 0: continuous."""
 
 
-
 @dataclass(frozen=True)
 class ImuGrade:
     """A grade of IMU: its noise, and the standard deviations of the errors that a calibration finds."""
@@ -67,32 +66,73 @@ class ImuGrade:
 
 GRADES = {
     'consumer': ImuGrade(
-        SimulatedNoise(400 * MICRO_G, 0.005 * DEG, 100 * MICRO_G, 20 * DEG_H, 100.0, 61e-6 * STANDARD_GRAVITY, DEG / 131.0),
-        0.05 * STANDARD_GRAVITY, 2.0 * DEG, 0.02, 0.01, 3e-3,
-        'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed, the sheet has none'),
+        SimulatedNoise(
+            400 * MICRO_G,
+            0.005 * DEG,
+            100 * MICRO_G,
+            20 * DEG_H,
+            100.0,
+            61e-6 * STANDARD_GRAVITY,
+            DEG / 131.0,
+        ),
+        0.05 * STANDARD_GRAVITY,
+        2.0 * DEG,
+        0.02,
+        0.01,
+        3e-3,
+        'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed, the sheet has none',
+    ),
     'industrial': ImuGrade(
         SimulatedNoise(120 * MICRO_G, 0.007 * DEG, 30 * MICRO_G, 10 * DEG_H, 100.0),
-        5e-3 * STANDARD_GRAVITY, 0.2 * DEG, 5e-3, 3e-3, 3e-3,
-        'Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h; matrix and arms before factory calibration'),
+        5e-3 * STANDARD_GRAVITY,
+        0.2 * DEG,
+        5e-3,
+        3e-3,
+        3e-3,
+        'Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h; matrix and arms before factory calibration',
+    ),
     'tactical': ImuGrade(
-        SimulatedNoise(150 * MICRO_G, 0.002 * DEG, 200 * MICRO_G, 8 * DEG_H, 100.0, 250 * MICRO_G, 0.005 * DEG),
-        15e-3 * STANDARD_GRAVITY, 0.5 * DEG, 5e-3, 0.87e-3, 5e-3,
-        'ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run 15 mg and 0.5 deg/s, axis to axis 0.05 deg'),
+        SimulatedNoise(
+            150 * MICRO_G, 0.002 * DEG, 200 * MICRO_G, 8 * DEG_H, 100.0, 250 * MICRO_G, 0.005 * DEG
+        ),
+        15e-3 * STANDARD_GRAVITY,
+        0.5 * DEG,
+        5e-3,
+        0.87e-3,
+        5e-3,
+        'ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run 15 mg and 0.5 deg/s, axis to axis 0.05 deg',
+    ),
     'navigation': ImuGrade(
         SimulatedNoise(1 * MICRO_G, 0.002 / 60 * DEG, 10 * MICRO_G, 0.005 * DEG_H, 100.0),
-        75 * MICRO_G, 0.02 * DEG_H, 1e-4, 3e-5, 0.02,
-        'assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h, run-to-run 50-100 ug and 0.01-0.03 deg/h'),
+        75 * MICRO_G,
+        0.02 * DEG_H,
+        1e-4,
+        3e-5,
+        0.02,
+        'assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h, run-to-run 50-100 ug and 0.01-0.03 deg/h',
+    ),
 }
 """Grades by name."""
 
 
-def realistic(grade: str = 'industrial', encoder_resolution: float = 0.001 * DEG, stamp_jitter: float = 50e-6) -> SimulatedNoise:
+def realistic(
+    grade: str = 'industrial', encoder_resolution: float = 0.001 * DEG, stamp_jitter: float = 50e-6
+) -> SimulatedNoise:
     """Return the noise of a grade, with an encoder's resolution (rad) and a stamp jitter (s)."""
-    return replace(GRADES[grade].noise, encoder_resolution=encoder_resolution, stamp_jitter=stamp_jitter)
+    return replace(
+        GRADES[grade].noise, encoder_resolution=encoder_resolution, stamp_jitter=stamp_jitter
+    )
 
 
-def gauss_markov(standard_deviation: float | np.ndarray, correlation_time: float, step: float, *, shape: tuple[int, ...],
-                 rng: np.random.Generator, before: np.ndarray | None = None) -> np.ndarray:
+def gauss_markov(
+    standard_deviation: float | np.ndarray,
+    correlation_time: float,
+    step: float,
+    *,
+    shape: tuple[int, ...],
+    rng: np.random.Generator,
+    before: np.ndarray | None = None,
+) -> np.ndarray:
     """
     Return a stationary first-order Gauss-Markov process along the first axis of `shape`.
 
@@ -101,8 +141,10 @@ def gauss_markov(standard_deviation: float | np.ndarray, correlation_time: float
     """
     decay = np.exp(-step / correlation_time)
     drive = rng.normal(0.0, standard_deviation, shape)
-    drive[1 if before is None else 0:] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
-    return autoregressive(drive.reshape(len(drive), -1), decay, 0.0 if before is None else before).reshape(shape)
+    drive[1 if before is None else 0 :] *= np.sqrt(-np.expm1(-2.0 * step / correlation_time))
+    return autoregressive(
+        drive.reshape(len(drive), -1), decay, 0.0 if before is None else before
+    ).reshape(shape)
 
 
 def quantise(values: np.ndarray, step: float) -> np.ndarray:
@@ -110,11 +152,15 @@ def quantise(values: np.ndarray, step: float) -> np.ndarray:
     return np.asarray(values) if step == 0.0 else np.round(np.asarray(values) / step) * step
 
 
-def jitter_stamps(stamp_ns: np.ndarray, standard_deviation: float, rng: np.random.Generator) -> np.ndarray:
+def jitter_stamps(
+    stamp_ns: np.ndarray, standard_deviation: float, rng: np.random.Generator
+) -> np.ndarray:
     """Return stamps with white jitter (s), still int64 and in the order of arrival."""
     if standard_deviation == 0.0:
         return stamp_ns
-    return stamp_ns + np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns))).astype(np.int64)
+    return stamp_ns + np.round(rng.normal(0.0, standard_deviation * 1e9, len(stamp_ns))).astype(
+        np.int64
+    )
 
 
 class ImuNoise:
@@ -133,28 +179,53 @@ class ImuNoise:
 
     """
 
-    def __init__(self, model: SimulatedNoise, *, sample_rate: float, rng: np.random.Generator, drawn: bool = False):
+    def __init__(
+        self,
+        model: SimulatedNoise,
+        *,
+        sample_rate: float,
+        rng: np.random.Generator,
+        drawn: bool = False,
+    ):
         self._model, self._rate, self._rng = model, sample_rate, rng
         sizes = (model.accel_instability, model.gyro_instability)
-        self._force_bias, self._rate_bias = [rng.normal(0.0, size, 3) for size in sizes] if drawn else (None, None)
+        self._force_bias, self._rate_bias = (
+            [rng.normal(0.0, size, 3) for size in sizes] if drawn else (None, None)
+        )
 
     def add(self, force_s: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings from outputs without noise, m/s^2 and rad/s, shape (n, 3), n at least 1."""
         model = self._model
-        force, self._force_bias = self._added(force_s, model.accel_density, model.accel_instability, self._force_bias)
-        rate, self._rate_bias = self._added(rate_s, model.gyro_density, model.gyro_instability, self._rate_bias)
+        force, self._force_bias = self._added(
+            force_s, model.accel_density, model.accel_instability, self._force_bias
+        )
+        rate, self._rate_bias = self._added(
+            rate_s, model.gyro_density, model.gyro_instability, self._rate_bias
+        )
         return quantise(force, model.accel_resolution), quantise(rate, model.gyro_resolution)
 
     def _added(self, true, density, instability, before):
         """Return (values with noise, last value of the bias)."""
         values = true + self._rng.normal(0.0, density * np.sqrt(self._rate), true.shape)
-        bias = gauss_markov(instability, self._model.correlation_time, 1.0 / self._rate, shape=true.shape, rng=self._rng, before=before)
+        bias = gauss_markov(
+            instability,
+            self._model.correlation_time,
+            1.0 / self._rate,
+            shape=true.shape,
+            rng=self._rng,
+            before=before,
+        )
         return values + bias, bias[-1]
 
 
-def read_encoders(position: np.ndarray, model: SimulatedNoise, rng: np.random.Generator) -> np.ndarray:
+def read_encoders(
+    position: np.ndarray, model: SimulatedNoise, rng: np.random.Generator
+) -> np.ndarray:
     """Return joint positions as read by noisy encoders of finite resolution, rad, shape (n, n_joints)."""
-    return quantise(position + rng.normal(0.0, model.encoder_noise, np.shape(position)), model.encoder_resolution)
+    return quantise(
+        position + rng.normal(0.0, model.encoder_noise, np.shape(position)),
+        model.encoder_resolution,
+    )
 
 
 class Felt(NamedTuple):
@@ -181,7 +252,9 @@ def _two_half_ranges(rng: np.random.Generator) -> Cause:
 
 def _unbalanced_mass(rng: np.random.Generator) -> Cause:
     """The gyroscopes' masses are off their axes: specific force turns them, 20 to 60 deg/h per g."""
-    per_force = rng.uniform(20.0, 60.0, (3, 3)) * rng.choice([-1, 1], (3, 3)) * DEG_H / STANDARD_GRAVITY
+    per_force = (
+        rng.uniform(20.0, 60.0, (3, 3)) * rng.choice([-1, 1], (3, 3)) * DEG_H / STANDARD_GRAVITY
+    )
     return lambda felt: felt._replace(rate=felt.rate + felt.true_force @ per_force.T)
 
 
@@ -204,8 +277,12 @@ def _narrow_range(rng: np.random.Generator) -> Cause:
 
 
 CAUSES: dict[str, Callable[[np.random.Generator], Cause]] = {
-    'two_half_ranges': _two_half_ranges, 'unbalanced_mass': _unbalanced_mass, 'soft_spring': _soft_spring, 'gain_by_sense': _gain_by_sense,
-    'narrow_range': _narrow_range}
+    'two_half_ranges': _two_half_ranges,
+    'unbalanced_mass': _unbalanced_mass,
+    'soft_spring': _soft_spring,
+    'gain_by_sense': _gain_by_sense,
+    'narrow_range': _narrow_range,
+}
 """Name -> function of a generator that draws the size and returns the cause; `narrow_range` belongs last."""
 
 
@@ -221,12 +298,23 @@ def hidden_causes(names: Sequence[str], seed: int, size: float = 1.0) -> list[Ca
     """
     for name in names:
         if name not in CAUSES:
-            raise InputError(f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of them", code='cause_unknown')
-    return [_scaled(CAUSES[name](np.random.default_rng([seed, list(CAUSES).index(name)])), size) for name in CAUSES if name in names]
+            raise InputError(
+                f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of them",
+                code='cause_unknown',
+            )
+    return [
+        _scaled(CAUSES[name](np.random.default_rng([seed, list(CAUSES).index(name)])), size)
+        for name in CAUSES
+        if name in names
+    ]
 
 
 def _scaled(cause, size):
     def answer(felt):
         answered = cause(felt)
-        return felt._replace(force=felt.force + size * (answered.force - felt.force), rate=felt.rate + size * (answered.rate - felt.rate))
+        return felt._replace(
+            force=felt.force + size * (answered.force - felt.force),
+            rate=felt.rate + size * (answered.rate - felt.rate),
+        )
+
     return cause if size == 1.0 else answer

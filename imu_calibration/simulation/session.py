@@ -16,7 +16,15 @@ from imu_calibration.kinematics.rotations import lever_matrix
 from imu_calibration.kinematics.signal_history import HALF_WIDTH
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.motion_builder import Profile
-from imu_calibration.simulation.sensor_noise import GRADES, Cause, Felt, ImuNoise, SimulatedNoise, jitter_stamps, read_encoders
+from imu_calibration.simulation.sensor_noise import (
+    GRADES,
+    Cause,
+    Felt,
+    ImuNoise,
+    SimulatedNoise,
+    jitter_stamps,
+    read_encoders,
+)
 from imu_calibration.simulation.table_controller import TableController
 
 LOUDEST = 0.25
@@ -39,7 +47,12 @@ def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndar
         Samples per second.
 
     """
-    loudness = LOUDEST * np.array(GEAR_AMPLITUDES)[(np.asarray(time) // GEAR_SECONDS).astype(int) % len(GEAR_AMPLITUDES)][:, None]
+    loudness = (
+        LOUDEST
+        * np.array(GEAR_AMPLITUDES)[
+            (np.asarray(time) // GEAR_SECONDS).astype(int) % len(GEAR_AMPLITUDES)
+        ][:, None]
+    )
     return loudness * unit_hum(time, rate), np.tile(loudness**2, 3)
 
 
@@ -88,7 +101,9 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
     for effect in model.effects:
         part = model.slices[effect.key]
         if effect.role is Role.OFFSET:
-            values[part] += rng.normal(0.0, grade.accel_bias if effect.sensor == 'accelerometer' else grade.gyro_bias, 3)
+            values[part] += rng.normal(
+                0.0, grade.accel_bias if effect.sensor == 'accelerometer' else grade.gyro_bias, 3
+            )
         elif effect.role is Role.LINEAR:
             spread = np.where(np.eye(3), grade.scale, grade.misalignment).ravel()
             values[part] += rng.normal(0.0, 1.0, 9) * spread
@@ -98,11 +113,19 @@ def random_values(model: SensorModel, grade: str = 'industrial', seed: int = 0) 
     return values
 
 
-def true_imu(table: Table, known: tuple[SensorModel, np.ndarray] | None, grade: str, *, seed: int,
-             catalogue: Catalogue = CATALOGUE) -> tuple[SensorModel, np.ndarray]:
+def true_imu(
+    table: Table,
+    known: tuple[SensorModel, np.ndarray] | None,
+    grade: str,
+    *,
+    seed: int,
+    catalogue: Catalogue = CATALOGUE,
+) -> tuple[SensorModel, np.ndarray]:
     """Return (model, values): the known ones, or those of a random IMU of a grade with size effect."""
     if known is None:
-        model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue)
+        model = SensorModel(
+            NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue
+        )
         return model, random_values(model, grade, seed)
     require_joints(known[0], table)
     return known
@@ -111,20 +134,36 @@ def true_imu(table: Table, known: tuple[SensorModel, np.ndarray] | None, grade: 
 def require_joints(model: SensorModel, table: Table) -> None:
     """Refuse a model with effects of the reference for joints that differ from those of the table."""
     if model.reference and set(model.joint_names) != set(table.joint_names):
-        raise InputError(f"the calibration must be of a table with joints {', '.join(table.joint_names)}, it names "
-                         f"{', '.join(model.joint_names)}; give its table", key='table')
+        raise InputError(
+            f'the calibration must be of a table with joints {", ".join(table.joint_names)}, it names '
+            f'{", ".join(model.joint_names)}; give its table',
+            key='table',
+        )
 
 
-def hidden_effect(model: SensorModel, name: str, seed: int = 0, *, share: float = 0.3, moment: float = 60.0) -> tuple[str, np.ndarray]:
+def hidden_effect(
+    model: SensorModel, name: str, seed: int = 0, *, share: float = 0.3, moment: float = 60.0
+) -> tuple[str, np.ndarray]:
     """Return (sensor, values) of an effect of a model's catalogue at a share of its plausible size; a step occurs at `moment`, s."""
     sensor = model.catalogue.owner_of(name, model.joint_names)
     effect = model.catalogue.find(sensor, name, model.joint_names)
     if not effect.plausible:
-        or_else = ', or give its largest size in its definition (largest)' if effect.definition else ''
-        raise InputError(f"effect '{name}' cannot be simulated by name, for its size is not known; "
-                         f'simulate with a calibration that contains it{or_else}', key='calibration', code='size_unknown')
+        or_else = (
+            ', or give its largest size in its definition (largest)' if effect.definition else ''
+        )
+        raise InputError(
+            f"effect '{name}' cannot be simulated by name, for its size is not known; "
+            f'simulate with a calibration that contains it{or_else}',
+            key='calibration',
+            code='size_unknown',
+        )
     rng = np.random.default_rng([seed, 11])
-    values = share * effect.largest * rng.uniform(0.4, 1.0, effect.size) * rng.choice((-1.0, 1.0), effect.size)
+    values = (
+        share
+        * effect.largest
+        * rng.uniform(0.4, 1.0, effect.size)
+        * rng.choice((-1.0, 1.0), effect.size)
+    )
     if effect.nonnegative:
         values = np.abs(values)
     if effect.timed:
@@ -170,19 +209,40 @@ class LiveSimulation:
 
     """
 
-    def __init__(self, model: SensorModel, values: np.ndarray, table: Table, *, motion: TableController | Profile,
-                 options: SimulationOptions = SimulationOptions(), seed: int = 0, start_ns: int = SESSION_START_NS,
-                 causes: Sequence[Cause] = (), drawn: bool = True):
-        self.model, self.values, self.table, self.motion, self.options = model, values, table, motion, options
+    def __init__(
+        self,
+        model: SensorModel,
+        values: np.ndarray,
+        table: Table,
+        *,
+        motion: TableController | Profile,
+        options: SimulationOptions = SimulationOptions(),
+        seed: int = 0,
+        start_ns: int = SESSION_START_NS,
+        causes: Sequence[Cause] = (),
+        drawn: bool = True,
+    ):
+        self.model, self.values, self.table, self.motion, self.options = (
+            model,
+            values,
+            table,
+            motion,
+            options,
+        )
         self.start_ns, self.causes = start_ns, tuple(causes)
         self._rng = np.random.default_rng([seed, 3])
         self._n = {'imu': 0, 'joints': 0, 'temperature': 0}
-        self._noise = ImuNoise(options.noise, sample_rate=options.imu_rate, rng=self._rng, drawn=drawn)
+        self._noise = ImuNoise(
+            options.noise, sample_rate=options.imu_rate, rng=self._rng, drawn=drawn
+        )
 
     def take(self, until: float) -> SimulatedBlock:
         """Return the samples from the end of the last block to `until` (s, exclusive)."""
-        return self.at(self._times('imu', self.options.imu_rate, 0.0, until), self._times('joints', self.options.joint_rate, 0.5, until),
-                       self._times('temperature', TEMPERATURE_RATE, 0.0, until))
+        return self.at(
+            self._times('imu', self.options.imu_rate, 0.0, until),
+            self._times('joints', self.options.joint_rate, 0.5, until),
+            self._times('temperature', TEMPERATURE_RATE, 0.0, until),
+        )
 
     def _times(self, stream, rate, offset, until):
         """Return the times of a stream's next samples before `until`, s."""
@@ -191,30 +251,56 @@ class LiveSimulation:
         self._n[stream] = stop
         return (np.arange(first, stop) + offset) / rate
 
-    def at(self, imu_time: np.ndarray, joint_time: np.ndarray, temperature_time: np.ndarray) -> SimulatedBlock:
+    def at(
+        self, imu_time: np.ndarray, joint_time: np.ndarray, temperature_time: np.ndarray
+    ) -> SimulatedBlock:
         """Return the samples at the times of each stream, s."""
         imu = self._imu(imu_time)
         motion, warmth = self.motion.at(joint_time), temperature_at(temperature_time, self.options)
         position = read_encoders(motion.position, self.options.noise, self._rng)
         velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
-        joints = JointSamples(self._stamps(motion.time), position, velocity, tuple(self.table.joint_names))
-        return SimulatedBlock(imu, joints, None if warmth is None else TemperatureSamples(self._stamps(temperature_time), warmth), imu_time)
+        joints = JointSamples(
+            self._stamps(motion.time), position, velocity, tuple(self.table.joint_names)
+        )
+        return SimulatedBlock(
+            imu,
+            joints,
+            None if warmth is None else TemperatureSamples(self._stamps(temperature_time), warmth),
+            imu_time,
+        )
 
     def _stamps(self, time):
         return self.start_ns + np.round(time * 1e9).astype(np.int64)
 
     def _imu(self, time):
         if not len(time):
-            return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id)
-        parts = zip(*(self._outputs(time[k:k + SIMULATED_BLOCK_SAMPLES]) for k in range(0, len(time), SIMULATED_BLOCK_SAMPLES)))
+            return ImuSamples(
+                np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), self.options.frame_id
+            )
+        parts = zip(
+            *(
+                self._outputs(time[k : k + SIMULATED_BLOCK_SAMPLES])
+                for k in range(0, len(time), SIMULATED_BLOCK_SAMPLES)
+            )
+        )
         noisy = self._noise.add(*map(np.concatenate, parts))
-        force, rate = (clip(self.model, sensor, self.values, output=output) for sensor, output in zip(SENSORS, noisy))
+        force, rate = (
+            clip(self.model, sensor, self.values, output=output)
+            for sensor, output in zip(SENSORS, noisy)
+        )
         stamps = jitter_stamps(self._stamps(time), self.options.noise.stamp_jitter, self._rng)
         return ImuSamples(stamps, force, rate, self.options.frame_id)
 
     def _outputs(self, time):
         """Return the outputs of the sensors without noise, each (n, 3)."""
-        outputs = answered(self.model, self.values, self.table, motion=self.motion.at(time), time=time, options=self.options)
+        outputs = answered(
+            self.model,
+            self.values,
+            self.table,
+            motion=self.motion.at(time),
+            time=time,
+            options=self.options,
+        )
         if not self.causes:
             return outputs
         felt = Felt(*self._true_motion(time), *outputs)
@@ -231,14 +317,26 @@ class LiveSimulation:
         """Return true specific force and rate, each (n, 3)."""
         references = References(self.model, self.table, self.motion.at(time))
         accelerometer, gyroscope = (references.at(sensor) for sensor in SENSORS)
-        true_force, arm = accelerometer.force_s, self.model.value('accelerometer', Role.ARM, self.values)
+        true_force, arm = (
+            accelerometer.force_s,
+            self.model.value('accelerometer', Role.ARM, self.values),
+        )
         if arm is not None:
-            true_force = true_force + lever_matrix(accelerometer.rate_s, accelerometer.alpha_s) @ arm
+            true_force = (
+                true_force + lever_matrix(accelerometer.rate_s, accelerometer.alpha_s) @ arm
+            )
         return true_force, gyroscope.rate_s
 
 
-def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: Profile, options: SimulationOptions = SimulationOptions(),
-             seed: int = 0) -> tuple[ImuSamples, JointSamples, TemperatureSamples | None]:
+def simulate(
+    model: SensorModel,
+    values: np.ndarray,
+    table: Table,
+    *,
+    profile: Profile,
+    options: SimulationOptions = SimulationOptions(),
+    seed: int = 0,
+) -> tuple[ImuSamples, JointSamples, TemperatureSamples | None]:
     """
     Simulate a session.
 
@@ -258,18 +356,35 @@ def simulate(model: SensorModel, values: np.ndarray, table: Table, *, profile: P
     (ImuSamples, JointSamples, TemperatureSamples or None)
 
     """
-    n_imu, n_joint = (int(profile.duration * rate) for rate in (options.imu_rate, options.joint_rate))
-    block = LiveSimulation(model, values, table, motion=profile, options=options, seed=seed, drawn=False).at(
-        np.arange(n_imu) / options.imu_rate, (np.arange(n_joint) + 0.5) / options.joint_rate, np.arange(0, profile.duration))
+    n_imu, n_joint = (
+        int(profile.duration * rate) for rate in (options.imu_rate, options.joint_rate)
+    )
+    block = LiveSimulation(
+        model, values, table, motion=profile, options=options, seed=seed, drawn=False
+    ).at(
+        np.arange(n_imu) / options.imu_rate,
+        (np.arange(n_joint) + 0.5) / options.joint_rate,
+        np.arange(0, profile.duration),
+    )
     return block.imu, block.joints, block.temperature
 
 
-def answered(model: SensorModel, values: np.ndarray, table: Table, *, motion: JointMotion, time: np.ndarray,
-             options: SimulationOptions) -> tuple[np.ndarray, np.ndarray]:
+def answered(
+    model: SensorModel,
+    values: np.ndarray,
+    table: Table,
+    *,
+    motion: JointMotion,
+    time: np.ndarray,
+    options: SimulationOptions,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the outputs of the sensors without noise, each (n, 3): motion, warm-up, and a machine if biases depend on vibration."""
     warmth, hum = temperature_at(time, options), 0.0
-    if warmth is not None:   # it never turns (`kinematics.signal_history`)
-        motion = replace(motion, thermal_branch=np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0))
+    if warmth is not None:  # it never turns (`kinematics.signal_history`)
+        motion = replace(
+            motion,
+            thermal_branch=np.clip((warmth - options.temperature_start_c) / HALF_WIDTH, -1.0, 1.0),
+        )
     if model.uses('vibration'):
         hum, variance = hum_and_variance(time, options.imu_rate)
         motion = replace(motion, vibration=variance)
@@ -281,4 +396,6 @@ def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray |
     """Return the temperature of the warm-up, or None without a temperature topic: ``start + rise (1 - exp(-t / tau))``."""
     if options.temperature_start_c is None:
         return None
-    return options.temperature_start_c + options.temperature_rise_c * (1 - np.exp(-time / options.temperature_time))
+    return options.temperature_start_c + options.temperature_rise_c * (
+        1 - np.exp(-time / options.temperature_time)
+    )

@@ -56,8 +56,13 @@ class JointTrajectory:
     def _curve(self):
         """The polynomials (PPoly), each by the quantities that are given at both of its ends."""
         from scipy.interpolate import BPoly, PPoly  # here, because its import is slow
-        given = [values for values in (self.position, self.rate, self.acceleration) if values is not None]
-        return PPoly.from_bernstein_basis(BPoly.from_derivatives(self.time, np.stack(given, axis=1)))
+
+        given = [
+            values for values in (self.position, self.rate, self.acceleration) if values is not None
+        ]
+        return PPoly.from_bernstein_basis(
+            BPoly.from_derivatives(self.time, np.stack(given, axis=1))
+        )
 
 
 def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajectory:
@@ -78,9 +83,14 @@ def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajec
 
     """
     if not len(points) or points.position.shape[1] != start.position.shape[1]:
-        raise InputError(f'a trajectory must have points with {start.position.shape[1]} positions each, got {points.position.shape}; '
-                         'name every joint of the table')
-    parts = {name: np.concatenate([getattr(start, name)[:1], values]) for name, values in points.columns().items()}
+        raise InputError(
+            f'a trajectory must have points with {start.position.shape[1]} positions each, got {points.position.shape}; '
+            'name every joint of the table'
+        )
+    parts = {
+        name: np.concatenate([getattr(start, name)[:1], values])
+        for name, values in points.columns().items()
+    }
     return JointTrajectory(np.concatenate([[0.0], points.time]) + start.time[0], **parts)
 
 
@@ -91,11 +101,17 @@ def braking_from(start: JointMotion, limits: MotionLimits) -> JointTrajectory:
     room = np.where(rate > 0, limits.upper - position, position - limits.lower)
     ends = room[(rate != 0) & (room > 0)] / np.abs(rate[(rate != 0) & (room > 0)])
     duration = max(min([wanted, *2.0 * ends]), SHORTEST_BRAKING)
-    return JointTrajectory(start.time[0] + np.array([0.0, duration]), np.stack([position, position + 0.5 * rate * duration]),
-                           np.stack([rate, 0.0 * rate]), np.zeros((2, len(rate))))
+    return JointTrajectory(
+        start.time[0] + np.array([0.0, duration]),
+        np.stack([position, position + 0.5 * rate * duration]),
+        np.stack([rate, 0.0 * rate]),
+        np.zeros((2, len(rate))),
+    )
 
 
-def excess(trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.005) -> tuple[float, float, float]:
+def excess(
+    trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.005
+) -> tuple[float, float, float]:
     """
     Return the excess of a trajectory over limits.
 
@@ -103,9 +119,14 @@ def excess(trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.00
     straight lines are ignored.
     """
     count = max(int(np.ceil((trajectory.end - trajectory.time[0]) / step)), 20)
-    motion = trajectory.at(np.union1d(np.linspace(trajectory.time[0], trajectory.end, count + 1), trajectory.time))
+    motion = trajectory.at(
+        np.union1d(np.linspace(trajectory.time[0], trajectory.end, count + 1), trajectory.time)
+    )
     beyond = np.maximum(limits.lower - motion.position, motion.position - limits.upper)
-    speed, acceleration = np.abs(motion.rate) / limits.speed, np.abs(motion.acceleration) / limits.acceleration
+    speed, acceleration = (
+        np.abs(motion.rate) / limits.speed,
+        np.abs(motion.acceleration) / limits.acceleration,
+    )
     return float(np.max(beyond)), float(np.max(speed)), float(np.max(acceleration))
 
 
@@ -119,17 +140,45 @@ KEPT_MOTIONS = 8
 class ControllerSettings:
     """Execution of a trajectory by the joints, and their faults."""
 
-    limits: str = setting('refuse', '', 'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
-                          'is slowed to the limits; beyond the range it is refused) or none (it is followed)',
-                          symptom='trajectories are not followed, or further and faster than the joints can',
-                         choices=('refuse', 'slow', 'none'))
-    lag: float = setting(0.0, 's', 'delay of the joints relative to a trajectory', (0.0, 10.0), 'measured joints are late')
-    speed_scaling: float = setting(1.0, '1', 'share of their speed at which trajectories are followed', (0.01, 1.0),
-                                   'motions last longer than commanded')
-    refuse_after: int = setting(-1, '1', 'trajectories that are followed before every further one is refused; -1: all are followed',
-                                (-1, 1_000_000), 'trajectories are not followed')
-    stall_joint: str = setting('', '', 'joint that stalls', symptom='no joint stalls, or another one')
-    stall_time: float = setting(0.0, 's', 'simulated time at which it stalls', (0.0, 1e7), 'the joint moves on, or never moved')
+    limits: str = setting(
+        'refuse',
+        '',
+        'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
+        'is slowed to the limits; beyond the range it is refused) or none (it is followed)',
+        symptom='trajectories are not followed, or further and faster than the joints can',
+        choices=('refuse', 'slow', 'none'),
+    )
+    lag: float = setting(
+        0.0,
+        's',
+        'delay of the joints relative to a trajectory',
+        (0.0, 10.0),
+        'measured joints are late',
+    )
+    speed_scaling: float = setting(
+        1.0,
+        '1',
+        'share of their speed at which trajectories are followed',
+        (0.01, 1.0),
+        'motions last longer than commanded',
+    )
+    refuse_after: int = setting(
+        -1,
+        '1',
+        'trajectories that are followed before every further one is refused; -1: all are followed',
+        (-1, 1_000_000),
+        'trajectories are not followed',
+    )
+    stall_joint: str = setting(
+        '', '', 'joint that stalls', symptom='no joint stalls, or another one'
+    )
+    stall_time: float = setting(
+        0.0,
+        's',
+        'simulated time at which it stalls',
+        (0.0, 1e7),
+        'the joint moves on, or never moved',
+    )
 
 
 class TableController:
@@ -155,12 +204,25 @@ class TableController:
 
     """
 
-    def __init__(self, profile: Profile | None, joint_names: tuple[str, ...], *, limits: MotionLimits | None = None,
-                 settings: ControllerSettings = ControllerSettings(), repeat: bool = False):
-        self.joint_names, self.limits, self.settings = tuple(joint_names), limits or free_limits(len(joint_names)), settings
+    def __init__(
+        self,
+        profile: Profile | None,
+        joint_names: tuple[str, ...],
+        *,
+        limits: MotionLimits | None = None,
+        settings: ControllerSettings = ControllerSettings(),
+        repeat: bool = False,
+    ):
+        self.joint_names, self.limits, self.settings = (
+            tuple(joint_names),
+            limits or free_limits(len(joint_names)),
+            settings,
+        )
         if settings.stall_joint and settings.stall_joint not in self.joint_names:
-            raise InputError(f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got '{settings.stall_joint}'; name one",
-                             code='joint_unknown')
+            raise InputError(
+                f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got '{settings.stall_joint}'; name one",
+                code='joint_unknown',
+            )
         self._profile, self._repeat, self._n_followed = profile, repeat, 0
         self._home = np.clip(np.zeros(len(joint_names)), self.limits.lower, self.limits.upper)
         self._taken: list[tuple[float, JointTrajectory]] = []
@@ -169,7 +231,11 @@ class TableController:
     @property
     def end(self) -> float:
         """When the motion ends, s; infinite when it repeats or waits for trajectories."""
-        return np.inf if self._profile is None or self._repeat or self._taken else self._profile.duration
+        return (
+            np.inf
+            if self._profile is None or self._repeat or self._taken
+            else self._profile.duration
+        )
 
     def follow(self, now: float, points: TrajectoryPoints) -> None:
         """
@@ -187,8 +253,10 @@ class TableController:
         if not len(points):
             return self._take(begin, braking_from(start, self.limits))
         if 0 <= self.settings.refuse_after <= self._n_followed:
-            raise InputError(f'the controller accepts at most {self.settings.refuse_after} trajectories, by its parameter',
-                             code='trajectory_count')
+            raise InputError(
+                f'the controller accepts at most {self.settings.refuse_after} trajectories, by its parameter',
+                code='trajectory_count',
+            )
         points = points.slowed(self.settings.speed_scaling)
         trajectory = trajectory_from(start, points)
         if self.settings.limits != 'none':
@@ -202,14 +270,20 @@ class TableController:
     def _within_limits(self, start, points, trajectory):
         beyond, speed, acceleration = excess(trajectory, self.limits)
         if beyond > LIMIT_ROUNDING:
-            raise InputError(f'a trajectory must stay within the range of the joints, it exceeds it by {beyond:.3g} rad or m; '
-                             'see the limits in the description of the table', code='joint_range')
+            raise InputError(
+                f'a trajectory must stay within the range of the joints, it exceeds it by {beyond:.3g} rad or m; '
+                'see the limits in the description of the table',
+                code='joint_range',
+            )
         fastest = max(speed, np.sqrt(acceleration))
         if fastest <= 1.0 + LIMIT_ROUNDING:
             return trajectory
         if self.settings.limits == 'refuse':
-            raise InputError(f'a trajectory must keep to speed and acceleration of the joints, it reaches {speed:.2f} times the one and '
-                             f'{acceleration:.2f} times the other; give it more time', code='joint_limits')
+            raise InputError(
+                f'a trajectory must keep to speed and acceleration of the joints, it reaches {speed:.2f} times the one and '
+                f'{acceleration:.2f} times the other; give it more time',
+                code='joint_limits',
+            )
         return trajectory_from(start, points.slowed(1.0 / fastest))
 
     def at(self, time: np.ndarray) -> JointMotion:
@@ -220,8 +294,13 @@ class TableController:
         if not self.settings.stall_joint or not late.any():
             return motion
         if self._stalled is None:
-            self._stalled = braking_from(self._commanded(np.array([self.settings.stall_time])), self.limits)
-        column, stuck = self.joint_names.index(self.settings.stall_joint), self._stalled.at(time[late])
+            self._stalled = braking_from(
+                self._commanded(np.array([self.settings.stall_time])), self.limits
+            )
+        column, stuck = (
+            self.joint_names.index(self.settings.stall_joint),
+            self._stalled.at(time[late]),
+        )
         for name in ('position', 'rate', 'acceleration', 'jerk'):
             getattr(motion, name)[late, column] = getattr(stuck, name)[:, column]
         return motion
@@ -247,4 +326,6 @@ class TableController:
         turns = np.floor(time / self._profile.duration)
         motion = self._profile.at(time - turns * self._profile.duration)
         first, last = self._profile.at(np.array([0.0, self._profile.duration])).position
-        return replace(motion, time=time, position=motion.position + turns[:, None] * (last - first))
+        return replace(
+            motion, time=time, position=motion.position + turns[:, None] * (last - first)
+        )

@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import Unpack
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.hand_workflow import calibrate_without_table, check_by_hand, gravity_of
+from imu_calibration.calibration.hand_workflow import (
+    calibrate_without_table,
+    check_by_hand,
+    gravity_of,
+)
 from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
 from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
 from imu_calibration.core.errors import InputError
@@ -22,7 +26,13 @@ from imu_calibration.document.decision import Verdict
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import Choices, inputs_of, made_from, provenance_with
-from imu_calibration.use_cases.recordings import Stand, jobs_for, name_of, process_mapper, provenance_of
+from imu_calibration.use_cases.recordings import (
+    Stand,
+    jobs_for,
+    name_of,
+    process_mapper,
+    provenance_of,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +60,7 @@ class Calibrated:
     def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """Return the errors of one sensor in every window, before and after, as a figure for a notebook."""
         from imu_calibration.report.calibration_sections import draw_windows
+
         return draw_windows(self.result.window_errors(), sensor)
 
     @cached_property
@@ -57,12 +68,16 @@ class Calibrated:
         """The report as one HTML page."""
         report('drawing the report')
         from imu_calibration.report.calibration_sections import calibration_report
+
         return calibration_report(self.result)
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:
         """Write calibration.yaml and, when wanted, report.html into a folder."""
-        files.write_texts(folder, ({'report.html': self.report} if report else {}) | {
-            'calibration.yaml': calibration_to_text(self.calibration)})
+        files.write_texts(
+            folder,
+            ({'report.html': self.report} if report else {})
+            | {'calibration.yaml': calibration_to_text(self.calibration)},
+        )
 
     def __repr__(self):
         return repr(self.calibration)
@@ -72,12 +87,19 @@ class Calibrated:
 
     def _repr_html_(self):
         from markupsafe import escape
+
         lines = ''.join(f'<li>{escape(line)}</li>' for line in summary(self.result))
         return f'<p><b>{self.verdict.text}</b></p><ul>{lines}</ul>{self.calibration._repr_html_()}'
 
 
-def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand | None = None, *, jobs: int | None = 1,
-              earlier: Calibration | str | PathLike | None = None, **choices: Unpack[Choices]) -> Calibrated:
+def calibrate(
+    recordings: str | PathLike | SampleBlock | Sequence,
+    table: Stand | None = None,
+    *,
+    jobs: int | None = 1,
+    earlier: Calibration | str | PathLike | None = None,
+    **choices: Unpack[Choices],
+) -> Calibrated:
     """
     Calibrate from one or several recordings of the same IMU.
 
@@ -104,42 +126,75 @@ def calibrate(recordings: str | PathLike | SampleBlock | Sequence, table: Stand 
     given = {**choices, 'earlier': earlier}
     earlier = None if earlier is None else files.given_calibration(earlier)
     if earlier is not None and table is None:
-        raise InputError('an earlier calibration must be compared on a table, none was given; give its description', key='table',
-                         code='table_missing')
-    recordings = [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
+        raise InputError(
+            'an earlier calibration must be compared on a table, none was given; give its description',
+            key='table',
+            code='table_missing',
+        )
+    recordings = (
+        [recordings] if isinstance(recordings, (str, PathLike, SampleBlock)) else list(recordings)
+    )
     stand, (options, table, sources) = table, inputs_of(recordings, table, choices)
     jobs = jobs_for(jobs, len(recordings))
-    with ThreadPoolExecutor(1) as hashing:   # reads the files during the calibration, not before it
+    with ThreadPoolExecutor(1) as hashing:  # reads the files during the calibration, not before it
         provenance = hashing.submit(provenance_with, 'calibrate', recordings, given, stand=stand)
         if table is None:
             result = calibrate_without_table(sources, options)
         else:
             result = _side_by_side(sources, table, options, recordings, jobs)
             if earlier is not None and result.calibration.proof:
-                result = _beside(result, check_on_table(sources, table, earlier, options=options).proof)
+                result = _beside(
+                    result, check_on_table(sources, table, earlier, options=options).proof
+                )
         calibration = result.calibration
-        return Calibrated(replace(result, calibration=replace(calibration, provenance=calibration.provenance | provenance.result())))
+        return Calibrated(
+            replace(
+                result,
+                calibration=replace(
+                    calibration, provenance=calibration.provenance | provenance.result()
+                ),
+            )
+        )
 
 
 def _beside(result, proof):
     """Return the result with the error after an earlier calibration, from `proof`, in its own proof."""
-    known = {sensor: found | ({'earlier': {name: proof[sensor][name] for name in ('after', 'ci95')}} if sensor in proof else {})
-             for sensor, found in result.calibration.proof.items()}
-    return replace(result, calibration=judged(replace(result.calibration, proof=known), result.tolerances))
+    known = {
+        sensor: found
+        | (
+            {'earlier': {name: proof[sensor][name] for name in ('after', 'ci95')}}
+            if sensor in proof
+            else {}
+        )
+        for sensor, found in result.calibration.proof.items()
+    }
+    return replace(
+        result, calibration=judged(replace(result.calibration, proof=known), result.tolerances)
+    )
 
 
 def _side_by_side(sources, table, options, recordings, jobs):
     """Calibrate with the table, recordings in several processes if `jobs` is above 1."""
     names = [name_of(recording) for recording in recordings]
-    names = [name if names.count(name) == 1 else f'recording {number}' if isinstance(recording, SampleBlock) else str(Path(recording))
-             for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)]
+    names = [
+        name
+        if names.count(name) == 1
+        else f'recording {number}'
+        if isinstance(recording, SampleBlock)
+        else str(Path(recording))
+        for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)
+    ]
     advance = counter('recordings', len(recordings) if jobs > 1 else 0)
     mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
     return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result
 
 
-def check(recording: str | PathLike | SampleBlock, calibration: Calibration | str | PathLike, table: Stand | None = None,
-          **choices: Unpack[Choices]) -> CheckResult:
+def check(
+    recording: str | PathLike | SampleBlock,
+    calibration: Calibration | str | PathLike,
+    table: Stand | None = None,
+    **choices: Unpack[Choices],
+) -> CheckResult:
     """
     Test whether a calibration helps on a recording: the error before and after, by sensor and kind of motion.
 
@@ -163,9 +218,17 @@ def check(recording: str | PathLike | SampleBlock, calibration: Calibration | st
     calibration = files.given_calibration(calibration)
     options, table, sources = inputs_of([recording], table, choices)
     if table is None:
-        result, notes = check_by_hand(sources[0], calibration, options), _gravity(options, calibration)
+        result, notes = (
+            check_by_hand(sources[0], calibration, options),
+            _gravity(options, calibration),
+        )
     else:
-        result, notes = check_on_table(sources, table, calibration, options=options, names=[name_of(recording)]), ()
+        result, notes = (
+            check_on_table(
+                sources, table, calibration, options=options, names=[name_of(recording)]
+            ),
+            (),
+        )
     return replace(result, notes=(*notes, *_notes(recording, calibration)))
 
 
@@ -174,10 +237,16 @@ def _gravity(options, calibration):
     if options.gravity:
         return ()
     taken = gravity_of(calibration, options)
-    return (f'gravity is that of the calibration, {taken:.6g} m/s^2; give the local value if it differs',)
+    return (
+        f'gravity is that of the calibration, {taken:.6g} m/s^2; give the local value if it differs',
+    )
 
 
 def _notes(recording, calibration):
     """Return a note when the calibration was made from this very recording."""
     same = made_from(calibration.provenance) & made_from(provenance_of([recording], {}))
-    return ('it was calibrated from this recording: the result can differ on new recordings',) if same else ()
+    return (
+        ('it was calibrated from this recording: the result can differ on new recordings',)
+        if same
+        else ()
+    )

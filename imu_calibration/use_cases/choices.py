@@ -19,7 +19,16 @@ from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.use_cases.recordings import Arm, Source, Stand, Topics, open_bag, provenance_of, source_of, table_of
+from imu_calibration.use_cases.recordings import (
+    Arm,
+    Source,
+    Stand,
+    Topics,
+    open_bag,
+    provenance_of,
+    source_of,
+    table_of,
+)
 from imu_calibration.use_cases.resources import config_file
 
 
@@ -75,7 +84,11 @@ class Inputs(NamedTuple):
     """One for each recording."""
 
 
-def inputs_of(recordings: Sequence[str | PathLike | SampleBlock], stand: Stand | None, choices: Mapping[str, Any]) -> Inputs:
+def inputs_of(
+    recordings: Sequence[str | PathLike | SampleBlock],
+    stand: Stand | None,
+    choices: Mapping[str, Any],
+) -> Inputs:
     """
     Return the inputs that the user has chosen; each recording can be opened.
 
@@ -96,19 +109,33 @@ def inputs_of(recordings: Sequence[str | PathLike | SampleBlock], stand: Stand |
     """
     strange = sorted(set(choices) - set(Choices.__annotations__))
     if strange:
-        raise InputError(f'{", ".join(strange)} cannot be chosen; the choices are {", ".join(Choices.__annotations__)}',
-                         code='choice_unknown')
+        raise InputError(
+            f'{", ".join(strange)} cannot be chosen; the choices are {", ".join(Choices.__annotations__)}',
+            code='choice_unknown',
+        )
     options, topics = calibration_options(choices), topics_of(choices)
     table = None if stand is None else table_of(stand, recordings, topics, gravity=options.gravity)
     for path in recordings:
         if not isinstance(path, SampleBlock):
             open_bag(path, topics, want_joints=table is not None).close()
-    return Inputs(options, table, [source_of(item, topics, None if table is None else table.joint_names) for item in recordings])
+    return Inputs(
+        options,
+        table,
+        [
+            source_of(item, topics, None if table is None else table.joint_names)
+            for item in recordings
+        ],
+    )
 
 
 def topics_of(choices: Mapping[str, Any]) -> Topics:
     """Return the topics that were chosen."""
-    return Topics(*(choices.get(name) for name in ('imu_topic', 'joint_topic', 'temperature_topic', 'frame_id')))
+    return Topics(
+        *(
+            choices.get(name)
+            for name in ('imu_topic', 'joint_topic', 'temperature_topic', 'frame_id')
+        )
+    )
 
 
 def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
@@ -116,11 +143,22 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     catalogue = catalogue_of(choices.get('catalogue'))
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
-    gravity, gravity_sd = local_gravity(*(choices.get(name) for name in ('gravity', 'latitude', 'height')))
-    return CalibrationOptions(choices.get('accelerometer_model'), choices.get('gyroscope_model'), choices.get('reference_model'),
-                              read(tolerances, catalogue), window_settings(choices.get('setting') or ()),
-                              nominal_of(choices.get('nominal')), gravity, catalogue, noise_of(choices.get('noise')),
-                              as_asked=bool(choices.get('model_as_asked')), gravity_sd=gravity_sd)
+    gravity, gravity_sd = local_gravity(
+        *(choices.get(name) for name in ('gravity', 'latitude', 'height'))
+    )
+    return CalibrationOptions(
+        choices.get('accelerometer_model'),
+        choices.get('gyroscope_model'),
+        choices.get('reference_model'),
+        read(tolerances, catalogue),
+        window_settings(choices.get('setting') or ()),
+        nominal_of(choices.get('nominal')),
+        gravity,
+        catalogue,
+        noise_of(choices.get('noise')),
+        as_asked=bool(choices.get('model_as_asked')),
+        gravity_sd=gravity_sd,
+    )
 
 
 def catalogue_of(chosen: Catalogue | str | PathLike | Mapping | None) -> Catalogue:
@@ -142,13 +180,18 @@ def window_settings(chosen: Sequence[str] | Mapping[str, float]) -> WindowSettin
         try:
             values[name] = float(text)
         except ValueError as error:
-            raise InputError(f"a setting must be NAME=NUMBER, got '{pair}'; write for example settling=1.0", key='setting') from error
+            raise InputError(
+                f"a setting must be NAME=NUMBER, got '{pair}'; write for example settling=1.0",
+                key='setting',
+            ) from error
     return override(WindowSettings(), values)
 
 
 def noise_of(chosen: str | PathLike | NoiseFigures | None) -> NoiseFigures | None:
     """Return the noise, read where it is a file."""
-    return chosen if chosen is None or isinstance(chosen, NoiseFigures) else files.read_noise(chosen)
+    return (
+        chosen if chosen is None or isinstance(chosen, NoiseFigures) else files.read_noise(chosen)
+    )
 
 
 def nominal_of(chosen: str | PathLike | NominalScaling | None) -> NominalScaling | None:
@@ -159,7 +202,9 @@ def nominal_of(chosen: str | PathLike | NominalScaling | None) -> NominalScaling
     known = NominalScaling.__dataclass_fields__
     strange = sorted(set(mapping) - set(known))
     if strange:
-        raise InputError(f"{chosen} may name {', '.join(known)}; it names {', '.join(strange)}; correct it")
+        raise InputError(
+            f'{chosen} may name {", ".join(known)}; it names {", ".join(strange)}; correct it'
+        )
     return NominalScaling(**{name: float(value) for name, value in mapping.items()})
 
 
@@ -183,8 +228,16 @@ def effect_rows(added: str | PathLike | None = None) -> list[dict[str, Any]]:
 def _row(effect):
     units = (effect.unit,) if isinstance(effect.unit, str) else tuple(dict.fromkeys(effect.unit))
     needs = [*effect.needs, *(motion.text for motion in MOTIONS if motion.name in effect.motion)]
-    return {'effect': effect.name, 'sensor': effect.sensor, 'unit': ', '.join(units), 'tolerance': effect.tolerance,
-            'compensation': effect.compensation, 'text': effect.explanation, 'equation': _equation(effect), 'needs': '; '.join(needs)}
+    return {
+        'effect': effect.name,
+        'sensor': effect.sensor,
+        'unit': ', '.join(units),
+        'tolerance': effect.tolerance,
+        'compensation': effect.compensation,
+        'text': effect.explanation,
+        'equation': _equation(effect),
+        'needs': '; '.join(needs),
+    }
 
 
 def _equation(effect):
@@ -192,7 +245,10 @@ def _equation(effect):
     columns = [text for group in effect.groups for text in group.text]
     if not columns or effect.warp is not None:
         return ''
-    shown = ' + '.join(f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}' for n, text in enumerate(columns[:MAX_SHOWN_COLUMNS], 1))
+    shown = ' + '.join(
+        f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}'
+        for n, text in enumerate(columns[:MAX_SHOWN_COLUMNS], 1)
+    )
     return f'output_i += {shown}{f" + ... ({len(columns)} columns)" if len(columns) > MAX_SHOWN_COLUMNS else ""}'
 
 
@@ -204,8 +260,13 @@ SHORT_HASH_DIGITS = 16
 """Hexadecimal digits of the hashes that earlier versions wrote."""
 
 
-def provenance_with(verb: str, recordings: Iterable[str | PathLike | SampleBlock], choices: Choices | Mapping[str, Any], *,
-                    stand: Stand | None = None) -> dict[str, Any]:
+def provenance_with(
+    verb: str,
+    recordings: Iterable[str | PathLike | SampleBlock],
+    choices: Choices | Mapping[str, Any],
+    *,
+    stand: Stand | None = None,
+) -> dict[str, Any]:
     """
     Return the provenance of a result, without anything that changes from run to run.
 
@@ -225,26 +286,44 @@ def provenance_with(verb: str, recordings: Iterable[str | PathLike | SampleBlock
     used['tolerances'] = used.get('tolerances') or config_file('tolerances.yaml')
     if isinstance(setting := used.get('setting'), Mapping):
         used['setting'] = [f'{name}={value}' for name, value in setting.items()]
-    options = {name: _named(used[name]) for name in sorted(used) if used[name] and name not in LABELS}
-    return {'verb': verb, **provenance_of(recordings, options), **{name: str(used[name]) for name in LABELS if used.get(name)}}
+    options = {
+        name: _named(used[name]) for name in sorted(used) if used[name] and name not in LABELS
+    }
+    return {
+        'verb': verb,
+        **provenance_of(recordings, options),
+        **{name: str(used[name]) for name in LABELS if used.get(name)},
+    }
 
 
 def _named(option):
     """Return name and hash of a file or of data in memory; other options unchanged."""
     if isinstance(option, (str, PathLike)):
-        return {'name': Path(option).name, 'sha256': files.hash_of(option)} if Path(option).is_file() else str(option)
+        return (
+            {'name': Path(option).name, 'sha256': files.hash_of(option)}
+            if Path(option).is_file()
+            else str(option)
+        )
     if isinstance(option, (bool, int, float)):
         return option
     if isinstance(option, Iterable) and not isinstance(option, Mapping):
         return list(option)
     mapping = option.to_mapping() if isinstance(option, Table) else option
-    known = {'sha256': sha256(to_text(dict(mapping)).encode()).hexdigest()} if isinstance(mapping, Mapping) else {}
+    known = (
+        {'sha256': sha256(to_text(dict(mapping)).encode()).hexdigest()}
+        if isinstance(mapping, Mapping)
+        else {}
+    )
     return {'name': 'in memory', **known}
 
 
 def made_from(found: Mapping[str, Any]) -> set[str]:
     """Return the hashes of the recordings of a provenance, as many digits as all versions write."""
-    return {str(bag.get('sha256'))[:SHORT_HASH_DIGITS] for bag in found.get('bags') or () if isinstance(bag, Mapping)}
+    return {
+        str(bag.get('sha256'))[:SHORT_HASH_DIGITS]
+        for bag in found.get('bags') or ()
+        if isinstance(bag, Mapping)
+    }
 
 
 def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> None:
@@ -272,14 +351,24 @@ def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> Non
     except ImuCalibrationError:
         before = None
     before = before if isinstance(before, Mapping) else {}
-    parts = {'verb': before.get('verb', found['verb']) == found['verb'], 'recordings': made_from(before) == made_from(found),
-             'reference': _stands(before) == _stands(found)}
+    parts = {
+        'verb': before.get('verb', found['verb']) == found['verb'],
+        'recordings': made_from(before) == made_from(found),
+        'reference': _stands(before) == _stands(found),
+    }
     if not all(parts.values()):
-        raise InputError(f'a result must not replace that of other inputs, {path} differs in '
-                         f'{" and ".join(name for name, same in parts.items() if not same)}; choose another folder, or overwrite it',
-                         key='force', code='other_result')
+        raise InputError(
+            f'a result must not replace that of other inputs, {path} differs in '
+            f'{" and ".join(name for name, same in parts.items() if not same)}; choose another folder, or overwrite it',
+            key='force',
+            code='other_result',
+        )
 
 
 def _stands(found):
     options = found.get('options')
-    return {name: options[name] for name in STANDS if name in options} if isinstance(options, Mapping) else {}
+    return (
+        {name: options[name] for name in STANDS if name in options}
+        if isinstance(options, Mapping)
+        else {}
+    )

@@ -6,7 +6,12 @@ from os import PathLike
 from pathlib import Path
 
 from imu_calibration.allan.figures import NoiseFigures
-from imu_calibration.compensation.stream import CompensationStream, late_ns, refuse_corrected, requested_transfer
+from imu_calibration.compensation.stream import (
+    CompensationStream,
+    late_ns,
+    refuse_corrected,
+    requested_transfer,
+)
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -45,11 +50,22 @@ class Compensated:
         return '\n'.join([f'<Compensated: {self.count} samples>', *self.warnings])
 
 
-def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration: Calibration | str | PathLike, *,
-               output: str | PathLike | None = None, corrected_topic: str = CORRECTED_TOPIC, target_frame: str = '',
-               target_xyz: Sequence[float] = (0.0, 0.0, 0.0), target_rpy: Sequence[float] = (0.0, 0.0, 0.0), correct_stamps: bool = False,
-               anyway: bool = False, noise: NoiseFigures | str | PathLike | None = None, imu_topic: str | None = None,
-               temperature_topic: str | None = None, frame_id: str | None = None) -> Compensated:
+def compensate(
+    recording: str | PathLike | ImuSamples | SampleBlock,
+    calibration: Calibration | str | PathLike,
+    *,
+    output: str | PathLike | None = None,
+    corrected_topic: str = CORRECTED_TOPIC,
+    target_frame: str = '',
+    target_xyz: Sequence[float] = (0.0, 0.0, 0.0),
+    target_rpy: Sequence[float] = (0.0, 0.0, 0.0),
+    correct_stamps: bool = False,
+    anyway: bool = False,
+    noise: NoiseFigures | str | PathLike | None = None,
+    imu_topic: str | None = None,
+    temperature_topic: str | None = None,
+    frame_id: str | None = None,
+) -> Compensated:
     """
     Correct the calibrated errors in a recording.
 
@@ -93,36 +109,62 @@ def compensate(recording: str | PathLike | ImuSamples | SampleBlock, calibration
     if isinstance(recording, (ImuSamples, SampleBlock)):
         return _in_memory(recording, calibration, transfer, late=late, used=used)
     if output is not None and Path(output).exists():
-        raise InputError(f'the output bag {output} must not exist yet; choose another name or remove it', code='exists_already')
+        raise InputError(
+            f'the output bag {output} must not exist yet; choose another name or remove it',
+            code='exists_already',
+        )
     topics = Topics(imu_topic, None, temperature_topic, frame_id)
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
         refuse_corrected(bag.imu_topic)
-        stream = CompensationStream(calibration, temperature=temperatures(recording, topics), transfer=transfer)
+        stream = CompensationStream(
+            calibration, temperature=temperatures(recording, topics), transfer=transfer
+        )
 
         def correct(imu):
             advance(len(imu))
             return stream.correct(imu)
+
         if output is None:
-            parts = [_corrected(block.imu, correct(block.imu), transfer, late) for block in bag.blocks() if block.imu is not None]
-            return _outcome(ImuSamples.concatenate(parts) if parts else None, stream, bag.lost, used)
+            parts = [
+                _corrected(block.imu, correct(block.imu), transfer, late)
+                for block in bag.blocks()
+                if block.imu is not None
+            ]
+            return _outcome(
+                ImuSamples.concatenate(parts) if parts else None, stream, bag.lost, used
+            )
         from msg_adapters.copying import copy_with_corrected
-        lost = copy_with_corrected(recording, output, bag.imu_topic, corrected_topic=corrected_topic, correct=correct,
-                                   propagate=stream.propagate, frame_id=target_frame or None,
-                                   mat_ts=None if transfer is None else transfer.mat_ts, late_ns=late, source_frame_id=frame_id)
+
+        lost = copy_with_corrected(
+            recording,
+            output,
+            bag.imu_topic,
+            corrected_topic=corrected_topic,
+            correct=correct,
+            propagate=stream.propagate,
+            frame_id=target_frame or None,
+            mat_ts=None if transfer is None else transfer.mat_ts,
+            late_ns=late,
+            source_frame_id=frame_id,
+        )
         return _outcome(None, stream, lost, used)
 
 
 def _in_memory(recording, calibration, transfer, *, late, used):
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
-    return _outcome(_corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {}, used)
+    return _outcome(
+        _corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {}, used
+    )
 
 
 def _outcome(imu, stream, lost, used):
     against = [*used.lines, *caveats(stream.calibration)]
-    return Compensated(imu, stream.count, against + stream.warnings(), lost, dict(used.refused), used.cautions)
+    return Compensated(
+        imu, stream.count, against + stream.warnings(), lost, dict(used.refused), used.cautions
+    )
 
 
 def _corrected(imu, corrected, transfer, late):

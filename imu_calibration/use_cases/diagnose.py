@@ -6,7 +6,11 @@ from functools import cached_property
 from os import PathLike
 from typing import Unpack
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import DiagnosisResult, diagnose_recording, diagnose_without_table
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
+    DiagnosisResult,
+    diagnose_recording,
+    diagnose_without_table,
+)
 from imu_calibration.calibration.result import exit_code
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import SampleBlock
@@ -53,6 +57,7 @@ class Diagnosed:
     def plot(self, number: int = 1) -> Drawn:
         """Return the residual against the cause of a finding, before and after; 0, or without findings: residuals over time."""
         from imu_calibration.report.diagnosis_page import draw_finding, draw_over_time
+
         if not number or not self.findings:
             return draw_over_time(self.result)
         return draw_finding(self.result.diagnosis, self.findings[number - 1], number)
@@ -62,20 +67,33 @@ class Diagnosed:
         """The report as one HTML page."""
         report('drawing the report')
         from imu_calibration.report.diagnosis_page import diagnosis_report
+
         return diagnosis_report(self.result)
 
     def save(self, folder: str | PathLike) -> None:
         """Write diagnosis.json, report.html, the extended calibration.yaml and, with proposed formulas, extended.yaml into a folder."""
-        files.write_texts(folder, {
-            'diagnosis.json': json.dumps(self.document, indent=1) + '\n', 'report.html': self.report,
-            'calibration.yaml': calibration_to_text(self.calibration),
-            **({} if self.proposed is None else {'extended.yaml': calibration_to_text(self.proposed)})})
+        files.write_texts(
+            folder,
+            {
+                'diagnosis.json': json.dumps(self.document, indent=1) + '\n',
+                'report.html': self.report,
+                'calibration.yaml': calibration_to_text(self.calibration),
+                **(
+                    {}
+                    if self.proposed is None
+                    else {'extended.yaml': calibration_to_text(self.proposed)}
+                ),
+            },
+        )
 
     def save_overlay(self, path: str | PathLike) -> None:
         """Write measured and simulated signals, residuals, spectra and histograms as MCAP for Foxglove (`overlay_topics`)."""
         from imu_calibration.use_cases.view import mcap_bytes, overlay_topics
+
         diagnosis = self.result.diagnosis
-        files.write_whole(path, mcap_bytes(overlay_topics(diagnosis.traces, diagnosis.baseline.model.joint_names)))
+        files.write_whole(
+            path, mcap_bytes(overlay_topics(diagnosis.traces, diagnosis.baseline.model.joint_names))
+        )
 
     def __str__(self):
         return '\n'.join(self.result.lines)
@@ -84,10 +102,13 @@ class Diagnosed:
 
     def _repr_html_(self):
         from markupsafe import escape
+
         return ''.join(f'<p>{escape(line)}</p>' for line in self.result.lines)
 
 
-def diagnose(recording: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> Diagnosed:
+def diagnose(
+    recording: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]
+) -> Diagnosed:
     """
     Find the model errors on a recording and their causes, and extend the model.
 

@@ -8,14 +8,36 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.exports.export import Export, export, find_target
-from imu_calibration.document.exports.loss import TrialMotion, import_file, motion_of, recorded_motion, temperature_at
+from imu_calibration.document.exports.loss import (
+    TrialMotion,
+    import_file,
+    motion_of,
+    recorded_motion,
+    temperature_at,
+)
 from imu_calibration.preprocessing.window_finder import session_truth
-from imu_calibration.use_cases.recordings import Stand, Topics, name_of, source_of, table_of, temperatures
+from imu_calibration.use_cases.recordings import (
+    Stand,
+    Topics,
+    name_of,
+    source_of,
+    table_of,
+    temperatures,
+)
 
 
-def export_calibration(calibration: str | PathLike | Calibration, to: str, *, output: str | PathLike | None = None,
-                       noise: str | PathLike | None = None, rate: float | None = None, bag: str | PathLike | None = None,
-                       stand: Stand | None = None, topics: Topics = Topics(), anyway: bool = False) -> Export:
+def export_calibration(
+    calibration: str | PathLike | Calibration,
+    to: str,
+    *,
+    output: str | PathLike | None = None,
+    noise: str | PathLike | None = None,
+    rate: float | None = None,
+    bag: str | PathLike | None = None,
+    stand: Stand | None = None,
+    topics: Topics = Topics(),
+    anyway: bool = False,
+) -> Export:
     """
     Write a calibration in the format of another program.
 
@@ -60,15 +82,24 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
     temperature = temperatures(bag, topics)
     if stand is None:
         blocks = [block.imu for block in source_of(bag, topics)() if block.imu is not None]
-        return recorded_motion(calibration, ImuSamples.concatenate(blocks), temperature, name=name_of(bag))
+        return recorded_motion(
+            calibration, ImuSamples.concatenate(blocks), temperature, name=name_of(bag)
+        )
     table = table_of(stand, [bag], topics)
     imu, ref = session_truth(source_of(bag, topics, table.joint_names)(), table)
     warmth = temperature_at(calibration, temperature, imu.stamp_ns)
-    return motion_of(ref.force_s, ref.rate_s, ref.alpha_s, temperature_c=warmth,
-                     text=f'{name_of(bag)}, moved as its table says ({len(imu)} samples)')
+    return motion_of(
+        ref.force_s,
+        ref.rate_s,
+        ref.alpha_s,
+        temperature_c=warmth,
+        text=f'{name_of(bag)}, moved as its table says ({len(imu)} samples)',
+    )
 
 
-def import_calibration(path: str | PathLike, source: str, *, output: str | PathLike | None = None, frame_id: str = '') -> Calibration:
+def import_calibration(
+    path: str | PathLike, source: str, *, output: str | PathLike | None = None, frame_id: str = ''
+) -> Calibration:
     """
     Read the file of another program as a calibration.
 
@@ -89,7 +120,9 @@ def import_calibration(path: str | PathLike, source: str, *, output: str | PathL
 
     """
     target = find_target(source, read=True)
-    found = import_file(target, files.read_bytes(path, f'file of {target.name}'), Path(path), frame_id=frame_id)
+    found = import_file(
+        target, files.read_bytes(path, f'file of {target.name}'), Path(path), frame_id=frame_id
+    )
     if output is not None:
         files.write_text(output, calibration_to_text(found))
     return found

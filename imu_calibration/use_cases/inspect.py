@@ -5,7 +5,12 @@ from dataclasses import dataclass, replace
 from os import PathLike
 
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.hand_workflow import EvidentHand, HandResult, hand_result, read_by_hand
+from imu_calibration.calibration.hand_workflow import (
+    EvidentHand,
+    HandResult,
+    hand_result,
+    read_by_hand,
+)
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError
@@ -51,12 +56,18 @@ class RecordingSummary:
         dropped = any(set(stream.dropped) - {'spike'} for stream in self.streams.values())
         if self.refused:
             return 1
-        return 3 if self.lost or dropped or unusable(self.findings) or warnings(self.findings) else 0
+        return (
+            3 if self.lost or dropped or unusable(self.findings) or warnings(self.findings) else 0
+        )
 
 
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     """Return the topics with the requested Imu topic, or with each one of the recording, and each frame_id if one has several."""
-    names = [topics.imu] if topics.imu is not None else [topic.name for topic in list_topics(bag) if topic.type == IMU_TYPE]
+    names = (
+        [topics.imu]
+        if topics.imu is not None
+        else [topic.name for topic in list_topics(bag) if topic.type == IMU_TYPE]
+    )
     found = [topics._replace(imu=name) for name in names]
     if topics.frame is None:
         found = [part for each in found for part in _by_frame(bag, each)]
@@ -69,7 +80,13 @@ def _by_frame(bag, topics):
     return [topics._replace(frame=frame) for frame in frames] if len(frames) > 1 else [topics]
 
 
-def inspect(bag: str | PathLike, topics: Iterable[Topics], table: Table | None, *, options: CalibrationOptions) -> list[RecordingSummary]:
+def inspect(
+    bag: str | PathLike,
+    topics: Iterable[Topics],
+    table: Table | None,
+    *,
+    options: CalibrationOptions,
+) -> list[RecordingSummary]:
     """Inspect each Imu topic of a recording, with the joints and temperatures used with it."""
     return [_look(bag, each, table, options) for each in topics]
 
@@ -81,13 +98,24 @@ def _look(bag, topics, table, options):
     by_hand = None
     if table is not None:
         try:
-            calibrated = calibrate([source_of(bag, topics, table.joint_names)], table, options, mapper=_watched_by(preflight))
+            calibrated = calibrate(
+                [source_of(bag, topics, table.joint_names)],
+                table,
+                options,
+                mapper=_watched_by(preflight),
+            )
         except ImuCalibrationError as error:
             calibrated = error
-    if not preflight.streams:   # not read to its end: no data to calibrate from
+    if not preflight.streams:  # not read to its end: no data to calibrate from
         preflight = Preflight(table and table.gravity_value, strict=False)
-        by_hand = _by_hand(source_of(bag, topics, want_joints='optional', want_temperature='optional'), options, preflight)
-    look = RecordingSummary(recording, preflight.streams, preflight.findings, preflight.lost, calibrated, by_hand)
+        by_hand = _by_hand(
+            source_of(bag, topics, want_joints='optional', want_temperature='optional'),
+            options,
+            preflight,
+        )
+    look = RecordingSummary(
+        recording, preflight.streams, preflight.findings, preflight.lost, calibrated, by_hand
+    )
     return look if table is None and not look.refused else replace(look, by_hand=None)
 
 
@@ -104,10 +132,14 @@ def _by_hand(source, options, preflight):
         return error
 
 
-def _watched_by(preflight: Preflight) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[SessionData]]:
+def _watched_by(
+    preflight: Preflight,
+) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[SessionData]]:
     """Return the map step of one recording that shows it to the checks, when it is read for the first time."""
+
     def mapper(step, numbered):
         if preflight.streams:
             return map(step, numbered)
         return [step.read(source(), session, preflight) for session, source in numbered]
+
     return mapper

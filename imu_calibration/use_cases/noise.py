@@ -40,27 +40,38 @@ class IdentifiedNoise:
     def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """Return the Allan deviations of one sensor with their model as a figure for a notebook."""
         from imu_calibration.report.noise_page import draw_curve
+
         return draw_curve(self.result, sensor)
 
     @cached_property
     def report(self) -> str:
         """The report as one HTML page."""
         from imu_calibration.report.noise_page import noise_report
+
         report('drawing the report')
         return noise_report(self.result, self.figures, self.horizon)
 
     def save(self, folder: str | PathLike, *, report: bool = True) -> None:
         """Write noise.yaml and, when wanted, report.html into a folder."""
-        files.write_texts(folder, ({'report.html': self.report} if report else {}) | {
-            'noise.yaml': noise_to_text(self.figures, self.horizon)})
+        files.write_texts(
+            folder,
+            ({'report.html': self.report} if report else {})
+            | {'noise.yaml': noise_to_text(self.figures, self.horizon)},
+        )
 
     def __str__(self):
         return '\n'.join(lines(self.figures))
 
 
-def noise(recording: str | PathLike | SampleBlock, *, imu_topic: str | None = None, temperature_topic: str | None = None,
-          frame_id: str | None = None,
-          nominal: str | PathLike | NominalScaling | None = None, horizon: float = HORIZON) -> IdentifiedNoise:
+def noise(
+    recording: str | PathLike | SampleBlock,
+    *,
+    imu_topic: str | None = None,
+    temperature_topic: str | None = None,
+    frame_id: str | None = None,
+    nominal: str | PathLike | NominalScaling | None = None,
+    horizon: float = HORIZON,
+) -> IdentifiedNoise:
     """
     Identify the noise of an IMU from a recording that holds rest.
 

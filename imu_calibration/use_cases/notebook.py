@@ -29,7 +29,10 @@ Recordings = str | PathLike | SampleBlock | Sequence[str | PathLike | SampleBloc
 def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the function with errors that name its arguments."""
     names = set(signature(function).parameters)
-    hints = {name: f'argument {name}' for name in (names | set(Choices.__annotations__) if 'choices' in names else names)}
+    hints = {
+        name: f'argument {name}'
+        for name in (names | set(Choices.__annotations__) if 'choices' in names else names)
+    }
 
     @wraps(function)
     def with_hints(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
@@ -37,6 +40,7 @@ def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments,
             return function(*arguments, **named)
         except ImuCalibrationError as error:
             raise type(error)(error.with_hint(hints), code=error.code) from None
+
     return with_hints
 
 
@@ -55,9 +59,17 @@ def load(path: str | PathLike) -> Calibration:
 
 
 @_for_notebooks
-def calibrate(recordings: Recordings | None = None, table: Stand | None = None, *, time: ArrayLike | None = None,
-              force: ArrayLike | None = None, rate: ArrayLike | None = None, joints: dict[str, ArrayLike] | None = None,
-              temperature_c: ArrayLike | None = None, **choices: Any) -> Calibrated:
+def calibrate(
+    recordings: Recordings | None = None,
+    table: Stand | None = None,
+    *,
+    time: ArrayLike | None = None,
+    force: ArrayLike | None = None,
+    rate: ArrayLike | None = None,
+    joints: dict[str, ArrayLike] | None = None,
+    temperature_c: ArrayLike | None = None,
+    **choices: Any,
+) -> Calibrated:
     """
     Calibrate from recordings, or from arrays: ``calibrate(time=t, force=f, rate=w)``.
 
@@ -75,12 +87,23 @@ def calibrate(recordings: Recordings | None = None, table: Stand | None = None, 
     """
     given = [values is not None for values in (recordings, time, force, rate)]
     if given not in ([True, False, False, False], [False, True, True, True]):
-        names = [name for name, there in zip(('recordings', 'time', 'force', 'rate'), given, strict=True) if there]
-        raise InputError(f'calibrate must have either recordings, or the arrays time, force and rate, got {", ".join(names) or "none"}; '
-                         'give one or the other')
+        names = [
+            name
+            for name, there in zip(('recordings', 'time', 'force', 'rate'), given, strict=True)
+            if there
+        ]
+        raise InputError(
+            f'calibrate must have either recordings, or the arrays time, force and rate, got {", ".join(names) or "none"}; '
+            'give one or the other'
+        )
     if recordings is None:
-        recordings = SampleBlock.from_arrays(cast(ArrayLike, time), cast(ArrayLike, force), cast(ArrayLike, rate),
-                                             joints=joints, temperature_c=temperature_c)
+        recordings = SampleBlock.from_arrays(
+            cast(ArrayLike, time),
+            cast(ArrayLike, force),
+            cast(ArrayLike, rate),
+            joints=joints,
+            temperature_c=temperature_c,
+        )
     return _calibrate(recordings, table, **choices)
 
 

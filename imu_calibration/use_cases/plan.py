@@ -21,10 +21,22 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
 from imu_calibration.estimation.solution import tolerances_of
-from imu_calibration.kinematics.motion_limits import NOT_CHECKED, limit_words, limits_of, missing_ranges, range_warnings
+from imu_calibration.kinematics.motion_limits import (
+    NOT_CHECKED,
+    limit_words,
+    limits_of,
+    missing_ranges,
+    range_warnings,
+)
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.campaign import LONGEST_SEPARATION, make_separator
-from imu_calibration.planning.planner import Plan, make_planner, plan_by_hand, plan_to_mapping, trajectory_to_mapping
+from imu_calibration.planning.planner import (
+    Plan,
+    make_planner,
+    plan_by_hand,
+    plan_to_mapping,
+    trajectory_to_mapping,
+)
 from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.report.figures import Drawn
@@ -51,29 +63,43 @@ class Planned:
     @property
     def exit_code(self) -> int:
         """0 when every parameter reaches its tolerance and every joint has a range or is declared endless, otherwise 3."""
-        return 3 if self.plan.missing or (self.table is not None and missing_ranges(self.table)) else 0
+        return (
+            3 if self.plan.missing or (self.table is not None and missing_ranges(self.table)) else 0
+        )
 
     @property
     def notes(self) -> list[str]:
         """Checks and doubts about the limits, a line each."""
-        return [] if self.table is None else [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
+        return (
+            []
+            if self.table is None
+            else [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
+        )
 
     @cached_property
     def report(self) -> str:
         """The report as one HTML page."""
         from imu_calibration.report.plan_page import plan_report
+
         report('drawing the report')
         return plan_report(self.plan, self.provenance)
 
     def plot(self) -> Drawn:
         """Return the standard deviations against time, in tolerances, as a figure for a notebook."""
         from imu_calibration.report.plan_page import draw_progress
+
         return draw_progress(self.plan)
 
-    def save(self, folder: str | PathLike, *, report: bool = True, storage: str = 'sqlite3') -> None:
+    def save(
+        self, folder: str | PathLike, *, report: bool = True, storage: str = 'sqlite3'
+    ) -> None:
         """Write plan.yaml, of joints trajectory.yaml and the bag `trajectory` with a message per motion, and, when wanted, report.html."""
         from msg_adapters.write import write_trajectories
-        place, moves_joints = files.make_folder(folder), self.table is not None and bool(self.plan.motions)
+
+        place, moves_joints = (
+            files.make_folder(folder),
+            self.table is not None and bool(self.plan.motions),
+        )
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
         if moves_joints:  # first, since it refuses where there is one already
@@ -81,23 +107,43 @@ class Planned:
         if report:
             files.write_text(place / 'report.html', page)
         if moves_joints:
-            files.write_text(place / 'trajectory.yaml', documents.to_text(trajectory_to_mapping(self.plan.points)))
+            files.write_text(
+                place / 'trajectory.yaml',
+                documents.to_text(trajectory_to_mapping(self.plan.points)),
+            )
         files.write_text(place / 'plan.yaml', text)
 
     def _messages(self):
         from imu_calibration.planning.motion_library import trajectory
-        names, begins = tuple(self.plan.model.joint_names), np.concatenate([[0.0], self.plan.ends[:-1]])
-        return [(PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
-                for begin, segments in zip(begins, self.plan.segments, strict=True) if segments]
+
+        names, begins = (
+            tuple(self.plan.model.joint_names),
+            np.concatenate([[0.0], self.plan.ends[:-1]]),
+        )
+        return [
+            (PLAN_START_NS + round(float(begin) * 1e9), trajectory(names, segments))
+            for begin, segments in zip(begins, self.plan.segments, strict=True)
+            if segments
+        ]
 
     def __str__(self):
         return '\n'.join(summary(self.plan) + self.notes)
 
 
-def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = None, grade: str = 'industrial', imu_rate: float = 100.0,
-         separate: Sequence[str] = (), diagnosis: str | PathLike | Mapping[str, Any] | None = None,
-         around: Mapping[str, float] | None = None, reach: float | None = None, longest: float = LONGEST_SEPARATION,
-         with_bound: bool = True, **choices: Any) -> Planned:
+def plan(
+    stand: Stand,
+    *,
+    calibration: str | PathLike | Calibration | None = None,
+    grade: str = 'industrial',
+    imu_rate: float = 100.0,
+    separate: Sequence[str] = (),
+    diagnosis: str | PathLike | Mapping[str, Any] | None = None,
+    around: Mapping[str, float] | None = None,
+    reach: float | None = None,
+    longest: float = LONGEST_SEPARATION,
+    with_bound: bool = True,
+    **choices: Any,
+) -> Planned:
     """
     Plan the motions that bring every parameter within its tolerance.
 
@@ -141,30 +187,60 @@ def plan(stand: Stand, *, calibration: str | PathLike | Calibration | None = Non
     known = _known(calibration, table, options)
     causes, sizes = tuple(separate), {}
     if diagnosis and not separate:
-        causes, sizes = class_in(diagnosis) if isinstance(diagnosis, Mapping) else files.read_mapping(diagnosis, 'diagnosis', class_in)
+        causes, sizes = (
+            class_in(diagnosis)
+            if isinstance(diagnosis, Mapping)
+            else files.read_mapping(diagnosis, 'diagnosis', class_in)
+        )
     if causes:
         if known is None:
-            raise InputError('separation of effects needs the calibration of the diagnosis with the finding, none was given; give it',
-                             key='calibration')
+            raise InputError(
+                'separation of effects needs the calibration of the diagnosis with the finding, none was given; give it',
+                key='calibration',
+            )
         owners = [(options.catalogue.owner_of(name, table.joint_names), name) for name in causes]
-        planner = make_separator(table, known, owners, noise=noise, rate=imu_rate, options=options, sizes=sizes, limits=limits)
+        planner = make_separator(
+            table,
+            known,
+            owners,
+            noise=noise,
+            rate=imu_rate,
+            options=options,
+            sizes=sizes,
+            limits=limits,
+        )
     else:
-        planner = make_planner(table, noise=noise, rate=imu_rate, options=options, limits=limits, calibration=known)
-    provenance = {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
-                  'known': Path(calibration).name if isinstance(calibration, (str, PathLike)) else 'a calibration' if known else 'nothing'}
+        planner = make_planner(
+            table, noise=noise, rate=imu_rate, options=options, limits=limits, calibration=known
+        )
+    provenance = {
+        'noise': grade if options.noise is None else 'as identified',
+        'imu_rate': imu_rate,
+        'known': Path(calibration).name
+        if isinstance(calibration, (str, PathLike))
+        else 'a calibration'
+        if known
+        else 'nothing',
+    }
     provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits))}
     if warnings := range_warnings(table):
         provenance['warnings'] = '; '.join(warnings)
     if causes:
         provenance['tells_apart'] = ', '.join(causes)
-    return Planned(planner.plan(start, with_bound=with_bound, longest=longest if causes else np.inf), table, provenance)
+    return Planned(
+        planner.plan(start, with_bound=with_bound, longest=longest if causes else np.inf),
+        table,
+        provenance,
+    )
 
 
 def _neighbourhood(limits, names, around, reach):
     """Return the limits restricted to `reach` about a pose, and the pose."""
     if reach is None or reach <= 0 or set(around) != set(names):
-        raise InputError(f'a neighbourhood must have a reach above 0 and a position of every joint ({", ".join(names)}), got reach {reach} '
-                         f'and {", ".join(around) or "no joint"}; give both')
+        raise InputError(
+            f'a neighbourhood must have a reach above 0 and a position of every joint ({", ".join(names)}), got reach {reach} '
+            f'and {", ".join(around) or "no joint"}; give both'
+        )
     position = np.where(limits.turns, DEG, 1.0) * [around[name] for name in names]
     return limits.reached(position, reach), position
 
@@ -197,13 +273,28 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
     """
     options = calibration_options(choices)
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
-    accelerometer, gyroscope = (parse_effects(sensor, asked[sensor] or '+'.join(BASE), catalogue=options.catalogue) for sensor in SENSORS)
-    model = HandModel(SensorModel(accelerometer, gyroscope, catalogue=options.catalogue), options.gravity or STANDARD_GRAVITY)
+    accelerometer, gyroscope = (
+        parse_effects(sensor, asked[sensor] or '+'.join(BASE), catalogue=options.catalogue)
+        for sensor in SENSORS
+    )
+    model = HandModel(
+        SensorModel(accelerometer, gyroscope, catalogue=options.catalogue),
+        options.gravity or STANDARD_GRAVITY,
+    )
     noise = expected_noise(options.noise, grade, imu_rate)
     report('planning')
-    found = plan_by_hand(model, tolerances=tolerances_of(model.model, options.tolerances), noise=noise, rate=imu_rate)
-    return Planned(found, None, {'noise': grade if options.noise is None else 'as identified', 'imu_rate': imu_rate,
-                                 'reference': 'gravity, by hand'})
+    found = plan_by_hand(
+        model, tolerances=tolerances_of(model.model, options.tolerances), noise=noise, rate=imu_rate
+    )
+    return Planned(
+        found,
+        None,
+        {
+            'noise': grade if options.noise is None else 'as identified',
+            'imu_rate': imu_rate,
+            'reference': 'gravity, by hand',
+        },
+    )
 
 
 def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, float]]:
@@ -218,10 +309,16 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
     """
     for finding in document.get('findings') or ():
         if finding.get('indistinguishable_from'):
-            sizes = {name: float(size['value']) for mate in finding.get('sizes_of_mates', {}).values() for name, size in mate.items()}
+            sizes = {
+                name: float(size['value'])
+                for mate in finding.get('sizes_of_mates', {}).values()
+                for name, size in mate.items()
+            }
             return (finding['effect'], *finding['indistinguishable_from']), sizes
-    raise InputError('the diagnosis must have a finding with collinear effects, it has none; no effects need to be separated',
-                     code='nothing_to_separate')
+    raise InputError(
+        'the diagnosis must have a finding with collinear effects, it has none; no effects need to be separated',
+        code='nothing_to_separate',
+    )
 
 
 def summary(made: Plan) -> list[str]:
@@ -230,11 +327,18 @@ def summary(made: Plan) -> list[str]:
         head = f'{len(made.motions)} motions in {made.seconds:.0f} s'
         if not made.missing:
             return [f'{head} separate {made.told_apart}']
-        return [head, f'at their assumed sizes, no motion of these joints in that time separates: {", ".join(made.missing)}']
+        return [
+            head,
+            f'at their assumed sizes, no motion of these joints in that time separates: {", ".join(made.missing)}',
+        ]
     count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
-    lines = [f'{len(made.motions)} {made.noun} in {made.seconds:.0f} s; {met} of {count} parameters are within their tolerance']
+    lines = [
+        f'{len(made.motions)} {made.noun} in {made.seconds:.0f} s; {met} of {count} parameters are within their tolerance'
+    ]
     if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
-        lines.append(f'every plan of these motions with the same probability (95 %) needs at least {made.lower_bound_seconds:.0f} s')
+        lines.append(
+            f'every plan of these motions with the same probability (95 %) needs at least {made.lower_bound_seconds:.0f} s'
+        )
     if made.missing:
         lines.append(f'outside their tolerance {made.scope}: {", ".join(made.missing)}')
     return lines

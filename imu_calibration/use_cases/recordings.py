@@ -43,28 +43,60 @@ class Topics(NamedTuple):
 
     def chosen(self) -> dict[str, Any]:
         """Return them as arguments of `msg_adapters.bag.open_recording`."""
-        return {'imu_topic': self.imu, 'joint_topic': self.joints, 'temperature_topic': self.temperature, 'frame_id': self.frame}
+        return {
+            'imu_topic': self.imu,
+            'joint_topic': self.joints,
+            'temperature_topic': self.temperature,
+            'frame_id': self.frame,
+        }
 
 
 def existing(path: str | PathLike) -> Path:
     """Return the path of a bag that is there."""
     if not Path(path).exists():
-        raise InputError(f'the bag {path} must exist, no such file; correct the path', code='bag_missing')
+        raise InputError(
+            f'the bag {path} must exist, no such file; correct the path', code='bag_missing'
+        )
     return Path(path)
 
 
-def open_bag(path: str | PathLike, topics: Topics, *, want_joints: bool | str = True, want_temperature: bool | str = True) -> Recording:
+def open_bag(
+    path: str | PathLike,
+    topics: Topics,
+    *,
+    want_joints: bool | str = True,
+    want_temperature: bool | str = True,
+) -> Recording:
     """Open a recording with the topics that were chosen; the rest as for `msg_adapters.bag.open_recording`."""
-    return open_recording(existing(path), **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature)
+    return open_recording(
+        existing(path),
+        **topics.chosen(),
+        want_joints=want_joints,
+        want_temperature=want_temperature,
+    )
 
 
-def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, *, want_joints: bool | str, want_temperature: bool | str,
-                quiet: bool) -> Iterator[SampleBlock]:
+def read_blocks(
+    path: str,
+    topics: Topics,
+    joint_names: Iterable[str] | None,
+    *,
+    want_joints: bool | str,
+    want_temperature: bool | str,
+    quiet: bool,
+) -> Iterator[SampleBlock]:
     """Yield the blocks of a recording and report the progress unless `quiet`; a plain function, so that another process can run it."""
-    recording = open_recording(path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature)
-    advance = counter(f'reading {Path(path).name}', 0 if quiet else recording.message_counts.get(recording.imu_topic, 0))
+    recording = open_recording(
+        path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature
+    )
+    advance = counter(
+        f'reading {Path(path).name}',
+        0 if quiet else recording.message_counts.get(recording.imu_topic, 0),
+    )
     with recording:
-        with closing(read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())) as blocks:
+        with closing(
+            read_ahead(recording.blocks(joint_names) if want_joints else recording.blocks())
+        ) as blocks:
             for block in blocks:
                 if block.imu is not None:
                     advance(len(block.imu))
@@ -73,8 +105,15 @@ def read_blocks(path: str, topics: Topics, joint_names: Iterable[str] | None, *,
             yield SampleBlock(dropped=recording.lost)
 
 
-def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics(), joint_names: Iterable[str] | None = None, *,
-              want_joints: bool | str | None = None, want_temperature: bool | str = True, quiet: bool = False) -> Source:
+def source_of(
+    recording: str | PathLike | SampleBlock,
+    topics: Topics = Topics(),
+    joint_names: Iterable[str] | None = None,
+    *,
+    want_joints: bool | str | None = None,
+    want_temperature: bool | str = True,
+    quiet: bool = False,
+) -> Source:
     """
     Return a callable, for repeated use, that yields the blocks of a recording; samples in memory are a recording of one block.
 
@@ -82,14 +121,33 @@ def source_of(recording: str | PathLike | SampleBlock, topics: Topics = Topics()
     """
     want_joints = joint_names is not None if want_joints is None else want_joints
     if isinstance(recording, SampleBlock):
-        return partial(iter, (recording if want_joints else SampleBlock(recording.imu, None, recording.temperature),))
-    return partial(read_blocks, str(existing(recording)), topics, joint_names, want_joints=want_joints, want_temperature=want_temperature,
-                   quiet=quiet)
+        return partial(
+            iter,
+            (
+                recording
+                if want_joints
+                else SampleBlock(recording.imu, None, recording.temperature),
+            ),
+        )
+    return partial(
+        read_blocks,
+        str(existing(recording)),
+        topics,
+        joint_names,
+        want_joints=want_joints,
+        want_temperature=want_temperature,
+        quiet=quiet,
+    )
 
 
 def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:
     """Return names and hashes of recordings and the options for a document: the same in every run."""
-    return {'bags': [{'name': name_of(recording), 'sha256': _hash_of(recording)} for recording in recordings], 'options': options}
+    return {
+        'bags': [
+            {'name': name_of(recording), 'sha256': _hash_of(recording)} for recording in recordings
+        ],
+        'options': options,
+    }
 
 
 def name_of(recording: str | PathLike | SampleBlock) -> str:
@@ -109,14 +167,21 @@ def temperatures(path: str | PathLike, topics: Topics) -> TemperatureSamples | N
     parts = []
     with open_bag(path, topics, want_joints=False) as recording:
         if recording.temperature_topic:
-            parts = [block.temperature for block in recording.blocks() if block.temperature is not None and len(block.temperature)]
+            parts = [
+                block.temperature
+                for block in recording.blocks()
+                if block.temperature is not None and len(block.temperature)
+            ]
     return TemperatureSamples.concatenate(parts) if parts else None
 
 
 def jobs_for(asked: int | None, n_items: int) -> int:
     """Return the number of processes: as requested, by default one per processor; at most the number of items."""
     if asked is not None and asked < 1:
-        raise InputError(f'at least one process must work, got {asked}; omit the number to use every processor', key='jobs')
+        raise InputError(
+            f'at least one process must work, got {asked}; omit the number to use every processor',
+            key='jobs',
+        )
     return max(1, min(asked or os.cpu_count() or 1, n_items))
 
 
@@ -132,20 +197,24 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
         Called with each result as soon as it is available.
 
     """
+
     def mapped(function, items):
         items = list(items)
         if min(jobs, len(items)) <= 1:
             return [_reported(function(item), done) for item in items]
         # Spawned, not forked: a fork of a process with threads can stop for ever.
-        with ProcessPoolExecutor(min(jobs, len(items)), mp_context=multiprocessing.get_context('spawn')) as pool:
+        with ProcessPoolExecutor(
+            min(jobs, len(items)), mp_context=multiprocessing.get_context('spawn')
+        ) as pool:
             return _in_order(pool, function, items, done)
+
     return mapped
 
 
 @contextmanager
 def _interruptions_blocked():
     """Keep Ctrl+C, which a terminal sends to all its processes, from those that are started here; this process ends them."""
-    resource_tracker.ensure_running()   # its start would end the block
+    resource_tracker.ensure_running()  # its start would end the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -174,7 +243,9 @@ def _in_order(pool, function, items, done):
         for future in as_completed(futures):
             done(future.result())
     except BaseException:
-        for worker in list((pool._processes or {}).values()):   # public from Python 3.14: terminate_workers
+        for worker in list(
+            (pool._processes or {}).values()
+        ):  # public from Python 3.14: terminate_workers
             worker.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
         raise
@@ -194,20 +265,26 @@ def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: No
     try:
         from dask import distributed
     except ImportError as error:
-        raise InputError('a scheduler needs dask.distributed, which is not installed; install imu_calibration[dask], or omit it',
-                         key='scheduler') from error
+        raise InputError(
+            'a scheduler needs dask.distributed, which is not installed; install imu_calibration[dask], or omit it',
+            key='scheduler',
+        ) from error
 
     def mapped(function, items):
         try:
             client = distributed.Client(address, timeout='10s', set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError(f'a dask scheduler must be reachable at {address}: {" ".join(str(error).split())}; '
-                             'start one with dask scheduler', key='scheduler') from error
+            raise InputError(
+                f'a dask scheduler must be reachable at {address}: {" ".join(str(error).split())}; '
+                'start one with dask scheduler',
+                key='scheduler',
+            ) from error
         with client, client.as_current():
             futures = client.map(function, list(items), pure=False)
             for future in distributed.as_completed(futures):
                 done(future.result())
             return [future.result() for future in futures]
+
     return mapped
 
 
@@ -237,8 +314,13 @@ Stand = str | PathLike | Table | Arm
 """A table description or a robot description (file), a table, or an arm."""
 
 
-def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = (), topics: Topics = Topics(), *,
-             gravity: float | None = None) -> Table:
+def table_of(
+    stand: Stand,
+    recordings: Sequence[str | PathLike | SampleBlock] = (),
+    topics: Topics = Topics(),
+    *,
+    gravity: float | None = None,
+) -> Table:
     """
     Return the chain of joints of a table or an arm.
 
@@ -264,8 +346,19 @@ def table_of(stand: Stand, recordings: Sequence[str | PathLike | SampleBlock] = 
         if Path(stand).suffix not in DESCRIPTIONS:
             return files.read_table(stand)
         stand = Arm(stand)
-    site = dict(stand.site or {}) if isinstance(stand.site, Mapping | None) else files.read_mapping(stand.site, 'table description')
-    bag = next(((str(existing(item)), topics.imu) for item in recordings if not isinstance(item, SampleBlock)), None)
+    site = (
+        dict(stand.site or {})
+        if isinstance(stand.site, Mapping | None)
+        else files.read_mapping(stand.site, 'table description')
+    )
+    bag = next(
+        (
+            (str(existing(item)), topics.imu)
+            for item in recordings
+            if not isinstance(item, SampleBlock)
+        ),
+        None,
+    )
     text = _description(stand, bag)
     if stand.up is not None:
         site['up'] = list(stand.up)
@@ -281,11 +374,21 @@ def _description(arm, bag):
     if arm.urdf is not None:
         return files.read_robot_description(arm.urdf, arm.allow_xacro)
     if bag is None:
-        raise InputError('the description of the robot whose link was named must be given, got none; give the file', key='urdf')
+        raise InputError(
+            'the description of the robot whose link was named must be given, got none; give the file',
+            key='urdf',
+        )
     return description_in(*bag)
 
 
 def _frame(recordings, bag):
     if bag is not None:
         return frame_of(*bag)
-    return next((item.imu.frame_id for item in recordings if isinstance(item, SampleBlock) and item.imu is not None), LIKELY_LINK)
+    return next(
+        (
+            item.imu.frame_id
+            for item in recordings
+            if isinstance(item, SampleBlock) and item.imu is not None
+        ),
+        LIKELY_LINK,
+    )

@@ -25,7 +25,9 @@ def share_folder() -> Path:
     for folder in _candidates():
         if (folder / 'config').is_dir() and (folder / 'package.xml').is_file():
             return folder
-    raise InputError(f'the config files of {PACKAGE} must be installed with it, none found near {__file__}; reinstall the package')
+    raise InputError(
+        f'the config files of {PACKAGE} must be installed with it, none found near {__file__}; reinstall the package'
+    )
 
 
 def config_file(name: str) -> Path:
@@ -42,7 +44,10 @@ def config_file(name: str) -> Path:
     path = folder / name
     if not path.is_file():
         known = ', '.join(sorted(p.name for p in folder.glob('*.yaml')))
-        raise InputError(f"config file '{name}' does not exist in {folder}; the files there are {known}", code='config_file_unknown')
+        raise InputError(
+            f"config file '{name}' does not exist in {folder}; the files there are {known}",
+            code='config_file_unknown',
+        )
     return path
 
 

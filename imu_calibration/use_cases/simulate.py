@@ -21,7 +21,12 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.replay import BIAS_TIME, ReplayNoise
 from imu_calibration.simulation.replay import replay as run_replay
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, hidden_effect, require_joints, true_imu
+from imu_calibration.simulation.session import (
+    SimulationOptions,
+    hidden_effect,
+    require_joints,
+    true_imu,
+)
 from imu_calibration.simulation.session import simulate as run_session
 from imu_calibration.use_cases.choices import Choices, catalogue_of, inputs_of
 from imu_calibration.use_cases.recordings import LIKELY_LINK, Arm, Stand, name_of, table_of
@@ -43,12 +48,25 @@ class Simulated:
     lost: int = 0
     """Samples of a replayed recording without known motion, which are left out."""
 
-    def save(self, path: str | PathLike, *, storage: str = 'sqlite3', compression: str = 'none') -> None:
+    def save(
+        self, path: str | PathLike, *, storage: str = 'sqlite3', compression: str = 'none'
+    ) -> None:
         """Write a rosbag2 folder ('sqlite3' or 'mcap', chunks of an mcap packed by 'zstd' or 'lz4') with truth.yaml and table.yaml."""
         from msg_adapters.write import write_session
+
         report(f'writing {Path(path).name}')
-        samples, packed = self.samples, {} if compression == 'none' else {'compression': compression}
-        write_session(path, cast(ImuSamples, samples.imu), samples.joints, temperature=samples.temperature, storage=storage, **packed)
+        samples, packed = (
+            self.samples,
+            {} if compression == 'none' else {'compression': compression},
+        )
+        write_session(
+            path,
+            cast(ImuSamples, samples.imu),
+            samples.joints,
+            temperature=samples.temperature,
+            storage=storage,
+            **packed,
+        )
         files.write_text(Path(path) / 'truth.yaml', calibration_to_text(self.truth))
         files.write_text(Path(path) / 'table.yaml', documents.to_text(self.table.to_mapping()))
 
@@ -56,11 +74,24 @@ class Simulated:
         return f'<Simulated: {self.duration:.0f} s, {len(self.samples.imu)} Imu, {len(self.samples.joints)} JointState>'
 
 
-def simulate(profile: str = 'calibration', *, table: Stand | None = None,
-             calibration: str | PathLike | Calibration | None = None, effects: Sequence[str] = (), size: float = 0.3,
-             grade: str = 'industrial', seed: int = 0, imu_seed: int | None = None, duration: float | None = None, imu_rate: float = 100.0,
-             joint_rate: float = 100.0, encoder_resolution_deg: float = 0.0, stamp_jitter_us: float = 0.0,
-             temperature: bool = False, catalogue: Catalogue | str | PathLike | Mapping | None = None) -> Simulated:
+def simulate(
+    profile: str = 'calibration',
+    *,
+    table: Stand | None = None,
+    calibration: str | PathLike | Calibration | None = None,
+    effects: Sequence[str] = (),
+    size: float = 0.3,
+    grade: str = 'industrial',
+    seed: int = 0,
+    imu_seed: int | None = None,
+    duration: float | None = None,
+    imu_rate: float = 100.0,
+    joint_rate: float = 100.0,
+    encoder_resolution_deg: float = 0.0,
+    stamp_jitter_us: float = 0.0,
+    temperature: bool = False,
+    catalogue: Catalogue | str | PathLike | Mapping | None = None,
+) -> Simulated:
     """
     Simulate a session on a turntable.
 
@@ -100,22 +131,47 @@ def simulate(profile: str = 'calibration', *, table: Stand | None = None,
     motion = make_profile(profile, seed, given, duration=duration)
     mover = given if motion.table is None else Table.from_mapping(motion.table)
     given_imu = None if calibration is None else files.given_calibration(calibration)
-    model, values = true_imu(mover, (given_imu.model, given_imu.values) if given_imu else None, grade,
-                             seed=seed if imu_seed is None else imu_seed, catalogue=catalogue_of(catalogue))
+    model, values = true_imu(
+        mover,
+        (given_imu.model, given_imu.values) if given_imu else None,
+        grade,
+        seed=seed if imu_seed is None else imu_seed,
+        catalogue=catalogue_of(catalogue),
+    )
     for name in effects:
         sensor, hidden = hidden_effect(model, name, seed, share=size, moment=0.6 * motion.duration)
-        model, values = replace(model, point={}).with_sized_effect(values, sensor, name, size=hidden)
-    warm = temperature or any('temperature' in effect.needs for effect in model.effects if effect.name in effects)
-    noise = replace(GRADES[grade].noise, encoder_resolution=math.radians(encoder_resolution_deg), stamp_jitter=stamp_jitter_us * 1e-6)
+        model, values = replace(model, point={}).with_sized_effect(
+            values, sensor, name, size=hidden
+        )
+    warm = temperature or any(
+        'temperature' in effect.needs for effect in model.effects if effect.name in effects
+    )
+    noise = replace(
+        GRADES[grade].noise,
+        encoder_resolution=math.radians(encoder_resolution_deg),
+        stamp_jitter=stamp_jitter_us * 1e-6,
+    )
     frame_id = table.imu_link if isinstance(table, Arm) and table.imu_link else LIKELY_LINK
-    options = SimulationOptions(imu_rate, joint_rate, noise, frame_id=frame_id, temperature_start_c=25.0 if warm else None)
-    samples = SampleBlock(*run_session(model, values, mover, profile=motion, options=options, seed=seed))
-    truth = true_calibration(model, values, options.frame_id, simulated={'seed': seed, 'profile': profile})
+    options = SimulationOptions(
+        imu_rate, joint_rate, noise, frame_id=frame_id, temperature_start_c=25.0 if warm else None
+    )
+    samples = SampleBlock(
+        *run_session(model, values, mover, profile=motion, options=options, seed=seed)
+    )
+    truth = true_calibration(
+        model, values, options.frame_id, simulated={'seed': seed, 'profile': profile}
+    )
     return Simulated(samples, mover, truth, motion.duration)
 
 
-def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike | Calibration, table: Stand | None, *, seed: int = 0,
-           **choices: Unpack[Choices]) -> Simulated:
+def replay(
+    recording: str | PathLike | SampleBlock,
+    calibration: str | PathLike | Calibration,
+    table: Stand | None,
+    *,
+    seed: int = 0,
+    **choices: Unpack[Choices],
+) -> Simulated:
     """
     Simulate a calibrated IMU on the motion of a recording: its joints, stamps, rates, temperature and identified noise.
 
@@ -139,19 +195,28 @@ def replay(recording: str | PathLike | SampleBlock, calibration: str | PathLike 
 
     """
     if table is None:
-        raise InputError('a replay needs the motion of the IMU, no table or arm was given; give one (by hand only the gyroscope '
-                         'measures the turns)', key='table', code='replay_by_hand')
+        raise InputError(
+            'a replay needs the motion of the IMU, no table or arm was given; give one (by hand only the gyroscope '
+            'measures the turns)',
+            key='table',
+            code='replay_by_hand',
+        )
     _, given, (source,) = inputs_of([recording], table, choices)
-    assert given is not None   # because a table or arm is given
+    assert given is not None  # because a table or arm is given
     known = files.given_calibration(calibration)
     require_joints(known.model, given)
     noise = None
     if all('noise_sd' in known.statistics.get(sensor, {}) for sensor in SENSORS):
-        noise = {sensor: ReplayNoise(*known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME)
-                 for sensor in SENSORS}
+        noise = {
+            sensor: ReplayNoise(
+                *known.noise(sensor), known.statistics[sensor].get('wander_time_s') or BIAS_TIME
+            )
+            for sensor in SENSORS
+        }
     report('simulating')
-    samples, lost = run_replay(source(), given, known.model, values=known.values, noise=noise,
-                               seed=seed)
+    samples, lost = run_replay(
+        source(), given, known.model, values=known.values, noise=noise, seed=seed
+    )
     truth = replace(known, provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}})
     stamps = cast(ImuSamples, samples.imu).stamp_ns
     return Simulated(samples, given, truth, 1e-9 * float(stamps[-1] - stamps[0]), lost)

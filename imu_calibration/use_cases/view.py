@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from imu_calibration.calibration.coverage import Coverage, arrows_of, cells_of, group_states, label_of, seen_of, table_coverage
+from imu_calibration.calibration.coverage import (
+    Coverage,
+    arrows_of,
+    cells_of,
+    group_states,
+    label_of,
+    seen_of,
+    table_coverage,
+)
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_workflow import HandResult
 from imu_calibration.calibration.live_poses import EMPTY_SCAN, hand_coverage
@@ -41,21 +49,50 @@ BAND = 1.959964
 def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, Any]:
     """Return every parameter with tolerance and status; without bands where the uncertainty of the values is unknown."""
     units = [effect.unit_of(k) for effect in calibration.model.effects for k in range(effect.size)]
-    rows: list[dict[str, Any]] = [{'name': name, 'value': float(value), 'unit': unit, 'tolerance': float(tolerance), 'status': str(status)}
-            for name, value, unit, tolerance, status in
-            zip(calibration.param_names, calibration.values, units, tolerances, calibration.status, strict=True)]
+    rows: list[dict[str, Any]] = [
+        {
+            'name': name,
+            'value': float(value),
+            'unit': unit,
+            'tolerance': float(tolerance),
+            'status': str(status),
+        }
+        for name, value, unit, tolerance, status in zip(
+            calibration.param_names,
+            calibration.values,
+            units,
+            tolerances,
+            calibration.status,
+            strict=True,
+        )
+    ]
     for row, sd in zip(rows, map(float, calibration.sd)):
-        if calibration.uncertainty_known and np.isfinite(sd):   # JSON has no infinity
-            row.update(sd=sd, low=row['value'] - BAND * sd, high=row['value'] + BAND * sd, ratio=sd / row['tolerance'])
+        if calibration.uncertainty_known and np.isfinite(sd):  # JSON has no infinity
+            row.update(
+                sd=sd,
+                low=row['value'] - BAND * sd,
+                high=row['value'] + BAND * sd,
+                ratio=sd / row['tolerance'],
+            )
     return {'parameters': rows}
 
 
 def residual(result: CalibrationResult) -> dict[str, Any]:
     """Return the errors of window means before and after, and the expected residual from noise, in the order of time."""
     errors = result.window_errors()
-    return {'windows': [{'time': float(errors.time[k]), 'motion': str(errors.kind[k]), **{
-        which: _by_sensor(getattr(errors, which), k) for which in ('before', 'after', 'floor')}}
-        for k in np.argsort(errors.time, kind='stable')]}
+    return {
+        'windows': [
+            {
+                'time': float(errors.time[k]),
+                'motion': str(errors.kind[k]),
+                **{
+                    which: _by_sensor(getattr(errors, which), k)
+                    for which in ('before', 'after', 'floor')
+                },
+            }
+            for k in np.argsort(errors.time, kind='stable')
+        ]
+    }
 
 
 LONGEST_SEGMENT = 1024
@@ -64,7 +101,9 @@ SHORTEST_SEGMENT = 64
 """Windows with fewer samples are left out."""
 
 
-def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def residual_spectrum(
+    result: CalibrationResult, windows: Sequence[Window]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """
     Return (frequency, sensor -> density) of the residuals of the windows with motion among some.
 
@@ -90,7 +129,10 @@ def residual_spectrum(result: CalibrationResult, windows: Sequence[Window]) -> t
 
     """
     from scipy.signal import welch  # here, because its import is slow
-    windows = [window for window in windows if window.kind != 'static' and len(window) >= SHORTEST_SEGMENT]
+
+    windows = [
+        window for window in windows if window.kind != 'static' and len(window) >= SHORTEST_SEGMENT
+    ]
     if not windows:
         return np.zeros(0), {sensor: np.zeros((0, 3)) for sensor in SENSORS}
     segment = min(LONGEST_SEGMENT, int(np.median([len(window) for window in windows])))
@@ -111,7 +153,9 @@ def _by_sensor(vectors, k):
 
 def _axes(vector):
     """Return the components by axis; unknown ones are omitted, because JSON has no NaN."""
-    return {axis: float(part) for axis, part in zip('xyz', vector, strict=True) if np.isfinite(part)}
+    return {
+        axis: float(part) for axis, part in zip('xyz', vector, strict=True) if np.isfinite(part)
+    }
 
 
 MIN_FILE_SECONDS = 1.0
@@ -133,7 +177,9 @@ def foxglove() -> Any:
         import foxglove.channels
         import foxglove.messages
     except ImportError as error:
-        raise InputError('a view needs foxglove-sdk, which is not installed; install imu_calibration[view]') from error
+        raise InputError(
+            'a view needs foxglove-sdk, which is not installed; install imu_calibration[view]'
+        ) from error
     return foxglove
 
 
@@ -157,8 +203,12 @@ def mcap_bytes(topics: Iterable[tuple[str, Sequence[tuple[float, Any]]]]) -> byt
     with sdk.open_mcap(whole, context=context):
         for topic, messages in topics:
             if isinstance(first := messages[0][1], dict):
-                channel = sdk.Channel(topic, schema={'title': topic.strip('/').replace('/', '.'), **_schema(first)},
-                                      message_encoding='json', context=context)
+                channel = sdk.Channel(
+                    topic,
+                    schema={'title': topic.strip('/').replace('/', '.'), **_schema(first)},
+                    message_encoding='json',
+                    context=context,
+                )
             else:
                 channel = sdk.channels.SceneUpdateChannel(topic, context=context)
             for time, content in messages:
@@ -169,7 +219,10 @@ def mcap_bytes(topics: Iterable[tuple[str, Sequence[tuple[float, Any]]]]) -> byt
 def _schema(content: Any) -> dict[str, Any]:
     """Return the JSON schema of a content."""
     if isinstance(content, dict):
-        return {'type': 'object', 'properties': {name: _schema(value) for name, value in content.items()}}
+        return {
+            'type': 'object',
+            'properties': {name: _schema(value) for name, value in content.items()},
+        }
     if isinstance(content, list):
         return {'type': 'array', 'items': _schema(next(iter(content), 0.0))}
     return {'type': 'string' if isinstance(content, str) else 'number'}
@@ -183,21 +236,42 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
         return found.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=0.9)
 
     def pose(place, turn=(0.0, 0.0, 0.0, 1.0)):
-        return found.Pose(position=found.Vector3(**_named(place)), orientation=found.Quaternion(**_named(turn)))
+        return found.Pose(
+            position=found.Vector3(**_named(place)), orientation=found.Quaternion(**_named(turn))
+        )
 
     def ball(place, rgb, size):
-        return found.SpherePrimitive(pose=pose(place), size=found.Vector3(x=size, y=size, z=size), color=color(rgb))
+        return found.SpherePrimitive(
+            pose=pose(place), size=found.Vector3(x=size, y=size, z=size), color=color(rgb)
+        )
 
     def arrow(start, along, rgb):
         length = float(np.linalg.norm(along))
-        return found.ArrowPrimitive(pose=pose(start, _from_x(along / length)), shaft_length=0.8 * length, shaft_diameter=0.025,
-                                    head_length=0.2 * length, head_diameter=0.05, color=color(rgb))
+        return found.ArrowPrimitive(
+            pose=pose(start, _from_x(along / length)),
+            shaft_length=0.8 * length,
+            shaft_diameter=0.025,
+            head_length=0.2 * length,
+            head_diameter=0.05,
+            color=color(rgb),
+        )
 
     (seen, of_seen, diameter), (above, of_line, line) = seen_of(coverage), label_of(coverage)
-    balls = [ball(*cell) for cell in cells_of(coverage)] + [ball(place, of_seen, diameter) for place in seen]
+    balls = [ball(*cell) for cell in cells_of(coverage)] + [
+        ball(place, of_seen, diameter) for place in seen
+    ]
     arrows = [arrow(start, end - start, rgb) for _, start, end, rgb in arrows_of(coverage)]
-    text = found.TextPrimitive(pose=pose(above), billboard=True, font_size=0.09, color=color(of_line), text=line)
-    entity = found.SceneEntity(timestamp=found.Timestamp(0), frame_id=frame_id, id='coverage', spheres=balls, arrows=arrows, texts=[text])
+    text = found.TextPrimitive(
+        pose=pose(above), billboard=True, font_size=0.09, color=color(of_line), text=line
+    )
+    entity = found.SceneEntity(
+        timestamp=found.Timestamp(0),
+        frame_id=frame_id,
+        id='coverage',
+        spheres=balls,
+        arrows=arrows,
+        texts=[text],
+    )
     return found.SceneUpdate(entities=[entity])
 
 
@@ -211,7 +285,9 @@ def _from_x(along):
     return turn / np.linalg.norm(turn) if turn[3] > 1e-9 else np.array([0.0, 0.0, 1.0, 0.0])
 
 
-def overlay_topics(traces: Traces, joint_names: Sequence[str]) -> Iterator[tuple[str, list[tuple[float, Any]]]]:
+def overlay_topics(
+    traces: Traces, joint_names: Sequence[str]
+) -> Iterator[tuple[str, list[tuple[float, Any]]]]:
     """
     Yield the topics of `mcap_bytes` for a diagnosis.
 
@@ -224,24 +300,60 @@ def overlay_topics(traces: Traces, joint_names: Sequence[str]) -> Iterator[tuple
         for axis, segment in zip(AXES, traces.segments.get(sensor, ())):
             names = [name.replace(' ', '_') for name in segment.signals]
             rows = np.column_stack(list(segment.signals.values()))
-            yield f'/overlay/{sensor}/{axis}', [(time, dict(zip(names, row))) for time, row in zip(segment.time.tolist(), rows.tolist())]
-        yield (f'/residual/{sensor}',
-               [(float(traces.time[k]), _residual(traces, sensor, joint_names, k)) for k in range(len(traces.time))])
+            yield (
+                f'/overlay/{sensor}/{axis}',
+                [
+                    (time, dict(zip(names, row)))
+                    for time, row in zip(segment.time.tolist(), rows.tolist())
+                ],
+            )
+        yield (
+            f'/residual/{sensor}',
+            [
+                (float(traces.time[k]), _residual(traces, sensor, joint_names, k))
+                for k in range(len(traces.time))
+            ],
+        )
         if sensor in traces.distances:
             frequency, density, noise = traces.distances[sensor].density()
-            yield f'/residual_spectrum/{sensor}', [(time, {'frequency': frequency.tolist(), 'noise': _by_axis(noise),
-                                                   **{when: _by_axis(own) for when, own in zip(WHEN, density)}}) for time in (0.0, end)]
+            yield (
+                f'/residual_spectrum/{sensor}',
+                [
+                    (
+                        time,
+                        {
+                            'frequency': frequency.tolist(),
+                            'noise': _by_axis(noise),
+                            **{when: _by_axis(own) for when, own in zip(WHEN, density)},
+                        },
+                    )
+                    for time in (0.0, end)
+                ],
+            )
         for k, axis in enumerate(AXES):
-            middles, counts = histogram({when: getattr(traces, when)[sensor][:, k] for when in WHEN})
-            content = {'residual': middles.tolist(), **{when: own.tolist() for when, own in counts.items()}}
+            middles, counts = histogram(
+                {when: getattr(traces, when)[sensor][:, k] for when in WHEN}
+            )
+            content = {
+                'residual': middles.tolist(),
+                **{when: own.tolist() for when, own in counts.items()},
+            }
             yield f'/residual_histogram/{sensor}/{axis}', [(time, content) for time in (0.0, end)]
 
 
 def _residual(traces, sensor, joint_names, k):
-    found = {'time': float(traces.time[k]), 'force': _named(traces.force_s[k]), 'rate': _named(traces.rate_s[k]),
-             'angle': dict(zip(joint_names, traces.position[k].tolist())),
-             **{when: _named(getattr(traces, when)[sensor][k]) for when in WHEN}}
-    return found if traces.temperature_c is None else found | {'temperature_c': float(traces.temperature_c[k])}
+    found = {
+        'time': float(traces.time[k]),
+        'force': _named(traces.force_s[k]),
+        'rate': _named(traces.rate_s[k]),
+        'angle': dict(zip(joint_names, traces.position[k].tolist())),
+        **{when: _named(getattr(traces, when)[sensor][k]) for when in WHEN},
+    }
+    return (
+        found
+        if traces.temperature_c is None
+        else found | {'temperature_c': float(traces.temperature_c[k])}
+    )
 
 
 def _by_axis(values):
@@ -270,9 +382,13 @@ class View:
     def lacks(self) -> tuple[str, ...]:
         """Content that cannot be shown, with the reason."""
         if self.coverage is None:
-            return ('a calibration file contains no residuals: only the parameters are shown; give the recording for residuals',)
+            return (
+                'a calibration file contains no residuals: only the parameters are shown; give the recording for residuals',
+            )
         if SPECTRUM_TOPIC not in self.contents:
-            return ('no window with motion was long enough for a spectrum, and by hand there is none: it is left out',)
+            return (
+                'no window with motion was long enough for a spectrum, and by hand there is none: it is left out',
+            )
         return ()
 
     def save(self, path: str | PathLike) -> None:
@@ -288,11 +404,18 @@ class View:
         shown: dict[str, Any] = dict(self.contents)
         if self.coverage is not None:
             shown[SPHERE_TOPIC] = scene_of(self.coverage, self.calibration.frame_id or 'imu_link')
-        times = (0.0, max(self.seconds, MIN_FILE_SECONDS))   # visible at any playback time
-        files.write_whole(path, mcap_bytes((topic, [(time, content) for time in times]) for topic, content in shown.items()))
+        times = (0.0, max(self.seconds, MIN_FILE_SECONDS))  # visible at any playback time
+        files.write_whole(
+            path,
+            mcap_bytes(
+                (topic, [(time, content) for time in times]) for topic, content in shown.items()
+            ),
+        )
 
 
-def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]) -> View:
+def view(
+    source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]
+) -> View:
     """
     Return the view of a recording, which is calibrated, or of a calibration file: only its parameters.
 
@@ -314,15 +437,32 @@ def view(source: str | PathLike | SampleBlock, table: Stand | None = None, **cho
     path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
     if path is None:
         result = calibrate(source, table, **choices).result
-        contents = {PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances), RESIDUAL_TOPIC: residual(result)}
+        contents = {
+            PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances),
+            RESIDUAL_TOPIC: residual(result),
+        }
         frequency, density = residual_spectrum(result, result.gathered.kept)
         if len(frequency):
-            contents[SPECTRUM_TOPIC] = {'lines': [{'frequency': float(f), **_by_sensor(density, k)} for k, f in enumerate(frequency)]}
-        return View(result.calibration, contents, _coverage(result), contents[RESIDUAL_TOPIC]['windows'][-1]['time'])
+            contents[SPECTRUM_TOPIC] = {
+                'lines': [
+                    {'frequency': float(f), **_by_sensor(density, k)}
+                    for k, f in enumerate(frequency)
+                ]
+            }
+        return View(
+            result.calibration,
+            contents,
+            _coverage(result),
+            contents[RESIDUAL_TOPIC]['windows'][-1]['time'],
+        )
     if table is not None:
         raise InputError('a table or arm needs a recording, a calibration file was given; omit one')
     calibration = files.read_calibration(path)
-    return View(calibration, {PARAMETERS_TOPIC: parameters(calibration, tolerances_of(calibration.model))}, None)
+    return View(
+        calibration,
+        {PARAMETERS_TOPIC: parameters(calibration, tolerances_of(calibration.model))},
+        None,
+    )
 
 
 def _document_of(path):
@@ -333,7 +473,11 @@ def _document_of(path):
 
 def _coverage(result: CalibrationResult) -> Coverage:
     if isinstance(result, HandResult):
-        found = hand_coverage(replace(EMPTY_SCAN, poses=result.hand.poses), result, HandOptions(tolerances=result.options.tolerances))
+        found = hand_coverage(
+            replace(EMPTY_SCAN, poses=result.hand.poses),
+            result,
+            HandOptions(tolerances=result.options.tolerances),
+        )
     else:
         assert isinstance(result, TableResult), 'a calibration is made by hand or on a table'
         found = table_coverage(result)

@@ -13,7 +13,11 @@ PERIOD = 0.01
 def record(n, seed, columns=1):
     """Gravity, white noise and a random walk."""
     rng = np.random.default_rng(seed)
-    return 9.81 + 1e-2 * rng.standard_normal((n, columns)) + 1e-5 * np.cumsum(rng.standard_normal((n, columns)), axis=0)
+    return (
+        9.81
+        + 1e-2 * rng.standard_normal((n, columns))
+        + 1e-5 * np.cumsum(rng.standard_normal((n, columns)), axis=0)
+    )
 
 
 def in_pieces(values, factors, seed, present=None):
@@ -29,25 +33,38 @@ def in_pieces(values, factors, seed, present=None):
 
 @pytest.mark.parametrize('n', (7, 1000, 99_991))
 def test_deviations_are_those_of_allantools(n):
-    allantools = pytest.importorskip('allantools', reason='pip install --no-deps -r constraints/oracles-alone.txt')
+    allantools = pytest.importorskip(
+        'allantools', reason='pip install --no-deps -r constraints/oracles-alone.txt'
+    )
     values, factors = record(n, n), averaging_factors(n)
-    taus, theirs, _, terms = allantools.oadev(values[:, 0], rate=1 / PERIOD, data_type='freq', taus=factors * PERIOD)
+    taus, theirs, _, terms = allantools.oadev(
+        values[:, 0], rate=1 / PERIOD, data_type='freq', taus=factors * PERIOD
+    )
     ours = in_pieces(values, factors, n)
-    assert len(taus) >= len(factors) - 1 and np.all(factors <= FULL)   # theirs leaves out what has a single term
-    deviations = np.sqrt(ours.variance()[:len(taus), 0])
-    print(f'largest difference from allantools {np.max(np.abs(deviations / theirs - 1)):.1e}, wanted 1e-12')
+    assert len(taus) >= len(factors) - 1 and np.all(
+        factors <= FULL
+    )  # theirs leaves out what has a single term
+    deviations = np.sqrt(ours.variance()[: len(taus), 0])
+    print(
+        f'largest difference from allantools {np.max(np.abs(deviations / theirs - 1)):.1e}, wanted 1e-12'
+    )
     np.testing.assert_allclose(deviations, theirs, rtol=1e-12)
-    np.testing.assert_array_equal(ours.terms[:len(taus)], terms)
+    np.testing.assert_array_equal(ours.terms[: len(taus)], terms)
 
 
 def test_beyond_the_full_overlap_the_rate_is_halved_and_nothing_is_lost(monkeypatch):
     """At a limit of 64 the halved rates take over early; they agree with allantools on the halved record, and with every position closely."""
-    allantools = pytest.importorskip('allantools', reason='pip install --no-deps -r constraints/oracles-alone.txt')
+    allantools = pytest.importorskip(
+        'allantools', reason='pip install --no-deps -r constraints/oracles-alone.txt'
+    )
     monkeypatch.setattr('imu_calibration.allan.curve.FULL', 64)
     values = record(40_000, 3)
     factors = averaging_factors(len(values))
     ours = np.sqrt(in_pieces(values, factors, 1).variance()[:, 0])
-    full = [allantools.oadev(values[:, 0], rate=1.0, data_type='freq', taus=[float(factor)])[1][0] for factor in factors[factors <= 4000]]
+    full = [
+        allantools.oadev(values[:, 0], rate=1.0, data_type='freq', taus=[float(factor)])[1][0]
+        for factor in factors[factors <= 4000]
+    ]
     # positions a 32nd of the averaging time apart or less: far below the sampling error of ten per cent
     np.testing.assert_allclose(ours[factors <= 4000], full, rtol=5e-3)
     halved = values[:, 0].reshape(-1, 2).mean(axis=1)
@@ -59,7 +76,11 @@ def test_beyond_the_full_overlap_the_rate_is_halved_and_nothing_is_lost(monkeypa
 def test_the_outcome_does_not_depend_on_the_pieces():
     values = record(50_000, 4, 6)
     factors = averaging_factors(len(values))
-    np.testing.assert_allclose(in_pieces(values, factors, 1).variance(), overlapping_allan_variance(values, factors), rtol=1e-11)
+    np.testing.assert_allclose(
+        in_pieces(values, factors, 1).variance(),
+        overlapping_allan_variance(values, factors),
+        rtol=1e-11,
+    )
 
 
 def test_memory_does_not_grow_with_the_record():
@@ -81,7 +102,11 @@ def test_stretches_are_not_connected():
         sums.end_stretch()
     terms = [np.maximum(len(stretch) - 2 * factors + 1, 0)[:, None] for stretch in (one, two)]
     parts = [overlapping_allan_variance(stretch, factors) for stretch in (one, two)]
-    np.testing.assert_allclose(sums.variance(), (terms[0] * parts[0] + terms[1] * parts[1]) / (terms[0] + terms[1]), rtol=1e-9)
+    np.testing.assert_allclose(
+        sums.variance(),
+        (terms[0] * parts[0] + terms[1] * parts[1]) / (terms[0] + terms[1]),
+        rtol=1e-9,
+    )
     assert sums.lengths == [3000, 5000]
 
 
@@ -108,7 +133,7 @@ def test_a_constant_hole_changes_nothing_before_and_after_it():
     for stretch in (values[:9000], values[9400:]):
         apart.push(stretch)
         apart.end_stretch()
-    full = factors <= 10   # longer means may miss a tenth of their samples
+    full = factors <= 10  # longer means may miss a tenth of their samples
     np.testing.assert_allclose(together.variance()[full], apart.variance()[full], rtol=1e-2)
     assert np.all(together.terms >= apart.terms)
 
@@ -134,7 +159,7 @@ def test_stamps_that_jitter_lose_nothing(kind):
     rng, stamps = np.random.default_rng(9), regular(4000)
     if kind == 'jitter':
         stamps = stamps + rng.normal(0, 1e6, 4000).astype(np.int64)
-    elif kind == 'packets':   # eight samples arrive together
+    elif kind == 'packets':  # eight samples arrive together
         stamps = np.repeat(stamps[7::8], 8) + np.tile(np.arange(8) * 20_000, 500)
     else:
         stamps = stamps // 3_000_000 * 3_000_000
@@ -144,7 +169,7 @@ def test_stamps_that_jitter_lose_nothing(kind):
 def test_a_loss_among_packets_is_still_found():
     stamps = np.repeat(regular(4000)[7::8], 8) + np.tile(np.arange(8) * 20_000, 500)
     keep = np.ones(4000, bool)
-    keep[1600:1640] = False   # five packets
+    keep[1600:1640] = False  # five packets
     assert abs(grid_steps(stamps[keep]).sum() - 4000) <= 2
 
 

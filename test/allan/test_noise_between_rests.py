@@ -31,7 +31,11 @@ def rests(scatter, seed):
 def test_the_variances_of_the_parts_make_those_of_the_whole():
     moments = rests(0.2, 1)
     parts = moments.parts
-    np.testing.assert_allclose((parts.terms * parts.variance).sum(axis=0) / parts.terms.sum(axis=0), moments.variance, rtol=1e-12)
+    np.testing.assert_allclose(
+        (parts.terms * parts.variance).sum(axis=0) / parts.terms.sum(axis=0),
+        moments.variance,
+        rtol=1e-12,
+    )
     np.testing.assert_allclose(parts.share(), 1 / PARTS)
 
 
@@ -44,9 +48,14 @@ def test_the_scatter_between_rests_is_found(scatter):
 
 def test_intervals_are_those_of_twelve_rests_not_of_their_samples():
     even, uneven = (identify_axis(rests(scatter, 3)) for scatter in (0.0, 0.3))
-    narrow, wide = (np.subtract(*axis.terms['white_noise'].interval[::-1]) for axis in (even, uneven))
+    narrow, wide = (
+        np.subtract(*axis.terms['white_noise'].interval[::-1]) for axis in (even, uneven)
+    )
     # the root of a variance that is known to scatter / sqrt(12), four standard deviations from end to end
-    assert wide == pytest.approx(4 * 0.5 * uneven.scatter / np.sqrt(PARTS), rel=0.3) and narrow < 0.3 * wide
+    assert (
+        wide == pytest.approx(4 * 0.5 * uneven.scatter / np.sqrt(PARTS), rel=0.3)
+        and narrow < 0.3 * wide
+    )
     lower, upper = uneven.terms['white_noise'].interval
     assert lower < 1.0 < upper and even.scatter < 0.04 < uneven.scatter
 
@@ -54,7 +63,10 @@ def test_intervals_are_those_of_twelve_rests_not_of_their_samples():
 def test_another_recording_is_predicted_as_unevenly_as_the_first():
     moments = rests(0.3, 3)
     axis = identify_axis(moments)
-    sure, unsure = (2.0 / predicted(moments, replace(axis, scatter=scatter))[1] for scatter in (0.0, axis.scatter))
+    sure, unsure = (
+        2.0 / predicted(moments, replace(axis, scatter=scatter))[1]
+        for scatter in (0.0, axis.scatter)
+    )
     np.testing.assert_allclose(unsure - sure, axis.scatter**2 / PARTS, rtol=1e-9)
 
 

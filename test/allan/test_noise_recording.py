@@ -10,7 +10,13 @@ from refusal import refused
 from scipy.signal import lfilter
 
 from imu_calibration.allan import identify
-from imu_calibration.allan.document import exit_code, filter_lines, lines, noise_from_text, noise_to_text
+from imu_calibration.allan.document import (
+    exit_code,
+    filter_lines,
+    lines,
+    noise_from_text,
+    noise_to_text,
+)
 from imu_calibration.allan.identify import figures_of, identify_noise, read_rest
 from imu_calibration.allan.processes import RANDOM_WALK
 from imu_calibration.allan.terms import Term, identify_axis
@@ -37,27 +43,39 @@ WALK = 0.03
 def resting(seconds, seed=0, walk=WALK, period=PERIOD):
     """An IMU at rest, z up: white noise of SIZES, a random walk of `walk` times that."""
     rng, n = np.random.default_rng(seed), int(seconds / period)
-    values = np.column_stack([size * (white(n, period, 1.0, rng) + random_walk(n, period, walk, rng)) for size in SIZES])
+    values = np.column_stack(
+        [size * (white(n, period, 1.0, rng) + random_walk(n, period, walk, rng)) for size in SIZES]
+    )
     values[:, 2] += 9.81
-    return ImuSamples(np.arange(n, dtype=np.int64) * round(period * 1e9) + 10**18, values[:, :3], values[:, 3:], 'imu_link')
+    return ImuSamples(
+        np.arange(n, dtype=np.int64) * round(period * 1e9) + 10**18,
+        values[:, :3],
+        values[:, 3:],
+        'imu_link',
+    )
 
 
 def source(imu, temperature=None, size=20_000):
     """Blocks of a recording, each time anew."""
+
     def blocks():
         for start in range(0, len(imu), size):
             part = imu.select(slice(start, start + size))
             warm = None
             if temperature is not None:
-                warm = temperature.select((temperature.stamp_ns >= part.stamp_ns[0]) & (temperature.stamp_ns <= part.stamp_ns[-1]))
+                warm = temperature.select(
+                    (temperature.stamp_ns >= part.stamp_ns[0])
+                    & (temperature.stamp_ns <= part.stamp_ns[-1])
+                )
             yield SampleBlock(part, temperature=warm)
+
     return blocks
 
 
 def changed(imu, columns, start, values):
     """The samples with something added to columns (0 to 5) from sample `start` on."""
     both = np.concatenate([imu.force_s, imu.rate_s], axis=1)
-    both[start:start + len(values), columns] += values
+    both[start : start + len(values), columns] += values
     return ImuSamples(imu.stamp_ns, both[:, :3], both[:, 3:], imu.frame_id)
 
 
@@ -69,6 +87,7 @@ def quiet():
     def identified(moments):
         axes.append(axes[-1] if len(axes) % 3 else identify_axis(moments))
         return axes[-1]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(identify, 'identify_axis', identified)
         return imu, identify_noise(source(imu))
@@ -85,6 +104,7 @@ def accelerometer_x_only(quiet, monkeypatch):
         others.extend(quiet[1].axes[:0:-1])
         found.append(identify_axis(moments))
         return found[-1]
+
     monkeypatch.setattr(identify, 'identify_axis', identified)
     return found
 
@@ -107,16 +127,22 @@ def test_the_outcome_does_not_depend_on_the_blocks(quiet):
 def test_a_knock_is_left_out_and_the_noise_is_as_without_it(quiet):
     imu, before = quiet
     rng = np.random.default_rng(1)
-    knocked = changed(imu, slice(0, 6), 30_000, rng.normal(0, 1, (40, 6)) * np.array([0.5] * 3 + [0.03] * 3))
+    knocked = changed(
+        imu, slice(0, 6), 30_000, rng.normal(0, 1, (40, 6)) * np.array([0.5] * 3 + [0.03] * 3)
+    )
     found = read_rest(source(knocked))
     assert len(found.parts) == 2 and 0.5 < found.left_out['motion'] < 6.0
     # short averages are the same, but for two seconds in twenty minutes
-    np.testing.assert_allclose(found.curve.variance[:10], before.record.curve.variance[:10], rtol=5e-3)
+    np.testing.assert_allclose(
+        found.curve.variance[:10], before.record.curve.variance[:10], rtol=5e-3
+    )
 
 
 def test_an_imu_that_was_moved_is_two_stretches(quiet):
     imu, before = quiet
-    tilted = changed(imu, 0, 30_000, np.full(30_000, 0.03))   # 3 mrad, less than a fifth of a sample's noise
+    tilted = changed(
+        imu, 0, 30_000, np.full(30_000, 0.03)
+    )  # 3 mrad, less than a fifth of a sample's noise
     found = read_rest(source(tilted))
     assert len(found.parts) == 2
     # the step would add 0.03^2 / 12 at the longest averages
@@ -147,7 +173,9 @@ def test_the_temperature_is_taken_out_and_said(quiet, accelerometer_x_only):
     (trend,) = found.record.trends[0]
     assert trend.name == 'temperature' and abs(trend.value - 5e-3) < 4 * trend.sd
     assert not any(found.record.trends[1:])
-    assert any(f'{1e6 * trend.value / 9.80665:.0f} ± ' in line for line in lines(figures_of(found)))   # ug/K
+    assert any(
+        f'{1e6 * trend.value / 9.80665:.0f} ± ' in line for line in lines(figures_of(found))
+    )  # ug/K
     # the curve with the trend is far above at long times, the one without it is not
     curve = found.record.curve
     longest = curve.tau > 100
@@ -165,10 +193,14 @@ def test_trends_are_not_found_in_a_walk():
     found = 0
     for ratio in (0.0, 1.0, 50.0):
         for _ in range(7):
-            means = rng.normal(size=(n, 6)) + np.cumsum(rng.normal(size=(n, 6)), axis=0) * np.sqrt(6 * ratio / n)
-            search = TrendSearch(Blocks(time, means, np.zeros(n, int), 20.0, 25 + 10 * (1 - np.exp(-time / 900))))
+            means = rng.normal(size=(n, 6)) + np.cumsum(rng.normal(size=(n, 6)), axis=0) * np.sqrt(
+                6 * ratio / n
+            )
+            search = TrendSearch(
+                Blocks(time, means, np.zeros(n, int), 20.0, 25 + 10 * (1 - np.exp(-time / 900)))
+            )
             found += sum(len(search.find(axis)) for axis in range(6))
-    assert found <= 4   # of 126 axes; one in a thousand each for temperature, turn-on and ramp
+    assert found <= 4  # of 126 axes; one in a thousand each for temperature, turn-on and ramp
 
 
 def test_what_goes_with_a_trend_is_known():
@@ -182,12 +214,18 @@ def test_what_goes_with_a_trend_is_known():
         walk = means[:, 0] = np.cumsum(rng.normal(size=n)) + 0.1 * rng.normal(size=n)
         values, *_ = search.regress(0, [('ramp', 0.0)])
         rest = walk - search.columns([('ramp', 0.0)])[:, 0] * values[0]
-        ratios.append([np.mean((series[40:] - 2 * series[20:-20] + series[:-40])**2) for series in
-                       (np.concatenate([[0], np.cumsum(x)]) for x in (rest, walk))])
-    kept = search.kept(0, (AxisTrend('ramp', 0.0, 1.0),)).of(RANDOM_WALK, np.array([20 * seconds]))[0]
+        ratios.append(
+            [
+                np.mean((series[40:] - 2 * series[20:-20] + series[:-40]) ** 2)
+                for series in (np.concatenate([[0], np.cumsum(x)]) for x in (rest, walk))
+            ]
+        )
+    kept = search.kept(0, (AxisTrend('ramp', 0.0, 1.0),)).of(RANDOM_WALK, np.array([20 * seconds]))[
+        0
+    ]
     left, whole = np.mean(ratios, axis=0)
     assert kept < 0.97
-    assert left / whole == pytest.approx(kept, abs=0.06)   # 300 records with about one average each
+    assert left / whole == pytest.approx(kept, abs=0.06)  # 300 records with about one average each
 
 
 def test_lost_samples_and_holes_in_time_change_little(quiet):
@@ -196,7 +234,9 @@ def test_lost_samples_and_holes_in_time_change_little(quiet):
     keep[20_000:20_400] = False
     found = read_rest(source(imu.select(keep)))
     assert found.curve.seconds == pytest.approx(1200.0, abs=2.0)
-    np.testing.assert_allclose(found.curve.variance[:16], before.record.curve.variance[:16], rtol=0.03)
+    np.testing.assert_allclose(
+        found.curve.variance[:16], before.record.curve.variance[:16], rtol=0.03
+    )
 
 
 def test_stamps_in_milliseconds_and_an_odd_rate_are_followed():
@@ -209,7 +249,9 @@ def test_stamps_in_milliseconds_and_an_odd_rate_are_followed():
 
 def test_what_moves_all_the_time_is_refused(tmp_path, capsys):
     rng = np.random.default_rng(8)
-    imu = changed(resting(20.0, 8), slice(0, 6), 0, np.cumsum(rng.normal(0, 0.05, (1000, 6)), axis=0))
+    imu = changed(
+        resting(20.0, 8), slice(0, 6), 0, np.cumsum(rng.normal(0, 0.05, (1000, 6)), axis=0)
+    )
     with refused(InputError, 'rest_too_short', 1000):
         read_rest(source(imu))
 
@@ -220,15 +262,37 @@ def test_a_document_is_read_as_it_was_written(quiet):
     assert noise_to_text(noise_from_text(text)) == text
     document = yaml.safe_load(text)
     assert document['format'] == 'imu_calibration/noise/1'
-    assert set(document['accelerometer']['white_noise']) == {'value', 'interval95', 'status', 'reason', 'unit'}
+    assert set(document['accelerometer']['white_noise']) == {
+        'value',
+        'interval95',
+        'status',
+        'reason',
+        'unit',
+    }
     assert document['accelerometer']['white_noise']['unit'] == 'm/s^2/sqrt(Hz)'
 
 
-@pytest.mark.parametrize('change, code, values', [
-    (lambda d: d.update(format='imu_calibration/1'), 'document_format', ['imu_calibration/1']), (lambda d: d.pop('gyroscope'), 'document_parts', ['gyroscope']),
-    (lambda d: d['gyroscope'].pop('random_walk'), 'part_missing', ['random_walk']), (lambda d: d.update(sampling_rate=0.0), 'rate_not_positive', [0]),
-    (lambda d: d['gyroscope']['white_noise'].update(value=[None] * 3), 'value_missing', ['white_noise']),
-    (lambda d: d['gyroscope']['white_noise'].update(interval95=[[2.0, 1.0], [2.0, 1.0], [2.0, 1.0]]), 'status_or_interval', ['white_noise', '[2.0, 1.0]'])])
+@pytest.mark.parametrize(
+    'change, code, values',
+    [
+        (lambda d: d.update(format='imu_calibration/1'), 'document_format', ['imu_calibration/1']),
+        (lambda d: d.pop('gyroscope'), 'document_parts', ['gyroscope']),
+        (lambda d: d['gyroscope'].pop('random_walk'), 'part_missing', ['random_walk']),
+        (lambda d: d.update(sampling_rate=0.0), 'rate_not_positive', [0]),
+        (
+            lambda d: d['gyroscope']['white_noise'].update(value=[None] * 3),
+            'value_missing',
+            ['white_noise'],
+        ),
+        (
+            lambda d: d['gyroscope']['white_noise'].update(
+                interval95=[[2.0, 1.0], [2.0, 1.0], [2.0, 1.0]]
+            ),
+            'status_or_interval',
+            ['white_noise', '[2.0, 1.0]'],
+        ),
+    ],
+)
 def test_a_spoiled_document_is_refused_in_one_line(quiet, change, code, values):
     document = yaml.safe_load(noise_to_text(figures_of(quiet[1])))
     change(document)
@@ -249,8 +313,7 @@ def test_the_report_holds_the_plots_and_is_the_same_each_time(quiet):
     figures = figures_of(quiet[1])
     page = noise_report(quiet[1], figures)
     assert page == noise_report(quiet[1], figures)
-    assert page.count('<svg') == 2 and  'nan' not in page.lower().replace('nano',
-                                                                                                                                  '')
+    assert page.count('<svg') == 2 and 'nan' not in page.lower().replace('nano', '')
 
 
 def test_memory_is_that_of_a_shorter_recording():
@@ -262,7 +325,15 @@ def test_memory_is_that_of_a_shorter_recording():
         def stream(blocks=blocks, seconds=seconds):
             part = blocks[0]
             for k in range(int(seconds / 100)):
-                yield SampleBlock(ImuSamples(part.stamp_ns + k * 100_000_000_000, part.force_s, part.rate_s, part.frame_id))
+                yield SampleBlock(
+                    ImuSamples(
+                        part.stamp_ns + k * 100_000_000_000,
+                        part.force_s,
+                        part.rate_s,
+                        part.frame_id,
+                    )
+                )
+
         tracemalloc.start()
         read_rest(stream)
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -273,11 +344,18 @@ def test_memory_is_that_of_a_shorter_recording():
 def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys):
     imu = resting(120.0, 10)
     write_session(tmp_path / 'bag', imu, None, temperature=None)
-    assert main(['noise', str(tmp_path / 'bag'), '--output', str(tmp_path / 'out'), '--rate', '200']) == 3
+    assert (
+        main(['noise', str(tmp_path / 'bag'), '--output', str(tmp_path / 'out'), '--rate', '200'])
+        == 3
+    )
     said = capsys.readouterr().out
     assert 'µg/√Hz' in said and '200 Hz' in said
     figures = files.read_noise(tmp_path / 'out/noise.yaml')
-    assert figures.frame_id == 'imu_link' and figures.rate == pytest.approx(50.0) and exit_code(figures) == 3
+    assert (
+        figures.frame_id == 'imu_link'
+        and figures.rate == pytest.approx(50.0)
+        and exit_code(figures) == 3
+    )
     assert figures.provenance['bags'][0]['name'] == 'bag'
     assert (tmp_path / 'out/report.html').read_text().startswith('<!DOCTYPE html>')
     short = imu.select(slice(0, 400))
@@ -291,7 +369,9 @@ def test_an_axis_whose_steps_hide_its_noise_is_refused_by_its_name():
     """It changes while the sensor is knocked, and stays at one step of a coarse converter else."""
     imu = resting(120.0, 11)
     knock = np.random.default_rng(11).normal(0, 1, (40, 6)) * np.array([0.5] * 3 + [0.03] * 3)
-    frozen = ImuSamples(imu.stamp_ns, np.where([False, True, False], 0.5, imu.force_s), imu.rate_s, imu.frame_id)
+    frozen = ImuSamples(
+        imu.stamp_ns, np.where([False, True, False], 0.5, imu.force_s), imu.rate_s, imu.frame_id
+    )
     with refused(InputError, 'coarse_steps', 'accelerometer y'):
         read_rest(source(changed(frozen, slice(0, 6), 3000, knock)))
 
@@ -302,7 +382,12 @@ def hummed(extra, seed, period=0.05, n=24_000):
     values = SIZES / np.sqrt(period) * rng.standard_normal((n, 6))
     values[:, 0] += extra * SIZES[0] / np.sqrt(period)
     values[:, 2] += 9.81
-    return ImuSamples(np.arange(n, dtype=np.int64) * round(period * 1e9) + 10**18, values[:, :3], values[:, 3:], 'imu_link')
+    return ImuSamples(
+        np.arange(n, dtype=np.int64) * round(period * 1e9) + 10**18,
+        values[:, :3],
+        values[:, 3:],
+        'imu_link',
+    )
 
 
 def test_an_oscillation_needs_a_line_in_the_periodogram(accelerometer_x_only):
@@ -310,35 +395,59 @@ def test_an_oscillation_needs_a_line_in_the_periodogram(accelerometer_x_only):
     time = np.arange(24_000) * 0.05
     sine = hummed(1.5 * np.sin(2 * np.pi * 0.41 * time), 11)
     radius, angle = 0.99, 2 * np.pi * 0.1 * 0.05
-    noise = lfilter([1.0], [1.0, -2 * radius * np.cos(angle), radius**2], np.random.default_rng(12).standard_normal(24_000))
+    noise = lfilter(
+        [1.0],
+        [1.0, -2 * radius * np.cos(angle), radius**2],
+        np.random.default_rng(12).standard_normal(24_000),
+    )
     broad = hummed(1.2 * noise / noise.std(), 13)
     found, other = (identify_noise(source(imu)) for imu in (sine, broad))
     frequency, amplitude = found.axes[0].oscillation
     assert frequency == pytest.approx(0.41, rel=0.01)
     assert amplitude == pytest.approx(1.5 * SIZES[0] / np.sqrt(0.05), rel=0.1)
     candidate = accelerometer_x_only[1]
-    assert candidate.excess > 1 and candidate.oscillation is not None and other.axes[0].oscillation is None
+    assert (
+        candidate.excess > 1
+        and candidate.oscillation is not None
+        and other.axes[0].oscillation is None
+    )
 
 
 def numbers(part):
     """All numbers of a document."""
     if isinstance(part, (dict, list)):
-        return [number for item in (part.values() if isinstance(part, dict) else part) for number in numbers(item)]
+        return [
+            number
+            for item in (part.values() if isinstance(part, dict) else part)
+            for number in numbers(item)
+        ]
     return [part] if isinstance(part, float) else []
 
 
-def test_an_interval_without_an_upper_end_is_null_in_the_file_and_finite_where_filters_take_it(quiet):
+def test_an_interval_without_an_upper_end_is_null_in_the_file_and_finite_where_filters_take_it(
+    quiet,
+):
     figures = figures_of(quiet[1])
-    open_ends = {name: Term(name, None, (0.0, np.inf), HELD) for name in ('white_noise', 'random_walk')}
+    open_ends = {
+        name: Term(name, None, (0.0, np.inf), HELD) for name in ('white_noise', 'random_walk')
+    }
     axis = replace(figures.gyroscope[2], terms=figures.gyroscope[2].terms | open_ends, form=())
     without = replace(figures, gyroscope=(axis,) * 3)
     text = noise_to_text(without)
     document = yaml.safe_load(text)
-    assert np.isfinite(numbers(document)).all() and document['gyroscope']['random_walk']['interval95'] == [[0.0, None]] * 3
+    assert (
+        np.isfinite(numbers(document)).all()
+        and document['gyroscope']['random_walk']['interval95'] == [[0.0, None]] * 3
+    )
     assert document['recording']['intervals_hold_for']
     again = noise_from_text(text)
-    assert again.gyroscope[0].terms['random_walk'].interval == (0.0, np.inf) and noise_to_text(again) == text
+    assert (
+        again.gyroscope[0].terms['random_walk'].interval == (0.0, np.inf)
+        and noise_to_text(again) == text
+    )
     assert again.gyroscope[0].white == pytest.approx(axis.sample_sd * np.sqrt(axis.shortest))
-    assert not {'inf', 'nan'} & {word for line in (*filter_lines(without, [100.0]), *lines(without)) for word in line.split()}
+    assert not {'inf', 'nan'} & {
+        word for line in (*filter_lines(without, [100.0]), *lines(without)) for word in line.split()
+    }
     with refused(InputError, 'walk_unbounded', 'gyroscope'):
         export(random_calibration(1), find_target('kalibr'), noise=without)

@@ -44,7 +44,10 @@ BAG = Path(__file__).parents[2] / 'bags' / 'sample_session'
 
 def axis_of(**figures):
     """An axis with these figures, nothing else."""
-    terms = {name: Term(name, value, (0.9 * value, 1.1 * value), DETERMINED) for name, value in figures.items()}
+    terms = {
+        name: Term(name, value, (0.9 * value, 1.1 * value), DETERMINED)
+        for name, value in figures.items()
+    }
     terms.setdefault('random_walk', Term('random_walk', None, (0.0, 1e-9), HELD))
     form = tuple(name for name in figures if name not in ('white_noise', TIME_KEY))
     return AxisFigures(terms, form)
@@ -52,21 +55,33 @@ def axis_of(**figures):
 
 def noise_of(force, rate, sampling=100.0):
     """Three equal axes of each sensor."""
-    return NoiseFigures((axis_of(**force),) * 3, (axis_of(**rate),) * 3, sampling, 'imu_link', {'seconds_at_rest': 1.0})
+    return NoiseFigures(
+        (axis_of(**force),) * 3,
+        (axis_of(**rate),) * 3,
+        sampling,
+        'imu_link',
+        {'seconds_at_rest': 1.0},
+    )
 
 
-@pytest.mark.parametrize('name, process', [('bias_instability', FLICKER), ('random_walk', RANDOM_WALK)])
+@pytest.mark.parametrize(
+    'name, process', [('bias_instability', FLICKER), ('random_walk', RANDOM_WALK)]
+)
 def test_sums_of_processes_have_the_allan_variance_of_the_noise(name, process):
     """Within 7 % in variance from some windows to sessions: flicker has no faster parts and ripples, a walk forgets after hours."""
     figures = noise_of({'white_noise': 1e-3, name: 0.7}, {'white_noise': 1e-5})
     found, tau = bias_processes(figures), np.geomspace(50.0, 1500.0, 12)
-    summed = sum(part.sd**2 * allan_variance(gauss_markov(part.time), tau) for part in found['accelerometer'])
+    summed = sum(
+        part.sd**2 * allan_variance(gauss_markov(part.time), tau) for part in found['accelerometer']
+    )
     np.testing.assert_allclose(summed, 0.49 * allan_variance(process, tau), rtol=0.07)
-    assert found['gyroscope'] == ()   # a bound is no measurement
+    assert found['gyroscope'] == ()  # a bound is no measurement
 
 
 def test_a_gauss_markov_process_stays_as_it_is():
-    figures = noise_of({'white_noise': 1e-3, 'gauss_markov': 0.2, TIME_KEY: 90.0}, {'white_noise': 1e-5})
+    figures = noise_of(
+        {'white_noise': 1e-3, 'gauss_markov': 0.2, TIME_KEY: 90.0}, {'white_noise': 1e-5}
+    )
     (process,) = bias_processes(figures)['accelerometer']
     assert process.time == pytest.approx(90.0) and process.sd == pytest.approx(0.2)
 
@@ -80,18 +95,24 @@ def test_what_a_bias_does_over_days_is_not_its_scatter_within_a_session():
 def wandering(seed, size, count=20):
     """Mean rows of windows every 20 s: one bias, white noise of 1e-4, flicker of an instability."""
     rng, times = np.random.default_rng(seed), 20.0 * np.arange(count)
-    wander = np.column_stack([flicker(20 * count, 1.0, size, rng).reshape(count, 20).mean(axis=1) for _ in range(3)])
+    wander = np.column_stack(
+        [flicker(20 * count, 1.0, size, rng).reshape(count, 20).mean(axis=1) for _ in range(3)]
+    )
     rows = np.stack([np.ones((count, 3)), 1e-4 * rng.standard_normal((count, 3)) + wander], axis=2)
     return rows, np.full((count, 3), 1e-8), times, [np.arange(count)]
 
 
 def offsets_of(rows, white, times, sessions, known):
-    return estimate_offsets(rows, white, times, sessions=sessions, information=np.zeros((2, 2)), known=known)
+    return estimate_offsets(
+        rows, white, times, sessions=sessions, information=np.zeros((2, 2)), known=known
+    )
 
 
 def test_known_processes_are_taken_and_the_rest_is_not_blamed_on_the_bias():
     """Twenty windows of known flicker: no offset to speak of, and no other process than the known ones."""
-    known = bias_processes(noise_of({'white_noise': 1e-5, 'bias_instability': 1e-3}, {'white_noise': 1e-5}))['accelerometer']
+    known = bias_processes(
+        noise_of({'white_noise': 1e-5, 'bias_instability': 1e-3}, {'white_noise': 1e-5})
+    )['accelerometer']
     for seed in range(4):
         found = offsets_of(*wandering(seed, 1e-3), known)
         assert found['bias_processes'] == known and found['offset_sd'] < 6e-4
@@ -100,13 +121,19 @@ def test_known_processes_are_taken_and_the_rest_is_not_blamed_on_the_bias():
 def test_a_bias_that_moves_much_more_than_was_measured_is_believed():
     known = (BiasProcess(1e-5, 100.0),)
     found = offsets_of(*wandering(5, 3e-3, 60), known)
-    assert found['bias_processes'][:1] == known and len(found['bias_processes']) == 2 and found['bias_processes'][1].sd > 1e-3
+    assert (
+        found['bias_processes'][:1] == known
+        and len(found['bias_processes']) == 2
+        and found['bias_processes'][1].sd > 1e-3
+    )
 
 
 @pytest.fixture(scope='module')
 def noise_file(tmp_path_factory):
     """A noise.yaml with walks that the sample session's windows are too short to see."""
-    figures = noise_of({'white_noise': 2e-4, 'random_walk': 2e-5}, {'white_noise': 1e-5, 'bias_instability': 3e-5})
+    figures = noise_of(
+        {'white_noise': 2e-4, 'random_walk': 2e-5}, {'white_noise': 1e-5, 'bias_instability': 3e-5}
+    )
     path = tmp_path_factory.mktemp('noise') / 'noise.yaml'
     path.write_text(noise_to_text(figures))
     return path
@@ -116,32 +143,55 @@ def noise_file(tmp_path_factory):
 def calibrated(noise_file, tmp_path_factory):
     """A folder with the sample session calibrated with known noise."""
     folder = tmp_path_factory.mktemp('with_noise')
-    assert main(['calibrate', str(BAG), '--table', str(BAG / 'table.yaml'), '--noise', str(noise_file), '--output', str(folder)]) == 0
+    assert (
+        main(
+            [
+                'calibrate',
+                str(BAG),
+                '--table',
+                str(BAG / 'table.yaml'),
+                '--noise',
+                str(noise_file),
+                '--output',
+                str(folder),
+            ]
+        )
+        == 0
+    )
     return folder
 
 
 def test_calibrate_takes_the_measured_noise_and_says_so(calibrated, noise_file):
     document = yaml.safe_load((calibrated / 'calibration.yaml').read_text())
-    walk = 2e-5 * np.sqrt(3600.0 / 2)   # what counts within an hour
+    walk = 2e-5 * np.sqrt(3600.0 / 2)  # what counts within an hour
     assert document['statistics']['accelerometer']['wander_sd'] == pytest.approx(walk, rel=1e-6)
     assert document['provenance']['options']['noise']['name'] == 'noise.yaml'
 
 
 def test_live_the_measured_noise_is_used_by_the_solution_and_the_diagnosis(noise_file):
     """On a table the biases move as was measured; by hand the noise is refused as it is offline."""
-    session, options = physics.make_session(3), CalibrationOptions(noise=files.read_noise(noise_file))
+    session, options = (
+        physics.make_session(3),
+        CalibrationOptions(noise=files.read_noise(noise_file)),
+    )
     live = LiveCalibration(Table.from_mapping(session.table), options)
     for block in blocks(session.imu, session.joints):
         live.push(block)
     known = live.solve(pending=True).solution.noise
-    assert {sensor: known[sensor].bias_processes[:len(wanted)] for sensor, wanted in options.bias_processes.items()} == options.bias_processes
+    assert {
+        sensor: known[sensor].bias_processes[: len(wanted)]
+        for sensor, wanted in options.bias_processes.items()
+    } == options.bias_processes
     assert question_about(live).snapshot.options.bias_processes == options.bias_processes
     with refused(InputError, 'table_only'):
         LiveByHand(options, LiveSettings())
 
 
 def test_by_hand_the_noise_is_refused_in_one_line(noise_file, tmp_path, capsys):
-    assert main(['calibrate', str(BAG), '--noise', str(noise_file), '--output', str(tmp_path / 'out')]) == 1
+    assert (
+        main(['calibrate', str(BAG), '--noise', str(noise_file), '--output', str(tmp_path / 'out')])
+        == 1
+    )
     error = capsys.readouterr().err
     assert '--table' in error and error.count('\n') == 1 and not (tmp_path / 'out').exists()
 
@@ -149,7 +199,21 @@ def test_by_hand_the_noise_is_refused_in_one_line(noise_file, tmp_path, capsys):
 def test_a_noise_file_that_is_none_is_refused_with_its_name(tmp_path, capsys):
     wrong = tmp_path / 'wrong.yaml'
     wrong.write_text('format: imu_calibration/1\n')
-    assert main(['calibrate', str(BAG), '--table', str(BAG / 'table.yaml'), '--noise', str(wrong), '--output', str(tmp_path / 'out')]) == 1
+    assert (
+        main(
+            [
+                'calibrate',
+                str(BAG),
+                '--table',
+                str(BAG / 'table.yaml'),
+                '--noise',
+                str(wrong),
+                '--output',
+                str(tmp_path / 'out'),
+            ]
+        )
+        == 1
+    )
     error = capsys.readouterr().err
     assert 'wrong.yaml' in error and 'imu_calibration/noise/1' in error and error.count('\n') == 1
 
@@ -157,9 +221,16 @@ def test_a_noise_file_that_is_none_is_refused_with_its_name(tmp_path, capsys):
 def test_readings_carry_the_measured_noise_at_their_own_rate(noise_file):
     """Recorded at 100 Hz, used at 500 Hz: five times the variance, offline and, once the rate is known, live."""
     plain = random_calibration(2, ())
-    known = with_measured_noise(replace(plain, covariance=np.zeros_like(plain.covariance)), files.read_noise(noise_file))
+    known = with_measured_noise(
+        replace(plain, covariance=np.zeros_like(plain.covariance)), files.read_noise(noise_file)
+    )
     count, unknown = 200, np.zeros((3, 3))
-    imu = ImuSamples(10**18 + 2_000_000 * np.arange(count), np.tile([0.0, 0.0, 9.81], (count, 1)), np.zeros((count, 3)), 'imu_link')
+    imu = ImuSamples(
+        10**18 + 2_000_000 * np.arange(count),
+        np.tile([0.0, 0.0, 9.81], (count, 1)),
+        np.zeros((count, 3)),
+        'imu_link',
+    )
     offline, live = CompensationStream(known), SampleCompensation(known)
     offline.correct(imu)
     first = live.covariances(unknown, unknown)
@@ -180,13 +251,41 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
     text, of_bags, of_nodes = truth.read_text(), [], []
     for file in (noise_file, twice):
         output = tmp_path / file.stem
-        assert main(['compensate', str(BAG), '--calibration', str(truth), '--anyway', '--noise', str(file), '--output', str(output)]) == 3   # nothing proves truth.yaml
-        of_bags.append(parse_imu(raw_messages(output, '/imu/data_corrected')[-1][1]).doubles[FIELDS['force_cov']][0])
-        live = adopt(text, 'here', CompensatorSettings(noise_file=str(file), anyway=True), frames=None).compensation
+        assert (
+            main(
+                [
+                    'compensate',
+                    str(BAG),
+                    '--calibration',
+                    str(truth),
+                    '--anyway',
+                    '--noise',
+                    str(file),
+                    '--output',
+                    str(output),
+                ]
+            )
+            == 3
+        )  # nothing proves truth.yaml
+        of_bags.append(
+            parse_imu(raw_messages(output, '/imu/data_corrected')[-1][1]).doubles[
+                FIELDS['force_cov']
+            ][0]
+        )
+        live = adopt(
+            text, 'here', CompensatorSettings(noise_file=str(file), anyway=True), frames=None
+        ).compensation
         of_nodes.append(live.covariances(np.zeros((3, 3)), np.zeros((3, 3)))[0][0, 0])
-    assert of_bags[1] / of_bags[0] == pytest.approx(4.0, rel=0.05) and of_nodes[1] / of_nodes[0] == pytest.approx(4.0, rel=0.02)
+    assert of_bags[1] / of_bags[0] == pytest.approx(4.0, rel=0.05) and of_nodes[1] / of_nodes[
+        0
+    ] == pytest.approx(4.0, rel=0.02)
     with refused(InputError, 'file_unreadable', 'missing.yaml'):
-        adopt(text, 'here', CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True), frames=None)
+        adopt(
+            text,
+            'here',
+            CompensatorSettings(noise_file=str(tmp_path / 'missing.yaml'), anyway=True),
+            frames=None,
+        )
 
 
 def test_the_noise_becomes_metres():
@@ -198,7 +297,9 @@ def test_the_noise_becomes_metres():
 
 
 def test_white_noise_that_may_be_none_counts_with_its_bound():
-    axis = AxisFigures({'white_noise': Term('white_noise', 0.0, (0.0, 3e-4), 'weak', 'may be none')})
+    axis = AxisFigures(
+        {'white_noise': Term('white_noise', 0.0, (0.0, 3e-4), 'weak', 'may be none')}
+    )
     assert axis.white == 3e-4
 
 

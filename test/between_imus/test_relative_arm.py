@@ -26,13 +26,25 @@ def motion(time, rng, axes=(1, 1, 1), size=15.0):
         for k, share in enumerate((1.0, 0.4)):
             angular = 2 * np.pi * AXES[axis, k]
             rate[:, axis] += axes[axis] * size * share * np.sin(angular * time + phase[axis, k])
-            alpha[:, axis] += axes[axis] * size * share * angular * np.cos(angular * time + phase[axis, k])
+            alpha[:, axis] += (
+                axes[axis] * size * share * angular * np.cos(angular * time + phase[axis, k])
+            )
     force = 9.8 * np.stack([np.sin(1.1 * time), np.cos(1.1 * time), 0.3 * np.sin(7 * time)], axis=1)
     return rate, alpha, force
 
 
-def pair(seed, period=0.016, period_b=None, duration=60.0, late=0.0, turn=(0, 0, 0), force_sd=0.0, rate_sd=0.0, limit=None,
-         axes=(1, 1, 1)):
+def pair(
+    seed,
+    period=0.016,
+    period_b=None,
+    duration=60.0,
+    late=0.0,
+    turn=(0, 0, 0),
+    force_sd=0.0,
+    rate_sd=0.0,
+    limit=None,
+    axes=(1, 1, 1),
+):
     """Two IMUs on one body, twisted; B is turned by the rotation vector `turn` and its stamps are `late`."""
     rng = np.random.default_rng(seed)
     phases = rng.integers(2**31)
@@ -40,13 +52,20 @@ def pair(seed, period=0.016, period_b=None, duration=60.0, late=0.0, turn=(0, 0,
     imus = []
     for which, step in (('a', period), ('b', period_b or period)):
         time = step * np.arange(int(duration / step))
-        rate, alpha, force = motion(time - (late if which == 'b' else 0.0), np.random.default_rng(phases), axes)
+        rate, alpha, force = motion(
+            time - (late if which == 'b' else 0.0), np.random.default_rng(phases), axes
+        )
         if which == 'b':
             force = (force + np.einsum('nij,j->ni', lever_matrix(rate, alpha), ARM)) @ mat_ab
             rate = rate @ mat_ab
         rate = rate + rng.normal(0, rate_sd, rate.shape)
-        imus.append(ImuSamples(10**18 + np.round(1e9 * time).astype(np.int64), force + rng.normal(0, force_sd, force.shape),
-                               rate if limit is None else np.clip(rate, -limit, limit)))
+        imus.append(
+            ImuSamples(
+                10**18 + np.round(1e9 * time).astype(np.int64),
+                force + rng.normal(0, force_sd, force.shape),
+                rate if limit is None else np.clip(rate, -limit, limit),
+            )
+        )
     return *imus, mat_ab
 
 
@@ -54,7 +73,9 @@ def naive_arm(imu_a, imu_b):
     """Plain least squares with central differences of the rate."""
     alpha = np.gradient(imu_a.rate_s, 1e-9 * (imu_a.stamp_ns - imu_a.stamp_ns[0]), axis=0)
     lever = lever_matrix(imu_a.rate_s, alpha)[1:-1]
-    return np.linalg.lstsq(lever.reshape(-1, 3), (imu_b.force_s - imu_a.force_s)[1:-1].ravel(), rcond=None)[0]
+    return np.linalg.lstsq(
+        lever.reshape(-1, 3), (imu_b.force_s - imu_a.force_s)[1:-1].ravel(), rcond=None
+    )[0]
 
 
 def test_windows_integrate_by_parts():
@@ -63,9 +84,13 @@ def test_windows_integrate_by_parts():
     windows = make_windows(time, np.arange(1.0, 6.0, 0.1), 0.15)
     values = np.stack([np.ones_like(time), time, np.sin(20 * time)], axis=1)
     slopes = np.stack([np.zeros_like(time), np.ones_like(time), 20 * np.cos(20 * time)], axis=1)
-    np.testing.assert_allclose(windows.mean(values)[:, 0], 1.0, atol=2e-3)  # quadrature over uneven stamps
+    np.testing.assert_allclose(
+        windows.mean(values)[:, 0], 1.0, atol=2e-3
+    )  # quadrature over uneven stamps
     np.testing.assert_allclose(windows.slope(values), windows.mean(slopes), atol=0.1)
-    even = make_windows(0.01 * np.arange(1000), np.arange(1.003, 8.0, 0.097), 0.08)  # eight samples, anywhere in the window
+    even = make_windows(
+        0.01 * np.arange(1000), np.arange(1.003, 8.0, 0.097), 0.08
+    )  # eight samples, anywhere in the window
     np.testing.assert_allclose(even.mean(np.ones((1000, 1))), 1.0, rtol=1e-12)
     np.testing.assert_allclose(even.slope(0.01 * np.arange(1000)[:, None]), 1.0, rtol=2e-3)
 
@@ -78,11 +103,36 @@ def test_exact_where_a_central_difference_makes_the_arm_too_long():
     assert 1.01 < np.linalg.norm(naive_arm(imu_a, imu_b)) / np.linalg.norm(ARM) < 1.05
 
 
-@pytest.mark.parametrize('turn', [(np.pi, 0, 0), (0, np.pi - 1e-9, 0), (0, 0, np.pi - 1e-4), (np.pi / np.sqrt(2), 0, np.pi / np.sqrt(2)), (0, 0, 0), (0, 0, 1e-5)])
+@pytest.mark.parametrize(
+    'turn',
+    [
+        (np.pi, 0, 0),
+        (0, np.pi - 1e-9, 0),
+        (0, 0, np.pi - 1e-4),
+        (np.pi / np.sqrt(2), 0, np.pi / np.sqrt(2)),
+        (0, 0, 0),
+        (0, 0, 1e-5),
+    ],
+)
 def test_the_angle_holds_for_imus_mounted_upside_down(turn):
-    found = RelativeArm(ARM, np.eye(3), Rotation.from_rotvec(turn).as_matrix(), 0.0, ('determined',) * 3,
-                        {'windows': 1, 'window': 0.1, 'clipped_share': 0.0, 'signal_rms': 1.0, 'residual_rms': 1.0, 'calibrated': True})
-    assert next(iter(found.lines())).startswith(f'B is turned by {np.degrees(np.linalg.norm(turn)):.2f} deg against A')
+    found = RelativeArm(
+        ARM,
+        np.eye(3),
+        Rotation.from_rotvec(turn).as_matrix(),
+        0.0,
+        ('determined',) * 3,
+        {
+            'windows': 1,
+            'window': 0.1,
+            'clipped_share': 0.0,
+            'signal_rms': 1.0,
+            'residual_rms': 1.0,
+            'calibrated': True,
+        },
+    )
+    assert next(iter(found.lines())).startswith(
+        f'B is turned by {np.degrees(np.linalg.norm(turn)):.2f} deg against A'
+    )
 
 
 def test_stamps_rates_and_axes_of_the_two_need_not_agree():
@@ -95,7 +145,9 @@ def test_stamps_rates_and_axes_of_the_two_need_not_agree():
 
 def test_a_gyroscope_that_lags_its_accelerometer_is_seen_and_does_no_harm():
     imu_a, imu_b, _ = pair(4, period=0.01)
-    lagging = [ImuSamples(imu.stamp_ns[1:], imu.force_s[1:], imu.rate_s[:-1]) for imu in (imu_a, imu_b)]
+    lagging = [
+        ImuSamples(imu.stamp_ns[1:], imu.force_s[1:], imu.rate_s[:-1]) for imu in (imu_a, imu_b)
+    ]
     found = estimate_arm(*lagging)
     assert found.diagnostics['rate_delay'] == pytest.approx(0.01, abs=1e-3)
     np.testing.assert_allclose(found.arm, ARM, atol=3e-4)
@@ -127,9 +179,15 @@ def test_sd_are_honest():
         imu_a, imu_b, _ = pair(100 + seed, force_sd=0.5, rate_sd=0.02, duration=30.0)
         found = estimate_arm(imu_a, imu_b)
         scores.append((found.arm - ARM) / found.diagnostics['motion_sd'])
-        assert not found.diagnostics['calibrated'] and np.all(found.diagnostics['calibration_sd'] > np.zeros(3))
-    print(f'mean square z {np.mean(np.square(scores)):.2f}, 95 % intervals hold {100 * np.mean(np.abs(scores) < 1.96):.1f} %')
-    assert 0.75 < np.mean(np.square(scores)) < 1.5   # 1.15 for these seeds: an sd wrong by a factor of 1.3 gives 0.68 or 1.95
+        assert not found.diagnostics['calibrated'] and np.all(
+            found.diagnostics['calibration_sd'] > np.zeros(3)
+        )
+    print(
+        f'mean square z {np.mean(np.square(scores)):.2f}, 95 % intervals hold {100 * np.mean(np.abs(scores) < 1.96):.1f} %'
+    )
+    assert (
+        0.75 < np.mean(np.square(scores)) < 1.5
+    )  # 1.15 for these seeds: an sd wrong by a factor of 1.3 gives 0.68 or 1.95
 
 
 @pytest.mark.slow
@@ -173,23 +231,33 @@ def test_boards_of_several_imus(recordings):
     The sd reported is 0.08-0.16 mm per axis; the design does not say where in the package the sensitive points are.
     """
     from msg_adapters.bag import open_recording
+
     arms, sds, errors = {}, {}, {}
     for name in ('array_2', 'array_5'):
-        imus = {k: read_by_hand(open_recording(recordings / name, f'/imu_{k}/data_raw', want_joints=False).blocks()).imu for k in BOARD_MM}
+        imus = {
+            k: read_by_hand(
+                open_recording(recordings / name, f'/imu_{k}/data_raw', want_joints=False).blocks()
+            ).imu
+            for k in BOARD_MM
+        }
         for a, b in PAIRS:
             found = estimate_arm(imus[a], imus[b])
             key = (name, a, b)
             arms[key], sds[key] = 1e3 * found.arm, 1e3 * found.arm_sd
             errors[key] = arms[key] - (np.array(BOARD_MM[b]) - BOARD_MM[a])
-            print(f'{name} {a}-{b}: error {np.round(errors[key], 2)} mm, sd {np.round(sds[key], 2)}, '
-                  f'{found.diagnostics["signal_rms"]:.1f} -> {found.diagnostics["residual_rms"]:.1f} m/s^2')
+            print(
+                f'{name} {a}-{b}: error {np.round(errors[key], 2)} mm, sd {np.round(sds[key], 2)}, '
+                f'{found.diagnostics["signal_rms"]:.1f} -> {found.diagnostics["residual_rms"]:.1f} m/s^2'
+            )
     apart = np.array([arms['array_5', a, b] - arms['array_2', a, b] for a, b in PAIRS])
     both = np.array([np.hypot(sds['array_5', a, b], sds['array_2', a, b]) for a, b in PAIRS])
     print('between the recordings, mm:', np.round(apart, 2).tolist())
-    print(f'largest error {np.max(np.abs(list(errors.values()))):.2f} mm, largest difference {np.max(np.abs(apart)):.2f} mm, '
-          f'mean square of difference over sd {np.mean((apart / both)**2):.2f}')
+    print(
+        f'largest error {np.max(np.abs(list(errors.values()))):.2f} mm, largest difference {np.max(np.abs(apart)):.2f} mm, '
+        f'mean square of difference over sd {np.mean((apart / both) ** 2):.2f}'
+    )
     assert np.max(np.abs(list(errors.values()))) < 0.5
     assert np.max(np.abs(apart)) < 0.35
-    assert np.mean((apart / both)**2) < 2.5
+    assert np.mean((apart / both) ** 2) < 2.5
     closure = [arms[n, 1, 3] + arms[n, 3, 7] - arms[n, 1, 7] for n in ('array_2', 'array_5')]
     assert np.max(np.abs(closure)) < 0.3

@@ -19,25 +19,52 @@ from msg_adapters.write import write_session
 
 from worlds.hand_sessions import GRAVITY, simulate
 
-FEW = ('accel_quadratic', 'accel_bias_drift', 'gyro_g_sensitivity', 'gyro_bandwidth', 'gyro_bias_drift', 'gyro_bias_trend', 'time_offset')
+FEW = (
+    'accel_quadratic',
+    'accel_bias_drift',
+    'gyro_g_sensitivity',
+    'gyro_bandwidth',
+    'gyro_bias_drift',
+    'gyro_bias_trend',
+    'time_offset',
+)
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
-FORMULA = CATALOGUE.with_effects(term('warm_force', sensor='gyroscope', column='f_x * (temperature_c - temperature_ref_c)', unit='(rad/s)/(m/s^2)/K',
-                                      tolerance=1e-6, text='A formula.', largest=1e-4))
-SESSIONS = {'bias and matrix': {}, 'findings': {'effects': ['accel_quadratic', 'gyro_g_sensitivity', 'gyro_bias_drift']},
-            'thermal': {'effects': ['accel_thermal_bias', 'gyro_thermal_scale']}, 'formula': {'effects': ['warm_force'], 'catalogue': FORMULA}}
+FORMULA = CATALOGUE.with_effects(
+    term(
+        'warm_force',
+        sensor='gyroscope',
+        column='f_x * (temperature_c - temperature_ref_c)',
+        unit='(rad/s)/(m/s^2)/K',
+        tolerance=1e-6,
+        text='A formula.',
+        largest=1e-4,
+    )
+)
+SESSIONS = {
+    'bias and matrix': {},
+    'findings': {'effects': ['accel_quadratic', 'gyro_g_sensitivity', 'gyro_bias_drift']},
+    'thermal': {'effects': ['accel_thermal_bias', 'gyro_thermal_scale']},
+    'formula': {'effects': ['warm_force'], 'catalogue': FORMULA},
+}
 RATES = {'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
 def spoiled(calibration, seed=3):
     """Return a calibration with values that are off by a few per mille, so that the errors after compensation are no noise alone."""
     rng = np.random.default_rng(seed)
-    return replace(calibration, values=calibration.values * (1 + 3e-3 * rng.normal(size=len(calibration.values))))
+    return replace(
+        calibration,
+        values=calibration.values * (1 + 3e-3 * rng.normal(size=len(calibration.values))),
+    )
 
 
 def same(found, wanted):
     """Assert that two entries of proofs have the same errors in total and in each regime."""
-    for part, other in ((found, wanted), *((found['regimes'][name], wanted['regimes'][name]) for name in wanted['regimes'])):
+    for part, other in (
+        (found, wanted),
+        *((found['regimes'][name], wanted['regimes'][name]) for name in wanted['regimes']),
+    ):
         assert part == pytest.approx(other, rel=1e-9)
 
 
@@ -48,12 +75,16 @@ def test_check_reports_the_error_of_the_compensated_bag(name, tmp_path):
     known = spoiled(session.truth)
     checked = imu.check(tmp_path / 'bag', known, session.table)
     imu.compensate(tmp_path / 'bag', known, output=tmp_path / 'corrected', anyway=True)
-    written = imu.check(tmp_path / 'corrected', known, session.table, imu_topic='/imu/data_corrected')
+    written = imu.check(
+        tmp_path / 'corrected', known, session.table, imu_topic='/imu/data_corrected'
+    )
     assert checked.proof.keys() == {'accelerometer', 'gyroscope'}
     for sensor, entry in checked.proof.items():
         assert entry['after'] == pytest.approx(written.proof[sensor]['before'], rel=1e-9)
         for regime, part in entry['regimes'].items():
-            assert part['after'] == pytest.approx(written.proof[sensor]['regimes'][regime]['before'], rel=1e-9)
+            assert part['after'] == pytest.approx(
+                written.proof[sensor]['regimes'][regime]['before'], rel=1e-9
+            )
 
 
 def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
@@ -62,21 +93,35 @@ def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
     known = spoiled(imu.calibrate(tmp_path / 'bag', gravity=GRAVITY).calibration)
     checked = imu.check(tmp_path / 'bag', known, gravity=GRAVITY)
     imu.compensate(tmp_path / 'bag', known, output=tmp_path / 'corrected', anyway=True)
-    raw, corrected = (read_by_hand(source_of(tmp_path / 'corrected', Topics(topic), want_joints=False)()).imu
-                      for topic in ('/imu/data_raw', '/imu/data_corrected'))
+    raw, corrected = (
+        read_by_hand(source_of(tmp_path / 'corrected', Topics(topic), want_joints=False)()).imu
+        for topic in ('/imu/data_raw', '/imu/data_corrected')
+    )
     written = prove_readings(gather_by_hand(raw), raw, corrected, gravity=GRAVITY)
     for sensor, entry in checked.proof.items():
-        assert entry['after'] == pytest.approx(written[sensor]['after'], rel=1e-9) and entry['after'] < 0.5 * entry['before']
+        assert (
+            entry['after'] == pytest.approx(written[sensor]['after'], rel=1e-9)
+            and entry['after'] < 0.5 * entry['before']
+        )
 
 
 def test_the_proof_from_statistics_of_windows_differs_from_that_of_readings_by_the_square_of_the_errors():
     """With the same values for all folds: held-out statistics against corrected readings."""
     from imu_calibration.calibration.proof import prove
     from imu_calibration.effects.forward_equations import applied_values
+
     session = imu.simulate('quick', seed=4, effects=['accel_quadratic', 'gyro_g_sensitivity'])
-    result = imu.calibrate(session.samples, session.table, accelerometer_model='bias+matrix+accel_size_effect+accel_quadratic',
-                           gyroscope_model='bias+matrix+gyro_g_sensitivity', model_as_asked=True).result
-    model, values = result.solution.model, applied_values(result.solution.model, result.solution.values)
+    result = imu.calibrate(
+        session.samples,
+        session.table,
+        accelerometer_model='bias+matrix+accel_size_effect+accel_quadratic',
+        gyroscope_model='bias+matrix+gyro_g_sensitivity',
+        model_as_asked=True,
+    ).result
+    model, values = (
+        result.solution.model,
+        applied_values(result.solution.model, result.solution.values),
+    )
     dealt = result.gathered.held_out.restricted(result.gathered_model, model)
     found = prove(model, before=(dealt, ([nominal_values(model)],)), after=(dealt, ([values],)))
     checked = imu.check(session.samples, result.calibration, session.table)
@@ -88,44 +133,76 @@ def drifting(size=0.5 * DEG, time_constant=35.0):
     """Return (samples, table, bias at the end, bias at the start, duration in s) of a session whose gyroscope bias drifts by `size` on each axis."""
     session = imu.simulate('random_short', seed=7, imu_rate=50.0)
     time = 1e-9 * (session.samples.imu.stamp_ns - session.samples.imu.stamp_ns[0])
-    course = -size * np.expm1(-time / time_constant) if np.isfinite(time_constant) else size * time / time[-1]
+    course = (
+        -size * np.expm1(-time / time_constant)
+        if np.isfinite(time_constant)
+        else size * time / time[-1]
+    )
     bias = session.truth.value('gyroscope', 'bias')
-    moved = replace(session.samples, imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + course[:, None]))
+    moved = replace(
+        session.samples,
+        imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + course[:, None]),
+    )
     return moved, session.table, bias + course[-1], bias, time[-1]
 
 
 def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third():
     samples, table, at_end, at_start, duration = drifting()
     calibration = imu.calibrate(samples, table).calibration
-    bias, sd = calibration.value('gyroscope', 'bias'), calibration.sd[calibration.model.slices['gyroscope', 'bias']]
-    assert np.all(np.abs(bias - at_end) < 5 * sd) and np.all(sd < 0.05 * DEG) and np.all(np.abs(bias - at_start) > 0.4 * DEG)
-    entry, = calibration.statistics['uncorrected']
+    bias, sd = (
+        calibration.value('gyroscope', 'bias'),
+        calibration.sd[calibration.model.slices['gyroscope', 'bias']],
+    )
+    assert (
+        np.all(np.abs(bias - at_end) < 5 * sd)
+        and np.all(sd < 0.05 * DEG)
+        and np.all(np.abs(bias - at_start) > 0.4 * DEG)
+    )
+    (entry,) = calibration.statistics['uncorrected']
     assert (entry['effect'], entry['applied']) == ('gyro_bias_drift', END)
     assert 0.05 * DEG < min(entry['rms']) and max(entry['rms']) < 0.5 * DEG
     line = next(line for line in caveats(calibration) if 'gyro_bias_drift' in line)
     assert line in imu.compensate(samples, calibration, anyway=True).warnings
-    judged, every = calibration.proof['gyroscope']['windows'], sum(calibration.statistics['windows'].values())
+    judged, every = (
+        calibration.proof['gyroscope']['windows'],
+        sum(calibration.statistics['windows'].values()),
+    )
     assert 0.2 * every < judged < 0.5 * every
     assert calibration.proof['gyroscope']['after'] < 0.2 * DEG
     again = calibration_from_text(calibration_to_text(calibration))
-    np.testing.assert_array_equal(again.model.centre['gyro_warm_up'], calibration.model.centre['gyro_warm_up'])
+    np.testing.assert_array_equal(
+        again.model.centre['gyro_warm_up'], calibration.model.centre['gyro_warm_up']
+    )
     ref_start, ref_end = (model_output(again, time) for time in (0.0, duration))
     np.testing.assert_allclose(ref_end, bias, atol=1e-3 * DEG)
     np.testing.assert_allclose(ref_start - ref_end, at_start - at_end, atol=0.1 * DEG)
 
 
-@pytest.mark.parametrize('name, size, time_constant', [('gyro_bias_drift', 1.5 * DEG, 400.0), ('gyro_bias_trend', 0.4 * DEG, np.inf)])
-def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_windows(name, size, time_constant):
+@pytest.mark.parametrize(
+    'name, size, time_constant',
+    [('gyro_bias_drift', 1.5 * DEG, 400.0), ('gyro_bias_trend', 0.4 * DEG, np.inf)],
+)
+def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_windows(
+    name, size, time_constant
+):
     """Its value at the end holds neither afterwards nor in a session that repeats it."""
     samples, table, at_end, at_start, duration = drifting(size, time_constant)
     calibration = imu.calibrate(samples, table).calibration
-    entry, = calibration.statistics['uncorrected']
+    (entry,) = calibration.statistics['uncorrected']
     assert (entry['effect'], entry['applied']) == (name, MEAN)
     time = np.linspace(0.0, duration, 1000)
-    course = -size * np.expm1(-time / time_constant) if np.isfinite(time_constant) else size * time / duration
-    np.testing.assert_allclose(calibration.value('gyroscope', 'bias'), at_start + course.mean(), atol=0.03 * course[-1])
+    course = (
+        -size * np.expm1(-time / time_constant)
+        if np.isfinite(time_constant)
+        else size * time / duration
+    )
+    np.testing.assert_allclose(
+        calibration.value('gyroscope', 'bias'), at_start + course.mean(), atol=0.03 * course[-1]
+    )
     np.testing.assert_allclose(entry['rms'], course.std(), rtol=0.1)
-    assert calibration.proof['gyroscope']['windows'] > 0.5 * sum(calibration.statistics['windows'].values())
+    assert calibration.proof['gyroscope']['windows'] > 0.5 * sum(
+        calibration.statistics['windows'].values()
+    )
     assert not any('starts again' in line for line in caveats(calibration))
 
 
@@ -133,6 +210,7 @@ def model_output(calibration, time):
     """Return the output of the gyroscope of a calibration at rest at a time, rad/s, shape (3,)."""
     from imu_calibration.effects.forward_equations import sensor_output
     from imu_calibration.kinematics.rotations import Reference
+
     nothing = np.zeros((1, 3))
     ref = Reference(np.array([time]), np.eye(3)[None], nothing, nothing, nothing, 0.0)
     return sensor_output(calibration.model, 'gyroscope', calibration.values, ref=ref)[0]
@@ -140,11 +218,26 @@ def model_output(calibration, time):
 
 def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     """The bias contains its mean; without that the applied bias is off by the mean, here ten times the scatter about it."""
-    effect = term('by_angle', sensor='gyroscope', column='cos(0.1 * angle_1)', unit='rad/s', tolerance=1e-4, text='A formula.')
+    effect = term(
+        'by_angle',
+        sensor='gyroscope',
+        column='cos(0.1 * angle_1)',
+        unit='rad/s',
+        tolerance=1e-4,
+        text='A formula.',
+    )
     session = imu.simulate('quick', seed=5, **RATES)
     catalogue, mean = CATALOGUE.with_effects(effect), 0.5 * DEG
-    moved = replace(session.samples, imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + mean))
-    result = imu.calibrate(moved, session.table, catalogue=catalogue, gyroscope_model='bias+matrix+by_angle', model_as_asked=True).result
+    moved = replace(
+        session.samples, imu=replace(session.samples.imu, rate_s=session.samples.imu.rate_s + mean)
+    )
+    result = imu.calibrate(
+        moved,
+        session.table,
+        catalogue=catalogue,
+        gyroscope_model='bias+matrix+by_angle',
+        model_as_asked=True,
+    ).result
     calibration = result.calibration
     assert calibration.statistics['uncorrected'][0]['applied'] == MEAN
     truth = session.truth.value('gyroscope', 'bias') + mean
@@ -153,7 +246,11 @@ def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     assert calibration.proof['gyroscope']['after'] < 0.05 * DEG
     part = calibration.model.slices['gyroscope', 'by_angle']
     mean_column = calibration.model.centre['by_angle'][0]
-    np.testing.assert_allclose(calibration.value('gyroscope', 'bias') - uncentred, mean_column * calibration.values[part], rtol=1e-9)
+    np.testing.assert_allclose(
+        calibration.value('gyroscope', 'bias') - uncentred,
+        mean_column * calibration.values[part],
+        rtol=1e-9,
+    )
 
 
 def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
@@ -164,18 +261,28 @@ def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
     calibration = imu.calibrate(moved, gravity=GRAVITY).calibration
     step = calibration.value('gyroscope', 'bias') - truth[9:12]
     np.testing.assert_allclose(step, course[-1], atol=0.05 * DEG)
-    assert 'gyroscope.gyro_bias_drift.time_constant' not in calibration.held_reason   # its columns are taken at a point, not at its prior
+    assert (
+        'gyroscope.gyro_bias_drift.time_constant' not in calibration.held_reason
+    )  # its columns are taken at a point, not at its prior
     assert calibration.statistics['uncorrected'][0]['applied'] == END
     assert calibration.proof['accelerometer']['windows'] < 40 / 2
 
 
 def test_corrected_readings_travel_with_their_sample():
     from imu_calibration.preprocessing.window_finder import MotionGatherer
+
     session = imu.simulate('quick', seed=2, stamp_jitter_us=3000.0)
     block = session.samples
-    marked = replace(block, imu=replace(block.imu, corrected=np.hstack([2 * block.imu.force_s, 3 * block.imu.rate_s])))
+    marked = replace(
+        block,
+        imu=replace(block.imu, corrected=np.hstack([2 * block.imu.force_s, 3 * block.imu.rate_s])),
+    )
     windows = MotionGatherer(session.table, keep_unused=True).all_of([marked])
     assert sum(map(len, windows)) > 0.9 * len(block.imu)
     for window in windows:
-        np.testing.assert_array_equal(window.corrected, np.hstack([2 * window.force_s, 3 * window.rate_s]))
-    assert isinstance(block.imu, ImuSamples) and (block.temperature is None or isinstance(block.temperature, TemperatureSamples))
+        np.testing.assert_array_equal(
+            window.corrected, np.hstack([2 * window.force_s, 3 * window.rate_s])
+        )
+    assert isinstance(block.imu, ImuSamples) and (
+        block.temperature is None or isinstance(block.temperature, TemperatureSamples)
+    )

@@ -51,10 +51,18 @@ def asked(late):
 
 def test_a_lag_is_taken_into_the_model_and_said_in_one_line(late, asked):
     session, table = late
-    place, true = asked.calibration.param_names.index('gyroscope.matrix.xx'), session.truth['gyroscope'].matrix[0, 0]
+    place, true = (
+        asked.calibration.param_names.index('gyroscope.matrix.xx'),
+        session.truth['gyroscope'].matrix[0, 0],
+    )
     assert asked.calibration.statistics['added'] == ['time_offset']
-    assert float(asked.calibration.value('reference', 'time_offset')) == pytest.approx(0.012, abs=1e-3)
-    assert abs(asked.calibration.values[place] - true) < 4 * asked.calibration.sd[place] and abs(asked.calibration.values[place] - true) < 2e-3
+    assert float(asked.calibration.value('reference', 'time_offset')) == pytest.approx(
+        0.012, abs=1e-3
+    )
+    assert (
+        abs(asked.calibration.values[place] - true) < 4 * asked.calibration.sd[place]
+        and abs(asked.calibration.values[place] - true) < 2e-3
+    )
     assert len([line for line in asked.verdict.lines() if 'time_offset (1' in line]) == 1
     plain = imu.calibrate(session.block, table, model_as_asked=True).calibration
     assert 'added' not in plain.statistics and OFFSET not in plain.param_names
@@ -67,8 +75,10 @@ def test_diagnose_hands_over_what_calibrate_does(late, asked):
     np.testing.assert_array_equal(found.calibration.values, asked.calibration.values)
     np.testing.assert_array_equal(found.calibration.sd, asked.calibration.sd)
     value, sd, _ = found.findings[0].parameters[OFFSET]
-    assert (value, sd) == (float(asked.calibration.value('reference', 'time_offset')),
-                           asked.calibration.sd[asked.calibration.param_names.index(OFFSET)])
+    assert (value, sd) == (
+        float(asked.calibration.value('reference', 'time_offset')),
+        asked.calibration.sd[asked.calibration.param_names.index(OFFSET)],
+    )
 
 
 def test_a_clean_session_adds_nothing():
@@ -86,19 +96,39 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
         made = []
         for k, window in enumerate(windows):
             values = model.start()
-            values[model.slices['gyroscope', 'gyro_g_sensitivity']] = 1e-3 if k >= share * len(windows) else 0.0
-            outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out,
-                       sd in zip(predict(model, values, TABLE, motion=window.motion), (2e-2, 2e-3))]
+            values[model.slices['gyroscope', 'gyro_g_sensitivity']] = (
+                1e-3 if k >= share * len(windows) else 0.0
+            )
+            outputs = [
+                out + rng.normal(0, sd, (len(window.time), 3))
+                for out, sd in zip(
+                    predict(model, values, TABLE, motion=window.motion), (2e-2, 2e-3)
+                )
+            ]
             made.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
         return made
+
     bare = SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES)
-    whole, half = (ResidualAnalysis.of(investigate(measured(share), TABLE, bare), TABLE) for share in (0.0, 0.5))
-    assert [question.name for question in whole.named] == ['gyro_g_sensitivity'] and not whole.unstable
+    whole, half = (
+        ResidualAnalysis.of(investigate(measured(share), TABLE, bare), TABLE)
+        for share in (0.0, 0.5)
+    )
+    assert [question.name for question in whole.named] == [
+        'gyro_g_sensitivity'
+    ] and not whole.unstable
     assert not half.named
-    question = next(question for question in half.problem.questions if question.name == 'gyro_g_sensitivity')
-    assert not half.problem.agrees_in_halves([question], question) and half.problem.search.score([], question).significant
+    question = next(
+        question for question in half.problem.questions if question.name == 'gyro_g_sensitivity'
+    )
+    assert (
+        not half.problem.agrees_in_halves([question], question)
+        and half.problem.search.score([], question).significant
+    )
     added = _disagreement(replace(half, unstable=[question]), bare.param_names)
-    assert np.all(np.linalg.eigvalsh(added) > -1e-18) and np.sqrt(np.diag(added)[bare.slices['gyroscope', 'bias']]).max() > 1e-4
+    assert (
+        np.all(np.linalg.eigvalsh(added) > -1e-18)
+        and np.sqrt(np.diag(added)[bare.slices['gyroscope', 'bias']]).max() > 1e-4
+    )
     assert not _disagreement(whole, bare.param_names).any()
 
 
@@ -123,14 +153,21 @@ def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     used = [window for window in windows if window.kind != 'unused']
     effects = questions.without_saturation(questions.testable_effects(model, table, used)[0])
-    linearised_at = partial(LinearisedProblem, used, table, model, effects=effects, locked=np.zeros(len(used), bool))
+    linearised_at = partial(
+        LinearisedProblem, used, table, model, effects=effects, locked=np.zeros(len(used), bool)
+    )
     first = linearised_at()
     by_name = {question.name: question for question in first.questions}
     for start in ('time_offset', 'gyro_bandwidth'):
         settled, near = settle_rivals(first, [by_name[start]], linearised_at)
         assert settled.search.run()[0].name == 'time_offset' and not near
     lag = linearised_at(point=first.point([by_name['gyro_bandwidth']]))
-    assert lag.values(same_questions(lag, [by_name['gyro_bandwidth']]))[lag.space.names.index('gyroscope.gyro_bandwidth.time_constant')] > 0.01
+    assert (
+        lag.values(same_questions(lag, [by_name['gyro_bandwidth']]))[
+            lag.space.names.index('gyroscope.gyro_bandwidth.time_constant')
+        ]
+        > 0.01
+    )
     assert settle_rivals(first, [by_name['gyro_quadratic']], linearised_at) == (first, [])
 
 
@@ -155,7 +192,10 @@ def test_a_rival_widens_by_its_weight_and_is_named_beside_the_finding(late, exam
     names = found.problem.baseline.param_names
     question = found.named[0]
     rivals = [Rival(question, question, behind, {names[0]: 0.3}) for behind in (0.0, 800.0)]
-    added = [_disagreement(replace(found, unstable=[], rejected=[], rivals=[rival]), names)[0, 0] for rival in rivals]
+    added = [
+        _disagreement(replace(found, unstable=[], rejected=[], rivals=[rival]), names)[0, 0]
+        for rival in rivals
+    ]
     assert added[0] == pytest.approx(0.5 * 0.3**2) and added[1] < 1e-200
     beside = replace(found, rivals=[replace(rivals[0], other=found.problem.questions[0])])
     mates = build_diagnosis(late[1], beside).findings[0].indistinguishable_from
@@ -169,41 +209,85 @@ def test_what_likelihood_asks_for_and_nobody_is_sure_of_is_not_named_but_widens(
     assert not found.named and 'time_offset' in [question.name for question in found.rejected]
     names = found.problem.baseline.param_names
     added = _disagreement(found, names)
-    assert np.sqrt(added[names.index('gyroscope.matrix.xx'), names.index('gyroscope.matrix.xx')]) > 3e-3
-    assert not _disagreement(replace(found, rejected=[]), names)[names.index('gyroscope.matrix.xx')].any()
+    assert (
+        np.sqrt(added[names.index('gyroscope.matrix.xx'), names.index('gyroscope.matrix.xx')])
+        > 3e-3
+    )
+    assert not _disagreement(replace(found, rejected=[]), names)[
+        names.index('gyroscope.matrix.xx')
+    ].any()
 
 
 def test_a_finding_of_the_model_as_asked_must_stand_out_too(examined, monkeypatch):
     found = examined
-    solution = extended_solution(found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named)
+    solution = extended_solution(
+        found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named
+    )
     assert by_evidence._without_faint(found, solution) is found
-    monkeypatch.setattr(by_evidence, 'stands_out', lambda solution, question: question is not found.named[0])
+    monkeypatch.setattr(
+        by_evidence, 'stands_out', lambda solution, question: question is not found.named[0]
+    )
     less = by_evidence._without_faint(found, solution)
-    assert found.named[0] not in less.named and list(less.unstable) == [*found.unstable, found.named[0]]
+    assert found.named[0] not in less.named and list(less.unstable) == [
+        *found.unstable,
+        found.named[0],
+    ]
 
 
-def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out(late, asked, examined, monkeypatch):
+def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_is_left_out(
+    late, asked, examined, monkeypatch
+):
     found = examined
-    solution = extended_solution(found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named)
+    solution = extended_solution(
+        found.problem.space, found.problem.noise, found.problem.baseline, chosen=found.named
+    )
     question = found.named[0]
-    assert stands_out(solution, question) and not stands_out(replace(solution, terms={'noise': 1e9 * solution.covariance}), question)
+    assert stands_out(solution, question) and not stands_out(
+        replace(solution, terms={'noise': 1e9 * solution.covariance}), question
+    )
     part = solution.model.slices[question.sensor, question.name]
-    doubled = SimpleNamespace(model=SimpleNamespace(slices={(question.sensor, question.name): slice(0, 2)}), held=np.zeros(2, bool),
-                              values=np.full(2, solution.values[part.start]), covariance=np.full((2, 2), 1e-12))
-    pair = SimpleNamespace(sensor=question.sensor, name=question.name, effect=replace(question.effect, components=('x', 'y')))
+    doubled = SimpleNamespace(
+        model=SimpleNamespace(slices={(question.sensor, question.name): slice(0, 2)}),
+        held=np.zeros(2, bool),
+        values=np.full(2, solution.values[part.start]),
+        covariance=np.full((2, 2), 1e-12),
+    )
+    pair = SimpleNamespace(
+        sensor=question.sensor,
+        name=question.name,
+        effect=replace(question.effect, components=('x', 'y')),
+    )
     monkeypatch.setattr(by_evidence, 'make_prior', lambda model: SimpleNamespace(mean=np.zeros(2)))
-    assert stands_out(doubled, pair)   # a convention makes covariances of whole effects singular
+    assert stands_out(doubled, pair)  # a convention makes covariances of whole effects singular
+
     def of(distances, correlation, sd=1e-6):
         shape = np.full((2, 2), correlation) + (1 - correlation) * np.eye(2)
-        return SimpleNamespace(model=doubled.model, held=doubled.held, values=sd * np.array(distances), covariance=sd**2 * shape)
+        return SimpleNamespace(
+            model=doubled.model,
+            held=doubled.held,
+            values=sd * np.array(distances),
+            covariance=sd**2 * shape,
+        )
+
     assert stands_out(of([6.0, 1.0], 0.0), pair)
-    assert not stands_out(of([2.5, -2.5], 0.9), pair)   # significant together (chi2 125), but no coefficient is
-    assert not stands_out(of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair)   # a size of no instrument
+    assert not stands_out(
+        of([2.5, -2.5], 0.9), pair
+    )  # significant together (chi2 125), but no coefficient is
+    assert not stands_out(
+        of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair
+    )  # a size of no instrument
     monkeypatch.undo()
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
     faint = imu.calibrate(late[0].block, late[1]).calibration
-    assert 'time_offset' in faint.statistics['denied'] and 'added' not in faint.statistics and OFFSET not in faint.param_names
-    place, was = (calibration.param_names.index('gyroscope.matrix.xx') for calibration in (faint, asked.calibration))
+    assert (
+        'time_offset' in faint.statistics['denied']
+        and 'added' not in faint.statistics
+        and OFFSET not in faint.param_names
+    )
+    place, was = (
+        calibration.param_names.index('gyroscope.matrix.xx')
+        for calibration in (faint, asked.calibration)
+    )
     assert faint.sd[place] > 5 * asked.calibration.sd[was]
 
 
@@ -211,12 +295,17 @@ def test_an_effect_that_is_removed_as_faint_leaves_an_unexplained_residual(monke
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
     session = make_session(5, {'accel_quadratic': 2e-4}, 'realistic')
     found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration.statistics
-    assert found['denied'] == ['accel_quadratic'] and 2e-3 < found['unexplained']['accelerometer']['rms'] < 2e-2
+    assert (
+        found['denied'] == ['accel_quadratic']
+        and 2e-3 < found['unexplained']['accelerometer']['rms'] < 2e-2
+    )
 
 
 def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     """Three quarters of a response to the cube of a force look like one to the force: with a formula for the cube that name is in no model."""
-    monkeypatch.setattr(by_evidence, 'stands_out', lambda *some: True)   # another guard, which sees to it here too
+    monkeypatch.setattr(
+        by_evidence, 'stands_out', lambda *some: True
+    )  # another guard, which sees to it here too
     session = make_session(141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141))
     found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
     assert not {'added', 'denied'} & set(found.statistics)
@@ -229,11 +318,20 @@ def test_a_bias_is_not_known_better_than_windows_agree_on_it():
     cause = Beyond('backlash', 2)
     session = make_session(2, None, 'realistic', cause=cause)
     calibration = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
-    axis, = cause.axes
+    (axis,) = cause.axes
     places = {name: calibration.param_names.index(f'accelerometer.bias.{name}') for name in 'xyz'}
-    errors = {name: abs(calibration.values[place] - session.truth['accelerometer'].bias['xyz'.index(name)]) for name, place in places.items()}
+    errors = {
+        name: abs(
+            calibration.values[place] - session.truth['accelerometer'].bias['xyz'.index(name)]
+        )
+        for name, place in places.items()
+    }
     assert errors[axis] < 2.5 * calibration.sd[places[axis]] and errors[axis] > 0.01
-    assert all(calibration.sd[places[axis]] > 3 * calibration.sd[places[name]] for name in places if name != axis), 'the others are as good as ever'
+    assert all(
+        calibration.sd[places[axis]] > 3 * calibration.sd[places[name]]
+        for name in places
+        if name != axis
+    ), 'the others are as good as ever'
 
 
 def test_what_a_rest_may_move_biases_by():
@@ -241,18 +339,31 @@ def test_what_a_rest_may_move_biases_by():
     model, noise = SensorModel(), np.full((400, 3), 3.0)
     residual = np.outer(np.where(np.arange(400) % 2, 5.0, -5.0), [1.0, 1.0, 0.1])
     rest = Unexplained(True, 4.0, 9.0, None, 0.0, residual, noise, axes=('y',))
-    assert biases_off(model, {'gyroscope': rest, 'accelerometer': replace(rest, significant=False)}) == [{'gyroscope.bias.y': pytest.approx(4.0)}]
-    assert biases_off(model, {'gyroscope': replace(rest, axes=('z',))}) == [{'gyroscope.bias.z': 0.0}]
+    assert biases_off(
+        model, {'gyroscope': rest, 'accelerometer': replace(rest, significant=False)}
+    ) == [{'gyroscope.bias.y': pytest.approx(4.0)}]
+    assert biases_off(model, {'gyroscope': replace(rest, axes=('z',))}) == [
+        {'gyroscope.bias.z': 0.0}
+    ]
 
 
 @pytest.mark.long
 def test_a_bias_that_steps_on_every_axis_passes_for_noise_and_is_told():
     session = make_session(7, {'knock_step': 0.05}, 'realistic')
     result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))
-    assert not result.diagnosis.findings and not result.diagnosis.unexplained['accelerometer'].significant
-    motion, bias = result.notes   # residuals of windows in motion, scatter of the means
+    assert (
+        not result.diagnosis.findings
+        and not result.diagnosis.unexplained['accelerometer'].significant
+    )
+    motion, bias = result.notes  # residuals of windows in motion, scatter of the means
     for note in (motion, bias):
-        assert 'accelerometer' in note and f'note: {note}' in result.lines and note[1:] in diagnosis_report(result)
+        assert (
+            'accelerometer' in note
+            and f'note: {note}' in result.lines
+            and note[1:] in diagnosis_report(result)
+        )
     assert result.document['notes'] == [motion, bias]
     plain = make_session(7, None, 'realistic')
-    assert not diagnose_recording(lambda: iter([plain.block]), Table.from_mapping(plain.table)).notes
+    assert not diagnose_recording(
+        lambda: iter([plain.block]), Table.from_mapping(plain.table)
+    ).notes

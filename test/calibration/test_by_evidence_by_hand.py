@@ -32,8 +32,11 @@ def asked(bent):
 
 def rows_missed(calibration, truth):
     """Errors of the gyroscope's matrix in reported standard deviations."""
-    return [abs(calibration.values[k] - true) / calibration.sd[k] for name, true in zip(PARAM_NAMES[ROWS], truth[ROWS])
-            for k in [calibration.param_names.index(name)]]
+    return [
+        abs(calibration.values[k] - true) / calibration.sd[k]
+        for name, true in zip(PARAM_NAMES[ROWS], truth[ROWS])
+        for k in [calibration.param_names.index(name)]
+    ]
 
 
 def test_what_the_turns_demand_is_taken_in_and_said_in_one_line(bent, asked):
@@ -41,7 +44,9 @@ def test_what_the_turns_demand_is_taken_in_and_said_in_one_line(bent, asked):
     assert len([line for line in asked.verdict.lines() if f'{QUADRATIC} (' in line]) == 1
     assert max(rows_missed(asked.calibration, bent[1])) < 4.5
     plain = imu.calibrate(SampleBlock(bent[0]), gravity=GRAVITY, model_as_asked=True).calibration
-    assert 'added' not in plain.statistics and not any(QUADRATIC in name for name in plain.param_names)
+    assert 'added' not in plain.statistics and not any(
+        QUADRATIC in name for name in plain.param_names
+    )
 
 
 def test_diagnose_hands_over_what_calibrate_does(bent, asked):
@@ -62,17 +67,27 @@ def test_live_it_is_in_the_model_as_well(bent, asked):
     assert result.calibration.statistics['added'] == [QUADRATIC]
     assert_same(result, asked.result)
     residual = live.residuals(run(make_live(), bent[0]))
-    assert np.abs(residual.rate_s).max() < 5e-3   # noise of a mean over two seconds, 2e-4, and the bias of each pose
+    assert (
+        np.abs(residual.rate_s).max() < 5e-3
+    )  # noise of a mean over two seconds, 2e-4, and the bias of each pose
 
 
 def test_what_only_one_half_shows_is_left_out_and_widens():
     """What goes with the square of the rate grows threefold after the middle: something has changed, and it is no property of the sensor."""
+
     def spoil(force, rate, time, pose):
-        return NOTHING, HIDDEN[QUADRATIC](force, rate, time, pose)[1] * (1 + 2 * (pose > 17)[:, None])
+        return NOTHING, HIDDEN[QUADRATIC](force, rate, time, pose)[1] * (
+            1 + 2 * (pose > 17)[:, None]
+        )
+
     samples, ranges, _ = simulate(31, n_poses=36, spoil=spoil)
     data, options = gather_by_hand(samples, ranges), HandOptions(GRAVITY)
     evident = solve_by_evidence(data, options)
-    assert set(evident.changes.unstable) <= {QUADRATIC, 'gyro_scale_asymmetry'} and evident.changes.unstable and evident.changes.added == ()
+    assert (
+        set(evident.changes.unstable) <= {QUADRATIC, 'gyro_scale_asymmetry'}
+        and evident.changes.unstable
+        and evident.changes.added == ()
+    )
     plain = solve_by_hand(data, options)
     np.testing.assert_array_equal(evident.hand.values, plain.values)
     grown = evident.hand.sd[ROWS] / plain.sd[ROWS]
@@ -94,4 +109,6 @@ def test_nothing_is_added_where_nothing_is_hidden(seed):
     data = gather_by_hand(samples, ranges)
     evident = solve_by_evidence(data, HandOptions(GRAVITY))
     assert evident.changes.to_mapping() == {}
-    np.testing.assert_array_equal(evident.hand.values, solve_by_hand(data, HandOptions(GRAVITY)).values)
+    np.testing.assert_array_equal(
+        evident.hand.values, solve_by_hand(data, HandOptions(GRAVITY)).values
+    )

@@ -33,7 +33,11 @@ def calibrated(pair):
 def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
     found = check(pair.second.block, calibrated.calibration, Table.from_mapping(pair.table))
     assert found.helps and found.exit_code == 0
-    assert all(part['after'] < 0.6 * part['before'] for entry in found.proof.values() for part in entry['regimes'].values())
+    assert all(
+        part['after'] < 0.6 * part['before']
+        for entry in found.proof.values()
+        for part in entry['regimes'].values()
+    )
 
 
 def test_a_file_of_another_imu_does_not_help(pair, calibrated):
@@ -51,7 +55,10 @@ def test_a_bias_that_moved_is_named(pair, calibrated):
 
 def test_the_recording_that_a_file_was_made_from_is_noticed(pair, calibrated):
     table = Table.from_mapping(pair.table)
-    assert check(pair.first.block, calibrated.calibration, table).notes and not check(pair.second.block, calibrated.calibration, table).notes
+    assert (
+        check(pair.first.block, calibrated.calibration, table).notes
+        and not check(pair.second.block, calibrated.calibration, table).notes
+    )
 
 
 def test_nothing_to_judge_on_is_no_proof():
@@ -68,7 +75,9 @@ def test_the_verb_prints_errors_and_answers_with_its_exit_code(capsys, tmp_path,
     assert Regime.FAST in out
     spoiled = calibrated.calibration.values.copy()
     spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.5
-    (tmp_path / 'calibration.yaml').write_text(calibration_to_text(replace(calibrated.calibration, values=spoiled)))
+    (tmp_path / 'calibration.yaml').write_text(
+        calibration_to_text(replace(calibrated.calibration, values=spoiled))
+    )
     assert main(['check', bag, '--calibration', file, '--table', table]) == 3
 
 
@@ -76,7 +85,9 @@ def test_an_earlier_calibration_is_proven_beside_a_new_one(pair, calibrated):
     spoiled = calibrated.calibration.values.copy()
     spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.05
     earlier = replace(calibrated.calibration, values=spoiled)
-    found = calibrate(pair.second.block, Table.from_mapping(pair.table), model_as_asked=True, earlier=earlier)
+    found = calibrate(
+        pair.second.block, Table.from_mapping(pair.table), model_as_asked=True, earlier=earlier
+    )
     entry = found.calibration.proof['gyroscope']
     assert entry['earlier']['after'] > 3 * entry['after']
     with refused(InputError, 'table_missing'):

@@ -36,14 +36,21 @@ def test_a_good_file_helps_at_rest_and_in_turns(second, calibrated):
     found = check(SampleBlock(second), calibrated, gravity=GRAVITY)
     assert found.helps and found.exit_code == 0
     accelerometer, gyroscope = found.proof['accelerometer'], found.proof['gyroscope']
-    assert accelerometer['after'] < 0.01 < 0.05 < accelerometer['before']       # scatter of the poses 2 mm/s^2, biases 0.2 m/s^2
+    assert (
+        accelerometer['after'] < 0.01 < 0.05 < accelerometer['before']
+    )  # scatter of the poses 2 mm/s^2, biases 0.2 m/s^2
     assert gyroscope['unit'] == 'rad per turn' and gyroscope['after'] < 0.3 * gyroscope['before']
-    assert gyroscope['regimes']['rest']['unit'] == 'rad/s' and gyroscope['regimes']['rest']['after'] < 1e-3
+    assert (
+        gyroscope['regimes']['rest']['unit'] == 'rad/s'
+        and gyroscope['regimes']['rest']['after'] < 1e-3
+    )
     assert accelerometer['windows'] == 12 and gyroscope['windows'] == 11
 
 
 def test_a_bias_that_moved_is_named(second, calibrated):
-    moved = second.rate_s - 3 * calibrated.value('gyroscope', 'bias')   # it has passed zero, so that nothing at all would now be better
+    moved = second.rate_s - 3 * calibrated.value(
+        'gyroscope', 'bias'
+    )  # it has passed zero, so that nothing at all would now be better
     found = check(SampleBlock(replace(second, rate_s=moved)), calibrated, gravity=GRAVITY)
     assert found.exit_code == 3 and found.proof['gyroscope']['regimes']['rest']['ci95'][0] > 1
     assert 'bias' in found.lines[1]
@@ -58,8 +65,14 @@ def test_turns_alone_tell_a_wrong_scale_of_the_gyroscope(second, calibrated):
     """At rest nothing is the matter; the angle after a turn of two radians errs by five per cent."""
     bias = calibrated.value('gyroscope', 'bias')
     wrong = replace(second, rate_s=bias + 1.05 * (second.rate_s - bias))
-    right, found = (check(SampleBlock(imu), calibrated, gravity=GRAVITY).proof['gyroscope']['regimes'] for imu in (second, wrong))
-    assert found['rest']['after'] == pytest.approx(right['rest']['after'], rel=0.1) and found['turns']['after'] > 5 * right['turns']['after']
+    right, found = (
+        check(SampleBlock(imu), calibrated, gravity=GRAVITY).proof['gyroscope']['regimes']
+        for imu in (second, wrong)
+    )
+    assert (
+        found['rest']['after'] == pytest.approx(right['rest']['after'], rel=0.1)
+        and found['turns']['after'] > 5 * right['turns']['after']
+    )
 
 
 def test_the_gravity_of_the_calibration_is_taken_and_said(second, calibrated):
@@ -72,9 +85,16 @@ def test_temperatures_reach_the_correction(first):
     imu, ranges, truth = hold_and_turn(5, rate_hz=50.0, n_poses=24)
     warm, temperature_c = warmed_up(imu, 5, rate=0.05, kelvin=10.0)
     block = SampleBlock(warm, temperature=TemperatureSamples(warm.stamp_ns, temperature_c))
-    asked = calibrate(block, gravity=GRAVITY, gyroscope_model='bias+matrix+gyro_thermal_bias', model_as_asked=True).calibration
-    plain = calibrate(block, gravity=GRAVITY, gyroscope_model='bias+matrix', model_as_asked=True).calibration
-    errors = [check(block, found, gravity=GRAVITY).proof['gyroscope']['regimes']['rest']['after'] for found in (asked, plain)]
+    asked = calibrate(
+        block, gravity=GRAVITY, gyroscope_model='bias+matrix+gyro_thermal_bias', model_as_asked=True
+    ).calibration
+    plain = calibrate(
+        block, gravity=GRAVITY, gyroscope_model='bias+matrix', model_as_asked=True
+    ).calibration
+    errors = [
+        check(block, found, gravity=GRAVITY).proof['gyroscope']['regimes']['rest']['after']
+        for found in (asked, plain)
+    ]
     assert errors[0] < 0.3 * errors[1]
 
 

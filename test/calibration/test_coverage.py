@@ -6,10 +6,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.advice import WEIGHTS, HandStep, _rollout, direction_words, foretold, shortest_turn
-from imu_calibration.calibration.coverage import DIRECTIONS, MIN_CELL_WORTH, Coverage, Step, label_of, table_coverage
+from imu_calibration.calibration.advice import (
+    WEIGHTS,
+    HandStep,
+    _rollout,
+    direction_words,
+    foretold,
+    shortest_turn,
+)
+from imu_calibration.calibration.coverage import (
+    DIRECTIONS,
+    MIN_CELL_WORTH,
+    Coverage,
+    Step,
+    label_of,
+    table_coverage,
+)
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings
-from imu_calibration.calibration.live_poses import EMPTY_SCAN, LiveByHand, hand_coverage, knowledge_of
+from imu_calibration.calibration.live_poses import (
+    EMPTY_SCAN,
+    LiveByHand,
+    hand_coverage,
+    knowledge_of,
+)
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.estimation.observability import MOTIONS, motions_about
@@ -40,12 +59,15 @@ def knowing(*ups, factor=1.0):
 
 def test_the_shortest_turn_brings_the_wanted_direction_up():
     from scipy.spatial.transform import Rotation
+
     rng = np.random.default_rng(2)
     for _ in range(20):
         now, wanted = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         axis, angle = shortest_turn(now, wanted)
         # What was up in the sensor frame turns backwards when the sensor turns forwards.
-        np.testing.assert_allclose(Rotation.from_rotvec(axis * angle).inv().apply(now), wanted, atol=1e-12)
+        np.testing.assert_allclose(
+            Rotation.from_rotvec(axis * angle).inv().apply(now), wanted, atol=1e-12
+        )
     axis, angle = shortest_turn(np.array([0, 0, 1.0]), np.array([0, 0, -1.0]))
     assert angle == pytest.approx(np.pi) and axis[2] == pytest.approx(0)
 
@@ -59,7 +81,9 @@ def test_at_first_everything_is_worth_having_and_the_time_is_foretold():
 
 def test_what_has_been_held_many_times_is_worth_less_than_what_has_not():
     knowledge = knowing(*[(1, 0, 0), (0, 1, 0)] * 10, (0, 0, 1))
-    worth = dict(zip(map(tuple, np.sign(DIRECTIONS).astype(int).tolist()), knowledge.best()[1], strict=True))
+    worth = dict(
+        zip(map(tuple, np.sign(DIRECTIONS).astype(int).tolist()), knowledge.best()[1], strict=True)
+    )
     assert max(worth[1, 0, 0], worth[0, 1, 0]) < 0.5 * worth[-1, 0, 0]
 
 
@@ -73,8 +97,14 @@ def test_an_attitude_that_nobody_took_is_worth_nothing_once_everything_is_known(
 def test_what_is_foretold_takes_off_what_is_missing():
     knowledge, steps = knowing((0, 0, 1)), foretold(knowing((0, 0, 1)))
     assert 8 <= len(steps) <= 20
-    hasty = [_rollout(knowing((0, 0, 1)), weight)[0] for weight in WEIGHTS]   # neither way of choosing is sooner at its end than what is foretold
-    assert sum(step.seconds for step in steps) == min(sum(step.seconds for step in plan) for plan in hasty) < max(sum(s.seconds for s in p) for p in hasty)
+    hasty = [
+        _rollout(knowing((0, 0, 1)), weight)[0] for weight in WEIGHTS
+    ]  # neither way of choosing is sooner at its end than what is foretold
+    assert (
+        sum(step.seconds for step in steps)
+        == min(sum(step.seconds for step in plan) for plan in hasty)
+        < max(sum(s.seconds for s in p) for p in hasty)
+    )
     before = float(knowledge.missing(knowledge.information))
     for step in steps:
         knowledge = knowledge.then(step)
@@ -86,7 +116,9 @@ def test_what_is_foretold_takes_off_what_is_missing():
 
 def by_the_picture(person, most=40):
     """(seconds planned, Coverage in the end) of a person who looks at nothing but the picture."""
-    live = LiveByHand(CalibrationOptions(), LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0)
+    live = LiveByHand(
+        CalibrationOptions(), LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0
+    )
     planned = live.coverage().seconds
     live.push(SampleBlock(person.hold()))
     for _ in range(most):
@@ -114,7 +146,11 @@ def test_who_follows_only_the_picture_has_everything_determined_in_time():
 
 
 def test_on_a_table_the_picture_shows_what_the_motion_did():
-    found = calibrate([str(ROOT / 'bags/sample_session')], str(ROOT / 'bags/sample_session/table.yaml'), model_as_asked=True)
+    found = calibrate(
+        [str(ROOT / 'bags/sample_session')],
+        str(ROOT / 'bags/sample_session/table.yaml'),
+        model_as_asked=True,
+    )
     shown = table_coverage(found.result, 'imu_link')
     assert shown.worth.shape == (26,) and (shown.worth >= 0).all() and (shown.worth <= 1).all()
     assert len(shown.seen) > 4 and np.allclose(np.linalg.norm(shown.seen, axis=1), 1)
@@ -128,6 +164,7 @@ def begun():
 
     from worlds.live_sessions import OPTIONS as TABLE_OPTIONS
     from worlds.live_sessions import TABLE, make_session
+
     imu, joints, _, _ = make_session(3, profile='quick')
     live, end = LiveCalibration(TABLE, TABLE_OPTIONS), imu.stamp_ns[0] + 20_000_000_000
     live.push(SampleBlock(imu.select(imu.stamp_ns < end), joints.select(joints.stamp_ns < end)))
@@ -138,22 +175,35 @@ def _sd_after(information, prior):
     """By the rows themselves; the gauge as exact as a millionth of a metre."""
     values, vectors = np.linalg.eigh(information)
     gauge = 1e-6 * prior.gauge
-    rows = np.concatenate([np.sqrt(np.clip(values, 0, None))[:, None] * vectors.T, np.diag(1 / prior.sd), gauge])
-    return np.sqrt((np.linalg.inv(np.linalg.qr(rows)[1])**2).sum(axis=1))
+    rows = np.concatenate(
+        [np.sqrt(np.clip(values, 0, None))[:, None] * vectors.T, np.diag(1 / prior.sd), gauge]
+    )
+    return np.sqrt((np.linalg.inv(np.linalg.qr(rows)[1]) ** 2).sum(axis=1))
 
 
 def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
     """What they would add to the information is added, one after the other; the first is the next one."""
     from imu_calibration.estimation.observability import added_information
     from imu_calibration.estimation.weighted_system import make_prior
+
     live, result = begun
     shown, solution = live.coverage(), result.solution
-    assert result.needed and 0 < shown.seconds < 600 and shown.next.text in {motion.text for motion in MOTIONS}
+    assert (
+        result.needed
+        and 0 < shown.seconds < 600
+        and shown.next.text in {motion.text for motion in MOTIONS}
+    )
     assert label_of(shown)[2] == f'{shown.next.text}, about {shown.seconds:.0f} s left'
-    lengths, prior, first = {motion.text: motion.seconds for motion in MOTIONS}, make_prior(solution.model), shown.next.text
+    lengths, prior, first = (
+        {motion.text: motion.seconds for motion in MOTIONS},
+        make_prior(solution.model),
+        shown.next.text,
+    )
     if shown.seconds == pytest.approx(lengths[first]):
         [motion] = [motion for motion in MOTIONS if motion.text == first]
-        more = added_information(solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity)
+        more = added_information(
+            solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity
+        )
         before, after = (_sd_after(solution.information + each, prior) for each in (0 * more, more))
         sd = after * np.maximum(result.calibration.sd / before, 1)
         assert (sd <= result.tolerances)[np.array(result.model.requested)].all()
@@ -161,7 +211,10 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
 
 def test_a_table_with_one_joint_is_told_no_seconds_of_motions_that_it_cannot_do(begun, monkeypatch):
     live, result = begun
-    monkeypatch.setattr('imu_calibration.calibration.coverage.possible_motions', lambda table: motions_about([0.6, 0.0, 0.8], [0.0, 0.0, 1.0]))
+    monkeypatch.setattr(
+        'imu_calibration.calibration.coverage.possible_motions',
+        lambda table: motions_about([0.6, 0.0, 0.8], [0.0, 0.0, 1.0]),
+    )
     shown = table_coverage(result)
     assert np.isnan(shown.seconds) and shown.next.text and 'left' not in label_of(shown)[2]
 
@@ -174,6 +227,7 @@ def picture(coverage):
     from builtin_interfaces.msg import Time
 
     from imu_calibration.nodes.calibration_status import markers_of
+
     made = {}
     for marker in markers_of(coverage, Time(sec=3)).markers:
         made.setdefault(marker.ns, []).append(marker)
@@ -182,10 +236,19 @@ def picture(coverage):
 
 def test_markers_carry_frame_cells_arrow_and_time():
     shown, now = start(), np.array([0, 0, 1.0])
-    shown = replace(shown, next=replace(shown.next, axis=shortest_turn(now, shown.next.up)[0], angle=shortest_turn(now, shown.next.up)[1]))
+    shown = replace(
+        shown,
+        next=replace(
+            shown.next,
+            axis=shortest_turn(now, shown.next.up)[0],
+            angle=shortest_turn(now, shown.next.up)[1],
+        ),
+    )
     shown = replace(shown, worth=np.where(DIRECTIONS @ now > 0.9, 0.0, shown.worth))
     made = picture(replace(shown, frame_id='my_imu', seen=np.eye(3), up=now))
-    assert {marker.header.frame_id for markers in made.values() for marker in markers} == {'my_imu'} and made['all'][0].action == made['all'][0].DELETEALL
+    assert {marker.header.frame_id for markers in made.values() for marker in markers} == {
+        'my_imu'
+    } and made['all'][0].action == made['all'][0].DELETEALL
     assert len(made['cells']) == 26 and len(made['seen'][0].points) == 3 and 'turn' in made
     best = int(np.argmax(shown.worth))
     sizes = [marker.scale.x for marker in made['cells']]
@@ -199,29 +262,53 @@ def test_markers_carry_frame_cells_arrow_and_time():
 def test_when_all_is_done_every_cell_is_green_and_the_text_says_so():
     done = Coverage(np.zeros(26), np.eye(3), np.eye(3)[0], Step(''), 0.0, True, 0.01 * np.eye(3))
     made = picture(done)
-    assert made['text'][0].text == label_of(done)[2] and 'next' not in made and len(made['arms']) == 3
-    assert len({(m.color.r, m.color.g, m.scale.x) for m in made['cells']}) == 1 and made['cells'][0].color.g > made['cells'][0].color.r
+    assert (
+        made['text'][0].text == label_of(done)[2] and 'next' not in made and len(made['arms']) == 3
+    )
+    assert (
+        len({(m.color.r, m.color.g, m.scale.x) for m in made['cells']}) == 1
+        and made['cells'][0].color.g > made['cells'][0].color.r
+    )
 
 
 def test_the_configuration_of_rviz_shows_the_topic_as_it_is_published():
     """By the names that rviz_default_plugins and rviz_common declare (plugins_description.xml of both)."""
     import yaml
-    known = {'rviz_common/Displays', 'rviz_common/Views', 'rviz_default_plugins/Axes', 'rviz_default_plugins/MarkerArray', 'rviz_default_plugins/MoveCamera',
-             'rviz_default_plugins/Orbit', ''}
+
+    known = {
+        'rviz_common/Displays',
+        'rviz_common/Views',
+        'rviz_default_plugins/Axes',
+        'rviz_default_plugins/MarkerArray',
+        'rviz_default_plugins/MoveCamera',
+        'rviz_default_plugins/Orbit',
+        '',
+    }
     found = yaml.safe_load((ROOT / 'config/coverage.rviz').read_text())
 
     def classes(part):
         parts = part.values() if isinstance(part, dict) else part if isinstance(part, list) else []
-        return ({part['Class']} if isinstance(part, dict) and 'Class' in part else set()).union(*map(classes, parts))
+        return ({part['Class']} if isinstance(part, dict) and 'Class' in part else set()).union(
+            *map(classes, parts)
+        )
+
     assert classes(found) <= known
-    [display] = [each for each in found['Visualization Manager']['Displays'] if each['Class'].endswith('MarkerArray')]
-    assert display['Topic']['Value'] == '/imu/coverage' and display['Topic']['Durability Policy'] == 'Transient Local'
+    [display] = [
+        each
+        for each in found['Visualization Manager']['Displays']
+        if each['Class'].endswith('MarkerArray')
+    ]
+    assert (
+        display['Topic']['Value'] == '/imu/coverage'
+        and display['Topic']['Durability Policy'] == 'Transient Local'
+    )
     assert found['Visualization Manager']['Global Options']['Fixed Frame'] == 'imu_link'
 
 
 def test_the_layout_for_foxglove_shows_picture_parameters_and_residuals():
     """As the layout classes of foxglove-sdk 0.30 write it; the topics are those that the node publishes."""
     import json
+
     text = (ROOT / 'config/coverage.foxglove.json').read_text()
     found = json.loads(text)
 
@@ -229,16 +316,28 @@ def test_the_layout_for_foxglove_shows_picture_parameters_and_residuals():
         if part['type'] == 'panel':
             return [part]
         return [panel for item in part['items'] for panel in panels(item['content'])]
+
     kinds = {panel['panelType']: panel['config'] for panel in panels(found['content'])}
     assert found['version'] == 1 and set(kinds) == {'ThreeDee', 'DiagnosticsSummary', 'Plot'}
-    assert kinds['ThreeDee']['topics'] == {'/imu/coverage': {'visible': True}} and kinds['DiagnosticsSummary']['topicToRender'] == '/diagnostics'
-    assert text.count('/imu/residual.linear_acceleration.') == 3 and text.count('/imu/residual.angular_velocity.') == 3
+    assert (
+        kinds['ThreeDee']['topics'] == {'/imu/coverage': {'visible': True}}
+        and kinds['DiagnosticsSummary']['topicToRender'] == '/diagnostics'
+    )
+    assert (
+        text.count('/imu/residual.linear_acceleration.') == 3
+        and text.count('/imu/residual.angular_velocity.') == 3
+    )
 
 
 def test_the_picture_of_the_readme_can_be_drawn(monkeypatch, tmp_path):
     """The same cells, arrows and lines as docs/coverage.png: nothing else runs the example."""
     monkeypatch.syspath_prepend(ROOT / 'examples')
     import coverage_picture
+
     first, on_the_way, last = coverage_picture.states()
-    assert first.seconds > on_the_way.seconds > 0 and direction_words(on_the_way.next.up) in on_the_way.next.text and len(on_the_way.seen) == 7
+    assert (
+        first.seconds > on_the_way.seconds > 0
+        and direction_words(on_the_way.next.up) in on_the_way.next.text
+        and len(on_the_way.seen) == 7
+    )
     assert last.done and not last.next.text

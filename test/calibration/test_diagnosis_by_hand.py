@@ -32,14 +32,35 @@ from worlds.hand_sessions import GRAVITY, simulate
 NOTHING = np.zeros(3)
 MG, DEG = 9.80665e-3, np.pi / 180
 HIDDEN = {
-    'accel_quadratic': lambda f, w, t, k: (4 * MG / 9.8**2 * np.array([1, -0.7, 0.5]) * f**2, NOTHING),
-    'accel_scale_asymmetry': lambda f, w, t, k: (np.array([3e-3, -2e-3, 2e-3]) * np.abs(f), NOTHING),
-    'accel_bias_drift': lambda f, w, t, k: (np.outer(-np.expm1(-t / 30), [8 * MG, -5 * MG, 6 * MG]), NOTHING),
-    'gyro_g_sensitivity': lambda f, w, t, k: (NOTHING, f @ np.array([[0, 3, 0], [-4, 0, 2], [0, 0, 5]]).T * 1e-4),
+    'accel_quadratic': lambda f, w, t, k: (
+        4 * MG / 9.8**2 * np.array([1, -0.7, 0.5]) * f**2,
+        NOTHING,
+    ),
+    'accel_scale_asymmetry': lambda f, w, t, k: (
+        np.array([3e-3, -2e-3, 2e-3]) * np.abs(f),
+        NOTHING,
+    ),
+    'accel_bias_drift': lambda f, w, t, k: (
+        np.outer(-np.expm1(-t / 30), [8 * MG, -5 * MG, 6 * MG]),
+        NOTHING,
+    ),
+    'gyro_g_sensitivity': lambda f, w, t, k: (
+        NOTHING,
+        f @ np.array([[0, 3, 0], [-4, 0, 2], [0, 0, 5]]).T * 1e-4,
+    ),
     'gyro_quadratic': lambda f, w, t, k: (NOTHING, np.array([8e-3, -6e-3, 7e-3]) * w**2),
-    'gyro_scale_asymmetry': lambda f, w, t, k: (NOTHING, np.array([1.2e-2, -1e-2, 1e-2]) * np.abs(w)),
-    'gyro_bias_trend': lambda f, w, t, k: (NOTHING, np.outer(t, [2e-3 * DEG, -1.5e-3 * DEG, 1e-3 * DEG])),
-    'gyro_bias_drift': lambda f, w, t, k: (NOTHING, np.outer(-np.expm1(-t / 30), [0.3 * DEG, -0.2 * DEG, 0.25 * DEG])),
+    'gyro_scale_asymmetry': lambda f, w, t, k: (
+        NOTHING,
+        np.array([1.2e-2, -1e-2, 1e-2]) * np.abs(w),
+    ),
+    'gyro_bias_trend': lambda f, w, t, k: (
+        NOTHING,
+        np.outer(t, [2e-3 * DEG, -1.5e-3 * DEG, 1e-3 * DEG]),
+    ),
+    'gyro_bias_drift': lambda f, w, t, k: (
+        NOTHING,
+        np.outer(-np.expm1(-t / 30), [0.3 * DEG, -0.2 * DEG, 0.25 * DEG]),
+    ),
 }
 """What each cause adds to the accelerometer and to the gyroscope, from the true force, rate, time and number of the pose."""
 
@@ -69,29 +90,57 @@ def responding():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('name', ['accel_bias_drift', 'accel_quadratic', 'gyro_bias_drift', 'gyro_bias_trend', 'gyro_g_sensitivity'])
+@pytest.mark.parametrize(
+    'name',
+    [
+        'accel_bias_drift',
+        'accel_quadratic',
+        'gyro_bias_drift',
+        'gyro_bias_trend',
+        'gyro_g_sensitivity',
+    ],
+)
 def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
-    found = (responding if name == 'gyro_g_sensitivity' else diagnosed(31, HIDDEN[name], n_poses=36)).diagnosis
-    assert found.findings, [(c.effect, c.gain_alone, c.p_value_alone, c.verdict) for c in found.candidates[:4]]
+    found = (
+        responding if name == 'gyro_g_sensitivity' else diagnosed(31, HIDDEN[name], n_poses=36)
+    ).diagnosis
+    assert found.findings, [
+        (c.effect, c.gain_alone, c.p_value_alone, c.verdict) for c in found.candidates[:4]
+    ]
     first = found.findings[0]
     assert name in (first.effect, *first.indistinguishable_from)
     assert first.gain.ci95[0] > 0 and first.gain.windows >= 23
-    assert first.gain.of == (OF_MODEL if name.endswith(('drift', 'trend')) else APPLIED)   # a drift is replaced by its value at the end
+    assert first.gain.of == (
+        OF_MODEL if name.endswith(('drift', 'trend')) else APPLIED
+    )  # a drift is replaced by its value at the end
     assert len(found.findings) == 1
 
 
 def test_the_attitudes_at_which_a_rest_appears_are_told():
     """A gyroscope whose bias is another one while y is level: no effect of the catalogue; beside a bias of every stop no place is told."""
+
     def spoil(f, w, t, k):
         return NOTHING, np.outer(np.abs(f[:, 1]) < 3.0, [0.0, 0.3 * DEG, 0.0])
+
     diagnosis = diagnosed(21500, spoil).diagnosis
     rest = diagnosis.unexplained['gyroscope']
     assert not diagnosis.findings and rest.axes == ('y',) and len(rest.regimes) == 1
     regime = rest.regimes[0]
-    assert regime.axis == 'y' and regime.variable == 'specific force along y' and -4.5 < regime.bounds[0] < -1.5 and 1.5 < regime.bounds[1] < 4.5
-    assert any(regime.variable in line and 'gyroscope y' in line for line in diagnosis_lines(diagnosis))
-    imu, ranges, _ = simulate(21500, n_poses=24, spoil=spoil)   # calibrate and diagnose use one test of the unexplained residual
-    assert solve_by_evidence(gather_by_hand(imu, ranges), HandOptions(GRAVITY)).changes.unexplained == {'gyroscope': rest.entry}
+    assert (
+        regime.axis == 'y'
+        and regime.variable == 'specific force along y'
+        and -4.5 < regime.bounds[0] < -1.5
+        and 1.5 < regime.bounds[1] < 4.5
+    )
+    assert any(
+        regime.variable in line and 'gyroscope y' in line for line in diagnosis_lines(diagnosis)
+    )
+    imu, ranges, _ = simulate(
+        21500, n_poses=24, spoil=spoil
+    )  # calibrate and diagnose use one test of the unexplained residual
+    assert solve_by_evidence(
+        gather_by_hand(imu, ranges), HandOptions(GRAVITY)
+    ).changes.unexplained == {'gyroscope': rest.entry}
     assert rest.entry['rms'] == rest.rms > 0 and rest.entry['axes'] == ['y']
     everywhere = diagnosed(21500, stops).diagnosis.unexplained['accelerometer']
     assert everywhere.significant and not everywhere.regimes
@@ -99,7 +148,9 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
 
 def test_the_earth_turns_about_the_vertical_and_is_no_finding():
     """Quiet gyroscopes see 80 % of its rate follow gravity."""
-    diagnosis = diagnosed(52, lambda f, w, t, k: (NOTHING, 0.8 * EARTH_RATE / GRAVITY * f), n_poses=20, rate_sd=2e-4).diagnosis
+    diagnosis = diagnosed(
+        52, lambda f, w, t, k: (NOTHING, 0.8 * EARTH_RATE / GRAVITY * f), n_poses=20, rate_sd=2e-4
+    ).diagnosis
     assert not diagnosis.findings and not diagnosis.unexplained['gyroscope'].significant
 
 
@@ -109,9 +160,13 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
     table = Table.from_mapping(profile.table)
     model = SensorModel(joint_names=table.joint_names)
     imu = simulate_session(model, random_values(model), table, profile=profile)[0]
-    monkeypatch.setattr(HandProblem, 'named', lambda self: [])   # what is asked about is known before the search
+    monkeypatch.setattr(
+        HandProblem, 'named', lambda self: []
+    )  # what is asked about is known before the search
     found = investigate_by_hand(gather_by_hand(imu), HandOptions(GRAVITY))
-    assert {'gyro_rate_product', 'gyro_quadratic'} <= {entry['effect'] for entry in found.not_testable}
+    assert {'gyro_rate_product', 'gyro_quadratic'} <= {
+        entry['effect'] for entry in found.not_testable
+    }
 
 
 def test_a_place_among_few_poses_is_paid_for(monkeypatch):
@@ -123,8 +178,14 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
     told = []
     for _ in range(20):
         up = rng.normal(size=(24, 3))
-        hand = SimpleNamespace(gravity=GRAVITY, state=SimpleNamespace(up=up / np.linalg.norm(up, axis=1, keepdims=True)), poses=poses)
-        block = SimpleNamespace(sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time)
+        hand = SimpleNamespace(
+            gravity=GRAVITY,
+            state=SimpleNamespace(up=up / np.linalg.norm(up, axis=1, keepdims=True)),
+            poses=poses,
+        )
+        block = SimpleNamespace(
+            sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time
+        )
         told += regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
     assert len(told) <= 2
 
@@ -137,11 +198,20 @@ def test_the_gain_is_the_error_of_corrected_readings_in_held_out_poses(respondin
         for side, chosen in enumerate(([], [q for q in named if q.name == 'gyro_g_sensitivity'])):
             model, values, earth = found.extended(smaller, chosen)
             force, rate = model.compensate(values, poses.force[out], poses.rate[out])
-            squares[side] += np.sum((rate - earth * force / np.linalg.norm(force, axis=1)[:, None])**2)
+            squares[side] += np.sum(
+                (rate - earth * force / np.linalg.norm(force, axis=1)[:, None]) ** 2
+            )
     assert (gain.of, gain.measure, gain.windows) == (APPLIED, 'poses', len(poses.start))
-    assert_allclose([gain.heldout_rms_before, gain.heldout_rms_after], np.sqrt(np.array(squares) / poses.rate.size), rtol=1e-7)
+    assert_allclose(
+        [gain.heldout_rms_before, gain.heldout_rms_after],
+        np.sqrt(np.array(squares) / poses.rate.size),
+        rtol=1e-7,
+    )
     of_model = found.problem.gain(found.held_out, [], found.named, sensor='gyroscope')
-    assert of_model.of == OF_MODEL and abs(gain.heldout_rms_before / of_model.heldout_rms_before - 1) > 1e-3
+    assert (
+        of_model.of == OF_MODEL
+        and abs(gain.heldout_rms_before / of_model.heldout_rms_before - 1) > 1e-3
+    )
 
 
 def test_the_variance_of_a_long_turn_includes_that_of_its_bias():
@@ -150,8 +220,10 @@ def test_the_variance_of_a_long_turn_includes_that_of_its_bias():
     for seed in (21510, 21511):
         imu, ranges, _ = simulate(seed, n_poses=24, still=1.0, duration=12.0)
         data = gather_by_hand(imu, ranges)
-        turns = build_rows(solve_by_hand(data, HandOptions(GRAVITY)), data.turns, [], constants=np.zeros(0))[0][-1]
-        ratios.append(np.mean(turns.rows[:, :, -1]**2 / turns.known))
+        turns = build_rows(
+            solve_by_hand(data, HandOptions(GRAVITY)), data.turns, [], constants=np.zeros(0)
+        )[0][-1]
+        ratios.append(np.mean(turns.rows[:, :, -1] ** 2 / turns.known))
     assert turns.name == 'turns' and 0.5 < np.mean(ratios) < 1.3, ratios
 
 
@@ -164,24 +236,37 @@ def test_sizes_agree_with_what_was_hidden(responding):
 
 def test_the_turns_tell_apart_what_is_one_to_the_norm():
     """a_y a_z in x, a_x a_z in y and a_x a_y in z change the norm alike; the directions that the gyroscope carries along do not."""
+
     def spoil(f, w, t, k):
         return 15 * MG / 9.8**2 * np.stack([f[:, 1] * f[:, 2], 0 * t, 0 * t], axis=1), NOTHING
+
     imu, ranges, _ = simulate(36, n_poses=36, spoil=spoil)
     data = gather_by_hand(imu, ranges)
     result = diagnose_by_hand(data, HandOptions(GRAVITY))
     assert result.diagnosis.findings[0].effect == 'accel_cross_product'
     for name, true in (('x_yz', 15 * MG / 9.8**2), ('y_xz', 0.0), ('z_xy', 0.0)):
         full = f'accelerometer.accel_cross_product.{name}'
-        assert abs(result.hand.value(full) - true) < 4.5 * result.hand.sd_of(full) and result.hand.sd_of(full) < 2 * MG / 9.8**2
+        assert (
+            abs(result.hand.value(full) - true) < 4.5 * result.hand.sd_of(full)
+            and result.hand.sd_of(full) < 2 * MG / 9.8**2
+        )
     products = HandOptions(GRAVITY, accelerometer=('bias', 'matrix', 'accel_cross_product'))
     alone = solve_by_hand(replace(data, turns=[]), products)
-    assert alone.sd_of('accelerometer.accel_cross_product.x_yz') > 10 * result.hand.sd_of('accelerometer.accel_cross_product.x_yz')
+    assert alone.sd_of('accelerometer.accel_cross_product.x_yz') > 10 * result.hand.sd_of(
+        'accelerometer.accel_cross_product.x_yz'
+    )
 
 
 @pytest.mark.long
 def test_nothing_hidden_nothing_found():
     """Poses and biases that scatter from pose to pose are no effect: no finding in five recordings (none in 24 during development)."""
-    named = [[f.effect for f in diagnosed(seed, pose_sd=0.002, drift_sd=2e-4, n_poses=20).diagnosis.findings] for seed in range(40, 45)]
+    named = [
+        [
+            f.effect
+            for f in diagnosed(seed, pose_sd=0.002, drift_sd=2e-4, n_poses=20).diagnosis.findings
+        ]
+        for seed in range(40, 45)
+    ]
     print(f'findings where nothing is hidden: {named}')
     assert not any(named)
 
@@ -195,15 +280,24 @@ def test_a_cause_that_no_catalogue_holds_is_unexplained():
 
 def test_what_turns_leave_is_an_angle_per_turn():
     """A rate that comes only while it turns, another one in each turn: 0.6 deg/s per axis for 1.6 s."""
+
     def slips(force, rate, time, pose):
         offsets = np.random.default_rng(98).normal(0, 0.6 * DEG, (pose.max() + 1, 3))
         return NOTHING, offsets[pose] * (np.linalg.norm(rate, axis=1) > 0.01)[:, None]
+
     found = diagnosed(33, slips).diagnosis
     rest = found.unexplained['gyroscope']
-    text, = (line for line in diagnosis_lines(found) if line.startswith('unexplained') and 'gyroscope' in line)
-    assert rest.significant and rest.unit == to_mapping(found)['unexplained']['gyroscope']['unit'] == 'rad/turn'
+    (text,) = (
+        line
+        for line in diagnosis_lines(found)
+        if line.startswith('unexplained') and 'gyroscope' in line
+    )
+    assert (
+        rest.significant
+        and rest.unit == to_mapping(found)['unexplained']['gyroscope']['unit'] == 'rad/turn'
+    )
     assert 'deg per turn' in text
-    assert rest.rms == pytest.approx(0.6 * DEG * 1.6, rel=0.4)   # the matrix takes a part
+    assert rest.rms == pytest.approx(0.6 * DEG * 1.6, rel=0.4)  # the matrix takes a part
 
 
 def test_the_document_and_the_extended_model_go_together(responding):
@@ -212,7 +306,12 @@ def test_the_document_and_the_extended_model_go_together(responding):
     assert document['findings'][0]['gain']['measure'] == 'poses'
     assert 'gyro_g_sensitivity' in responding.hand.model.gyroscope
     untestable = {entry['effect'] for entry in document['not_testable']}
-    assert {'accel_size_effect', 'table_tilt', 'accel_thermal_bias', 'gyro_saturation'} <= untestable
+    assert {
+        'accel_size_effect',
+        'table_tilt',
+        'accel_thermal_bias',
+        'gyro_saturation',
+    } <= untestable
 
 
 def test_too_few_poses_are_refused_with_their_number():
@@ -229,13 +328,18 @@ def test_xsens_counts_tells_no_stories(recordings):
     from imu_calibration.core.samples import NominalScaling
     from imu_calibration.references.options import CalibrationOptions
     from msg_adapters.bag import open_recording
+
     options = CalibrationOptions(nominal=NominalScaling(32768, 415, 32768, 4770))
     with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:
-        found = diagnose_without_table(recording.blocks, replace(options, gravity=9.81744)).diagnosis
+        found = diagnose_without_table(
+            recording.blocks, replace(options, gravity=9.81744)
+        ).diagnosis
     assert [f.effect for f in found.findings] == ['gyro_g_sensitivity']
     gain = found.findings[0].gain
     rest = found.unexplained['accelerometer']
-    print(f'xsens_counts: g-sensitivity lowers held-out rates by {100 * gain.reduction:.0f} % (95 %: {100 * gain.ci95[0]:.0f} to '
-          f'{100 * gain.ci95[1]:.0f} %); accelerometer unexplained {1e3 * rest.rms:.2f} mm/s^2 rms, {rest.sigma:.0f} sd beyond noise')
+    print(
+        f'xsens_counts: g-sensitivity lowers held-out rates by {100 * gain.reduction:.0f} % (95 %: {100 * gain.ci95[0]:.0f} to '
+        f'{100 * gain.ci95[1]:.0f} %); accelerometer unexplained {1e3 * rest.rms:.2f} mm/s^2 rms, {rest.sigma:.0f} sd beyond noise'
+    )
     assert gain.ci95[0] > 0.5
     assert rest.significant and 5e-4 < rest.rms < 2e-3

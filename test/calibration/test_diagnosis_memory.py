@@ -28,11 +28,18 @@ def question():
     span, rng = imu.stamp_ns[-1] - imu.stamp_ns[0] + 5_000_000, np.random.default_rng(5)
     live = LiveCalibration(TABLE, CalibrationOptions(tolerances=TOLERANCES))
     for k in range(RUNS):
-        force, rate = (rows + rng.normal(0.0, sd, rows.shape) for rows, sd in ((imu.force_s, 2e-3), (imu.rate_s, 2e-4)))
+        force, rate = (
+            rows + rng.normal(0.0, sd, rows.shape)
+            for rows, sd in ((imu.force_s, 2e-3), (imu.rate_s, 2e-4))
+        )
         again = replace(imu, stamp_ns=imu.stamp_ns + k * span, force_s=force, rate_s=rate)
         moved = replace(joints, stamp_ns=joints.stamp_ns + k * span)
         for at in range(0, len(imu), 400):
-            live.push(SampleBlock(again.select(slice(at, at + 400)), moved.select(slice(at // 2, at // 2 + 200))))
+            live.push(
+                SampleBlock(
+                    again.select(slice(at, at + 400)), moved.select(slice(at // 2, at // 2 + 200))
+                )
+            )
     live.solve(pending=True)
     return question_about(live)
 
@@ -41,9 +48,18 @@ def question():
 def test_peak_of_a_live_diagnosis(question):
     windows = question.snapshot.gathered.spreads[0].windows
     assert sum(map(len, windows)) <= MAX_LIVE_SAMPLES
-    size = sum(each.nbytes for window in windows
-               for each in (window.stamp_ns, window.time, window.force_s, window.rate_s, *vars(window.motion).values())
-               if isinstance(each, np.ndarray))
+    size = sum(
+        each.nbytes
+        for window in windows
+        for each in (
+            window.stamp_ns,
+            window.time,
+            window.force_s,
+            window.rate_s,
+            *vars(window.motion).values(),
+        )
+        if isinstance(each, np.ndarray)
+    )
     tracemalloc.start()
     try:
         answer = question.answer()

@@ -8,7 +8,15 @@ import pytest
 
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.table_calibration import calibrate
-from imu_calibration.calibration.table_result import JOINT_POSITION_SD, _faster, _heavier, _tilted, _turned, error_budget, parameter_shifts
+from imu_calibration.calibration.table_result import (
+    JOINT_POSITION_SD,
+    _faster,
+    _heavier,
+    _tilted,
+    _turned,
+    error_budget,
+    parameter_shifts,
+)
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solver import solve
@@ -19,10 +27,22 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
-                                       {'name': 'inner', 'axis': [1, 0, 0]}],
-                            'up': [0, 0, 1], 'gravity': 9.81, 'latitude': 48.8, 'azimuth_deg': 0.0})
-NO_TILT = CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect', reference_model='none')
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'outer', 'axis': [0, 0, 1]},
+            {'name': 'middle', 'axis': [0, 1, 0]},
+            {'name': 'inner', 'axis': [1, 0, 0]},
+        ],
+        'up': [0, 0, 1],
+        'gravity': 9.81,
+        'latitude': 48.8,
+        'azimuth_deg': 0.0,
+    }
+)
+NO_TILT = CalibrationOptions(
+    accelerometer_model='bias+matrix+accel_size_effect', reference_model='none'
+)
 SIZES = np.array([1e-3] * 3 + [1e-4] * 9 + [1e-4] * 9)
 
 
@@ -31,8 +51,14 @@ def recording():
     """A short session of an IMU with a size effect."""
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
     values = random_values(model, 'industrial', 4)
-    imu, joints, _ = simulate(model, values, TABLE, profile=make_profile('quick', 4, TABLE),
-                              options=SimulationOptions(noise=GRADES['industrial'].noise), seed=4)
+    imu, joints, _ = simulate(
+        model,
+        values,
+        TABLE,
+        profile=make_profile('quick', 4, TABLE),
+        options=SimulationOptions(noise=GRADES['industrial'].noise),
+        seed=4,
+    )
     return SampleBlock(imu, joints)
 
 
@@ -50,7 +76,10 @@ def result(recording):
 def moved(recording, result, false_table):
     """Return how the estimate moves when the reference is wrong, at the same weights."""
     gathered = GatherStep(false_table, result.model)((0, lambda: iter([recording])))
-    return solve(gathered.accumulator, result.model, noise=result.solution.noise).values - result.solution.values
+    return (
+        solve(gathered.accumulator, result.model, noise=result.solution.noise).values
+        - result.solution.values
+    )
 
 
 @pytest.mark.parametrize('axis', (0, 1))
@@ -61,7 +90,9 @@ def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, 
     assert np.linalg.norm(shift[:12]) > 1e-4
     for effect in result.solution.model.effects[:3]:
         part = result.solution.model.slices[effect.sensor, effect.name]
-        assert actual[part] == pytest.approx(shift[part], abs=0.02 * np.max(np.abs(shift[part])) + 1e-9)
+        assert actual[part] == pytest.approx(
+            shift[part], abs=0.02 * np.max(np.abs(shift[part])) + 1e-9
+        )
 
 
 def test_a_wrong_gravity_scales_the_accelerometer_matrix(recording, result):
@@ -74,7 +105,10 @@ def test_a_wrong_gravity_scales_the_accelerometer_matrix(recording, result):
 def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
     shift = parameter_shifts(result, [partial(_faster, 1 + 1e-3)])[0].sum(axis=0)
     names = result.solution.param_names
-    arms, matrix = (result.solution.model.slices[key] for key in (('accelerometer', 'accel_size_effect'), ('gyroscope', 'matrix')))
+    arms, matrix = (
+        result.solution.model.slices[key]
+        for key in (('accelerometer', 'accel_size_effect'), ('gyroscope', 'matrix'))
+    )
     assert names[matrix.start] == 'gyroscope.matrix.xx'
     assert shift[matrix] == pytest.approx(1e-3 * result.solution.values[matrix], abs=2e-6)
     assert shift[arms] == pytest.approx(2e-3 * result.solution.values[arms], abs=2e-5)
@@ -89,24 +123,34 @@ def test_joint_errors_are_drawn_anew_in_every_window(result):
     draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)
     own = budget.causes['joint position']
     large = own > 1e-12
-    assert draws.std(axis=0)[large] == pytest.approx(own[large], rel=0.06)  # 4000 draws: 1.1 % each, five of it
+    assert draws.std(axis=0)[large] == pytest.approx(
+        own[large], rel=0.06
+    )  # 4000 draws: 1.1 % each, five of it
 
 
 def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):
     without = error_budget(result)
     assert list(without.causes) == ['noise', 'levelling', 'joint position', 'table rate', 'gravity']
     matrix = result.solution.model.slices['accelerometer', 'matrix']
-    assert np.max(without.causes['levelling'][matrix]) > 10 * np.max(without.causes['noise'][matrix])
+    assert np.max(without.causes['levelling'][matrix]) > 10 * np.max(
+        without.causes['noise'][matrix]
+    )
     with_tilt = error_budget(calibrated(recording, TABLE, CalibrationOptions()))
     assert 'levelling' not in with_tilt.causes
 
 
 def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result, monkeypatch):
     small = error_budget(result)
-    monkeypatch.setattr('imu_calibration.calibration.table_result.JOINT_POSITION_SD', 10 * JOINT_POSITION_SD)
+    monkeypatch.setattr(
+        'imu_calibration.calibration.table_result.JOINT_POSITION_SD', 10 * JOINT_POSITION_SD
+    )
     large = error_budget(result)
-    assert small.total**2 == pytest.approx(sum(part**2 for part in small.causes.values()), rel=1e-12)
-    assert large.causes['joint position'] == pytest.approx(10 * small.causes['joint position'], rel=1e-3, abs=1e-12)
+    assert small.total**2 == pytest.approx(
+        sum(part**2 for part in small.causes.values()), rel=1e-12
+    )
+    assert large.causes['joint position'] == pytest.approx(
+        10 * small.causes['joint position'], rel=1e-3, abs=1e-12
+    )
 
 
 def test_gravity_sd_of_the_table_description_is_used(result):
@@ -117,7 +161,15 @@ def test_gravity_sd_of_the_table_description_is_used(result):
 def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording, result):
     """The sd of every scale factor contains 1e-4 of its value; the budget has the same share."""
     place = replace(result.table, gravity=None)
-    scales = [result.solution.param_names.index(f'accelerometer.matrix.{axis}') for axis in ('xx', 'yy', 'zz')]
-    stated, exact = (np.diag(calibrated(recording, table).calibration.covariance)[scales] for table in (place, replace(place, gravity_sd=0.0)))
-    assert stated - exact == pytest.approx(1e-8 * result.solution.values[scales]**2, rel=1e-3)
-    assert error_budget(replace(result, table=place)).causes['gravity'][scales] == pytest.approx(1e-4, rel=0.02)
+    scales = [
+        result.solution.param_names.index(f'accelerometer.matrix.{axis}')
+        for axis in ('xx', 'yy', 'zz')
+    ]
+    stated, exact = (
+        np.diag(calibrated(recording, table).calibration.covariance)[scales]
+        for table in (place, replace(place, gravity_sd=0.0))
+    )
+    assert stated - exact == pytest.approx(1e-8 * result.solution.values[scales] ** 2, rel=1e-3)
+    assert error_budget(replace(result, table=place)).causes['gravity'][scales] == pytest.approx(
+        1e-4, rel=0.02
+    )

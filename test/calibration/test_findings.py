@@ -5,7 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.diagnosis.findings import DISAGREED, LEAVES_MOST, candidates_of, finding, motions_of_one_joint, sentence
+from imu_calibration.calibration.diagnosis.findings import (
+    DISAGREED,
+    LEAVES_MOST,
+    candidates_of,
+    finding,
+    motions_of_one_joint,
+    sentence,
+)
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.observability import OTHER_MOUNT
@@ -15,8 +22,12 @@ from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Score
 
-FIRST, SECOND, MATE, OTHER = (Question(CATALOGUE.find('accelerometer', name), (k,), 3, name)
-                              for k, name in enumerate(('accel_quadratic', 'accel_cubic', 'accel_scale_asymmetry', 'accel_cross_product')))
+FIRST, SECOND, MATE, OTHER = (
+    Question(CATALOGUE.find('accelerometer', name), (k,), 3, name)
+    for k, name in enumerate(
+        ('accel_quadratic', 'accel_cubic', 'accel_scale_asymmetry', 'accel_cross_product')
+    )
+)
 GAIN = Gain('accelerometer', 'samples', 2.0, 1.0, (0.4, 0.6), 5)
 
 
@@ -37,7 +48,9 @@ class Search:
         return tuple(k for question in chosen for k in question.parameters)
 
     def estimate(self, chosen, question):
-        return 10.0 * np.array(question.parameters) + sum(self.indices(chosen)), np.ones(len(question.parameters))
+        return 10.0 * np.array(question.parameters) + sum(self.indices(chosen)), np.ones(
+            len(question.parameters)
+        )
 
 
 @pytest.fixture(scope='module')
@@ -45,7 +58,16 @@ def solution():
     """Return the solution of a model with both findings."""
     model = SensorModel(accelerometer=('bias', 'matrix', FIRST.name, SECOND.name))
     size = len(model.param_names)
-    return Solution(model, np.linspace(0.1, 1.0, size), {'noise': 1e-4 * np.eye(size)}, np.zeros(size, bool), {}, {}, np.eye(size), {})
+    return Solution(
+        model,
+        np.linspace(0.1, 1.0, size),
+        {'noise': 1e-4 * np.eye(size)},
+        np.zeros(size, bool),
+        {},
+        {},
+        np.eye(size),
+        {},
+    )
 
 
 def test_an_effect_as_good_as_two_findings_belongs_to_the_first():
@@ -62,21 +84,35 @@ def test_a_finding_names_its_own_mates_and_the_motion_against_the_best_of_them(s
         asked.append((question, mate))
         return 'turn it over'
 
-    made = [finding(Search(), [FIRST, SECOND], place, solution=solution, share=lambda named, q: 0.9, gain_of=lambda place: GAIN,
-                    motion_of=motion_of)
-            for place in (0, 1)]
+    made = [
+        finding(
+            Search(),
+            [FIRST, SECOND],
+            place,
+            solution=solution,
+            share=lambda named, q: 0.9,
+            gain_of=lambda place: GAIN,
+            motion_of=motion_of,
+        )
+        for place in (0, 1)
+    ]
     assert [f.indistinguishable_from for f in made] == [(MATE.name,), (MATE.name, OTHER.name)]
     assert asked == [(FIRST, MATE), (SECOND, MATE)]
     assert made[1].heldout_gain == 30.0 and made[1].separating_motion == 'turn it over'
     # MATE is parameter 2 beside SECOND (1) in the place of FIRST, and beside FIRST (0) in that of SECOND
-    assert [f.sizes_of_mates[MATE.name] for f in made] == [{'accelerometer.accel_scale_asymmetry.x': (size, '1')} for size in (23.0, 22.0)]
+    assert [f.sizes_of_mates[MATE.name] for f in made] == [
+        {'accelerometer.accel_scale_asymmetry.x': (size, '1')} for size in (23.0, 22.0)
+    ]
     assert set(made[1].parameters) == {f'accelerometer.accel_cubic.{axis}' for axis in 'xyz'}
 
 
 @pytest.mark.parametrize('agree, verdict', [(True, LEAVES_MOST), (False, DISAGREED)])
 def test_what_is_not_named_for_its_windows_disagree_is_not_said_to_leave_the_rest(agree, verdict):
     asked = []
-    rows = {row.effect: row.verdict for row in candidates_of(Search(), [], agree=lambda *those: asked.append(those) or agree)}
+    rows = {
+        row.effect: row.verdict
+        for row in candidates_of(Search(), [], agree=lambda *those: asked.append(those) or agree)
+    }
     assert rows[FIRST.name] == verdict and ([FIRST], FIRST) in asked
 
 
@@ -87,10 +123,15 @@ def test_what_explains_much_but_leaves_most_is_said():
 
     class LagHypothesis:
         candidates = (Candidate('time_offset', 'reference', 4321.0, 0.0, 4321.0, 0.0, LEAVES_MOST),)
+
     assert all(word in nothing_named(LagHypothesis) for word in ('time_offset', '4321 nats'))
-    LagHypothesis.candidates = (Candidate('gyro_delay', 'gyroscope', 163.0, 0.0, 163.0, 0.0, DISAGREED),)
+    LagHypothesis.candidates = (
+        Candidate('gyro_delay', 'gyroscope', 163.0, 0.0, 163.0, 0.0, DISAGREED),
+    )
     assert all(word in nothing_named(LagHypothesis) for word in ('gyro_delay', '163 nats'))
-    LagHypothesis.candidates = (Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),)
+    LagHypothesis.candidates = (
+        Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),
+    )
     assert 'time_offset' not in nothing_named(LagHypothesis)
 
 
@@ -98,28 +139,46 @@ class LagsAndDelay(forward.Evidence):
     """A delay is a lag of each sensor: two of the three cost the same but for rounding; what is better makes a lag negative."""
 
     def __init__(self, better=0.0):
-        super().__init__(np.zeros((4, 4)), np.zeros((0, 4, 4)), prior_sd=np.ones(3), prior_mean=np.zeros(3))
+        super().__init__(
+            np.zeros((4, 4)), np.zeros((0, 4, 4)), prior_sd=np.ones(3), prior_mean=np.zeros(3)
+        )
         self.better = better
 
     def heldout(self, used):
-        return 1e6 + {(0,): 300.0, (0, 1): 0.0, (1, 2): -4e-6 - self.better, (0, 2): -8e-6}.get(tuple(sorted(used)), 1e6)
+        return 1e6 + {(0,): 300.0, (0, 1): 0.0, (1, 2): -4e-6 - self.better, (0, 2): -8e-6}.get(
+            tuple(sorted(used)), 1e6
+        )
 
     def p_value(self, smaller, larger):
         return 0.0
 
     def heldout_parts(self, used):
-        return {sensor: np.full((2, 3), self.heldout(used) / 12) for sensor in ('accelerometer', 'gyroscope')}
+        return {
+            sensor: np.full((2, 3), self.heldout(used) / 12)
+            for sensor in ('accelerometer', 'gyroscope')
+        }
 
     def fit(self, used, number=None):
-        return np.array([-0.01 if self.better and (k == 1 and 2 in used or k == 2 and 0 in used) else 0.01 for k in used]), 1e-12 * np.eye(len(used))
+        return np.array(
+            [
+                -0.01 if self.better and (k == 1 and 2 in used or k == 2 and 0 in used) else 0.01
+                for k in used
+            ]
+        ), 1e-12 * np.eye(len(used))
 
     loss = heldout
 
 
 @pytest.mark.parametrize('better', [0.0, 50.0])
 def test_rounding_replaces_nothing_and_neither_does_what_makes_another_lag_negative(better):
-    effects = CATALOGUE.find('reference', 'time_offset'), CATALOGUE.find('gyroscope', 'gyro_bandwidth'), CATALOGUE.find('accelerometer', 'accel_bandwidth')
-    delay, gyroscope, accelerometer = asked = [Question(effect, (k,), 1, effect.name) for k, effect in enumerate(effects)]
+    effects = (
+        CATALOGUE.find('reference', 'time_offset'),
+        CATALOGUE.find('gyroscope', 'gyro_bandwidth'),
+        CATALOGUE.find('accelerometer', 'accel_bandwidth'),
+    )
+    delay, gyroscope, accelerometer = asked = [
+        Question(effect, (k,), 1, effect.name) for k, effect in enumerate(effects)
+    ]
     found = forward.Search(LagsAndDelay(better), (), asked).reconsidered([delay, gyroscope])
     assert found == [delay, gyroscope]
 
@@ -127,12 +186,20 @@ def test_rounding_replaces_nothing_and_neither_does_what_makes_another_lag_negat
 @pytest.mark.parametrize('after, words', [(1.0, 'falls by 50 %'), (1.9998, 'falls by 0.01 %')])
 def test_a_small_gain_is_not_told_as_none(after, words):
     gain = Gain('accelerometer', 'samples', 2.0, after, (0.0, 0.6), 5)
-    assert sentence(FIRST.effect, {'accelerometer.accel_quadratic.x': (1e-5, 1e-6, '(m/s^2)^-1')}, gain).endswith(f'{words}.')
+    assert sentence(
+        FIRST.effect, {'accelerometer.accel_quadratic.x': (1e-5, 1e-6, '(m/s^2)^-1')}, gain
+    ).endswith(f'{words}.')
 
 
 def test_a_single_joint_is_told_what_it_can_do_and_to_be_mounted_anew():
     def question(sensor, name):
         return Question(CATALOGUE.find(sensor, name), (0,), 1, name)
-    lags = motions_of_one_joint(question('gyroscope', 'gyro_bandwidth'), question('gyroscope', 'gyro_delay'))
+
+    lags = motions_of_one_joint(
+        question('gyroscope', 'gyro_bandwidth'), question('gyroscope', 'gyro_delay')
+    )
     assert 'oscillate at 1, 2 and 4 Hz' in lags and 'two axes' not in lags
-    assert OTHER_MOUNT in motions_of_one_joint(question('accelerometer', 'accel_quadratic'), question('accelerometer', 'accel_scale_asymmetry'))
+    assert OTHER_MOUNT in motions_of_one_joint(
+        question('accelerometer', 'accel_quadratic'),
+        question('accelerometer', 'accel_scale_asymmetry'),
+    )

@@ -21,20 +21,42 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
-TABLE = Table.from_mapping({
-    'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}],
-    'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0, 'mount': {'rpy_deg': [0, 0, 0], 'xyz': None}})
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'outer', 'axis': [0, 0, 1]},
+            {'name': 'middle', 'axis': [0, 1, 0]},
+            {'name': 'inner', 'axis': [1, 0, 0]},
+        ],
+        'up': [0, 0, 1],
+        'latitude': 48.8,
+        'height': 150.0,
+        'azimuth_deg': 0.0,
+        'mount': {'rpy_deg': [0, 0, 0], 'xyz': None},
+    }
+)
 SD = 1e-6
 """Live and offline agree to this share of the standard deviation."""
 
 
 def session(tilt=(0.0, 0.0), seed=1):
     """IMU and joint samples of the quick profile, and the true values."""
-    model = SensorModel(('bias', 'matrix', 'accel_size_effect'), ('bias', 'matrix'), ('table_tilt',), TABLE.joint_names)
+    model = SensorModel(
+        ('bias', 'matrix', 'accel_size_effect'),
+        ('bias', 'matrix'),
+        ('table_tilt',),
+        TABLE.joint_names,
+    )
     values = random_values(model, 'industrial', seed)
     values[model.slices['reference', 'table_tilt']] = tilt
-    imu, joints, _ = simulate(model.at(values), values, TABLE, profile=make_profile('quick', seed, TABLE),
-                              options=SimulationOptions(50.0, 50.0), seed=seed)
+    imu, joints, _ = simulate(
+        model.at(values),
+        values,
+        TABLE,
+        profile=make_profile('quick', seed, TABLE),
+        options=SimulationOptions(50.0, 50.0),
+        seed=seed,
+    )
     return imu, joints
 
 
@@ -105,7 +127,10 @@ def test_windows_that_are_open_count_only_when_asked_for(quick):
     live = LiveCalibration(TABLE)
     completed = [window for part in list(blocks(*quick))[:700] for window in live.push(part)]
     used = sum(len(window) for window in completed if window.kind != 'unused')
-    without, with_open = (sum(live.solve(pending=flag).calibration.statistics['samples_used'].values()) for flag in (False, True))
+    without, with_open = (
+        sum(live.solve(pending=flag).calibration.statistics['samples_used'].values())
+        for flag in (False, True)
+    )
     assert without == used < with_open
     assert sum(live.solve().calibration.statistics['samples_used'].values()) == used
 
@@ -121,7 +146,10 @@ def test_a_tilted_table_is_linearised_anew_like_offline(tilted):
     run(live, *tilted)
     expected = offline(tilted)
     tilt = expected.calibration.value('reference', 'table_tilt')
-    assert np.all(np.abs(tilt - [0.004, -0.003]) < 4 * expected.calibration.sd[expected.model.slices['reference', 'table_tilt']])
+    assert np.all(
+        np.abs(tilt - [0.004, -0.003])
+        < 4 * expected.calibration.sd[expected.model.slices['reference', 'table_tilt']]
+    )
     assert_same(live.solve(pending=True).calibration, expected.calibration)
     assert not live.needs_linearising
 
@@ -132,7 +160,10 @@ def test_a_store_too_small_is_said_and_still_gives_the_first_pass(tilted):
     result = live.solve(pending=True)
     assert live.needs_linearising and not live._collector.store.complete
     tilt = result.calibration.value('reference', 'table_tilt')
-    assert np.all(np.abs(tilt - [0.004, -0.003]) < 6 * result.calibration.sd[result.model.slices['reference', 'table_tilt']] + 1e-5)
+    assert np.all(
+        np.abs(tilt - [0.004, -0.003])
+        < 6 * result.calibration.sd[result.model.slices['reference', 'table_tilt']] + 1e-5
+    )
 
 
 def cut(samples, start, stop):
@@ -151,7 +182,9 @@ def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
     result, expected = second.solve(pending=True), offline(*halves)
     assert_same(result.calibration, expected.calibration)
     assert result.calibration.conditions == expected.calibration.conditions
-    assert_same(second.solve(pending=True).calibration, expected.calibration)   # solving does not add the earlier run again
+    assert_same(
+        second.solve(pending=True).calibration, expected.calibration
+    )  # solving does not add the earlier run again
 
 
 WARMTH = np.array([0.004, -0.006, 0.0025])
@@ -162,7 +195,11 @@ def at_temperature(samples, temperature_c):
     """A part of a session, warmed up by 3 K about a temperature, with the readings of accelerometers that drift with it from 20 C on."""
     imu, joints = samples
     warm = temperature_c + np.linspace(-1.5, 1.5, len(imu))
-    return replace(imu, force_s=imu.force_s + (warm - 20.0)[:, None] * WARMTH), joints, TemperatureSamples(imu.stamp_ns, warm)
+    return (
+        replace(imu, force_s=imu.force_s + (warm - 20.0)[:, None] * WARMTH),
+        joints,
+        TemperatureSamples(imu.stamp_ns, warm),
+    )
 
 
 def test_a_proven_session_is_proven_after_resume(quick):
@@ -174,25 +211,46 @@ def test_a_proven_session_is_proven_after_resume(quick):
     assert set(before.decisions.values()) == {HELPS} and after.decisions == before.decisions
     for sensor in before.proof:
         assert after.proof[sensor]['windows'] == before.proof[sensor]['windows']
-        assert after.proof[sensor]['after'] == pytest.approx(before.proof[sensor]['after'], rel=1e-3)
+        assert after.proof[sensor]['after'] == pytest.approx(
+            before.proof[sensor]['after'], rel=1e-3
+        )
 
 
 def test_a_session_resumed_30_kelvin_warmer_knows_both_temperatures(quick):
     """Each part alone says little of the drift; the two together say it, about the temperature of the first."""
-    parts = [at_temperature([cut(s, *part) for s in quick], temperature_c) for part, temperature_c in (((0.0, 0.5), 20.0), ((0.5, 1.0), 50.0))]
-    options = CalibrationOptions(accelerometer_model='bias+matrix+accel_size_effect+accel_thermal_bias')
+    parts = [
+        at_temperature([cut(s, *part) for s in quick], temperature_c)
+        for part, temperature_c in (((0.0, 0.5), 20.0), ((0.5, 1.0), 50.0))
+    ]
+    options = CalibrationOptions(
+        accelerometer_model='bias+matrix+accel_size_effect+accel_thermal_bias'
+    )
     first = LiveCalibration(TABLE, options)
     run(first, *parts[0])
     second = LiveCalibration(TABLE, options, saved=first.saved(pending=True))
-    assert second.model.temperature_ref_c == first.model.temperature_ref_c == pytest.approx(18.5, abs=0.6)
+    assert (
+        second.model.temperature_ref_c
+        == first.model.temperature_ref_c
+        == pytest.approx(18.5, abs=0.6)
+    )
     run(second, *parts[1])
-    found, expected = second.solve(pending=True).calibration, offline(*parts, options=options).calibration
+    found, expected = (
+        second.solve(pending=True).calibration,
+        offline(*parts, options=options).calibration,
+    )
     assert_same(found, expected)
-    plain = offline(quick).calibration   # before it was warmed
-    for effect, truth in (('accel_thermal_bias', WARMTH),
-                          ('bias', plain.value('accelerometer', 'bias') + (second.model.temperature_ref_c - 20.0) * WARMTH)):
+    plain = offline(quick).calibration  # before it was warmed
+    for effect, truth in (
+        ('accel_thermal_bias', WARMTH),
+        (
+            'bias',
+            plain.value('accelerometer', 'bias') + (second.model.temperature_ref_c - 20.0) * WARMTH,
+        ),
+    ):
         error = found.value('accelerometer', effect) - truth
-        assert np.all(np.abs(error) < 4 * found.sd[found.model.slices['accelerometer', effect]]), effect
+        assert np.all(np.abs(error) < 4 * found.sd[found.model.slices['accelerometer', effect]]), (
+            effect
+        )
     assert found.sd[found.model.slices['accelerometer', 'accel_thermal_bias']].max() < 1e-4
 
 
@@ -203,12 +261,17 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     data = collector.to_bytes(gathered, live.model)
     again = collector.from_bytes(data)[0]
     assert collector.to_bytes(again, live.model) == data
-    found, expected = (conclude(solve_gathered(each, live.model), each, live.model, table=TABLE).calibration for each in (again, gathered))
+    found, expected = (
+        conclude(solve_gathered(each, live.model), each, live.model, table=TABLE).calibration
+        for each in (again, gathered)
+    )
     assert_same(found, expected, 1e-12)
 
 
 def test_before_the_first_temperature_there_is_nothing_to_save():
-    live = LiveCalibration(TABLE, CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias'))
+    live = LiveCalibration(
+        TABLE, CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias')
+    )
     with refused(InputError, 'temperature_missing'):
         live.saved()
 
@@ -217,10 +280,21 @@ def test_a_state_of_another_model_or_a_broken_one_is_refused(quick):
     live = LiveCalibration(TABLE)
     data = collector.to_bytes(live.gathered(), live.model)
     with refused(DocumentError, 'other_model', 'accel_size_effect'):
-        LiveCalibration(TABLE, CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias'), saved=data)
+        LiveCalibration(
+            TABLE,
+            CalibrationOptions(accelerometer_model='bias+matrix+accel_thermal_bias'),
+            saved=data,
+        )
     with refused(DocumentError, 'other_model', 25, 50):
-        collector.require_columns(collector.from_bytes(data)[1], replace(live.model, temperature_ref_c=50.0))
-    for broken in (b'', b'nothing', data[:len(data) // 2], data.replace(b'accumulator/4', b'accumulator/9')):
+        collector.require_columns(
+            collector.from_bytes(data)[1], replace(live.model, temperature_ref_c=50.0)
+        )
+    for broken in (
+        b'',
+        b'nothing',
+        data[: len(data) // 2],
+        data.replace(b'accumulator/4', b'accumulator/9'),
+    ):
         with refused(DocumentError, 'accumulator_damaged'):
             collector.from_bytes(broken)
 
@@ -247,8 +321,12 @@ def test_groups_name_the_motion_that_is_still_needed(quick):
     run(live, *(s.select(slice(until, None)) for s in quick), seed=1)
     live.solve(pending=True)
     done = {(g.sensor, g.effect): g for g in live.groups()}
-    assert all(g.sd <= g.tolerance and not g.needs for g in done.values() if g.status == 'determined')
-    assert sum(g.status == 'determined' for g in done.values()) > sum(g.status == 'determined' for g in groups.values())
+    assert all(
+        g.sd <= g.tolerance and not g.needs for g in done.values() if g.status == 'determined'
+    )
+    assert sum(g.status == 'determined' for g in done.values()) > sum(
+        g.status == 'determined' for g in groups.values()
+    )
 
 
 def test_residuals_are_what_the_model_leaves(quick):
@@ -288,7 +366,11 @@ def test_memory_stays_bounded(quick):
     length = int(imu.stamp_ns[-1] - imu.stamp_ns[0]) + 10**10
     largest = []
     for turn in range(3):
-        run(live, replace(imu, stamp_ns=imu.stamp_ns + turn * length), replace(joints, stamp_ns=joints.stamp_ns + turn * length))
+        run(
+            live,
+            replace(imu, stamp_ns=imu.stamp_ns + turn * length),
+            replace(joints, stamp_ns=joints.stamp_ns + turn * length),
+        )
         collector = live._collector
         assert not collector.gathered.kept
         largest.append(collector.gatherer.n_buffered)
@@ -318,8 +400,16 @@ def test_solving_takes_no_more_than_its_share():
 
 def stream_block(n_imu, n_joints, start=0.0):
     """A block with so many samples at 100 Hz from `start` s on."""
-    imu = ImuSamples(((start + np.arange(n_imu) / 100) * 1e9).astype(np.int64), np.zeros((n_imu, 3)), np.zeros((n_imu, 3)))
-    joints = JointSamples(((start + np.arange(n_joints) / 100) * 1e9).astype(np.int64), np.zeros((n_joints, 3)), np.zeros((n_joints, 3)))
+    imu = ImuSamples(
+        ((start + np.arange(n_imu) / 100) * 1e9).astype(np.int64),
+        np.zeros((n_imu, 3)),
+        np.zeros((n_imu, 3)),
+    )
+    joints = JointSamples(
+        ((start + np.arange(n_joints) / 100) * 1e9).astype(np.int64),
+        np.zeros((n_joints, 3)),
+        np.zeros((n_joints, 3)),
+    )
     return SampleBlock(imu, joints)
 
 
@@ -335,8 +425,14 @@ def test_streams_are_watched_by_silence_stamps_and_losses():
     assert watch.state(1.6).word == 'trouble' and '3 imu not finite' in watch.state(1.6).message
     watch.note(stream_block(100, 100, 5.0), 12.0)
     assert watch.state(12.0).word == 'good'
-    watch.note(SampleBlock(imu=stream_block(100, 0, 30.0).imu, joints=stream_block(0, 100, 6.0).joints), 13.0)
-    assert watch.state(13.0).word == 'good'   # for a moment
-    watch.note(SampleBlock(imu=stream_block(100, 0, 32.0).imu, joints=stream_block(0, 100, 8.0).joints), 15.5)
+    watch.note(
+        SampleBlock(imu=stream_block(100, 0, 30.0).imu, joints=stream_block(0, 100, 6.0).joints),
+        13.0,
+    )
+    assert watch.state(13.0).word == 'good'  # for a moment
+    watch.note(
+        SampleBlock(imu=stream_block(100, 0, 32.0).imu, joints=stream_block(0, 100, 8.0).joints),
+        15.5,
+    )
     assert 'ahead of the joint stamps' in watch.state(15.5).message
     assert watch.state(30.0).word == 'silent'

@@ -36,7 +36,9 @@ class Station:
     """A LiveCalibration fed as calibration_node feeds it."""
 
     def __init__(self, session, **settings):
-        self.live = LiveCalibration(Table.from_mapping(session.table), settings=LiveSettings(**settings))
+        self.live = LiveCalibration(
+            Table.from_mapping(session.table), settings=LiveSettings(**settings)
+        )
         for block in blocks(session.imu, session.joints):
             self.live.push(block)
         self.live.solve(pending=True)
@@ -55,7 +57,9 @@ def hidden():
 @pytest.fixture(scope='module')
 def expected(hidden):
     """What the verb diagnose says of it, and hands over."""
-    return diagnose_recording(lambda: iter([SampleBlock(hidden.imu, hidden.joints)]), Table.from_mapping(hidden.table))
+    return diagnose_recording(
+        lambda: iter([SampleBlock(hidden.imu, hidden.joints)]), Table.from_mapping(hidden.table)
+    )
 
 
 @pytest.fixture(scope='module')
@@ -70,10 +74,17 @@ def station(hidden):
 def test_the_answer_is_that_of_the_verb(station, expected):
     """The same effect, with the very same figures, sizes of the calibration included."""
     first, state = expected.diagnosis.findings[0], station.answer.state
-    assert first.effect == 'accel_quadratic' and state.values['windows'] == expected.diagnosis.windows
-    assert state.word == 'found' and state.message.startswith(f'accel_quadratic: {first.explanation}')
+    assert (
+        first.effect == 'accel_quadratic' and state.values['windows'] == expected.diagnosis.windows
+    )
+    assert state.word == 'found' and state.message.startswith(
+        f'accel_quadratic: {first.explanation}'
+    )
     assert state.values['p-value'] == f'{first.p_value:.2g}'
-    assert state.values['held-out reduction'] == f'{first.gain.reduction:.3f}' and first.gain.reduction > 0.05
+    assert (
+        state.values['held-out reduction'] == f'{first.gain.reduction:.3f}'
+        and first.gain.reduction > 0.05
+    )
     for name, (value, sd, unit) in first.parameters.items():
         assert state.values[name] == f'{value:.4g} +- {sd:.2g} {unit}'
 
@@ -82,13 +93,15 @@ def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(
     live = station.live
     assert live.adopt(station.answer.extension)
     found = live.solve(pending=True).calibration
-    assert 'accel_quadratic' in found.statistics['added'] and not {'added', 'denied'} & set(station.before.statistics)
+    assert 'accel_quadratic' in found.statistics['added'] and not {'added', 'denied'} & set(
+        station.before.statistics
+    )
     assert found.statistics['added'] == expected.calibration.statistics['added']
     assert_same(found, expected.calibration)
     for sensor, entry in expected.calibration.proof.items():
         assert found.proof[sensor]['after'] == pytest.approx(entry['after'], rel=1e-9)
     assert sum('accel_quadratic (' in line for line in found.notes) == 1
-    again = station.question().answer()   # about a session whose model is wide already
+    again = station.question().answer()  # about a session whose model is wide already
     assert again.extension.added == station.answer.extension.added
     assert live.adopt(again.extension)
     assert_same(live.solve(pending=True).calibration, expected.calibration)
@@ -98,11 +111,11 @@ def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(
 def test_windows_after_the_adoption_count_like_those_before(hidden, expected):
     live = LiveCalibration(Table.from_mapping(hidden.table))
     every = list(blocks(hidden.imu, hidden.joints))
-    for block in every[:3 * len(every) // 4]:
+    for block in every[: 3 * len(every) // 4]:
         live.push(block)
     live.solve(pending=True)
     assert live.adopt(question_about(live).answer().extension)
-    for block in every[3 * len(every) // 4:]:
+    for block in every[3 * len(every) // 4 :]:
         live.push(block)
     named = {key for key, part in live.solve(pending=True).model.slices.items()}
     assert ('accelerometer', 'accel_quadratic') in named
@@ -131,7 +144,9 @@ def test_the_model_as_asked_stays(hidden):
         live.push(block)
     before = live.solve(pending=True).calibration
     answer = question_about(live).answer()
-    assert answer.state.word == 'found' and not live.adopt(answer.extension)   # it is said, and that is all
+    assert answer.state.word == 'found' and not live.adopt(
+        answer.extension
+    )  # it is said, and that is all
     after = live.solve(pending=True).calibration
     assert after.param_names == before.param_names and 'added' not in after.statistics
     np.testing.assert_array_equal(after.sd, before.sd)
@@ -144,7 +159,11 @@ def test_what_cannot_join_is_said_and_widens(hidden):
     assert answer.extension.changes.lacking == ('accel_quadratic',) and not answer.extension.added
     assert station.live.adopt(answer.extension)
     after = station.live.solve(pending=True).calibration
-    assert after.param_names == before.param_names and (after.sd >= before.sd).all() and np.max(after.sd / before.sd) > 1.5
+    assert (
+        after.param_names == before.param_names
+        and (after.sd >= before.sd).all()
+        and np.max(after.sd / before.sd) > 1.5
+    )
     lines = [line for line in after.notes if 'accel_quadratic' in line or 'offline' in line]
     assert len(lines) == 2 and 'accel_quadratic' in lines[0]
 
@@ -156,18 +175,32 @@ def test_a_resumed_session_keeps_what_joined(station, hidden):
     saved = station.live.saved(pending=True)
     table = Table.from_mapping(hidden.table)
     resumed = LiveCalibration(table, saved=saved)
-    assert resumed.extension.added == station.live.extension.added and resumed.model.has_columns_of(station.live.model)
+    assert resumed.extension.added == station.live.extension.added and resumed.model.has_columns_of(
+        station.live.model
+    )
     assert_same(resumed.solve().calibration, station.live.solve(pending=True).calibration)
-    assert resumed.result.calibration.statistics['added'] == station.live.result.calibration.statistics['added']
-    assert question_about(resumed) is None   # the windows of before have no samples any more
+    assert (
+        resumed.result.calibration.statistics['added']
+        == station.live.result.calibration.statistics['added']
+    )
+    assert question_about(resumed) is None  # the windows of before have no samples any more
     half = hidden.imu.stamp_ns[len(hidden.imu) // 2]
     later = 10**12
-    for block in blocks(replace(hidden.imu, stamp_ns=hidden.imu.stamp_ns + later).select(hidden.imu.stamp_ns < half),
-                        replace(hidden.joints, stamp_ns=hidden.joints.stamp_ns + later).select(hidden.joints.stamp_ns < half)):
+    for block in blocks(
+        replace(hidden.imu, stamp_ns=hidden.imu.stamp_ns + later).select(
+            hidden.imu.stamp_ns < half
+        ),
+        replace(hidden.joints, stamp_ns=hidden.joints.stamp_ns + later).select(
+            hidden.joints.stamp_ns < half
+        ),
+    ):
         resumed.push(block)
     resumed.solve(pending=True)
     answer = question_about(resumed).answer()
-    assert answer.extension.added == station.live.extension.added and not answer.extension.changes.lacking
+    assert (
+        answer.extension.added == station.live.extension.added
+        and not answer.extension.changes.lacking
+    )
     with refused(DocumentError, 'other_model', 'accel_quadratic'):
         LiveCalibration(table, CalibrationOptions(as_asked=True), saved=saved)
 
@@ -188,7 +221,10 @@ def test_without_windows_nothing_is_asked(hidden):
 def test_a_window_keeps_no_chunk_alive(station):
     """A window that was cut from a chunk of 20 s would keep all of it."""
     for window in station.live.last.gathered.spreads[0].windows:
-        assert all(array.base is None for array in (window.force_s, window.rate_s, window.stamp_ns, window.motion.position))
+        assert all(
+            array.base is None
+            for array in (window.force_s, window.rate_s, window.stamp_ns, window.motion.position)
+        )
 
 
 class Slow:
@@ -214,10 +250,12 @@ class Slow:
 
 
 def test_the_thread_answers_when_asked_and_once_at_a_time(monkeypatch):
-    monkeypatch.setattr('imu_calibration.nodes.diagnosis_thread.MAX_DIAGNOSIS_SHARE', 1.0)   # a busy machine makes the first answer long, and the pause after it
+    monkeypatch.setattr(
+        'imu_calibration.nodes.diagnosis_thread.MAX_DIAGNOSIS_SHARE', 1.0
+    )  # a busy machine makes the first answer long, and the pause after it
     thread, question = DiagnosisThread(3600.0), Slow('first')
     thread.ask_when_due(question, True)
-    assert question.asked == 0 and thread.state.word == 'waiting'   # the period is not over
+    assert question.asked == 0 and thread.state.word == 'waiting'  # the period is not over
     thread.want()
     thread.ask_when_due(question, True)
     thread.want()
@@ -226,8 +264,12 @@ def test_the_thread_answers_when_asked_and_once_at_a_time(monkeypatch):
     question.go.set()
     until(lambda: not thread.is_running, 'the answer', 10.0)
     assert thread.state.message == 'first' and thread.n_answers == 1
-    assert question not in vars(thread).values()   # its windows would remain in memory
-    until(lambda: thread.ask_when_due(question, False) or thread.n_answers == 2, 'the second question', 10.0)   # it was wanted while the first was being answered
+    assert question not in vars(thread).values()  # its windows would remain in memory
+    until(
+        lambda: thread.ask_when_due(question, False) or thread.n_answers == 2,
+        'the second question',
+        10.0,
+    )  # it was wanted while the first was being answered
 
 
 def test_a_session_started_anew_forgets_the_question_and_an_ending_one_stops_it():
@@ -247,6 +289,7 @@ def test_a_failure_is_a_status_and_zero_is_off():
 
         def answer(self):
             raise ValueError('broken')
+
     thread = DiagnosisThread(3600.0)
     thread.want()
     thread.ask_when_due(Broken, True)
@@ -262,7 +305,11 @@ def test_who_saves_waits_for_the_answer_and_asks_the_same_once():
     thread, question = DiagnosisThread(3600.0), Slow('first')
     threading.Timer(0.2, question.go.set).start()
     thread.settle(question)
-    assert thread.n_answers == 1 and thread.take_extension() is not None and thread.take_extension() is None
+    assert (
+        thread.n_answers == 1
+        and thread.take_extension() is not None
+        and thread.take_extension() is None
+    )
     thread.settle(question)
     thread.settle(None)
     assert thread.n_answers == 1
@@ -274,6 +321,13 @@ def test_who_saves_waits_for_the_answer_and_asks_the_same_once():
 
 def test_what_stays_unexplained_is_said(expected):
     diagnosis = expected.diagnosis
-    rest = {sensor: replace(found, significant=sensor == 'gyroscope', rms=1e-3) for sensor, found in diagnosis.unexplained.items()}
+    rest = {
+        sensor: replace(found, significant=sensor == 'gyroscope', rms=1e-3)
+        for sensor, found in diagnosis.unexplained.items()
+    }
     state = describe(replace(diagnosis, findings=(), unexplained=rest))
-    assert state.word == 'unexplained' and state.message.startswith('unexplained: ') and 'gyroscope' in state.message
+    assert (
+        state.word == 'unexplained'
+        and state.message.startswith('unexplained: ')
+        and 'gyroscope' in state.message
+    )

@@ -14,10 +14,15 @@ WORSE = 1.05
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(('cause', 'world'), [
-    ('driver_lag', {'table': 'shaft', 'profile': 'sweeps'}), ('motor_ripple', {'table': 'shaft', 'profile': 'sweeps'}),
-    ('backlash', {}),
-], ids=lambda value: value if isinstance(value, str) else value.get('table', 'gimbals'))
+@pytest.mark.parametrize(
+    ('cause', 'world'),
+    [
+        ('driver_lag', {'table': 'shaft', 'profile': 'sweeps'}),
+        ('motor_ripple', {'table': 'shaft', 'profile': 'sweeps'}),
+        ('backlash', {}),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.get('table', 'gimbals'),
+)
 def test_what_is_handed_over_helps_in_another_session(cause, world):
     pair = make_pair(cause, 21, **world)
     table = Table.from_mapping(pair.table)
@@ -32,5 +37,7 @@ def test_what_is_handed_over_helps_in_another_session(cause, world):
             assert found.exit_code == 3
             continue
         worst = max(part['after'] / part['before'] for part in entry['regimes'].values())
-        print(f'{cause}, {sensor}: error after / before {entry["after"] / entry["before"]:.3f} wanted below 1, worst motion {worst:.3f} wanted at most {WORSE}')
+        print(
+            f'{cause}, {sensor}: error after / before {entry["after"] / entry["before"]:.3f} wanted below 1, worst motion {worst:.3f} wanted at most {WORSE}'
+        )
         assert entry['after'] < entry['before'] and worst <= WORSE

@@ -28,11 +28,15 @@ def test_matrix_and_size_effect_are_fixed_and_bias_and_common_arm_are_estimated(
     calibration = vertical[1]
     for role, nominal in ((Role.LINEAR, np.eye(3).ravel()), (Role.ARMS, np.zeros(9))):
         part = calibration.model.part('accelerometer', role)
-        assert set(calibration.status[part]) == {HELD} and np.array_equal(calibration.values[part], nominal)
+        assert set(calibration.status[part]) == {HELD} and np.array_equal(
+            calibration.values[part], nominal
+        )
     statuses = calibration.status[calibration.model.part('accelerometer', Role.OFFSET)]
     assert set(statuses) != {HELD}
     arm = calibration.status[calibration.model.part('accelerometer', Role.ARM)]
-    assert len(arm) == 3 and set(arm) != {HELD}, 'without the arm, centripetal acceleration would be a bias'
+    assert len(arm) == 3 and set(arm) != {HELD}, (
+        'without the arm, centripetal acceleration would be a bias'
+    )
 
 
 def test_a_calibration_of_one_attitude_is_unproven_for_others_and_applies_to_the_same_one(vertical):
@@ -41,10 +45,15 @@ def test_a_calibration_of_one_attitude_is_unproven_for_others_and_applies_to_the
     assert calibration.decisions['gyroscope'] is not UNPROVEN
     assert 'the same attitude' in calibration.decision_reasons['accelerometer']
     again = calibration_from_text(calibration_to_text(calibration))
-    assert again.proof['accelerometer']['one_attitude'] is True and again.decisions == calibration.decisions
+    assert (
+        again.proof['accelerometer']['one_attitude'] is True
+        and again.decisions == calibration.decisions
+    )
     gravity = np.array([0.0, 0.0, pair.second.truth['gravity']])
-    raw, corrected = (np.linalg.norm(imu.force_s.mean(axis=0) - gravity)
-                      for imu in (pair.second.imu, calibration.compensate(pair.second.imu)))
+    raw, corrected = (
+        np.linalg.norm(imu.force_s.mean(axis=0) - gravity)
+        for imu in (pair.second.imu, calibration.compensate(pair.second.imu))
+    )
     assert corrected < 0.05 * raw
 
 
@@ -55,7 +64,14 @@ def test_check_on_the_same_attitude_reports_the_error_of_that_recording(vertical
 
 
 def test_one_attitude_is_never_called_harmful():
-    entry = {'before': 0.01, 'after': 0.03, 'ci95': [2.9, 3.2], 'unit': 'm/s^2', 'windows': 24, 'one_attitude': True}
+    entry = {
+        'before': 0.01,
+        'after': 0.03,
+        'ci95': [2.9, 3.2],
+        'unit': 'm/s^2',
+        'windows': 24,
+        'one_attitude': True,
+    }
     assert decide(entry) is UNPROVEN and 'the same attitude' in reason_of(entry)
 
 

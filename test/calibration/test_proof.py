@@ -1,6 +1,5 @@
 """A calibration is proven on windows that took no part, before it is handed over."""
 
-
 import re
 
 import numpy as np
@@ -35,7 +34,11 @@ def clean():
 
 @pytest.fixture(scope='module')
 def late():
-    return calibrated(make_pair('driver_lag', 1, table='shaft', profile='sweeps'), reference_model='table_tilt', model_as_asked=True)
+    return calibrated(
+        make_pair('driver_lag', 1, table='shaft', profile='sweeps'),
+        reference_model='table_tilt',
+        model_as_asked=True,
+    )
 
 
 def test_both_sides_are_compared_with_the_same_table():
@@ -44,7 +47,11 @@ def test_both_sides_are_compared_with_the_same_table():
     model = SensorModel(reference=tuple(names))
     values = np.arange(1.0, 1.0 + len(model.prior()[0]))
     kept = applied_values(model, values)
-    assert names and all((kept[model.slices[effect.key]] == values[model.slices[effect.key]]).all() for effect in model.effects if effect.sensor == 'reference')
+    assert names and all(
+        (kept[model.slices[effect.key]] == values[model.slices[effect.key]]).all()
+        for effect in model.effects
+        if effect.sensor == 'reference'
+    )
 
 
 def test_a_good_calibration_is_proven_in_every_motion(clean):
@@ -58,14 +65,24 @@ def test_a_good_calibration_is_proven_in_every_motion(clean):
 
 
 def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, tmp_path):
-    true = make_pair('driver_lag', 1, table='shaft', profile='sweeps').first.truth['gyroscope'].matrix[0, 0]
+    true = (
+        make_pair('driver_lag', 1, table='shaft', profile='sweeps')
+        .first.truth['gyroscope']
+        .matrix[0, 0]
+    )
     gain = late.calibration.value('gyroscope', 'matrix')[0, 0]
-    assert abs(gain - true) > 2 * abs(1.0 - true)   # what has to be noticed
+    assert abs(gain - true) > 2 * abs(1.0 - true)  # what has to be noticed
     assert late.verdict.decisions['gyroscope'] is not HELPS and late.exit_code == 3
     assert late.calibration.proof['gyroscope']['delay_s'] == pytest.approx(0.012, abs=2e-3)
     line = reason_of(late.calibration.proof['gyroscope'])
-    assert re.search(r'\b1\d(\.\d+)? ms\b', line) and '\n' not in line and line == late.calibration.decision_reasons['gyroscope']
-    assert late.verdict.decisions['accelerometer'] is HELPS   # its residuals are large, and it helps in every motion
+    assert (
+        re.search(r'\b1\d(\.\d+)? ms\b', line)
+        and '\n' not in line
+        and line == late.calibration.decision_reasons['gyroscope']
+    )
+    assert (
+        late.verdict.decisions['accelerometer'] is HELPS
+    )  # its residuals are large, and it helps in every motion
     late.save(tmp_path, report=False)
     assert 'proof:' in (tmp_path / 'calibration.yaml').read_text()
 
@@ -78,10 +95,13 @@ def test_a_fold_is_left_out_as_if_it_had_not_been_recorded(clean):
     for k, block in enumerate(dealt.blocks):
         if k % TABLE_FOLDS != 2:
             rest.merge(block.accumulator)
-    assert not rest.blocks   # memory that nobody needs
+    assert not rest.blocks  # memory that nobody needs
     again = solve(rest, result.model, noise=result.solution.noise)
     free = ~(result.solution.held | again.held)
-    step, wanted = ((values - result.solution.values)[free] / result.solution.sd[free] for values in (without[2], again.values))
+    step, wanted = (
+        (values - result.solution.values)[free] / result.solution.sd[free]
+        for values in (without[2], again.values)
+    )
     # biases wander from window to window: what is dealt out apart is whitened apart
     assert np.corrcoef(step, wanted)[0, 1] > 0.95 and np.abs(step - wanted).max() < 0.3
 
@@ -99,8 +119,9 @@ def test_memory_does_not_grow_with_the_session(clean):
     for _ in range(3):
         twice.merge(clean.result.gathered.held_out)
     sizes = [factor.shape for block in twice.blocks for factor in block.pieces.values()]
-    assert twice.n_windows == 3 * clean.result.gathered.held_out.n_windows and max(rows for rows, _ in sizes) <= max(width for _,
-                                                                                                                     width in sizes)
+    assert twice.n_windows == 3 * clean.result.gathered.held_out.n_windows and max(
+        rows for rows, _ in sizes
+    ) <= max(width for _, width in sizes)
 
 
 def test_a_regime_that_gets_worse_is_named(clean):

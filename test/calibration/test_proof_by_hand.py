@@ -26,7 +26,11 @@ def session():
 def test_a_good_calibration_is_proven_on_poses_and_turns(session):
     hand = solve_by_hand(session, OPTIONS)
     proof = prove_by_hand(hand, session.turns)
-    assert proof['accelerometer']['windows'] == 20 and proof['gyroscope']['unit'] == 'rad per turn' and all(decide(entry) is HELPS for entry in proof.values())
+    assert (
+        proof['accelerometer']['windows'] == 20
+        and proof['gyroscope']['unit'] == 'rad per turn'
+        and all(decide(entry) is HELPS for entry in proof.values())
+    )
     for entry in proof.values():
         assert entry['after'] < 0.2 * entry['before'] and entry['ci95'][1] < 0.3
 
@@ -36,9 +40,18 @@ def test_a_part_is_left_out_as_if_it_had_not_been_recorded(session):
     out = np.arange(20) % HAND_PROOF_FOLDS == 3
     (step,) = values_without(hand, session.turns, [out])
     place = np.cumsum(~out) - 1
-    rest = [replace(turn, first=int(place[turn.first]), last=int(place[turn.last])) for turn in session.turns if not (out[turn.first] or out[turn.last])]
-    parts = {name: getattr(session.poses, name)[~out] for name in ('force', 'rate', 'force_sem', 'rate_sem', 'start', 'stop', 'time')}
-    again = solve_by_hand(replace(session, poses=replace(session.poses, **parts), turns=rest), OPTIONS)
+    rest = [
+        replace(turn, first=int(place[turn.first]), last=int(place[turn.last]))
+        for turn in session.turns
+        if not (out[turn.first] or out[turn.last])
+    ]
+    parts = {
+        name: getattr(session.poses, name)[~out]
+        for name in ('force', 'rate', 'force_sem', 'rate_sem', 'start', 'stop', 'time')
+    }
+    again = solve_by_hand(
+        replace(session, poses=replace(session.poses, **parts), turns=rest), OPTIONS
+    )
     free, sd = ~hand.hand_model.fixed, hand.sd[~hand.hand_model.fixed]
     moved = (again.values - hand.values)[free] / sd
     assert np.abs(moved).max() > 0.5

@@ -35,15 +35,23 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, sca
     """
     table, blocks = opened(recordings / name)
     calibration = calibrate([lambda: iter(blocks)], table, options).calibration
-    values, sds = (dict(zip(calibration.param_names, numbers)) for numbers in (calibration.values, calibration.sd))
+    values, sds = (
+        dict(zip(calibration.param_names, numbers))
+        for numbers in (calibration.values, calibration.sd)
+    )
     found = values[f'gyroscope.matrix.{diagonal}']
     assert abs(found - scale) < 0.003
     assert sds[f'gyroscope.matrix.{diagonal}'] < 0.002
     lag = 0.0
     if options is BOTH:
-        lag = values['gyroscope.gyro_bandwidth.time_constant'] + values['reference.time_offset.offset']
+        lag = (
+            values['gyroscope.gyro_bandwidth.time_constant']
+            + values['reference.time_offset.offset']
+        )
         assert 0.0115 < lag < 0.0145
-    print(f'{name}: gyroscope scale along the shaft {found:.4f} (known {scale}), lag {lag * 1e3:.1f} ms (known 12-14)')
+    print(
+        f'{name}: gyroscope scale along the shaft {found:.4f} (known {scale}), lag {lag * 1e3:.1f} ms (known 12-14)'
+    )
 
 
 @pytest.mark.long
@@ -59,9 +67,15 @@ def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
     document = diagnose_recording(source, table).document
     effects = {finding['effect'] for finding in document['findings']}
     assert effects and effects <= {'time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter'}
-    lag = sum(entry['value'] for finding in document['findings'] for entry in finding['parameters'].values())
+    lag = sum(
+        entry['value']
+        for finding in document['findings']
+        for entry in finding['parameters'].values()
+    )
     gain = document['findings'][0]['gain']
-    print(f'{name}: {sorted(effects)} of {lag * 1e3:.2f} ms, held-out residual falls by {gain["reduction"]:.2f} {np.round(gain["ci95"], 2)}')
+    print(
+        f'{name}: {sorted(effects)} of {lag * 1e3:.2f} ms, held-out residual falls by {gain["reduction"]:.2f} {np.round(gain["ci95"], 2)}'
+    )
     assert 0.0115 < lag < 0.0145
     assert gain['ci95'][0] > 0.3
 
@@ -73,5 +87,8 @@ def test_what_one_axis_cannot_show_is_held(recordings):
     with open_recording(folder, imu_topic='/imu/data_raw') as recording:
         result = calibrate([lambda: recording.blocks(table.joint_names)], table)
     status = dict(zip(result.calibration.param_names, result.calibration.status))
-    assert all(status[f'gyroscope.matrix.{name}'] == 'held' for name in ('xx', 'xy', 'yx', 'yy', 'zx', 'zy'))
+    assert all(
+        status[f'gyroscope.matrix.{name}'] == 'held'
+        for name in ('xx', 'xy', 'yx', 'yy', 'zx', 'zy')
+    )
     assert exit_code(result.calibration) == 3

@@ -21,12 +21,21 @@ TRUE = np.array([0.01, -0.02, 0.015, 15.0])
 
 @pytest.fixture(scope='module')
 def session():
-    return make_session(21, {'gyro_bias_drift': TRUE}, profile='quick', noise='realistic', imu_rate=50.0, joint_rate=50.0)
+    return make_session(
+        21,
+        {'gyro_bias_drift': TRUE},
+        profile='quick',
+        noise='realistic',
+        imu_rate=50.0,
+        joint_rate=50.0,
+    )
 
 
 @pytest.fixture(scope='module')
 def calibration(session):
-    return imu.calibrate(session.block, Table.from_mapping(session.table), gyroscope_model=MODEL, model_as_asked=True).calibration
+    return imu.calibrate(
+        session.block, Table.from_mapping(session.table), gyroscope_model=MODEL, model_as_asked=True
+    ).calibration
 
 
 def test_a_requested_warm_up_has_its_time_constant(calibration):
@@ -34,11 +43,15 @@ def test_a_requested_warm_up_has_its_time_constant(calibration):
     part = calibration.model.slices['gyroscope', 'gyro_bias_drift']
     assert np.all(calibration.sd[part] < 0.05 * np.abs(TRUE))
     # Means of windows of a third of the time constant bend the exponential by a hundredth.
-    assert np.all(np.abs(calibration.values[part] - TRUE) < 4 * calibration.sd[part] + 0.02 * np.abs(TRUE))
+    assert np.all(
+        np.abs(calibration.values[part] - TRUE) < 4 * calibration.sd[part] + 0.02 * np.abs(TRUE)
+    )
 
 
 def test_live_a_requested_warm_up_is_that_of_the_recording(session, calibration):
-    live = LiveCalibration(Table.from_mapping(session.table), CalibrationOptions(gyroscope_model=MODEL, as_asked=True))
+    live = LiveCalibration(
+        Table.from_mapping(session.table), CalibrationOptions(gyroscope_model=MODEL, as_asked=True)
+    )
     live.push(session.block)
     found = live.solve(pending=True).calibration
     assert found.param_names == calibration.param_names
@@ -50,8 +63,18 @@ def test_live_a_requested_warm_up_is_that_of_the_recording(session, calibration)
 def test_by_hand_a_requested_warm_up_has_its_time_constant(constant):
     """The iteration left the prior for thousands of seconds, with amplitudes of the wrong sign."""
     samples, *_ = hold_and_turn(21, n_poses=24, rate_hz=50.0)
-    time, amplitudes = 1e-9 * (samples.stamp_ns - samples.stamp_ns[0]), np.array([0.01, -0.02, 0.015])
-    samples = replace(samples, rate_s=samples.rate_s - np.outer(np.expm1(-time / constant), amplitudes))
-    found = imu.calibrate(SampleBlock(samples), gravity=9.81, gyroscope_model=MODEL, model_as_asked=True).calibration
+    time, amplitudes = (
+        1e-9 * (samples.stamp_ns - samples.stamp_ns[0]),
+        np.array([0.01, -0.02, 0.015]),
+    )
+    samples = replace(
+        samples, rate_s=samples.rate_s - np.outer(np.expm1(-time / constant), amplitudes)
+    )
+    found = imu.calibrate(
+        SampleBlock(samples), gravity=9.81, gyroscope_model=MODEL, model_as_asked=True
+    ).calibration
     part = found.model.slices['gyroscope', 'gyro_bias_drift']
-    assert np.all(np.abs(found.values[part] - [*amplitudes, constant]) < 4 * found.sd[part]) and found.sd[part][-1] < 0.1 * constant
+    assert (
+        np.all(np.abs(found.values[part] - [*amplitudes, constant]) < 4 * found.sd[part])
+        and found.sd[part][-1] < 0.1 * constant
+    )

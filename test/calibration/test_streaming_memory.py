@@ -17,8 +17,12 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from imu_calibration.use_cases.resources import config_file
 
-TABLE = Table.from_mapping(yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8')))
-MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))
+TABLE = Table.from_mapping(
+    yaml.safe_load(config_file('table_simulated.yaml').read_text(encoding='utf-8'))
+)
+MODEL = SensorModel(
+    accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names)
+)
 PAUSE_NS = 2_000_000_000
 """Between the repetitions, so that the jump of the joints back to the start lies in no window."""
 BLOCK = 4096
@@ -30,8 +34,14 @@ ALLOWED_GROWTH = 1 << 20
 def piece():
     """Return the IMU and the joints of a short session at 100 Hz."""
     profile = make_profile('quick', 4, TABLE)
-    return simulate(MODEL, random_values(MODEL, 'industrial', 4), TABLE, profile=profile, options=SimulationOptions(100.0, 50.0),
-                    seed=4)[:2]
+    return simulate(
+        MODEL,
+        random_values(MODEL, 'industrial', 4),
+        TABLE,
+        profile=profile,
+        options=SimulationOptions(100.0, 50.0),
+        seed=4,
+    )[:2]
 
 
 def stream(imu, joints, repetitions):
@@ -42,7 +52,12 @@ def stream(imu, joints, repetitions):
             part = slice(start, start + BLOCK)
             begin, end = imu.stamp_ns[part][[0, -1]]
             near = slice(*np.searchsorted(joints.stamp_ns, [begin if start else 0, end + 1]))
-            yield SampleBlock(*(type(s)(**{**vars(s), 'stamp_ns': s.stamp_ns + k * span}) for s in (imu.select(part), joints.select(near))))
+            yield SampleBlock(
+                *(
+                    type(s)(**{**vars(s), 'stamp_ns': s.stamp_ns + k * span})
+                    for s in (imu.select(part), joints.select(near))
+                )
+            )
 
 
 def peak(imu, joints, repetitions):
@@ -58,8 +73,13 @@ def peak(imu, joints, repetitions):
 @pytest.mark.long
 def test_peak_memory_does_not_grow_with_the_stream(piece, monkeypatch):
     """Three times the length takes no more memory, once all that is kept on purpose is full; nothing of the data is lost by it."""
-    for module, name, value in ((gathering, 'KEPT_POSES', 20), (gathering, 'KEPT_SAMPLES', 2000), (least_squares, 'MAX_MEAN_ROWS', 64),
-                                (least_squares, 'MAX_ACCUMULATOR_BLOCKS', 4), (least_squares, 'LEAST_ROWS', 4)):
+    for module, name, value in (
+        (gathering, 'KEPT_POSES', 20),
+        (gathering, 'KEPT_SAMPLES', 2000),
+        (least_squares, 'MAX_MEAN_ROWS', 64),
+        (least_squares, 'MAX_ACCUMULATOR_BLOCKS', 4),
+        (least_squares, 'LEAST_ROWS', 4),
+    ):
         monkeypatch.setattr(module, name, value)
     imu, joints = piece
     short, short_peak = peak(imu, joints, 1)
@@ -69,7 +89,9 @@ def test_peak_memory_does_not_grow_with_the_stream(piece, monkeypatch):
     used = [sum(found.accumulator.samples.values()) for found in (short, long)]
     assert abs(used[1] - 3 * used[0]) < 0.02 * used[1]
     once, thrice = (solve(found.accumulator, MODEL) for found in (short, long))
-    assert np.max(np.abs(thrice.values - once.values) / once.sd) < 2.0, 'the same samples again say the same'
+    assert np.max(np.abs(thrice.values - once.values) / once.sd) < 2.0, (
+        'the same samples again say the same'
+    )
 
 
 def test_what_is_kept_by_default_is_small(piece):

@@ -16,17 +16,26 @@ def session():
 
 
 def calibrated(session, minimum):
-    return calibrate(session.block, Table.from_mapping(session.table), setting={'static_minimum': minimum}, model_as_asked=True).calibration
+    return calibrate(
+        session.block,
+        Table.from_mapping(session.table),
+        setting={'static_minimum': minimum},
+        model_as_asked=True,
+    ).calibration
 
 
 def unused_rests(calibration):
-    return [reason for reason in calibration.judgement.reasons if reason.word is WARNING and reason.key == 'setting']
+    return [
+        reason
+        for reason in calibration.judgement.reasons
+        if reason.word is WARNING and reason.key == 'setting'
+    ]
 
 
 def test_a_static_minimum_that_removes_all_rests_is_reported_with_the_number_of_samples(session):
     calibration = calibrated(session, 30.0)
     assert 'static' not in calibration.statistics['windows']
-    warning, = unused_rests(calibration)
+    (warning,) = unused_rests(calibration)
     count = calibration.statistics['stream']['rest too short']
     assert count > 1000 and str(count) in warning.what and 'static_minimum' in warning.next
 

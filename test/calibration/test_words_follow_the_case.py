@@ -26,26 +26,46 @@ VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 
 def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
     pair = make_pair(None, 1, table='shaft', profile='sweeps')
     table = Table.from_mapping(pair.table)
-    result = calibrate(pair.first.block, table, accelerometer_model='bias+matrix', model_as_asked=True).result
+    result = calibrate(
+        pair.first.block, table, accelerometer_model='bias+matrix', model_as_asked=True
+    ).result
     needs = {text for text, _ in motions_needed(result.solution, result.tolerances, table).values()}
     possible = {motion.text for motion in motions_about((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))}
     assert OTHER_MOUNT in needs and needs <= {OTHER_MOUNT} | possible
-    assert possible == {motion.text for motion in MOTIONS if motion.name in ('spin_x', 'oscillate_x')}
+    assert possible == {
+        motion.text for motion in MOTIONS if motion.name in ('spin_x', 'oscillate_x')
+    }
 
 
 def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
     """Spins about a level axis would show every entry of the matrix; about the vertical one gravity stays where it is."""
     table = Table.from_mapping(VERTICAL)
     session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
-    result = calibrate(SampleBlock(session.imu, session.joints), table, accelerometer_model='bias+matrix', model_as_asked=True).result
+    result = calibrate(
+        SampleBlock(session.imu, session.joints),
+        table,
+        accelerometer_model='bias+matrix',
+        model_as_asked=True,
+    ).result
     needed = motions_needed(result.solution, result.tolerances, table)
-    held = [name for name, status in zip(result.calibration.param_names, result.calibration.status) if status == 'held' and name.startswith('accelerometer.matrix')]
+    held = [
+        name
+        for name, status in zip(result.calibration.param_names, result.calibration.status)
+        if status == 'held' and name.startswith('accelerometer.matrix')
+    ]
     assert held and {needed[name][0] for name in held} == {OTHER_MOUNT}
-    reasons = [reason for reason in result.verdict.reasons if held[0] in reason.what or 'accelerometer.matrix (' in reason.what]
+    reasons = [
+        reason
+        for reason in result.verdict.reasons
+        if held[0] in reason.what or 'accelerometer.matrix (' in reason.what
+    ]
     assert reasons and all(OTHER_MOUNT in reason.next for reason in reasons)
     for motion in motions_about((0.0, 0.0, -1.0), (0.0, 0.6, -0.8)):
-        assert all(abs(piece.force_s @ piece.rate_s[0]).max() == pytest.approx(0.8 * 9.8 * np.linalg.norm(piece.rate_s[0]))
-                   for piece in motion.make(9.8))
+        assert all(
+            abs(piece.force_s @ piece.rate_s[0]).max()
+            == pytest.approx(0.8 * 9.8 * np.linalg.norm(piece.rate_s[0]))
+            for piece in motion.make(9.8)
+        )
 
 
 def test_compare_says_that_off_diagonal_terms_include_the_mounting():
@@ -53,7 +73,10 @@ def test_compare_says_that_off_diagonal_terms_include_the_mounting():
     values = first.values.copy()
     values[first.param_names.index('gyroscope.matrix.xy')] += 0.05
     by_hand = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
-    pairs = [[replace(first, gauge=gauge), replace(first, gauge=gauge, values=values)] for gauge in (first.gauge, by_hand)]
+    pairs = [
+        [replace(first, gauge=gauge), replace(first, gauge=gauge, values=values)]
+        for gauge in (first.gauge, by_hand)
+    ]
     on_table, without = (compare(*pair).lines for pair in pairs)
     assert len(on_table) == len(without) + 1 and sum('mounted' in line for line in on_table) == 1
     assert len(compare(first, first).lines) < len(without)
@@ -62,12 +85,28 @@ def test_compare_says_that_off_diagonal_terms_include_the_mounting():
 def test_a_ros_1_bag_is_told_how_to_be_converted(tmp_path):
     rosbags = pytest.importorskip('rosbags.rosbag1')
     from rosbags.typesys import Stores, get_typestore
+
     store = get_typestore(Stores.ROS1_NOETIC)
-    imu, header, stamp = (store.types[f'{name}'] for name in ('sensor_msgs/msg/Imu', 'std_msgs/msg/Header', 'builtin_interfaces/msg/Time'))
-    vector, quaternion, cov = store.types['geometry_msgs/msg/Vector3'], store.types['geometry_msgs/msg/Quaternion'], np.zeros(9)
+    imu, header, stamp = (
+        store.types[f'{name}']
+        for name in ('sensor_msgs/msg/Imu', 'std_msgs/msg/Header', 'builtin_interfaces/msg/Time')
+    )
+    vector, quaternion, cov = (
+        store.types['geometry_msgs/msg/Vector3'],
+        store.types['geometry_msgs/msg/Quaternion'],
+        np.zeros(9),
+    )
     with rosbags.Writer(tmp_path / 'old.bag') as writer:
         connection = writer.add_connection('/imu/data_raw', imu.__msgtype__, typestore=store)
-        message = imu(header(0, stamp(1, 0), 'imu_link'), quaternion(0.0, 0.0, 0.0, 1.0), cov, vector(0.0, 0.0, 0.0), cov, vector(0.0, 0.0, 9.8), cov)
+        message = imu(
+            header(0, stamp(1, 0), 'imu_link'),
+            quaternion(0.0, 0.0, 0.0, 1.0),
+            cov,
+            vector(0.0, 0.0, 0.0),
+            cov,
+            vector(0.0, 0.0, 9.8),
+            cov,
+        )
         writer.write(connection, 10**9, store.serialize_ros1(message, imu.__msgtype__))
     calibration = random_calibration(1)
     with refused(InputError, 'ros1_bag', 'rosbags-convert'):

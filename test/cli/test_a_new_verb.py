@@ -27,7 +27,9 @@ def run(options):
 @pytest.fixture(autouse=True)
 def weigh(monkeypatch):
     """Add the module and its name for the length of a test."""
-    module = SimpleNamespace(EXAMPLES=('session.bag --gravity 9.81',), add_arguments=add_arguments, run=run)
+    module = SimpleNamespace(
+        EXAMPLES=('session.bag --gravity 9.81',), add_arguments=add_arguments, run=run
+    )
     monkeypatch.setitem(sys.modules, 'imu_calibration.cli.weigh', module)
     monkeypatch.setitem(parser.VERBS, 'weigh', 'The weight of a bag.')
 
@@ -39,10 +41,19 @@ def test_it_runs_and_its_exit_code_is_that_of_the_program(capsys):
 
 def test_an_error_is_one_line_with_its_option(capsys):
     assert main(['weigh', 'session.bag']) == 1
-    assert capsys.readouterr() == ('', 'imu_calibration weigh: the local gravity must be known, none came; give it (--gravity)\n')
+    assert capsys.readouterr() == (
+        '',
+        'imu_calibration weigh: the local gravity must be known, none came; give it (--gravity)\n',
+    )
 
 
-@pytest.mark.parametrize(('arguments', 'words'), [(['weigh'], 'the following arguments are required: BAG'), (['weigh', 'a', '--grvty', '1'], '--grvty')])
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['weigh'], 'the following arguments are required: BAG'),
+        (['weigh', 'a', '--grvty', '1'], '--grvty'),
+    ],
+)
 def test_wrong_arguments_are_refused_with_one_line(arguments, words, capsys):
     with pytest.raises(SystemExit) as ended:
         main(arguments)

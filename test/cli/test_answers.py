@@ -21,14 +21,24 @@ LAST_DIGITS = {'rel': 0.05, 'abs': 1e-3}
 
 def same(found, wanted):
     """Return whether two texts have the same names, in any order, and the same numbers."""
-    numbers = [[float(number) for number in NUMBER.findall(KEY.sub(' ', text.replace('−', '-')))] for text in (found, wanted)]
-    return Counter(KEY.findall(found)) == Counter(KEY.findall(wanted)) and numbers[0] == pytest.approx(numbers[1], **LAST_DIGITS)
+    numbers = [
+        [float(number) for number in NUMBER.findall(KEY.sub(' ', text.replace('−', '-')))]
+        for text in (found, wanted)
+    ]
+    return Counter(KEY.findall(found)) == Counter(KEY.findall(wanted)) and numbers[
+        0
+    ] == pytest.approx(numbers[1], **LAST_DIGITS)
 
 
 def test_pages_differ_by_their_names_and_numbers_only():
     text = 'gyroscope.bias.z is determined, its sd is 0.240 of its tolerance (calibration.yaml)'
     assert same('calibration.yaml: sd / tolerance 0.241 for gyroscope.bias.z', text)
-    for other in (text.replace('0.240', '0.270'), text.replace('bias.z', 'bias.y'), text + ' 2', text.replace('calibration.yaml', 'file')):
+    for other in (
+        text.replace('0.240', '0.270'),
+        text.replace('bias.z', 'bias.y'),
+        text + ' 2',
+        text.replace('calibration.yaml', 'file'),
+    ):
         assert not same(other, text)
 
 
@@ -46,7 +56,10 @@ def test_a_page_is_written_with_what_its_commands_print(tmp_path):
     text = 'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\n$ printf "c\\n" | grep -c c\nold\n```\n\nand go on'
     with answers.inside(tmp_path):
         written = answers.worked_through(text)
-    assert written == 'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\na 1\nb 2\n$ printf "c\\n" | grep -c c\n1\n```\n\nand go on'
+    assert (
+        written
+        == 'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\na 1\nb 2\n$ printf "c\\n" | grep -c c\n1\n```\n\nand go on'
+    )
     with pytest.raises(ValueError, match='rm'):
         answers.run('rm -r /')
 

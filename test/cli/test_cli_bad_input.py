@@ -15,7 +15,11 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 from msg_adapters.write import write_session
 
-JOINTS = [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]}, {'name': 'inner', 'axis': [1, 0, 0]}]
+JOINTS = [
+    {'name': 'outer', 'axis': [0, 0, 1]},
+    {'name': 'middle', 'axis': [0, 1, 0]},
+    {'name': 'inner', 'axis': [1, 0, 0]},
+]
 DESCRIPTION = {'joints': JOINTS, 'up': [0, 0, 1], 'latitude': 48.8}
 TABLE = Table.from_mapping(DESCRIPTION)
 G = 9.80665
@@ -26,8 +30,14 @@ def session():
     """A short session: (ImuSamples, JointSamples)."""
     model = SensorModel()
     options = SimulationOptions(noise=GRADES['industrial'].noise)
-    return simulate(model, random_values(model, 'industrial', 2), TABLE, profile=make_profile('quick', 2, TABLE), options=options,
-                    seed=2)[:2]
+    return simulate(
+        model,
+        random_values(model, 'industrial', 2),
+        TABLE,
+        profile=make_profile('quick', 2, TABLE),
+        options=options,
+        seed=2,
+    )[:2]
 
 
 @pytest.fixture(scope='module')
@@ -36,8 +46,20 @@ def home(tmp_path_factory, session):
     folder = tmp_path_factory.mktemp('bad_input')
     write_session(str(folder / 'bag'), *session)
     (folder / 'table.yaml').write_text(yaml.safe_dump(DESCRIPTION))
-    assert main(['calibrate', str(folder / 'bag'), '--table', str(folder / 'table.yaml'), '--output', str(folder / 'good'),
-                 '--no-report']) == 0
+    assert (
+        main(
+            [
+                'calibrate',
+                str(folder / 'bag'),
+                '--table',
+                str(folder / 'table.yaml'),
+                '--output',
+                str(folder / 'good'),
+                '--no-report',
+            ]
+        )
+        == 0
+    )
     return folder
 
 
@@ -79,17 +101,23 @@ def described(folder, **changes):
 
 @pytest.mark.parametrize('option', ('--imu-topic', '--joint-topic'))
 def test_an_unknown_topic(capsys, tmp_path, home, option):
-    line = calibrate_refused(capsys, tmp_path, home / 'bag', home / 'table.yaml', option, '/nowhere')
+    line = calibrate_refused(
+        capsys, tmp_path, home / 'bag', home / 'table.yaml', option, '/nowhere'
+    )
     assert '/nowhere' in line and ('/imu/data_raw' in line or '/joint_states' in line)
 
 
 def test_a_topic_of_another_type(capsys, tmp_path, home):
-    line = calibrate_refused(capsys, tmp_path, home / 'bag', home / 'table.yaml', '--imu-topic', '/joint_states')
+    line = calibrate_refused(
+        capsys, tmp_path, home / 'bag', home / 'table.yaml', '--imu-topic', '/joint_states'
+    )
     assert '/joint_states' in line and 'Imu' in line
 
 
 def test_no_joint_states(capsys, tmp_path, home, session):
-    line = calibrate_refused(capsys, tmp_path, rewritten(tmp_path, session[0], None), home / 'table.yaml')
+    line = calibrate_refused(
+        capsys, tmp_path, rewritten(tmp_path, session[0], None), home / 'table.yaml'
+    )
     assert 'JointState' in line
 
 
@@ -105,20 +133,28 @@ def test_degrees_where_radians_belong(capsys, tmp_path, home, session, what, nam
     if what == 'rates':
         imu = replace(imu, rate_s=np.rad2deg(imu.rate_s))
     else:
-        joints = replace(joints, position=np.rad2deg(joints.position), velocity=np.rad2deg(joints.velocity))
-    line = calibrate_refused(capsys, tmp_path, rewritten(tmp_path, imu, joints), home / 'table.yaml')
+        joints = replace(
+            joints, position=np.rad2deg(joints.position), velocity=np.rad2deg(joints.velocity)
+        )
+    line = calibrate_refused(
+        capsys, tmp_path, rewritten(tmp_path, imu, joints), home / 'table.yaml'
+    )
     assert name in line and 'rad' in line
 
 
 def test_g_where_metres_per_second_squared_belong(capsys, tmp_path, home, session):
     imu = replace(session[0], force_s=session[0].force_s / G)
-    line = calibrate_refused(capsys, tmp_path, rewritten(tmp_path, imu, session[1]), home / 'table.yaml')
+    line = calibrate_refused(
+        capsys, tmp_path, rewritten(tmp_path, imu, session[1]), home / 'table.yaml'
+    )
     assert 'm/s^2' in line and 'accelerometer_scale 0.101972' in line
 
 
 def test_g_by_hand(capsys, tmp_path, session):
     imu = replace(session[0], force_s=session[0].force_s / G)
-    line = refused(capsys, 'calibrate', rewritten(tmp_path, imu, None), '--output', tmp_path / 'out')
+    line = refused(
+        capsys, 'calibrate', rewritten(tmp_path, imu, None), '--output', tmp_path / 'out'
+    )
     assert 'm/s^2' in line and 'g' in line
     assert not (tmp_path / 'out').exists()
 
@@ -130,7 +166,9 @@ def test_an_empty_bag(capsys, tmp_path, home, session):
 
 
 def test_a_bag_that_is_not_there(capsys, tmp_path, home):
-    assert 'correct the path' in calibrate_refused(capsys, tmp_path, tmp_path / 'nothing', home / 'table.yaml')
+    assert 'correct the path' in calibrate_refused(
+        capsys, tmp_path, tmp_path / 'nothing', home / 'table.yaml'
+    )
 
 
 def test_a_file_that_is_no_bag(capsys, tmp_path, home):
@@ -138,13 +176,16 @@ def test_a_file_that_is_no_bag(capsys, tmp_path, home):
     calibrate_refused(capsys, tmp_path, tmp_path / 'notes.txt', home / 'table.yaml')
 
 
-@pytest.mark.parametrize(('changes', 'words'), (
-    ({'joints': [dict(JOINTS[0], axis=[0, 0, 0]), *JOINTS[1:]]}, ('axis', 'outer', 'zero')),
-    ({'latitude': None}, ('gravity', 'latitude')),
-    ({'joints': []}, ('joint',)),
-    ({'gravity': 'much'}, ('gravity', 'much')),
-    ({'colour': 'grey'}, ('colour', 'unknown')),
-))
+@pytest.mark.parametrize(
+    ('changes', 'words'),
+    (
+        ({'joints': [dict(JOINTS[0], axis=[0, 0, 0]), *JOINTS[1:]]}, ('axis', 'outer', 'zero')),
+        ({'latitude': None}, ('gravity', 'latitude')),
+        ({'joints': []}, ('joint',)),
+        ({'gravity': 'much'}, ('gravity', 'much')),
+        ({'colour': 'grey'}, ('colour', 'unknown')),
+    ),
+)
 def test_a_table_description_that_does_not_hold(capsys, tmp_path, home, changes, words):
     line = calibrate_refused(capsys, tmp_path, home / 'bag', described(tmp_path, **changes))
     assert [word for word in words if word not in line] == []
@@ -157,9 +198,21 @@ def test_a_table_file_that_is_no_mapping(capsys, tmp_path, home, text):
 
 
 def test_a_calibration_from_a_newer_format(capsys, tmp_path, home):
-    text = (home / 'good' / 'calibration.yaml').read_text().replace('imu_calibration/1', 'imu_calibration/2')
+    text = (
+        (home / 'good' / 'calibration.yaml')
+        .read_text()
+        .replace('imu_calibration/1', 'imu_calibration/2')
+    )
     (tmp_path / 'newer.yaml').write_text(text)
-    line = refused(capsys, 'compensate', home / 'bag', '--calibration', tmp_path / 'newer.yaml', '--output', tmp_path / 'out')
+    line = refused(
+        capsys,
+        'compensate',
+        home / 'bag',
+        '--calibration',
+        tmp_path / 'newer.yaml',
+        '--output',
+        tmp_path / 'out',
+    )
     assert 'imu_calibration/2' in line
     assert not (tmp_path / 'out').exists()
 
@@ -181,7 +234,9 @@ def test_a_calibration_that_cannot_be_used(capsys, tmp_path, home, damage):
 def test_an_output_folder_that_cannot_be_written(capsys, tmp_path, home, verb):
     """A file stands where the folder should be (permissions do not stop an administrator)."""
     (tmp_path / 'taken').write_text('mine')
-    line = refused(capsys, verb, home / 'bag', '--table', home / 'table.yaml', '--output', tmp_path / 'taken')
+    line = refused(
+        capsys, verb, home / 'bag', '--table', home / 'table.yaml', '--output', tmp_path / 'taken'
+    )
     assert str(tmp_path / 'taken') in line
     assert (tmp_path / 'taken').read_text() == 'mine'
 
@@ -189,17 +244,41 @@ def test_an_output_folder_that_cannot_be_written(capsys, tmp_path, home, verb):
 @pytest.mark.skipif(os.geteuid() == 0, reason='an administrator may write everywhere')
 def test_an_output_folder_without_permission(capsys, tmp_path, home):
     (tmp_path / 'closed').mkdir(mode=0o500)
-    assert str(tmp_path / 'closed') in refused(capsys, 'calibrate', home / 'bag', '--table', home / 'table.yaml', '--output', tmp_path / 'closed')
+    assert str(tmp_path / 'closed') in refused(
+        capsys,
+        'calibrate',
+        home / 'bag',
+        '--table',
+        home / 'table.yaml',
+        '--output',
+        tmp_path / 'closed',
+    )
 
 
 def test_an_output_bag_that_exists(capsys, home):
-    line = refused(capsys, 'compensate', home / 'bag', '--calibration', home / 'good' / 'calibration.yaml', '--output', home / 'good')
+    line = refused(
+        capsys,
+        'compensate',
+        home / 'bag',
+        '--calibration',
+        home / 'good' / 'calibration.yaml',
+        '--output',
+        home / 'good',
+    )
     assert str(home / 'good') in line
 
 
-@pytest.mark.parametrize('more', (('--setting', 'settling=soon'), ('--setting', 'colour=1'), ('--setting', 'settling=-1'),
-                                  ('--accelerometer-model', 'bias+magic'), ('--gyroscope-model', 'bias'),
-                                  ('--reference-model', 'table_tlit')))
+@pytest.mark.parametrize(
+    'more',
+    (
+        ('--setting', 'settling=soon'),
+        ('--setting', 'colour=1'),
+        ('--setting', 'settling=-1'),
+        ('--accelerometer-model', 'bias+magic'),
+        ('--gyroscope-model', 'bias'),
+        ('--reference-model', 'table_tlit'),
+    ),
+)
 def test_options_that_do_not_fit(capsys, tmp_path, home, more):
     calibrate_refused(capsys, tmp_path, home / 'bag', home / 'table.yaml', *more)
 
@@ -216,9 +295,18 @@ def test_a_truncated_bag_gives_what_came_before_the_damage(capsys, tmp_path, hom
     write_session(str(tmp_path / 'whole'), *session, storage='mcap')
     file = next((tmp_path / 'whole').glob('*.mcap'))
     content = file.read_bytes()
-    file.write_bytes(content[:int(0.93 * len(content))])
-    code = main(['calibrate', str(tmp_path / 'whole'), '--table', str(home / 'table.yaml'), '--output', str(tmp_path / 'out'),
-                 '--no-report'])
+    file.write_bytes(content[: int(0.93 * len(content))])
+    code = main(
+        [
+            'calibrate',
+            str(tmp_path / 'whole'),
+            '--table',
+            str(home / 'table.yaml'),
+            '--output',
+            str(tmp_path / 'out'),
+            '--no-report',
+        ]
+    )
     printed = capsys.readouterr()
     assert code == 3
     document = yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())
@@ -230,6 +318,16 @@ def test_a_truncated_bag_gives_what_came_before_the_damage(capsys, tmp_path, hom
 def test_what_was_there_survives_a_refusal(capsys, tmp_path, home):
     (tmp_path / 'out').mkdir()
     (tmp_path / 'out' / 'calibration.yaml').write_text('the one before')
-    refused(capsys, 'calibrate', home / 'bag', '--table', home / 'table.yaml', '--imu-topic', '/nowhere', '--output', tmp_path / 'out')
+    refused(
+        capsys,
+        'calibrate',
+        home / 'bag',
+        '--table',
+        home / 'table.yaml',
+        '--imu-topic',
+        '/nowhere',
+        '--output',
+        tmp_path / 'out',
+    )
     assert [p.name for p in (tmp_path / 'out').iterdir()] == ['calibration.yaml']
     assert (tmp_path / 'out' / 'calibration.yaml').read_text() == 'the one before'

@@ -38,20 +38,53 @@ def calibrated(**proof):
 
 SENTENCES = {
     'check_helps': (lambda: checked(accelerometer=ENTRY, gyroscope=ENTRY), 'the calibration helps'),
-    'check_helps_one': (lambda: checked(accelerometer=HARMED, gyroscope=ENTRY), 'it helps the gyroscope only'),
-    'check_helps_none': (lambda: checked(accelerometer=HARMED, gyroscope=HARMED), 'it helps no sensor'),
-    'decision': (lambda: reason_of(ENTRY), 'error 20.4 mg to 1.02 mg on held-out data (8 windows, after / before 0.03 to 0.08)'),
+    'check_helps_one': (
+        lambda: checked(accelerometer=HARMED, gyroscope=ENTRY),
+        'it helps the gyroscope only',
+    ),
+    'check_helps_none': (
+        lambda: checked(accelerometer=HARMED, gyroscope=HARMED),
+        'it helps no sensor',
+    ),
+    'decision': (
+        lambda: reason_of(ENTRY),
+        'error 20.4 mg to 1.02 mg on held-out data (8 windows, after / before 0.03 to 0.08)',
+    ),
     'no_proof': (lambda: reason_of(None), NO_PROOF),
-    'not_corrected': (lambda: trust.usable(calibrated(accelerometer=HARMED, gyroscope=ENTRY)).lines[0].partition(': error')[0],
-                      'the accelerometer is not corrected: harms'),
-    'no_sensor_helps': (lambda: refusal(trust.usable, calibrated(accelerometer=HARMED, gyroscope=HARMED)).partition(': ')[0],
-                        'a calibration must help a sensor on held-out data to be applied, this one does not'),
-    'document_format': (lambda: refusal(calibration_from_text, 'format: x'), "a calibration document must have 'format: imu_calibration/1', got 'x'; "
-                        "give a file written by 'imu_calibration calibrate'"),
-    'document_newer': (lambda: refusal(calibration_from_text, 'format: imu_calibration/2'), "a calibration document must not be newer than "
-                       "'imu_calibration/1', got 'imu_calibration/2'; update imu_calibration"),
-    'hint': (lambda: with_hint('give the local gravity', 'gravity', {'gravity': '--gravity'}), 'give the local gravity (--gravity)'),
-    'nothing_lost': (lambda: loss_lines(find_target('px4'), Loss((), (), {'accelerometer': 0.0, 'gyroscope': 0.0}, {}, '')), ['lost: nothing']),
+    'not_corrected': (
+        lambda: (
+            trust.usable(calibrated(accelerometer=HARMED, gyroscope=ENTRY))
+            .lines[0]
+            .partition(': error')[0]
+        ),
+        'the accelerometer is not corrected: harms',
+    ),
+    'no_sensor_helps': (
+        lambda: refusal(trust.usable, calibrated(accelerometer=HARMED, gyroscope=HARMED)).partition(
+            ': '
+        )[0],
+        'a calibration must help a sensor on held-out data to be applied, this one does not',
+    ),
+    'document_format': (
+        lambda: refusal(calibration_from_text, 'format: x'),
+        "a calibration document must have 'format: imu_calibration/1', got 'x'; "
+        "give a file written by 'imu_calibration calibrate'",
+    ),
+    'document_newer': (
+        lambda: refusal(calibration_from_text, 'format: imu_calibration/2'),
+        'a calibration document must not be newer than '
+        "'imu_calibration/1', got 'imu_calibration/2'; update imu_calibration",
+    ),
+    'hint': (
+        lambda: with_hint('give the local gravity', 'gravity', {'gravity': '--gravity'}),
+        'give the local gravity (--gravity)',
+    ),
+    'nothing_lost': (
+        lambda: loss_lines(
+            find_target('px4'), Loss((), (), {'accelerometer': 0.0, 'gyroscope': 0.0}, {}, '')
+        ),
+        ['lost: nothing'],
+    ),
 }
 """Key -> (function that makes the sentence, sentence)."""
 

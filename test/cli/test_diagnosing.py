@@ -14,8 +14,36 @@ pytestmark = pytest.mark.slow
 def outcome(tmp_path_factory):
     """A session whose gyroscopes feel gravity, and its diagnosis."""
     folder = tmp_path_factory.mktemp('diagnosis')
-    assert main(['simulate', '--profile', 'short', '--effect', 'gyro_g_sensitivity', '--seed', '11', '--imu-rate', '50', '--joint-rate', '50', '--output', str(folder / 'bag')]) == 0
-    code = main(['diagnose', str(folder / 'bag'), '--table', str(folder / 'bag' / 'table.yaml'), '--output', str(folder / 'out')])
+    assert (
+        main(
+            [
+                'simulate',
+                '--profile',
+                'short',
+                '--effect',
+                'gyro_g_sensitivity',
+                '--seed',
+                '11',
+                '--imu-rate',
+                '50',
+                '--joint-rate',
+                '50',
+                '--output',
+                str(folder / 'bag'),
+            ]
+        )
+        == 0
+    )
+    code = main(
+        [
+            'diagnose',
+            str(folder / 'bag'),
+            '--table',
+            str(folder / 'bag' / 'table.yaml'),
+            '--output',
+            str(folder / 'out'),
+        ]
+    )
     assert code in (0, 3)
     return folder
 
@@ -38,9 +66,32 @@ def test_the_hidden_effects_are_found_and_measured(outcome):
 def test_the_extended_calibration_is_accepted_everywhere(outcome):
     """`compensate` takes the file as it is, and `simulate --calibration` runs it."""
     calibration = str(outcome / 'out' / 'calibration.yaml')
-    assert main(['compensate', str(outcome / 'bag'), '--calibration', calibration, '--output', str(outcome / 'corrected')]) == 0
-    again = main(['simulate', '--table', str(outcome / 'bag' / 'table.yaml'), '--profile', 'quick', '--calibration', calibration, '--output',
-                  str(outcome / 'again')])
+    assert (
+        main(
+            [
+                'compensate',
+                str(outcome / 'bag'),
+                '--calibration',
+                calibration,
+                '--output',
+                str(outcome / 'corrected'),
+            ]
+        )
+        == 0
+    )
+    again = main(
+        [
+            'simulate',
+            '--table',
+            str(outcome / 'bag' / 'table.yaml'),
+            '--profile',
+            'quick',
+            '--calibration',
+            calibration,
+            '--output',
+            str(outcome / 'again'),
+        ]
+    )
     assert again == 0
     found = calibration_from_text((outcome / 'out' / 'calibration.yaml').read_text())
     assert found.has('gyroscope', 'gyro_g_sensitivity')

@@ -11,7 +11,7 @@ from refusal import refused
 from imu_calibration.core.errors import InputError
 from imu_calibration.document import files
 
-FULL = '''
+FULL = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 from imu_calibration.document import files
@@ -20,7 +20,7 @@ try:
     files.write_whole(sys.argv[1], b'x' * 5000)
 except InputError as error:
     print(error)
-'''
+"""
 
 
 def place_of(kind, folder):
@@ -30,23 +30,48 @@ def place_of(kind, folder):
         if os.geteuid() == 0:
             pytest.skip('root may write everywhere')
         (folder / 'closed').mkdir(mode=0o400)
-    return {'a file as parent': folder / 'file' / 'calibration.yaml', 'a name too long': folder / ('x' * 300), 'a folder': folder,
-            'folder without permission': folder / 'closed' / 'calibration.yaml', 'a path with zero': folder / 'a\0b'}[kind]
+    return {
+        'a file as parent': folder / 'file' / 'calibration.yaml',
+        'a name too long': folder / ('x' * 300),
+        'a folder': folder,
+        'folder without permission': folder / 'closed' / 'calibration.yaml',
+        'a path with zero': folder / 'a\0b',
+    }[kind]
 
 
-@pytest.mark.parametrize('write', (lambda place: files.write_whole(place, b'new'), lambda place: files.write_text(place, 'new'), files.try_place),
-                         ids=('bytes', 'text', 'try'))
-@pytest.mark.parametrize('kind', ('a file as parent', 'a name too long', 'a folder', 'folder without permission', 'a path with zero'))
+@pytest.mark.parametrize(
+    'write',
+    (
+        lambda place: files.write_whole(place, b'new'),
+        lambda place: files.write_text(place, 'new'),
+        files.try_place,
+    ),
+    ids=('bytes', 'text', 'try'),
+)
+@pytest.mark.parametrize(
+    'kind',
+    (
+        'a file as parent',
+        'a name too long',
+        'a folder',
+        'folder without permission',
+        'a path with zero',
+    ),
+)
 def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, kind, write):
     place = place_of(kind, tmp_path)
     with refused(InputError, 'not_writable') as refusal:
         write(place)
     assert '\n' not in str(refusal.value)
-    assert {path.name for path in tmp_path.iterdir()} <= {'file', 'closed'} and (tmp_path / 'file').read_text() == 'here already'
+    assert {path.name for path in tmp_path.iterdir()} <= {'file', 'closed'} and (
+        tmp_path / 'file'
+    ).read_text() == 'here already'
 
 
 @pytest.mark.parametrize('step', ('mkdir', 'open', 'fsync', 'replace', 'unlink too'))
-@pytest.mark.parametrize('code', (errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EIO), ids=errno.errorcode.get)
+@pytest.mark.parametrize(
+    'code', (errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EIO), ids=errno.errorcode.get
+)
 def test_whatever_step_fails_the_old_file_stays_whole(tmp_path, monkeypatch, step, code):
     """Also where taking the new file away fails as well: that ended the node, with the table's time in it."""
     place = tmp_path / 'calibration.yaml'
@@ -54,7 +79,14 @@ def test_whatever_step_fails_the_old_file_stays_whole(tmp_path, monkeypatch, ste
 
     def fail(*arguments, **options):
         raise OSError(code, os.strerror(code))
-    where = {'mkdir': 'pathlib.Path.mkdir', 'open': 'builtins.open', 'fsync': 'os.fsync', 'replace': 'os.replace', 'unlink too': 'os.fsync'}[step]
+
+    where = {
+        'mkdir': 'pathlib.Path.mkdir',
+        'open': 'builtins.open',
+        'fsync': 'os.fsync',
+        'replace': 'os.replace',
+        'unlink too': 'os.fsync',
+    }[step]
     with monkeypatch.context() as patch:
         patch.setattr(where, fail)
         if step == 'unlink too':
@@ -69,7 +101,9 @@ def test_whatever_step_fails_the_old_file_stays_whole(tmp_path, monkeypatch, ste
 def test_a_full_disk_leaves_what_was_there(tmp_path):
     place = tmp_path / 'calibration.yaml'
     place.write_text('old')
-    done = subprocess.run([sys.executable, '-c', FULL, str(place)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, '-c', FULL, str(place)], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 0 and os.strerror(errno.EFBIG) in done.stdout, done.stderr
     assert place.read_text() == 'old' and list(tmp_path.iterdir()) == [place]
 
@@ -114,6 +148,6 @@ def test_no_more_than_a_document_may_hold_is_read_from_a_large_file(tmp_path):
     with refused(InputError, 'file_unreadable'):
         files.read_calibration('/dev/zero')
     with open(tmp_path / 'large.yaml', 'wb') as stream:
-        stream.truncate(1 << 40)   # without blocks on the disk
+        stream.truncate(1 << 40)  # without blocks on the disk
     with refused(InputError, 'document_limit', 2000000):
         files.read_calibration(tmp_path / 'large.yaml')

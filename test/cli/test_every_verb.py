@@ -12,7 +12,9 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.progress import listening, report, reported
 
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
-SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
+SESSION, TABLE, TRUTH = (
+    f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml')
+)
 
 
 HELP_NEEDS = {'simulate': {'numpy'}, 'plan': {'numpy'}, 'convert': {'numpy'}}
@@ -22,19 +24,51 @@ HELP_NEEDS = {'simulate': {'numpy'}, 'plan': {'numpy'}, 'convert': {'numpy'}}
 @pytest.mark.live
 @pytest.mark.parametrize('verb', ['--version', *parser.VERBS])
 def test_help_imports_no_heavy_module(verb):
-    program = ('import sys\nfrom imu_calibration.cli.main import main\ntry:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n'
-               'print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)')
-    done = subprocess.run([sys.executable, '-c', program, verb, '--help'], cwd=ROOT, capture_output=True, text=True, check=True)
-    found = set(done.stderr.split()) & {'numpy', 'scipy', 'matplotlib', 'tqdm', 'yaml', 'rosbags', 'jinja2', 'rclpy'}
+    program = (
+        'import sys\nfrom imu_calibration.cli.main import main\ntry:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n'
+        'print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', program, verb, '--help'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = set(done.stderr.split()) & {
+        'numpy',
+        'scipy',
+        'matplotlib',
+        'tqdm',
+        'yaml',
+        'rosbags',
+        'jinja2',
+        'rclpy',
+    }
     assert found <= HELP_NEEDS.get(verb, set())
 
 
 @pytest.mark.live
 def test_an_inspection_imports_neither_the_search_nor_slow_libraries():
-    program = ('import sys\nfrom imu_calibration.cli.main import main\nmain(sys.argv[1:])\nprint(*sys.modules, file=sys.stderr)')
-    done = subprocess.run([sys.executable, '-c', program, 'inspect', SESSION], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert not set(done.stderr.split()) & {'scipy.interpolate', 'scipy.optimize', 'scipy.stats', 'scipy.signal', 'matplotlib', 'rclpy', 'jinja2',
-                                           'imu_calibration.references.gravity.model_selection', 'imu_calibration.use_cases.calibrate'}
+    program = 'import sys\nfrom imu_calibration.cli.main import main\nmain(sys.argv[1:])\nprint(*sys.modules, file=sys.stderr)'
+    done = subprocess.run(
+        [sys.executable, '-c', program, 'inspect', SESSION],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert not set(done.stderr.split()) & {
+        'scipy.interpolate',
+        'scipy.optimize',
+        'scipy.stats',
+        'scipy.signal',
+        'matplotlib',
+        'rclpy',
+        'jinja2',
+        'imu_calibration.references.gravity.model_selection',
+        'imu_calibration.use_cases.calibrate',
+    }
 
 
 @pytest.mark.parametrize('verb', parser.VERBS)
@@ -44,15 +78,21 @@ def test_help_fits_a_screen_and_has_two_examples(verb, capsys, monkeypatch):
         main([verb, '--help'])
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) < 60
-    examples = lines[lines.index('examples:') + 1:]
+    examples = lines[lines.index('examples:') + 1 :]
     assert len(examples) == 2
-    for example in examples:   # each option exists, and all that are required are there
+    for example in examples:  # each option exists, and all that are required are there
         words = example.split()
         assert words[:2] == ['imu_calibration', verb]
         parser.make_parser(verb).parse_args(words[1:])
 
 
-@pytest.mark.parametrize(('arguments', 'closest'), [(['calibrat', 'x'], 'calibrate'), (['check', 'x', '--calibraton', 'y', '--calibration', 'z'], '--calibration')])
+@pytest.mark.parametrize(
+    ('arguments', 'closest'),
+    [
+        (['calibrat', 'x'], 'calibrate'),
+        (['check', 'x', '--calibraton', 'y', '--calibration', 'z'], '--calibration'),
+    ],
+)
 def test_the_closest_name_is_suggested(arguments, closest, capsys):
     with pytest.raises(SystemExit) as ended:
         main(arguments)
@@ -60,31 +100,81 @@ def test_the_closest_name_is_suggested(arguments, closest, capsys):
     assert ended.value.code == 1 and error.count('\n') == 1 and f'did you mean {closest}?' in error
 
 
-@pytest.mark.parametrize(('arguments', 'closest'), [
-    (['calibrate', SESSION, '--table', TABLE, '--output', 'never', '--accelerometer-model', 'bias+matrx'], 'matrix'),
-    (['calibrate', SESSION, '--table', TABLE, '--output', 'never', '--accelerometer-model', 'size_efect'], 'size_effect'),
-    (['calibrate', SESSION, '--table', TABLE, '--output', 'never', '--imu-topic', '/imu/dat_raw'], '/imu/data_raw'),
-    (['simulate', '--output', 'never', '--effect', 'accel_bandwith'], 'accel_bandwidth'),
-    (['simulate', '--output', 'never', '--profile', 'calibratin'], 'calibration'),
-    (['export', TRUTH, '--to', 'kalib', '--output', 'never'], 'kalibr'),
-])
-def test_the_closest_model_effect_topic_profile_or_program_is_suggested(arguments, closest, capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ('arguments', 'closest'),
+    [
+        (
+            [
+                'calibrate',
+                SESSION,
+                '--table',
+                TABLE,
+                '--output',
+                'never',
+                '--accelerometer-model',
+                'bias+matrx',
+            ],
+            'matrix',
+        ),
+        (
+            [
+                'calibrate',
+                SESSION,
+                '--table',
+                TABLE,
+                '--output',
+                'never',
+                '--accelerometer-model',
+                'size_efect',
+            ],
+            'size_effect',
+        ),
+        (
+            [
+                'calibrate',
+                SESSION,
+                '--table',
+                TABLE,
+                '--output',
+                'never',
+                '--imu-topic',
+                '/imu/dat_raw',
+            ],
+            '/imu/data_raw',
+        ),
+        (['simulate', '--output', 'never', '--effect', 'accel_bandwith'], 'accel_bandwidth'),
+        (['simulate', '--output', 'never', '--profile', 'calibratin'], 'calibration'),
+        (['export', TRUTH, '--to', 'kalib', '--output', 'never'], 'kalibr'),
+    ],
+)
+def test_the_closest_model_effect_topic_profile_or_program_is_suggested(
+    arguments, closest, capsys, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 1
-    assert f'; did you mean {closest}?;' in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+    assert (
+        f'; did you mean {closest}?;' in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+    )
 
 
-@pytest.mark.parametrize(('arguments', 'code', 'keys'), [
-    (['inspect', SESSION], 0, {'topics', 'imu'}),
-    (['compare', TRUTH, TRUTH], 0, {'rows', 'lines'}),
-    (['effects'], 0, {'effects'}),
-    (['export', '--list'], 0, {'targets'}),
-    (['compare', TRUTH, 'nowhere.yaml'], 1, 'file_unreadable'),
-])
+@pytest.mark.parametrize(
+    ('arguments', 'code', 'keys'),
+    [
+        (['inspect', SESSION], 0, {'topics', 'imu'}),
+        (['compare', TRUTH, TRUTH], 0, {'rows', 'lines'}),
+        (['effects'], 0, {'effects'}),
+        (['export', '--list'], 0, {'targets'}),
+        (['compare', TRUTH, 'nowhere.yaml'], 1, 'file_unreadable'),
+    ],
+)
 def test_json_is_one_document_and_nothing_else(arguments, code, keys, capsys):
     assert main([*arguments, '--json']) == code
     document = json.loads(capsys.readouterr().out)
-    assert document['format'] == 'imu_calibration/cli/1' and document['verb'] == arguments[0] and document['exit_code'] == code
+    assert (
+        document['format'] == 'imu_calibration/cli/1'
+        and document['verb'] == arguments[0]
+        and document['exit_code'] == code
+    )
     assert set(document['result']) == keys if code == 0 else document['error']['code'] == keys
 
 
@@ -95,7 +185,10 @@ def test_quiet_prints_no_result(capsys):
 
 def test_numbers_that_are_not_finite_become_null():
     from imu_calibration.cli.main import json_text
-    assert json.loads(json_text('x', 0, {'a': float('nan'), 'b': [float('inf'), 1.5]}))['result'] == {'a': None, 'b': [None, 1.5]}
+
+    assert json.loads(json_text('x', 0, {'a': float('nan'), 'b': [float('inf'), 1.5]}))[
+        'result'
+    ] == {'a': None, 'b': [None, 1.5]}
 
 
 def test_verbose_prints_each_phase_with_its_time(capsys):
@@ -105,9 +198,16 @@ def test_verbose_prints_each_phase_with_its_time(capsys):
     assert 'reading sample_session: ' in capsys.readouterr().err and quiet.err == ''
 
 
-@pytest.mark.parametrize(('arguments', 'phases'), [(['simulate', '--profile', 'six_faces'], ['simulating', 'writing output']),
-                                                   (['plan', '--by-hand'], ['drawing the report'])])
-def test_verbs_without_a_recording_name_their_phases_too(arguments, phases, capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ('arguments', 'phases'),
+    [
+        (['simulate', '--profile', 'six_faces'], ['simulating', 'writing output']),
+        (['plan', '--by-hand'], ['drawing the report']),
+    ],
+)
+def test_verbs_without_a_recording_name_their_phases_too(
+    arguments, phases, capsys, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     assert main([*arguments, '--output', 'output', '--verbose']) == 0
     names = [line.partition(': ')[0] for line in capsys.readouterr().err.splitlines()]
@@ -126,7 +226,11 @@ def test_a_listener_gets_each_step_and_only_in_its_context():
 def test_an_interruption_ends_with_130(place, monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
+
     from imu_calibration.cli import effects
-    monkeypatch.setattr(*((effects, 'run') if place == 'run' else (parser, 'make_parser')), interrupt)
+
+    monkeypatch.setattr(
+        *((effects, 'run') if place == 'run' else (parser, 'make_parser')), interrupt
+    )
     assert main_module.main(['effects']) == 130
     assert capsys.readouterr().err.count('\n') == 1

@@ -23,13 +23,21 @@ from msg_adapters.write import write_session
 
 TABLE_FILE = config_file('table_simulated.yaml')
 TABLE = Table.from_mapping(yaml.safe_load(TABLE_FILE.read_text(encoding='utf-8')))
-MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))
+MODEL = SensorModel(
+    accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names)
+)
 
 
 def session(seed, values):
     """Return (imu, joints) of a short session."""
-    imu, joints, _ = simulate(MODEL, values, TABLE, profile=make_profile('quick', seed, TABLE), options=SimulationOptions(100.0, 100.0),
-                              seed=seed)
+    imu, joints, _ = simulate(
+        MODEL,
+        values,
+        TABLE,
+        profile=make_profile('quick', seed, TABLE),
+        options=SimulationOptions(100.0, 100.0),
+        seed=seed,
+    )
     return imu, joints
 
 
@@ -37,17 +45,34 @@ def session(seed, values):
 def recordings(tmp_path_factory):
     """Two units, one of them with two recordings, and a file that is no bag; the values of each unit."""
     folder = tmp_path_factory.mktemp('fleet')
-    truth = {name: random_values(MODEL, 'industrial', seed) for seed, name in enumerate(('unit_a', 'unit_b'))}
+    truth = {
+        name: random_values(MODEL, 'industrial', seed)
+        for seed, name in enumerate(('unit_a', 'unit_b'))
+    }
     write_session(folder / 'unit_a', *session(0, truth['unit_a']), storage='sqlite3')
     for part in (1, 2):
-        write_session(folder / 'unit_b' / f'part_{part}', *session(part, truth['unit_b']), storage='mcap')
+        write_session(
+            folder / 'unit_b' / f'part_{part}', *session(part, truth['unit_b']), storage='mcap'
+        )
     (folder / 'unit_c.mcap').write_bytes(b'no bag' * 100)
     return folder, truth
 
 
 def run_fleet(folder, output, *more):
     """Run the verb without reports."""
-    return main(['fleet', str(folder), '--table', str(TABLE_FILE), '--output', str(output), '--no-report', '--model-as-asked', *more])
+    return main(
+        [
+            'fleet',
+            str(folder),
+            '--table',
+            str(TABLE_FILE),
+            '--output',
+            str(output),
+            '--no-report',
+            '--model-as-asked',
+            *more,
+        ]
+    )
 
 
 def read_csv(path):
@@ -74,7 +99,9 @@ def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
     assert '\n' not in units['unit_c']['error']
     assert not (output / 'unit_c').exists()
     page = (output / 'summary.html').read_text()
-    assert 'unit_c' in page and ' of 3 units</p>' in page and '--accent' in page   # the style of all reports
+    assert (
+        'unit_c' in page and ' of 3 units</p>' in page and '--accent' in page
+    )  # the style of all reports
     assert capsys.readouterr().err == ''
 
 
@@ -96,17 +123,27 @@ def test_the_summary_is_that_of_the_units(result):
     summary = {row['parameter']: row for row in read_csv(result[1] / 'summary.csv')}
     values = np.array([float(row['gyroscope.matrix.zz']) for row in units])
     found = summary['gyroscope.matrix.zz']
-    np.testing.assert_allclose([float(found['mean']), float(found['spread'])], [values.mean(), values.std(ddof=1)], rtol=1e-12)
+    np.testing.assert_allclose(
+        [float(found['mean']), float(found['spread'])],
+        [values.mean(), values.std(ddof=1)],
+        rtol=1e-12,
+    )
     assert found['highest_unit'] == units[int(np.argmax(values))]['name']
-    assert float(found['spread_over_sd']) > 10, 'units of one grade differ by far more than a calibration is uncertain'
+    assert float(found['spread_over_sd']) > 10, (
+        'units of one grade differ by far more than a calibration is uncertain'
+    )
 
 
 def test_a_unit_has_the_word_of_each_sensor(result):
     known = read_calibration(result[1] / 'unit_a' / 'calibration.yaml')
-    unit = UnitResult('unit_d', replace(known, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}), 'harms')
+    unit = UnitResult(
+        'unit_d', replace(known, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}), 'harms'
+    )
     row = unit_rows([unit])[0]
     assert (row['decision'], row['accelerometer'], row['gyroscope']) == ('harms', 'harms', 'helps')
-    assert isinstance(row['exit_code'], int) and all(isinstance(value, float) for name, value in row.items() if '.' in name)
+    assert isinstance(row['exit_code'], int) and all(
+        isinstance(value, float) for name, value in row.items() if '.' in name
+    )
     page = summary_html([unit], summarise([unit]))
     assert '<span class="tag harms">' in page
 
@@ -124,8 +161,13 @@ def test_processes_give_the_same_bytes(recordings, result, tmp_path):
 def test_a_cluster_gives_the_same_bytes(recordings, result, tmp_path):
     """A scheduler with two workers does the same work."""
     distributed = pytest.importorskip('dask.distributed', reason='the extra dask is not installed')
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, host='127.0.0.1') as cluster:
-        assert run_fleet(recordings[0], tmp_path, '--scheduler', cluster.scheduler_address) == result[0]
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, host='127.0.0.1'
+    ) as cluster:
+        assert (
+            run_fleet(recordings[0], tmp_path, '--scheduler', cluster.scheduler_address)
+            == result[0]
+        )
     assert_same_files(tmp_path, result[1])
 
 
@@ -155,12 +197,31 @@ def test_several_recordings_that_do_not_belong_together_are_refused(recordings, 
     """Another frame, another table, or a file that is no bag: one line with the name of the recording at fault."""
     folder, truth = recordings
     imu, joints = session(3, truth['unit_a'])
-    write_session(tmp_path / 'other_frame', replace(imu, frame_id='second_imu'), joints, storage='mcap')
-    write_session(tmp_path / 'other_table', imu, replace(joints, names=('a', 'b', 'c')), storage='mcap')
-    for bad, expected in ((tmp_path / 'other_frame', "'second_imu'"), (tmp_path / 'other_table', 'a, b, c'),
-                          (folder / 'unit_c.mcap', 'readable bag')):
-        code = main(['calibrate', str(folder / 'unit_a'), str(bad), '--table', str(TABLE_FILE), '--output', str(tmp_path / 'out'),
-                     '--no-report', '--jobs', '1'])
+    write_session(
+        tmp_path / 'other_frame', replace(imu, frame_id='second_imu'), joints, storage='mcap'
+    )
+    write_session(
+        tmp_path / 'other_table', imu, replace(joints, names=('a', 'b', 'c')), storage='mcap'
+    )
+    for bad, expected in (
+        (tmp_path / 'other_frame', "'second_imu'"),
+        (tmp_path / 'other_table', 'a, b, c'),
+        (folder / 'unit_c.mcap', 'readable bag'),
+    ):
+        code = main(
+            [
+                'calibrate',
+                str(folder / 'unit_a'),
+                str(bad),
+                '--table',
+                str(TABLE_FILE),
+                '--output',
+                str(tmp_path / 'out'),
+                '--no-report',
+                '--jobs',
+                '1',
+            ]
+        )
         error = capsys.readouterr().err
         assert code == 1 and bad.name in error and expected in error and error.count('\n') == 1
     assert not (tmp_path / 'out' / 'calibration.yaml').exists()
@@ -172,13 +233,23 @@ def unit(name, bias, status='determined'):
     values = model.start()
     values[0] = bias
     statuses = (status,) + ('held',) * (len(values) - 1)
-    return UnitResult(name, Calibration(model, values, 4.0 * np.eye(len(values)), statuses), 'good', 0)
+    return UnitResult(
+        name, Calibration(model, values, 4.0 * np.eye(len(values)), statuses), 'good', 0
+    )
 
 
 def test_spread_leaves_out_what_is_held():
     """Units that know nothing of a parameter do not enter its mean; refused units enter nothing."""
-    first, second = summarise([unit('a', 1.0), unit('b', 5.0), unit('c', 100.0, 'held'), UnitResult('d', error='broken')])[:2]
-    assert (first.count, first.mean, first.typical_sd, first.lowest, first.highest) == (2, 3.0, 2.0, (1.0, 'a'), (5.0, 'b'))
+    first, second = summarise(
+        [unit('a', 1.0), unit('b', 5.0), unit('c', 100.0, 'held'), UnitResult('d', error='broken')]
+    )[:2]
+    assert (first.count, first.mean, first.typical_sd, first.lowest, first.highest) == (
+        2,
+        3.0,
+        2.0,
+        (1.0, 'a'),
+        (5.0, 'b'),
+    )
     np.testing.assert_allclose([first.spread, first.ratio], [np.sqrt(8), np.sqrt(2)])
     assert second.count == 0 and np.isnan(second.mean)
 

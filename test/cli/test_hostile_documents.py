@@ -29,7 +29,7 @@ from worlds.compensation_cases import random_calibration
 from worlds.limited import limited, refused, survived
 from worlds.small_bags import hostile_calibration, write_small_bag
 
-pytestmark = pytest.mark.live   # each input is read in a process with limits
+pytestmark = pytest.mark.live  # each input is read in a process with limits
 
 
 @pytest.fixture
@@ -41,16 +41,26 @@ def bag(tmp_path):
 def test_nested_powers_in_a_calibration_are_refused_before_they_are_multiplied_out(tmp_path, bag):
     """29 kB took all memory: each level of abs(...)**9 multiplies the text of the compensation by nine."""
     (tmp_path / 'calibration.yaml').write_text(hostile_calibration())
-    ended = refused('compensate', bag, '--calibration', tmp_path / 'calibration.yaml', '--output', tmp_path / 'corrected')
+    ended = refused(
+        'compensate',
+        bag,
+        '--calibration',
+        tmp_path / 'calibration.yaml',
+        '--output',
+        tmp_path / 'corrected',
+    )
     assert '5000' in ended.err and not (tmp_path / 'corrected').exists()
 
 
 # Places
 
+
 def test_a_pipe_as_calibration_is_refused_and_not_waited_for(tmp_path, bag):
     os.mkfifo(tmp_path / 'calibration.yaml')
     for path in (tmp_path / 'calibration.yaml', '/dev/zero'):
-        ended = refused('compensate', bag, '--calibration', path, '--output', tmp_path / 'corrected')
+        ended = refused(
+            'compensate', bag, '--calibration', path, '--output', tmp_path / 'corrected'
+        )
         assert str(path) in ended.err and not (tmp_path / 'corrected').exists()
 
 
@@ -73,6 +83,7 @@ def load_samples():
 
 def _refusal(load, names):
     import io
+
     target = io.BytesIO()
     head = io.BytesIO()
     np.save(head, np.zeros(0))
@@ -85,15 +96,20 @@ def _refusal(load, names):
     try:
         load(target.getvalue())
     except DocumentError as error:
-        return 'refused' if re.findall(r'\d{6,}', str(error)) else str(error)   # bytes that are needed, bytes that are accepted
+        return (
+            'refused' if re.findall(r'\d{6,}', str(error)) else str(error)
+        )  # bytes that are needed, bytes that are accepted
 
 
 @pytest.mark.parametrize('damage', [b'', b'PK', b'(' * 5000])
 def test_damaged_sessions_are_one_line(damage):
     import io
+
     target = io.BytesIO()
     with zipfile.ZipFile(target, 'w') as archive:
-        archive.writestr('header.npy', b'\x93NUMPY\1\0' + len(damage).to_bytes(2, 'little') + damage)
+        archive.writestr(
+            'header.npy', b'\x93NUMPY\1\0' + len(damage).to_bytes(2, 'little') + damage
+        )
     for data in (damage, target.getvalue()):
         with pytest.raises(DocumentError):
             from_bytes(data)
@@ -102,6 +118,7 @@ def test_damaged_sessions_are_one_line(damage):
 def test_a_link_under_a_guessable_name_is_not_followed(tmp_path):
     """In a shared folder anybody can place a link under the name of a temporary file."""
     import zlib
+
     victim = tmp_path / 'victim'
     victim.write_text('untouched')
     for name in (f'.{os.getpid()}.{zlib.crc32(b"result.yaml"):08x}', f'.write_test_{os.getpid()}'):
@@ -116,9 +133,11 @@ def test_a_link_under_a_guessable_name_is_not_followed(tmp_path):
 
 # Names
 
+
 def test_a_name_is_neither_a_formula_nor_mathematics(tmp_path):
     def paint(figure):
         figure.add_subplot().set_title('$\\bad{$')
+
     assert 'bad' in draw('x', (2, 2), paint, label='x')
     result = UnitResult('=cmd|calc!A1')
     assert list(csv.reader(csv_text(unit_rows([result])).splitlines()))[1][0] == "'=cmd|calc!A1"
@@ -127,7 +146,13 @@ def test_a_name_is_neither_a_formula_nor_mathematics(tmp_path):
 class UnitResult:
     """A unit that was refused."""
 
-    calibration, verdict, verdicts, exit_code, error = None, '', {'accelerometer': '', 'gyroscope': ''}, 1, 'refused'
+    calibration, verdict, verdicts, exit_code, error = (
+        None,
+        '',
+        {'accelerometer': '', 'gyroscope': ''},
+        1,
+        'refused',
+    )
 
     def __init__(self, name):
         self.name = name
@@ -135,9 +160,21 @@ class UnitResult:
 
 def test_saved_samples_of_another_shape_are_refused():
     import io
-    good = {'format': np.array('imu_calibration/hand_samples/1'), 'frame_id': np.array('imu'), 'stamp_ns': np.arange(4), 'force_s': np.ones((4, 3)),
-            'rate_s': np.ones((4, 3))}
-    for change in ({}, {'stamp_ns': np.array(1)}, {'force_s': np.ones((4, 2))}, {'rate_s': np.ones((5, 3))}, {'force_s': np.ones((4, 3), int)}):
+
+    good = {
+        'format': np.array('imu_calibration/hand_samples/1'),
+        'frame_id': np.array('imu'),
+        'stamp_ns': np.arange(4),
+        'force_s': np.ones((4, 3)),
+        'rate_s': np.ones((4, 3)),
+    }
+    for change in (
+        {},
+        {'stamp_ns': np.array(1)},
+        {'force_s': np.ones((4, 2))},
+        {'rate_s': np.ones((5, 3))},
+        {'force_s': np.ones((4, 3), int)},
+    ):
         target = io.BytesIO()
         np.savez(target, **good | change)
         if change:
@@ -149,6 +186,7 @@ def test_saved_samples_of_another_shape_are_refused():
 
 # Text that breaks its parser
 
+
 def test_damaged_files_of_other_programs_are_one_line(tmp_path):
     """A byte more in a struct of a .mat file ended the process by a segmentation fault in scipy."""
     content = export(random_calibration(0, ()), find_target('mat')).content
@@ -158,23 +196,49 @@ def test_damaged_files_of_other_programs_are_one_line(tmp_path):
     text = export(random_calibration(0, ()), find_target('autoware'), rate=200.0).content.decode()
     for value in ('0.9{', '.', '1e999'):
         (tmp_path / 'x.yaml').write_text(re.sub(r'\{x: [^,]*', '{x: ' + value, text))
-        refused('import', tmp_path / 'x.yaml', '--from', 'autoware', '--output', tmp_path / 'out.yaml')
-
+        refused(
+            'import', tmp_path / 'x.yaml', '--from', 'autoware', '--output', tmp_path / 'out.yaml'
+        )
 
 
 def test_deep_and_long_texts_are_one_line(tmp_path, bag):
     (tmp_path / 'deep.json').write_text('[' * 100_000)
     refused('import', tmp_path / 'deep.json', '--from', 'basalt', '--output', tmp_path / 'out.yaml')
-    (tmp_path / 'digits.json').write_text('{"value0": {"calib_accel_bias": [' + '9' * 4000 + ', 0, 0]}}')
-    refused('import', tmp_path / 'digits.json', '--from', 'basalt', '--output', tmp_path / 'out.yaml')
-    (tmp_path / 'table.yaml').write_text('joints: [{name: outer, axis: [0, 0, 1]}]\ngravity: ' + '9' * 4000)
-    assert 'digits' in refused('calibrate', bag, '--table', tmp_path / 'table.yaml', '--output', tmp_path / 'out').err.replace('characters', 'digits')
-    (tmp_path / 'arm.urdf').write_text('<robot name="x"><joint name="j" type="fixed">' + '<origin>' * 5000 + '</origin>' * 5000 + '</joint></robot>')
+    (tmp_path / 'digits.json').write_text(
+        '{"value0": {"calib_accel_bias": [' + '9' * 4000 + ', 0, 0]}}'
+    )
+    refused(
+        'import', tmp_path / 'digits.json', '--from', 'basalt', '--output', tmp_path / 'out.yaml'
+    )
+    (tmp_path / 'table.yaml').write_text(
+        'joints: [{name: outer, axis: [0, 0, 1]}]\ngravity: ' + '9' * 4000
+    )
+    assert 'digits' in refused(
+        'calibrate', bag, '--table', tmp_path / 'table.yaml', '--output', tmp_path / 'out'
+    ).err.replace('characters', 'digits')
+    (tmp_path / 'arm.urdf').write_text(
+        '<robot name="x"><joint name="j" type="fixed">'
+        + '<origin>' * 5000
+        + '</origin>' * 5000
+        + '</joint></robot>'
+    )
     refused('plan', '--urdf', tmp_path / 'arm.urdf', '--output', tmp_path / 'out')
 
 
-@pytest.mark.parametrize('text', ['', '<robot>', '<robot/>', '<robot name="a"><link name="x&#10;&#27;[2J"/></robot>', 'x' * 3_000_000,
-                                  '<robot name="a"><joint name="j" type="fixed">' + '<origin>' * 256 + '</origin>' * 256 + '</joint></robot>'])
+@pytest.mark.parametrize(
+    'text',
+    [
+        '',
+        '<robot>',
+        '<robot/>',
+        '<robot name="a"><link name="x&#10;&#27;[2J"/></robot>',
+        'x' * 3_000_000,
+        '<robot name="a"><joint name="j" type="fixed">'
+        + '<origin>' * 256
+        + '</origin>' * 256
+        + '</joint></robot>',
+    ],
+)
 def test_descriptions_are_refused_or_have_clean_names(text):
     try:
         assert root_of(text).isprintable()
@@ -185,48 +249,87 @@ def test_descriptions_are_refused_or_have_clean_names(text):
 def test_a_damaged_description_in_a_recording_is_left_out(tmp_path):
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
+
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = [writer.add_connection(topic, kind, typestore=store) for topic, kind in (
-            ('/imu/data_raw', IMU_TYPE), ('/robot_description', 'std_msgs/msg/String'), ('/tf_static', 'tf2_msgs/msg/TFMessage'))]
+        topics = [
+            writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in (
+                ('/imu/data_raw', IMU_TYPE),
+                ('/robot_description', 'std_msgs/msg/String'),
+                ('/tf_static', 'tf2_msgs/msg/TFMessage'),
+            )
+        ]
         for topic in topics[1:]:
-            for data in (b'', b'\0\1', b'\0\1\0\0\xff\xff\xff\x7f', b'\0\1\0\0\xff\xff\xff\xff' + b'x' * 99):
+            for data in (
+                b'',
+                b'\0\1',
+                b'\0\1\0\0\xff\xff\xff\x7f',
+                b'\0\1\0\0\xff\xff\xff\xff' + b'x' * 99,
+            ):
                 writer.write(topic, 1, data)
     refused('calibrate', tmp_path / 'bag', '--imu-link', 'imu_link', '--output', tmp_path / 'out')
-    assert '/robot_description' in refused('inspect', tmp_path / 'bag', '--imu-link', 'imu_link').err
+    assert (
+        '/robot_description' in refused('inspect', tmp_path / 'bag', '--imu-link', 'imu_link').err
+    )
 
 
-@pytest.mark.parametrize('change', [lambda text: text.replace('float64', 'string'), lambda text: text.replace('float64 x', 'float64[3] x'),
-                                    lambda text: text.replace('int32 sec', 'float64 sec'), lambda text: 'int32 x\n', lambda text: text + '\n@!',
-                                    lambda text: 'module sensor_msgs { module msg { struct Imu { double x; }; }; };'])
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda text: text.replace('float64', 'string'),
+        lambda text: text.replace('float64 x', 'float64[3] x'),
+        lambda text: text.replace('int32 sec', 'float64 sec'),
+        lambda text: 'int32 x\n',
+        lambda text: text + '\n@!',
+        lambda text: 'module sensor_msgs { module msg { struct Imu { double x; }; }; };',
+    ],
+)
 @pytest.mark.parametrize('language', ['ros2msg', 'ros2idl', 'x'])
 def test_definitions_of_another_kind_are_one_line(tmp_path, change, language):
     """An IDL definition ended `inspect` with KeyError 'imu'."""
     import sqlite3
+
     bag = write_small_bag(tmp_path / 'bag')
     connection = sqlite3.connect(bag / 'bag_0.db3')
-    for number, text in connection.execute('SELECT id, encoded_message_definition FROM message_definitions').fetchall():
-        connection.execute('UPDATE message_definitions SET encoding = ?, encoded_message_definition = ? WHERE id = ?', (language, change(text), number))
+    for number, text in connection.execute(
+        'SELECT id, encoded_message_definition FROM message_definitions'
+    ).fetchall():
+        connection.execute(
+            'UPDATE message_definitions SET encoding = ?, encoded_message_definition = ? WHERE id = ?',
+            (language, change(text), number),
+        )
     connection.commit()
     connection.close()
     survived('inspect', bag)
 
 
-@pytest.mark.parametrize('text, code, values', [('a: 1\nb: 2\na: 3\n', 'key_repeated', ['a', 'line 3']), ('x: {a: 1, a: 2}', 'key_repeated', ['line 1']),
-                                                ('- a\n', 'not_a_mapping', ['list']), ('<<: {a: 1}', 'key_repeated', ['<<', 'line 1'])])
+@pytest.mark.parametrize(
+    'text, code, values',
+    [
+        ('a: 1\nb: 2\na: 3\n', 'key_repeated', ['a', 'line 3']),
+        ('x: {a: 1, a: 2}', 'key_repeated', ['line 1']),
+        ('- a\n', 'not_a_mapping', ['list']),
+        ('<<: {a: 1}', 'key_repeated', ['<<', 'line 1']),
+    ],
+)
 def test_a_repeated_key_is_an_error(text, code, values):
     with expected(InputError, code, *values):
         from_text(text)
-    assert from_text('a: {a: 1}\nb: [{a: 1}, {a: 2}]\n? [1]\n: a'.replace('? [1]\n: a', 'c: a')) == {'a': {'a': 1}, 'b': [{'a': 1}, {'a': 2}], 'c': 'a'}
+    assert from_text(
+        'a: {a: 1}\nb: [{a: 1}, {a: 2}]\n? [1]\n: a'.replace('? [1]\n: a', 'c: a')
+    ) == {'a': {'a': 1}, 'b': [{'a': 1}, {'a': 2}], 'c': 'a'}
 
 
 # Ends
+
 
 def compensate_on_a_small_disk(arguments):
     """Run a verb that cannot write more than 20 kB into a file."""
     import resource
 
     from imu_calibration.cli.main import main
+
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
     return main(arguments)
 
@@ -236,7 +339,10 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, storage):
     bag = write_small_bag(tmp_path / 'bag', storage=storage)
     write_text(tmp_path / 'calibration.yaml', calibration_to_text(random_calibration(0, ())))
     before = sorted(path.name for path in tmp_path.iterdir())
-    for arguments in (['compensate', str(bag), '--calibration', str(tmp_path / 'calibration.yaml'), '--anyway'], ['simulate']):
+    for arguments in (
+        ['compensate', str(bag), '--calibration', str(tmp_path / 'calibration.yaml'), '--anyway'],
+        ['simulate'],
+    ):
         ended = limited(compensate_on_a_small_disk, [*arguments, '--output', str(tmp_path / 'out')])
         assert ended.code == 1 and ended.err.count('\n') == 1, ended
         assert sorted(path.name for path in tmp_path.iterdir()) == before
@@ -244,18 +350,28 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, storage):
 
 def test_what_was_decompressed_is_removed_on_sigterm(tmp_path):
     from msg_adapters.compression import zstd
+
     bag, temporary = write_small_bag(tmp_path / 'bag'), tmp_path / 'temporary'
     temporary.mkdir()
     database = next(bag.glob('*.db3'))
     Path(f'{database}.zstd').write_bytes(zstd().compress(database.read_bytes()))
     database.unlink()
     (bag / 'metadata.yaml').unlink()
-    program = ('import time, msg_adapters.sqlite_file as f\nold = f.SqliteFile.count\n'
-               'f.SqliteFile.count = lambda self: (print("decompressed", flush=True), time.sleep(60), old(self))[2]\n'
-               f'import sys\nfrom imu_calibration.__main__ import main\nsys.argv[1:] = ["inspect", {str(bag)!r}]\nraise SystemExit(main())')
-    process = subprocess.Popen([sys.executable, '-c', program], env={**os.environ, 'TMPDIR': str(temporary)}, stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == 'decompressed\n' and list(temporary.glob('imu_calibration_*/*'))
+    program = (
+        'import time, msg_adapters.sqlite_file as f\nold = f.SqliteFile.count\n'
+        'f.SqliteFile.count = lambda self: (print("decompressed", flush=True), time.sleep(60), old(self))[2]\n'
+        f'import sys\nfrom imu_calibration.__main__ import main\nsys.argv[1:] = ["inspect", {str(bag)!r}]\nraise SystemExit(main())'
+    )
+    process = subprocess.Popen(
+        [sys.executable, '-c', program],
+        env={**os.environ, 'TMPDIR': str(temporary)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == 'decompressed\n' and list(
+        temporary.glob('imu_calibration_*/*')
+    )
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=60)
     assert process.returncode not in (0, -signal.SIGTERM) and 'Traceback' not in err

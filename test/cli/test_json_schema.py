@@ -16,21 +16,50 @@ from imu_calibration.cli.watch import NodeStatus
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
-SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
+SESSION, TABLE, TRUTH = (
+    f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml')
+)
 with open(f'{ROOT}/docs/cli.schema.json', encoding='utf8') as schema_file:
     SCHEMA = json.load(schema_file)
 VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 QUICK = {
-    'inspect': [SESSION], 'compare': [TRUTH, TRUTH], 'effects': [], 'export': [TRUTH, '--to', 'kalibr', '--output', 'kalibr.yaml'],
-    'import': ['kalibr.yaml', '--from', 'kalibr', '--output', 'imported.yaml'], 'simulate': ['--profile', 'six_faces', '--seed', '3', '--output', 'simulated'],
-    'plan': ['--by-hand', '--no-report', '--output', 'plan'], 'convert': ['log.csv', '--columns', 'time=t:s', 'force=ax,ay,az:m/s^2', 'rate=gx,gy,gz:rad/s', '--output', 'converted'],
+    'inspect': [SESSION],
+    'compare': [TRUTH, TRUTH],
+    'effects': [],
+    'export': [TRUTH, '--to', 'kalibr', '--output', 'kalibr.yaml'],
+    'import': ['kalibr.yaml', '--from', 'kalibr', '--output', 'imported.yaml'],
+    'simulate': ['--profile', 'six_faces', '--seed', '3', '--output', 'simulated'],
+    'plan': ['--by-hand', '--no-report', '--output', 'plan'],
+    'convert': [
+        'log.csv',
+        '--columns',
+        'time=t:s',
+        'force=ax,ay,az:m/s^2',
+        'rate=gx,gy,gz:rad/s',
+        '--output',
+        'converted',
+    ],
 }
 """Verb -> arguments, in an order in which each finds the files of those before."""
 LONG = {
-    'calibrate': [SESSION, '--table', TABLE, '--output', 'found'], 'compensate': [SESSION, '--calibration', 'found/calibration.yaml', '--output', 'corrected'],
-    'check': [SESSION, '--table', TABLE, '--calibration', 'found/calibration.yaml'], 'diagnose': [SESSION, '--table', TABLE, '--output', 'diagnosed'],
-    'noise': [SESSION, '--output', 'noise'], 'view': [SESSION, '--table', TABLE, '--model-as-asked', '--output', 'view.mcap'],
-    'fleet': ['units', '--table', TABLE, '--model-as-asked', '--no-report', '--jobs', '1', '--output', 'fleet'], 'plan': ['--table', TABLE, '--no-report', '--no-bound', '--output', 'plan_table'],
+    'calibrate': [SESSION, '--table', TABLE, '--output', 'found'],
+    'compensate': [SESSION, '--calibration', 'found/calibration.yaml', '--output', 'corrected'],
+    'check': [SESSION, '--table', TABLE, '--calibration', 'found/calibration.yaml'],
+    'diagnose': [SESSION, '--table', TABLE, '--output', 'diagnosed'],
+    'noise': [SESSION, '--output', 'noise'],
+    'view': [SESSION, '--table', TABLE, '--model-as-asked', '--output', 'view.mcap'],
+    'fleet': [
+        'units',
+        '--table',
+        TABLE,
+        '--model-as-asked',
+        '--no-report',
+        '--jobs',
+        '1',
+        '--output',
+        'fleet',
+    ],
+    'plan': ['--table', TABLE, '--no-report', '--no-bound', '--output', 'plan_table'],
 }
 ELSEWHERE = {'arm', 'watch'}
 
@@ -56,8 +85,14 @@ def document_of(arguments, capsys):
 
 def test_each_verb_is_described_and_tried():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-    assert SCHEMA['properties']['verb']['enum'] == list(parser.VERBS) and {*QUICK, *LONG, *ELSEWHERE} == set(parser.VERBS)
-    assert [part['then']['properties']['result']['$ref'] for part in SCHEMA['allOf']] == [f'#/$defs/{verb}' for verb in parser.VERBS]
+    assert SCHEMA['properties']['verb']['enum'] == list(parser.VERBS) and {
+        *QUICK,
+        *LONG,
+        *ELSEWHERE,
+    } == set(parser.VERBS)
+    assert [part['then']['properties']['result']['$ref'] for part in SCHEMA['allOf']] == [
+        f'#/$defs/{verb}' for verb in parser.VERBS
+    ]
 
 
 def test_quick_verbs(folder, monkeypatch, capsys):
@@ -70,17 +105,34 @@ def test_quick_verbs(folder, monkeypatch, capsys):
 def test_other_verbs(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     for verb, arguments in LONG.items():
-        if verb != 'view' or find_spec('foxglove'):   # the extra view is not among the oldest versions
+        if verb != 'view' or find_spec(
+            'foxglove'
+        ):  # the extra view is not among the oldest versions
             document_of([verb, *arguments], capsys)
 
 
 @pytest.mark.real_data
 def test_arm(recordings, capsys):
-    document_of(['arm', str(recordings / 'array_2'), '--imu-topic', '/imu_1/data_raw', '--imu-topic', '/imu_7/data_raw'], capsys)
+    document_of(
+        [
+            'arm',
+            str(recordings / 'array_2'),
+            '--imu-topic',
+            '/imu_1/data_raw',
+            '--imu-topic',
+            '/imu_7/data_raw',
+        ],
+        capsys,
+    )
 
 
 def test_watch(capsys):
-    node = SimpleNamespace(complete=True, name='calibration_node', statuses={'streams': NodeStatus(0, 'Imu messages', {'rate [Hz]': '100'})}, screen=str)
+    node = SimpleNamespace(
+        complete=True,
+        name='calibration_node',
+        statuses={'streams': NodeStatus(0, 'Imu messages', {'rate [Hz]': '100'})},
+        screen=str,
+    )
     result = watch._watch(node, SimpleNamespace(patience=1.0, once=True, json=True))
     VALIDATOR.validate(json.loads(json_text('watch', result.exit_code, result.document)))
 
@@ -90,10 +142,16 @@ def test_an_error_is_described(capsys):
     VALIDATOR.validate(json.loads(capsys.readouterr().out))
 
 
-@pytest.mark.parametrize(('verb', 'code', 'document'), [
-    ('arm', 0, {'arm': [1.0, 2.0], 'sd': [1.0, 1.0, 1.0], 'unit': 'm', 'notes': []}), ('check', 0, {'proof': {}}),
-    ('compare', 0, {'rows': [], 'lines': [], 'more': 1}), ('compare', 0, {'error': 'text', 'key': None}), ('compar', 0, {'rows': [], 'lines': []}),
-    ('import', 0, {'output': 'x', 'held': np.array([1.5])}),
-])
+@pytest.mark.parametrize(
+    ('verb', 'code', 'document'),
+    [
+        ('arm', 0, {'arm': [1.0, 2.0], 'sd': [1.0, 1.0, 1.0], 'unit': 'm', 'notes': []}),
+        ('check', 0, {'proof': {}}),
+        ('compare', 0, {'rows': [], 'lines': [], 'more': 1}),
+        ('compare', 0, {'error': 'text', 'key': None}),
+        ('compar', 0, {'rows': [], 'lines': []}),
+        ('import', 0, {'output': 'x', 'held': np.array([1.5])}),
+    ],
+)
 def test_another_document_is_refused(verb, code, document):
     assert not VALIDATOR.is_valid(json.loads(json_text(verb, code, document)))

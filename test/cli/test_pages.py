@@ -34,7 +34,12 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp('user')
     by_hand = simulate(7, n_poses=14)[0]
     rng = np.random.default_rng(1)
-    still = ImuSamples(10**18 + 5_000_000 * np.arange(60_000), rng.normal([0, 0, 9.81], 0.01, (60_000, 3)), rng.normal(0, 1e-3, (60_000, 3)), 'imu_link')
+    still = ImuSamples(
+        10**18 + 5_000_000 * np.arange(60_000),
+        rng.normal([0, 0, 9.81], 0.01, (60_000, 3)),
+        rng.normal(0, 1e-3, (60_000, 3)),
+        'imu_link',
+    )
     for name, imu in (('my_bag', by_hand), ('my_drive', by_hand), ('still_bag', still)):
         write_session(place / name, imu)
     for name in ('session', 'later_session'):
@@ -61,11 +66,21 @@ def test_arrays_calibrate_as_the_readme_shows(tmp_path):
     imu = simulate(7, n_poses=14)[0]
     names = {'time': imu.stamp_ns * 1e-9, 'force': imu.force_s, 'rate': imu.rate_s}
     exec(code.replace("'result'", repr(str(tmp_path / 'result'))), names)
-    assert (tmp_path / 'result' / 'calibration.yaml').is_file() and imu_calibration.load(tmp_path / 'result' / 'calibration.yaml')
+    assert (tmp_path / 'result' / 'calibration.yaml').is_file() and imu_calibration.load(
+        tmp_path / 'result' / 'calibration.yaml'
+    )
 
 
 def test_the_messages_of_typical_mistakes_are_those_of_the_product():
-    code = '\n'.join(path.read_text() for folder in ('imu_calibration', 'msg_adapters') for path in (ROOT / folder).rglob('*.py'))
-    rows = re.findall(r'^\| `(.*?)` \|', (ROOT / 'docs/turntable.md').read_text().partition('## Typical mistakes')[2], re.MULTILINE)
+    code = '\n'.join(
+        path.read_text()
+        for folder in ('imu_calibration', 'msg_adapters')
+        for path in (ROOT / folder).rglob('*.py')
+    )
+    rows = re.findall(
+        r'^\| `(.*?)` \|',
+        (ROOT / 'docs/turntable.md').read_text().partition('## Typical mistakes')[2],
+        re.MULTILINE,
+    )
     sentences = [row.partition(' ... ')[0] for row in rows if '.' not in row.split()[0]]
     assert len(sentences) >= 6 and [text for text in sentences if text not in code] == []

@@ -24,10 +24,17 @@ from imu_calibration.cli.terminal import Terminal
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
-SESSION, TABLE, TRUTH = (f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml'))
+SESSION, TABLE, TRUTH = (
+    f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml')
+)
 PRINTING = {
-    'inspect': [SESSION], 'compare': [TRUTH, TRUTH], 'effects': [], 'export': ['--list'], 'plan': ['--by-hand', '--no-report', '--output', 'plan'],
-    'check': [SESSION, '--table', TABLE, '--calibration', TRUTH], 'noise': [SESSION, '--output', 'noise'],
+    'inspect': [SESSION],
+    'compare': [TRUTH, TRUTH],
+    'effects': [],
+    'export': ['--list'],
+    'plan': ['--by-hand', '--no-report', '--output', 'plan'],
+    'check': [SESSION, '--table', TABLE, '--calibration', TRUTH],
+    'noise': [SESSION, '--output', 'noise'],
 }
 
 
@@ -35,7 +42,9 @@ def shown(monkeypatch, capsys, width, run):
     """Return the words that are printed on a terminal of a width; dotted names may break at a dot."""
     monkeypatch.setenv('COLUMNS', str(width))
     out = io.StringIO()
-    monkeypatch.setattr(Terminal, 'of', classmethod(lambda cls, stream=None: cls(stream or out, width)))
+    monkeypatch.setattr(
+        Terminal, 'of', classmethod(lambda cls, stream=None: cls(stream or out, width))
+    )
     run()
     return (capsys.readouterr().out + out.getvalue()).replace('.', ' ').split()
 
@@ -45,34 +54,62 @@ def test_no_word_of_a_help_is_broken(verb, monkeypatch, capsys):
     def run():
         with pytest.raises(SystemExit):
             main([verb, '--help'])
+
     wide, narrow = (shown(monkeypatch, capsys, width, run) for width in (400, 80))
-    assert set(narrow) - {'\\'} <= set(wide)   # a continued example ends with it
+    assert set(narrow) - {'\\'} <= set(wide)  # a continued example ends with it
 
 
 @pytest.mark.long
 @pytest.mark.parametrize('verb', PRINTING)
 def test_no_word_of_a_result_is_broken(verb, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    wide, narrow = (shown(monkeypatch, capsys, width, lambda folder=folder: main([verb, *(folder if word in ('plan', 'noise') else word for word in PRINTING[verb])]))
-                    for width, folder in ((400, 'first'), (80, 'other')))
+    wide, narrow = (
+        shown(
+            monkeypatch,
+            capsys,
+            width,
+            lambda folder=folder: main(
+                [verb, *(folder if word in ('plan', 'noise') else word for word in PRINTING[verb])]
+            ),
+        )
+        for width, folder in ((400, 'first'), (80, 'other'))
+    )
     assert {*narrow} - {'other'} <= set(wide) and len(narrow) > 10
 
 
 def test_a_table_that_is_too_wide_breaks_between_words():
     """No column is narrower than its longest word."""
     out = io.StringIO()
-    rows = [('accelerometer.accel_size_effect.xx', 'angular acceleration', '0.0463', ''), ('gyroscope.bias.x', 'turns at 30 to 120 deg/s', '12345.678', 'read')]
-    show.show_table(Terminal(out, 48), ('parameter', 'motion', 'value', ''), rows, numbers=('value',))
+    rows = [
+        ('accelerometer.accel_size_effect.xx', 'angular acceleration', '0.0463', ''),
+        ('gyroscope.bias.x', 'turns at 30 to 120 deg/s', '12345.678', 'read'),
+    ]
+    show.show_table(
+        Terminal(out, 48), ('parameter', 'motion', 'value', ''), rows, numbers=('value',)
+    )
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= 48
-    assert set(out.getvalue().split()) == {'parameter', 'motion', 'value', *' '.join(cell.replace('.', ' ') if row.index(cell) == 0 else cell for row in rows for cell in row).split()}
+    assert set(out.getvalue().split()) == {
+        'parameter',
+        'motion',
+        'value',
+        *' '.join(
+            cell.replace('.', ' ') if row.index(cell) == 0 else cell for row in rows for cell in row
+        ).split(),
+    }
 
 
-@pytest.mark.parametrize(('width', 'name'), [(120, 'accelerometer.bias.x'), (24, 'accelerometer bias x')])
+@pytest.mark.parametrize(
+    ('width', 'name'), [(120, 'accelerometer.bias.x'), (24, 'accelerometer bias x')]
+)
 def test_names_keep_their_dots_where_the_table_fits(width, name):
     out = io.StringIO()
-    show.show_table(Terminal(out, width), ('parameter', 'value', ''), [('accelerometer.bias.x', '1.0', '')])
-    assert name.split()[-1] in out.getvalue() and ('accelerometer.bias.x' in out.getvalue()) == (width == 120)
+    show.show_table(
+        Terminal(out, width), ('parameter', 'value', ''), [('accelerometer.bias.x', '1.0', '')]
+    )
+    assert name.split()[-1] in out.getvalue() and ('accelerometer.bias.x' in out.getvalue()) == (
+        width == 120
+    )
 
 
 def test_a_table_without_rows_has_no_lines():
@@ -92,17 +129,19 @@ def test_a_bar_has_the_name_of_its_phase_moves_between_reports_and_is_removed(mo
     monkeypatch.setattr(sys, 'stderr', screen)
 
     def wait_for(*words):
-        end = time.monotonic() + 60.0   # far longer than the period of the bar, for a busy machine
+        end = time.monotonic() + 60.0  # far longer than the period of the bar, for a busy machine
         while not all(word in screen.getvalue() for word in words) and time.monotonic() < end:
             time.sleep(0.02)
         assert all(word in screen.getvalue() for word in words)
 
     with ProgressBars() as bars:
         bars('solving', 0, 0)
-        wait_for('solving |#### ', 'solving |######## ')   # without a further report
+        wait_for('solving |#### ', 'solving |######## ')  # without a further report
         bars('reading', 30, 40)
         wait_for('reading  75% |' + 30 * '#')
-    assert screen.getvalue().rpartition('\r')[0].rpartition('\r')[2].strip() == '' and 'progress' not in [thread.name for thread in threading.enumerate()]
+    assert screen.getvalue().rpartition('\r')[0].rpartition('\r')[
+        2
+    ].strip() == '' and 'progress' not in [thread.name for thread in threading.enumerate()]
 
 
 def test_the_bar_is_removed_before_other_text(monkeypatch):
@@ -117,22 +156,35 @@ def test_the_bar_is_removed_before_other_text(monkeypatch):
         print('warning', file=sys.stderr)
         shown = screen.getvalue()
         bars('drawing', 0, 4)
-    assert re.search(r'solving .*\r +\rresult\nwarning\n$', shown) and 'drawing' in screen.getvalue() and sys.stdout is screen
+    assert (
+        re.search(r'solving .*\r +\rresult\nwarning\n$', shown)
+        and 'drawing' in screen.getvalue()
+        and sys.stdout is screen
+    )
 
 
 def on_terminal(arguments, *, errors=False, code=0, **environment):
     """Return what a verb writes on a terminal of 80 columns, with its standard error or without."""
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 50, 80, 0, 0))
-    kept = {name: value for name, value in os.environ.items() if name not in ('COLUMNS', 'NO_COLOR', 'FORCE_COLOR')}
-    process = subprocess.Popen([sys.executable, '-m', 'imu_calibration', *arguments], cwd=ROOT, stdout=theirs, stderr=theirs if errors else subprocess.DEVNULL,
-                               env=kept | {'TERM': 'xterm', **environment})
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ('COLUMNS', 'NO_COLOR', 'FORCE_COLOR')
+    }
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'imu_calibration', *arguments],
+        cwd=ROOT,
+        stdout=theirs,
+        stderr=theirs if errors else subprocess.DEVNULL,
+        env=kept | {'TERM': 'xterm', **environment},
+    )
     os.close(theirs)
     found = b''
     while True:
         try:
             part = os.read(ours, 65536)
-        except OSError:   # the other end is closed
+        except OSError:  # the other end is closed
             part = b''
         if not part:
             break
@@ -150,7 +202,16 @@ def test_help_is_shorter_than_60_lines_on_a_terminal(verb):
 
 
 @pytest.mark.live
-@pytest.mark.parametrize('arguments', [['compensate', '--help'], ['convert', '--help'], ['effects'], ['inspect', SESSION], ['export', '--list']])
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ['compensate', '--help'],
+        ['convert', '--help'],
+        ['effects'],
+        ['inspect', SESSION],
+        ['export', '--list'],
+    ],
+)
 def test_no_line_is_wider_than_the_terminal(arguments):
     """The terminal itself would break them within a word: help up to 138 columns, equations, names of parameters."""
     lines = re.sub(rb'\x1b\[[0-9;?]*[a-zA-Z]', b'', on_terminal(arguments)).decode().splitlines()
@@ -158,7 +219,14 @@ def test_no_line_is_wider_than_the_terminal(arguments):
 
 
 @pytest.mark.live
-@pytest.mark.parametrize('arguments', [['calibrate', SESSION, '--table', 'nowhere.yaml', '--output', 'never'], ['calibrate', SESSION, '--gravty', '9'], ['calibrat']])
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ['calibrate', SESSION, '--table', 'nowhere.yaml', '--output', 'never'],
+        ['calibrate', SESSION, '--gravty', '9'],
+        ['calibrat'],
+    ],
+)
 def test_no_line_of_an_error_is_wider_than_the_terminal(arguments):
     lines = on_terminal(arguments, errors=True, code=1).decode().splitlines()
     assert len(lines) > 1 and max(map(len, lines)) <= 80
@@ -168,7 +236,12 @@ def test_no_line_of_an_error_is_wider_than_the_terminal(arguments):
 def test_colour_is_for_terminals_and_not_with_no_color():
     assert b'\x1b[32m' in on_terminal(['inspect', SESSION])
     assert b'\x1b[3' not in on_terminal(['inspect', SESSION], NO_COLOR='1')
-    plain = subprocess.run([sys.executable, '-m', 'imu_calibration', 'inspect', SESSION], cwd=ROOT, capture_output=True, check=True)
+    plain = subprocess.run(
+        [sys.executable, '-m', 'imu_calibration', 'inspect', SESSION],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    )
     assert b'\x1b' not in plain.stdout + plain.stderr
 
 
@@ -182,38 +255,73 @@ def test_an_interruption_ends_worker_processes_without_tracebacks(tmp_path):
     """Ctrl+C reaches all processes of a terminal; workers printed theirs, and the verb ended with 1."""
     for name in ('first', 'second'):
         shutil.copytree(SESSION, tmp_path / 'units' / name)
-    program = ('import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'   # a background job ignores it
-               'from imu_calibration.__main__ import main\nif __name__ == "__main__":\n    sys.exit(main())\n')
-    process = subprocess.Popen([sys.executable, '-c', program, 'fleet', str(tmp_path / 'units'), '--table', TABLE, '--jobs', '2',
-                                '--output', str(tmp_path / 'never')], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    program = (
+        'import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'  # a background job ignores it
+        'from imu_calibration.__main__ import main\nif __name__ == "__main__":\n    sys.exit(main())\n'
+    )
+    process = subprocess.Popen(
+        [
+            sys.executable,
+            '-c',
+            program,
+            'fleet',
+            str(tmp_path / 'units'),
+            '--table',
+            TABLE,
+            '--jobs',
+            '2',
+            '--output',
+            str(tmp_path / 'never'),
+        ],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     end = time.monotonic() + 60.0
-    while len(children_of(process)) < 3 and time.monotonic() < end:   # two workers and the tracker of resources
+    while (
+        len(children_of(process)) < 3 and time.monotonic() < end
+    ):  # two workers and the tracker of resources
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)
     error = process.communicate(timeout=60)[1]
-    assert process.returncode == 130 and error.count('\n') == 1 and not (tmp_path / 'never').exists(), error
+    assert (
+        process.returncode == 130 and error.count('\n') == 1 and not (tmp_path / 'never').exists()
+    ), error
 
 
 def interrupted_at(module, *arguments):
     """Run a verb that gets SIGINT while it imports a module."""
-    program = ('import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'   # a background job ignores it
-               f'class Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name == {module!r}:\n'
-               '            sys.meta_path.remove(self)\n            os.kill(os.getpid(), signal.SIGINT)\n'
-               'sys.meta_path.insert(0, Watch())\n'
-               'from imu_calibration.__main__ import main\nsys.exit(main())\n')
-    return subprocess.run([sys.executable, '-c', program, *arguments], cwd=ROOT, capture_output=True, text=True)
+    program = (
+        'import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'  # a background job ignores it
+        f'class Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name == {module!r}:\n'
+        '            sys.meta_path.remove(self)\n            os.kill(os.getpid(), signal.SIGINT)\n'
+        'sys.meta_path.insert(0, Watch())\n'
+        'from imu_calibration.__main__ import main\nsys.exit(main())\n'
+    )
+    return subprocess.run(
+        [sys.executable, '-c', program, *arguments], cwd=ROOT, capture_output=True, text=True
+    )
 
 
 @pytest.mark.live
-@pytest.mark.parametrize('module', ['imu_calibration.cli.main', 'imu_calibration.cli.parser', 'numpy', 'datetime', 'scipy'])
+@pytest.mark.parametrize(
+    'module',
+    ['imu_calibration.cli.main', 'imu_calibration.cli.parser', 'numpy', 'datetime', 'scipy'],
+)
 def test_an_early_interruption_ends_with_130_in_one_line(module, tmp_path):
     """
     The signal arrives while a module is imported; numpy turned it into a broken installation where it imports `datetime`.
 
     It is tried again every 20 ms until no numerical package runs: `inspect` may end before, a calibration has hundreds of such moments.
     """
-    done = interrupted_at(module, 'calibrate', SESSION, '--table', TABLE, '--output', str(tmp_path / 'never'))
-    assert done.returncode == 130 and done.stderr.count('\n') == 1 and 'Traceback' not in done.stderr, done.stderr
+    done = interrupted_at(
+        module, 'calibrate', SESSION, '--table', TABLE, '--output', str(tmp_path / 'never')
+    )
+    assert (
+        done.returncode == 130 and done.stderr.count('\n') == 1 and 'Traceback' not in done.stderr
+    ), done.stderr
     assert not (tmp_path / 'never').exists()
 
 

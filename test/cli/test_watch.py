@@ -18,9 +18,15 @@ pytestmark = pytest.mark.usefixtures('few_candidates')
 STATUSES = {
     'streams': NodeStatus(0, 'Imu messages come', {}),
     'calibration': NodeStatus(1, 'weak; accelerometer.bias.x: 3 mg', {}),
-    'diagnosis': NodeStatus(1, 'gyro_g_sensitivity: the gyroscopes respond to specific force; more', {}),
-    'accelerometer accel_size_effect': NodeStatus(1, 'weak', {'standard error [m]': '0.005', 'tolerance [m]': '0.001', 'needs': 'spin'}),
-    'gyroscope bias': NodeStatus(0, 'determined', {'standard error [rad/s]': '1e-05', 'tolerance [rad/s]': '0.0001'}),
+    'diagnosis': NodeStatus(
+        1, 'gyro_g_sensitivity: the gyroscopes respond to specific force; more', {}
+    ),
+    'accelerometer accel_size_effect': NodeStatus(
+        1, 'weak', {'standard error [m]': '0.005', 'tolerance [m]': '0.001', 'needs': 'spin'}
+    ),
+    'gyroscope bias': NodeStatus(
+        0, 'determined', {'standard error [rad/s]': '1e-05', 'tolerance [rad/s]': '0.0001'}
+    ),
     'gyroscope matrix': NodeStatus(0, 'no solution yet', {'parameter': 'x'}),
 }
 
@@ -36,26 +42,46 @@ def shown(statuses=STATUSES, picture='hold it still with +x -y up, about 25 s le
 def test_a_bar_shrinks_to_the_tick_and_below_it():
     ratios = [1000, 100, 10, 1, 0.3, 0.01]
     lengths = [bar(ratio).count('#') for ratio in ratios]
-    assert lengths == sorted(lengths, reverse=True) and lengths[-1] == 0 and len({len(bar(ratio)) for ratio in ratios}) == 1
-    assert bar(1.0).index('|') == bar(1.0).count('#') and bar(1e9) == bar(1000) and '?' in bar(math.nan)
+    assert (
+        lengths == sorted(lengths, reverse=True)
+        and lengths[-1] == 0
+        and len({len(bar(ratio)) for ratio in ratios}) == 1
+    )
+    assert (
+        bar(1.0).index('|') == bar(1.0).count('#')
+        and bar(1e9) == bar(1000)
+        and '?' in bar(math.nan)
+    )
 
 
 def test_ratios_are_those_of_the_node():
     assert ratio_of(STATUSES['accelerometer accel_size_effect']) == pytest.approx(5.0)
-    assert math.isnan(ratio_of(STATUSES['gyroscope matrix'])) and math.isnan(ratio_of(NodeStatus(0, '', {'standard error [m]': 'x', 'tolerance [m]': '1'})))
+    assert math.isnan(ratio_of(STATUSES['gyroscope matrix'])) and math.isnan(
+        ratio_of(NodeStatus(0, '', {'standard error [m]': 'x', 'tolerance [m]': '1'}))
+    )
 
 
 def test_everything_that_counts_stands_in_80_columns():
     text = shown()
     assert max(map(len, text.splitlines())) <= 80
-    for words in ('calibration_node', 'streams  Imu messages come', 'verdict  weak', 'finding  gyro_g_sensitivity', 'accel. accel_size_effect', ' 5',
-                  'next  hold it still with +x -y up, about 25 s left'):
+    for words in (
+        'calibration_node',
+        'streams  Imu messages come',
+        'verdict  weak',
+        'finding  gyro_g_sensitivity',
+        'accel. accel_size_effect',
+        ' 5',
+        'next  hold it still with +x -y up, about 25 s left',
+    ):
         assert words in text, text
     assert '; more' not in text and text.count('|') >= 3 and BAR > 10
 
 
 def test_before_anything_came_the_screen_is_short():
-    assert shown({'streams': NodeStatus(2, 'no Imu messages come')}, '').strip().splitlines() == ['calibration_node', 'streams  no Imu messages come']
+    assert shown({'streams': NodeStatus(2, 'no Imu messages come')}, '').strip().splitlines() == [
+        'calibration_node',
+        'streams  no Imu messages come',
+    ]
 
 
 @pytest.mark.long
@@ -65,18 +91,43 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
     from examples.processes import local_environment, node_command
 
     from ros.live_station import TABLE, free_domain
+
     domain_id, lock = free_domain()
     environment = local_environment(domain_id) | {'COLUMNS': '80', 'LINES': '40', 'TERM': 'xterm'}
     watch = [sys.executable, '-m', 'imu_calibration', 'watch']
-    nobody = subprocess.run([*watch, '--patience', '1'], env=environment, capture_output=True, text=True, timeout=60)
-    assert nobody.returncode == 1 and "'calibration_node' must run" in nobody.stderr and nobody.stderr.count('\n') == 1
-    nodes = [subprocess.Popen(node_command(name, parameters), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for name, parameters in (
-        ('simulator_node', {'profile': 'quick', 'time_factor': 8.0}), ('calibration_node', {'table_file': str(TABLE)}))]
+    nobody = subprocess.run(
+        [*watch, '--patience', '1'], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert (
+        nobody.returncode == 1
+        and "'calibration_node' must run" in nobody.stderr
+        and nobody.stderr.count('\n') == 1
+    )
+    nodes = [
+        subprocess.Popen(
+            node_command(name, parameters),
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for name, parameters in (
+            ('simulator_node', {'profile': 'quick', 'time_factor': 8.0}),
+            ('calibration_node', {'table_file': str(TABLE)}),
+        )
+    ]
     try:
-        once = subprocess.run([*watch, '--once', '--patience', '60'], env=environment, capture_output=True, text=True, timeout=90)
+        once = subprocess.run(
+            [*watch, '--once', '--patience', '60'],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=90,
+        )
         assert once.returncode == 0 and 'streams' in once.stdout and '|' in once.stdout, once
         screen_end, terminal = pty.openpty()
-        with subprocess.Popen(watch, env=environment, stdin=subprocess.DEVNULL, stdout=terminal, stderr=terminal) as watching:
+        with subprocess.Popen(
+            watch, env=environment, stdin=subprocess.DEVNULL, stdout=terminal, stderr=terminal
+        ) as watching:
             os.close(terminal)
             time.sleep(8)
             for node in nodes:
@@ -85,10 +136,14 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
             while True:
                 try:
                     drawn += os.read(screen_end, 65536)
-                except OSError:   # the other end is closed: it has ended
+                except OSError:  # the other end is closed: it has ended
                     break
             assert watching.wait(60) == 0
-        assert b'calibration_node has ended' in drawn and b'Traceback' not in drawn and b'accel.' in drawn
+        assert (
+            b'calibration_node has ended' in drawn
+            and b'Traceback' not in drawn
+            and b'accel.' in drawn
+        )
     finally:
         for node in nodes:
             node.kill()

@@ -13,11 +13,19 @@ from imu_calibration.compensation.kernel import make_kernel
 from worlds.compensation_cases import FURTHER, random_calibration
 
 DERIVATIVE = CausalDerivative(5, 0.005)
-FORCE, RATE, SLOPE, DT = np.array([1.0, -2.0, 9.0]), np.array([1.5, -0.8, 2.0]), np.array([4.0, -6.0, 3.0]), 4.0
+FORCE, RATE, SLOPE, DT = (
+    np.array([1.0, -2.0, 9.0]),
+    np.array([1.5, -0.8, 2.0]),
+    np.array([4.0, -6.0, 3.0]),
+    4.0,
+)
 FORCE_COV = np.array([[4e-4, 1e-4, 0], [1e-4, 9e-4, -2e-4], [0, -2e-4, 5e-4]])
 RATE_COV = 1e-2 * FORCE_COV[::-1, ::-1]
 TRANSFER = Transfer.from_pose('base', (0.4, -0.3, 0.2), (0.3, 1.0, -2.0))
-EFFECTS = {'usual': (('accel_size_effect',), ()), 'all': (FURTHER['accelerometer'], FURTHER['gyroscope'])}
+EFFECTS = {
+    'usual': (('accel_size_effect',), ()),
+    'all': (FURTHER['accelerometer'], FURTHER['gyroscope']),
+}
 N_DRAWS = 4000
 
 
@@ -40,12 +48,17 @@ def test_noise_agrees_with_monte_carlo(effects, transfer):
     rng = np.random.default_rng(5)
     kernel = make_kernel(calibration, transfer)
     force = FORCE + rng.multivariate_normal(np.zeros(3), FORCE_COV, N_DRAWS)
-    rates = rng.multivariate_normal(np.zeros(3), RATE_COV, (N_DRAWS, DERIVATIVE.taps))   # newest first, as the weights
+    rates = rng.multivariate_normal(
+        np.zeros(3), RATE_COV, (N_DRAWS, DERIVATIVE.taps)
+    )  # newest first, as the weights
     slope = SLOPE + np.einsum('k,nki->ni', DERIVATIVE.weights, rates)
     rows = np.column_stack([force, RATE + rates[:, 0], slope, np.full(N_DRAWS, DT)])
     out = np.array([kernel(*row) for row in rows.tolist()])
     sensitivity = with_derivative(calibration, transfer).at(FORCE, RATE, SLOPE, dt=DT)
-    for got, predicted in zip((out[:, :3], out[:, 3:]), sensitivity.covariances(FORCE_COV, RATE_COV, with_parameters=False)):
+    for got, predicted in zip(
+        (out[:, :3], out[:, 3:]),
+        sensitivity.covariances(FORCE_COV, RATE_COV, with_parameters=False),
+    ):
         agree(np.cov(got.T), predicted)
 
 
@@ -56,7 +69,9 @@ def test_parameters_agree_with_monte_carlo(effects, transfer):
     rng = np.random.default_rng(6)
     draws = rng.multivariate_normal(calibration.values, calibration.covariance, 300)
     sample = [*np.concatenate([FORCE, RATE, SLOPE]).tolist(), DT]
-    out = np.array([make_kernel(replace(calibration, values=values), transfer)(*sample) for values in draws])
+    out = np.array(
+        [make_kernel(replace(calibration, values=values), transfer)(*sample) for values in draws]
+    )
     predicted = with_derivative(calibration, transfer).at(FORCE, RATE, SLOPE, dt=DT).parameters
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     # 300 draws: 8 %, four times that; the derivative of the inverse gyroscope matrix in the tangential term is left out.
@@ -68,7 +83,9 @@ def test_what_is_published_has_the_share_of_the_parameters():
     shares = []
     for sd in (1e-4, 1e-3):
         sensitivity = with_derivative(random_calibration(1, sd=sd)).at(FORCE, RATE, SLOPE, dt=DT)
-        whole, noise_only = (sensitivity.covariances(FORCE_COV, RATE_COV, flag) for flag in (True, False))
+        whole, noise_only = (
+            sensitivity.covariances(FORCE_COV, RATE_COV, flag) for flag in (True, False)
+        )
         shares.append([np.trace(a - b) for a, b in zip(whole, noise_only)])
     assert np.all(np.array(shares) > 0)
     np.testing.assert_allclose(np.divide(*shares[::-1]), 100.0, rtol=1e-6)

@@ -10,9 +10,14 @@ from imu_calibration.compensation.kernel import kernel_text, make_kernel
 
 from worlds.compensation_cases import FURTHER, random_calibration, random_motion
 
-some = {sensor: st.lists(st.sampled_from(names), unique=True).map(tuple) for sensor, names in FURTHER.items()}
+some = {
+    sensor: st.lists(st.sampled_from(names), unique=True).map(tuple)
+    for sensor, names in FURTHER.items()
+}
 small = st.floats(-1.0, 1.0)
-poses = st.none() | st.builds(lambda *n: Transfer.from_pose('base', n[:3], [3 * x for x in n[3:]]), *[small] * 6)
+poses = st.none() | st.builds(
+    lambda *n: Transfer.from_pose('base', n[:3], [3 * x for x in n[3:]]), *[small] * 6
+)
 
 
 def both(calibration, transfer, seed=0, n=12):
@@ -20,11 +25,24 @@ def both(calibration, transfer, seed=0, n=12):
     alpha = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
     branch = np.random.default_rng([seed, 23]).uniform(-1.0, 1.0, n)
     vibration = np.random.default_rng([seed, 24]).uniform(0.0, 0.1, (n, 3))
-    expected = compensate(calibration, force, rate, alpha_s=alpha, temperature_c=temperature, thermal_branch=branch, vibration=vibration,
-                          transfer=transfer)
+    expected = compensate(
+        calibration,
+        force,
+        rate,
+        alpha_s=alpha,
+        temperature_c=temperature,
+        thermal_branch=branch,
+        vibration=vibration,
+        transfer=transfer,
+    )
     kernel = make_kernel(calibration, transfer)
     dt = temperature - calibration.model.temperature_ref_c
-    got = np.array([kernel(*row) for row in np.column_stack([force, rate, slope, dt, branch, vibration]).tolist()])
+    got = np.array(
+        [
+            kernel(*row)
+            for row in np.column_stack([force, rate, slope, dt, branch, vibration]).tolist()
+        ]
+    )
     return got, np.column_stack([expected.force, expected.rate])
 
 
@@ -47,7 +65,9 @@ def test_the_usual_model_is_one_straight_line(accelerometer):
 def test_zero_input_does_not_trip_the_asymmetry():
     calibration = random_calibration(2, ('accel_scale_asymmetry',), ('gyro_scale_asymmetry',))
     kernel = make_kernel(calibration)
-    force, rate = (calibration.value(sensor, 'bias')[None] for sensor in ('accelerometer', 'gyroscope'))
+    force, rate = (
+        calibration.value(sensor, 'bias')[None] for sensor in ('accelerometer', 'gyroscope')
+    )
     expected = compensate(calibration, force, rate, alpha_s=np.zeros((1, 3)))
     got = kernel(*force[0].tolist(), *rate[0].tolist(), 0.0, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(got, np.column_stack([expected.force, expected.rate])[0], atol=1e-15)

@@ -8,7 +8,9 @@ from imu_calibration.compensation.angular_acceleration import CausalDerivative, 
 
 def slopes(derivative, values):
     """Derivative wherever the window is full, shape (n - taps + 1, 3)."""
-    return np.stack([np.convolve(column, derivative.weights, 'valid') for column in values.T], axis=1)
+    return np.stack(
+        [np.convolve(column, derivative.weights, 'valid') for column in values.T], axis=1
+    )
 
 
 @pytest.mark.parametrize('taps', [2, 3, 8, 41])
@@ -18,15 +20,23 @@ def test_a_parabola_has_its_slope_of_half_a_window_ago(taps):
     rate = np.stack([3.0 + 2.0 * time, time**2, np.ones(100)], axis=1)
     slope = slopes(derivative, rate)[1:]
     late = time[taps:] - derivative.delay
-    np.testing.assert_allclose(slope, np.stack([np.full(len(late), 2.0), 2 * late, np.zeros(len(late))], axis=1), atol=1e-10)
+    np.testing.assert_allclose(
+        slope,
+        np.stack([np.full(len(late), 2.0), 2 * late, np.zeros(len(late))], axis=1),
+        atol=1e-10,
+    )
 
 
 @pytest.mark.parametrize('taps', [2, 5, 20])
 def test_noise_is_as_predicted(taps):
     derivative = CausalDerivative(taps, 0.01)
-    np.testing.assert_allclose(np.sqrt((derivative.weights**2).sum()), derivative.noise_sd(1.0), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.sqrt((derivative.weights**2).sum()), derivative.noise_sd(1.0), rtol=1e-12
+    )
     slope = slopes(derivative, np.random.default_rng(2).normal(0.0, 0.3, (20_000, 3)))
-    assert slope.std() == pytest.approx(derivative.noise_sd(0.3), rel=0.03)   # 60 000 values, serially correlated over `taps`
+    assert slope.std() == pytest.approx(
+        derivative.noise_sd(0.3), rel=0.03
+    )  # 60 000 values, serially correlated over `taps`
 
 
 def test_the_window_is_the_shortest_whose_noise_stays_below_a_third():

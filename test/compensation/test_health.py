@@ -33,7 +33,12 @@ def follow(world, *, offset=0.0, cut=None, **options):
     calibration = plain_calibration(offset)
     watch = StopWatch(CalibrationHealth(calibration, None, HealthOptions(**options)))
     out, imu = [], world.imu
-    for stamp, rate, force in zip(imu.stamp_ns[:cut].tolist(), imu.rate_s[:cut].tolist(), imu.force_s[:cut].tolist(), strict=True):
+    for stamp, rate, force in zip(
+        imu.stamp_ns[:cut].tolist(),
+        imu.rate_s[:cut].tolist(),
+        imu.force_s[:cut].tolist(),
+        strict=True,
+    ):
         corrected = (rate[0], rate[1], rate[2] - offset, *force)
         out.append(watch.follow(stamp, (*rate, *force), corrected)[:3])
     return watch, np.array(out)
@@ -42,11 +47,14 @@ def follow(world, *, offset=0.0, cut=None, **options):
 @pytest.mark.parametrize('shake', [0.0, 0.15])
 def test_stops_are_found_where_the_robot_stands_and_nowhere_else(shake):
     world = drive(3, 5, shake=shake)
-    detector, time = StopDetector(np.repeat([0.02, 0.002], 3)), (world.imu.stamp_ns - world.imu.stamp_ns[0]) * 1e-9
+    detector, time = (
+        StopDetector(np.repeat([0.02, 0.002], 3)),
+        (world.imu.stamp_ns - world.imu.stamp_ns[0]) * 1e-9,
+    )
     rows = np.column_stack([time, world.imu.force_s, world.imu.rate_s])
     seen = np.zeros(len(time), bool)
     for a in range(0, len(rows), 25):
-        stop = detector.push(rows[a:a + 25])
+        stop = detector.push(rows[a : a + 25])
         if stop is not None:
             seen[(time >= stop.start) & (time < stop.end)] = True
     assert not (seen & ~world.still).any()
@@ -55,12 +63,14 @@ def test_stops_are_found_where_the_robot_stands_and_nowhere_else(shake):
 
 def test_how_a_stream_is_cut_does_not_change_the_stops():
     world = drive(4, 2)
-    rows = np.column_stack([(world.imu.stamp_ns - world.imu.stamp_ns[0]) * 1e-9, world.imu.force_s, world.imu.rate_s])
+    rows = np.column_stack(
+        [(world.imu.stamp_ns - world.imu.stamp_ns[0]) * 1e-9, world.imu.force_s, world.imu.rate_s]
+    )
     whole, pieces = StopDetector(np.full(6, 0.01)), StopDetector(np.full(6, 0.01))
     upto = int(39.5 * RATE)
     expected = whole.push(rows[:upto])
     for a in range(0, upto, 7):
-        found = pieces.push(rows[a:min(a + 7, upto)])
+        found = pieces.push(rows[a : min(a + 7, upto)])
     assert found.start == expected.start and found.n_samples == expected.n_samples
     np.testing.assert_allclose(found.mean, expected.mean, atol=1e-12)
 
@@ -84,13 +94,20 @@ def test_the_error_of_a_mean_includes_the_decay_of_a_slow_stop():
         for seconds in (0.3, 0.7, 1.5, 3.0, 6.0):
             time = np.arange(0, 60, 1 / RATE)
             phase = time % 15.0
-            rate = np.where(phase < 7.0, 0.3, 0.02 * np.exp(-(phase - 7.0) / seconds))[:, None] * [0.1, -0.2, 1.0] + moved
+            rate = (
+                np.where(phase < 7.0, 0.3, 0.02 * np.exp(-(phase - 7.0) / seconds))[:, None]
+                * [0.1, -0.2, 1.0]
+                + moved
+            )
             force = np.array([0.0, 0.0, G]) + rng.normal(0, 0.02, (len(time), 3))
             health = CalibrationHealth(plain_calibration(), None, HealthOptions())
-            detector, rate = StopDetector(health.noise_sd), rate + rng.normal(0, 0.002, (len(time), 3))
+            detector, rate = (
+                StopDetector(health.noise_sd),
+                rate + rng.normal(0, 0.002, (len(time), 3)),
+            )
             rows = np.column_stack([time, force, rate, force, rate])
             for start in range(0, len(rows), 25):
-                stop = detector.push(rows[start:start + 25])
+                stop = detector.push(rows[start : start + 25])
                 if stop is not None:
                     health.judge(stop)
                     found.add(health.state.word)
@@ -117,7 +134,9 @@ def test_a_bias_that_warms_up_is_named_with_its_size():
     watch, _ = follow(world)
     assert watch.health.state.word == MOVED
     assert watch.health.update is None
-    told, axis = re.search(r'([+-][\d.e-]+) deg/s [a-z ]*\b([xyz])\b', watch.health.state.message).groups()
+    told, axis = re.search(
+        r'([+-][\d.e-]+) deg/s [a-z ]*\b([xyz])\b', watch.health.state.message
+    ).groups()
     assert axis == 'z' and float(told) == pytest.approx(world.bias[-1, 2] / DEG, abs=0.01)
 
 
@@ -126,12 +145,15 @@ def test_gravity_that_reads_wrong_is_named_and_a_place_is_not_blamed():
     wrong, _ = follow(drive(7, 2, gravity=1.02 * G))
     assert wrong.health.state.word == MOVED and 'gravity reads 10.00' in wrong.health.state.message
     known, _ = follow(drive(7, 2, gravity=1.004 * G), gravity=G)
-    assert known.health.state.word == MOVED   # where gravity is known, a place is no excuse
+    assert known.health.state.word == MOVED  # where gravity is known, a place is no excuse
 
 
 def test_a_calibration_of_another_sensor_does_harm():
     watch, _ = follow(drive(8, 2), offset=1.0 * DEG)
-    assert watch.health.state.word == HARMS and 'without the calibration it would be less' in watch.health.state.message
+    assert (
+        watch.health.state.word == HARMS
+        and 'without the calibration it would be less' in watch.health.state.message
+    )
 
 
 def test_an_update_takes_the_drift_off_and_knows_how_well():
@@ -162,10 +184,18 @@ def test_an_update_fades_and_its_uncertainty_grows_back():
     prior = update.predict(0.0)[1]
     np.testing.assert_allclose(prior, SD**2)
     update.measure(0.0, 5.0, rate=np.full(3, 0.1 * DEG), variance=np.full(3, 1e-12))
-    bias, variance = zip(*(update.predict(5.0 + after) for after in (0.0, 60.0, 600.0, 6000.0)), strict=True)
-    assert (np.diff(np.array(bias)[:, 0]) < 0).all() and (np.diff(np.array(variance)[:, 0]) > 0).all()
-    assert bias[0][0] == pytest.approx(0.1 * DEG, rel=0.02) and bias[2][0] == pytest.approx(0.1 * DEG * np.exp(-1), rel=0.02)
-    assert np.sqrt(variance[-1][0]) == pytest.approx(0.1 * DEG, rel=0.05)   # as wide as what was seen, no longer as the calibration said
+    bias, variance = zip(
+        *(update.predict(5.0 + after) for after in (0.0, 60.0, 600.0, 6000.0)), strict=True
+    )
+    assert (np.diff(np.array(bias)[:, 0]) < 0).all() and (
+        np.diff(np.array(variance)[:, 0]) > 0
+    ).all()
+    assert bias[0][0] == pytest.approx(0.1 * DEG, rel=0.02) and bias[2][0] == pytest.approx(
+        0.1 * DEG * np.exp(-1), rel=0.02
+    )
+    assert np.sqrt(variance[-1][0]) == pytest.approx(
+        0.1 * DEG, rel=0.05
+    )  # as wide as what was seen, no longer as the calibration said
 
 
 def test_a_stop_that_grows_is_one_measurement():
@@ -178,7 +208,19 @@ def test_a_stop_that_grows_is_one_measurement():
 
 
 def test_a_turn_faster_than_any_bias_moves_is_no_stop():
-    calm, turning = (CalibrationHealth(plain_calibration(), None, HealthOptions(update=True)) for _ in range(2))
+    calm, turning = (
+        CalibrationHealth(plain_calibration(), None, HealthOptions(update=True)) for _ in range(2)
+    )
     for health, rate in ((calm, 0.0), (turning, 1.2 * MOST_MOVED)):
-        health.judge(Stop(0.0, 5.0, 500, np.array([0.0, 0.0, G, 0.0, 0.0, rate]), np.array([0.0, 0.0, G, 0.0, 0.0, rate]), np.full(6, 1e-3), np.zeros(6)))
+        health.judge(
+            Stop(
+                0.0,
+                5.0,
+                500,
+                np.array([0.0, 0.0, G, 0.0, 0.0, rate]),
+                np.array([0.0, 0.0, G, 0.0, 0.0, rate]),
+                np.full(6, 1e-3),
+                np.zeros(6),
+            )
+        )
     assert calm.state.word == HOLDS and turning.state.word == WAITING

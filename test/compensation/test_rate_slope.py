@@ -28,7 +28,7 @@ NOISE = 0.002
 def stamps_of(kind, true_ns, rng):
     """The stamps that a driver of that kind gives to samples taken at `true_ns`."""
     index, n = np.arange(len(true_ns)), len(true_ns)
-    if kind == 'usb packets':   # eight samples, 20 us apart, when the last of them was taken
+    if kind == 'usb packets':  # eight samples, 20 us apart, when the last of them was taken
         last = np.minimum(index | 7, n - 1)
         return true_ns[last] + 300_000 + 20_000 * (index % 8)
     if kind == 'arrival':
@@ -37,11 +37,15 @@ def stamps_of(kind, true_ns, rng):
         return true_ns // 1_000_000 * 1_000_000
     if kind == 'jitter':
         return true_ns + rng.normal(0.0, 0.2 * PERIOD_NS, n).astype(np.int64)
-    if kind == 'runaway':   # steps of any length that have nothing to do with the sampling
+    if kind == 'runaway':  # steps of any length that have nothing to do with the sampling
         return true_ns[0] + np.cumsum(rng.exponential(PERIOD_NS, n)).astype(np.int64)
-    if kind.endswith(' ms'):   # 'normal 2.0 ms', 'exponential 3.0 ms': independent, so that stamps overtake each other
+    if kind.endswith(
+        ' ms'
+    ):  # 'normal 2.0 ms', 'exponential 3.0 ms': independent, so that stamps overtake each other
         law, scatter, _ = kind.split()
-        return true_ns + (1e6 * float(scatter) * getattr(rng, f'standard_{law}')(n)).astype(np.int64)
+        return true_ns + (1e6 * float(scatter) * getattr(rng, f'standard_{law}')(n)).astype(
+            np.int64
+        )
     return {'regular': true_ns, 'irregular': true_ns, 'zeros': np.zeros(n, np.int64)}[kind]
 
 
@@ -50,7 +54,11 @@ DRIVERS = ('regular', 'usb packets', 'arrival', 'milliseconds', 'jitter')
 
 def motion(time_s):
     """Rate and its derivative at some times, each (n, 3)."""
-    amplitude, omega, phase = np.array([[3.0, 1.0, 0.5], [0.4, 2.0, 0.3], [1.0, 0.5, 2.0]]), np.array([4.0, 9.0, 15.0]), np.array([0.3, 1.0, 2.0])
+    amplitude, omega, phase = (
+        np.array([[3.0, 1.0, 0.5], [0.4, 2.0, 0.3], [1.0, 0.5, 2.0]]),
+        np.array([4.0, 9.0, 15.0]),
+        np.array([0.3, 1.0, 2.0]),
+    )
     angle = np.outer(time_s, omega) + phase
     return np.sin(angle) @ amplitude.T, (np.cos(angle) * omega) @ amplitude.T
 
@@ -59,22 +67,45 @@ def tracker():
     return RateSlope(lambda period: CausalDerivative(max(int(0.04 / period), 2), period))
 
 
-@given(st.lists(st.tuples(st.sampled_from((*DRIVERS, 'runaway', 'zeros')), st.integers(1, 400), st.sampled_from((1.0, 1.0, 0.4, 2.5)),
-                          st.sampled_from((0, 0, 30_000_000, 3_000_000_000, -5_000_000_000))), min_size=1, max_size=5), st.data())
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from((*DRIVERS, 'runaway', 'zeros')),
+            st.integers(1, 400),
+            st.sampled_from((1.0, 1.0, 0.4, 2.5)),
+            st.sampled_from((0, 0, 30_000_000, 3_000_000_000, -5_000_000_000)),
+        ),
+        min_size=1,
+        max_size=5,
+    ),
+    st.data(),
+)
 def test_blocks_give_the_same_as_samples_however_the_stream_is_cut(stretches, data):
     rng, parts, end = np.random.default_rng(len(stretches)), [], START
     for kind, n, scale, pause in stretches:
-        parts.append(stamps_of(kind, end + (PERIOD_NS * scale * np.arange(1, n + 1)).astype(np.int64), rng))
+        parts.append(
+            stamps_of(kind, end + (PERIOD_NS * scale * np.arange(1, n + 1)).astype(np.int64), rng)
+        )
         end += int(PERIOD_NS * scale * n) + pause
     stamps = np.concatenate(parts)
-    keep = np.sort(rng.integers(0, len(stamps), len(stamps)))   # some lost, some twice
+    keep = np.sort(rng.integers(0, len(stamps), len(stamps)))  # some lost, some twice
     stamps, values = stamps[keep], rng.normal(size=(len(stamps), 3))[keep]
     cuts = sorted({0, len(stamps), *data.draw(st.lists(st.integers(0, len(stamps)), max_size=4))})
     one, other = tracker(), tracker()
-    expected = np.array([one.push(int(stamp), *value) for stamp, value in zip(stamps, values.tolist())])
-    got = np.concatenate([other.push_block(stamps[a:b], values[a:b]) for a, b in zip(cuts, cuts[1:])])
-    np.testing.assert_allclose(got, expected, atol=1e-8)   # values of 1 over 1 ms: rounding of 1e-13 x 1000
-    assert (one.line, one.derivative, one.n_without) == (other.line, other.derivative, other.n_without)
+    expected = np.array(
+        [one.push(int(stamp), *value) for stamp, value in zip(stamps, values.tolist())]
+    )
+    got = np.concatenate(
+        [other.push_block(stamps[a:b], values[a:b]) for a, b in zip(cuts, cuts[1:])]
+    )
+    np.testing.assert_allclose(
+        got, expected, atol=1e-8
+    )  # values of 1 over 1 ms: rounding of 1e-13 x 1000
+    assert (one.line, one.derivative, one.n_without) == (
+        other.line,
+        other.derivative,
+        other.n_without,
+    )
     np.testing.assert_allclose(one.error().moment, other.error().moment, rtol=1e-6, atol=1e-9)
 
 
@@ -86,38 +117,57 @@ def test_whatever_the_stamps_the_derivative_is_that_of_the_true_times(kind):
     found, ideal = tracker(), tracker()
     got = found.push_block(stamps_of(kind, true_ns, np.random.default_rng(1)), rate)[300:]
     expected = ideal.push_block(true_ns, rate)[300:]
-    assert np.sqrt(np.mean((got - expected)**2) / np.mean(expected**2)) < 0.03
-    assert found.line.word == (COUNTED if kind in ('usb packets', 'jitter') else REGULAR) and not found.doubt and not found.n_without
+    assert np.sqrt(np.mean((got - expected) ** 2) / np.mean(expected**2)) < 0.03
+    assert (
+        found.line.word == (COUNTED if kind in ('usb packets', 'jitter') else REGULAR)
+        and not found.doubt
+        and not found.n_without
+    )
 
 
 @pytest.mark.parametrize('kind', ('regular', 'usb packets'))
 @pytest.mark.parametrize('factor', (0.5, 0.7, 0.9, 1.3, 3.0))
 def test_a_rate_that_changes_in_mid_stream_is_followed(kind, factor):
-    true_ns = START + np.cumsum(np.repeat([PERIOD_NS, round(PERIOD_NS * factor)], N)).astype(np.int64)
+    true_ns = START + np.cumsum(np.repeat([PERIOD_NS, round(PERIOD_NS * factor)], N)).astype(
+        np.int64
+    )
     rate, _ = motion((true_ns - START) * 1e-9)
     found = tracker()
-    got = found.push_block(stamps_of(kind, true_ns, np.random.default_rng(1)), rate)[N + 600:]
+    got = found.push_block(stamps_of(kind, true_ns, np.random.default_rng(1)), rate)[N + 600 :]
     assert found.line.period_ns == pytest.approx(PERIOD_NS * factor, rel=0.03)
     ideal = tracker()
     expected = ideal.push_block(true_ns[N:], rate[N:])[600:]
-    assert np.sqrt(np.mean((got - expected)**2) / np.mean(expected**2)) < 0.06
+    assert np.sqrt(np.mean((got - expected) ** 2) / np.mean(expected**2)) < 0.06
 
 
 def test_a_packet_that_is_lost_costs_one_window_and_no_false_derivative():
     true_ns = START + PERIOD_NS * np.arange(N)
     rate, _ = motion((true_ns - START) * 1e-9)
-    stamps, keep = stamps_of('usb packets', true_ns, None), np.delete(np.arange(N), np.arange(1000, 1016))
+    stamps, keep = (
+        stamps_of('usb packets', true_ns, None),
+        np.delete(np.arange(N), np.arange(1000, 1016)),
+    )
     found, ideal = tracker(), tracker()
-    got, expected = found.push_block(stamps[keep], rate[keep]), ideal.push_block(true_ns, rate)[keep]
+    got, expected = (
+        found.push_block(stamps[keep], rate[keep]),
+        ideal.push_block(true_ns, rate)[keep],
+    )
     assert np.all(got[1000:1003] == 0.0)
-    np.testing.assert_allclose(got[1012:1100], expected[1012:1100], atol=0.04 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        got[1012:1100], expected[1012:1100], atol=0.04 * np.abs(expected).max()
+    )
 
 
 def test_stamps_that_stand_still_give_no_derivative_and_its_size_as_the_error():
     true_ns = START + PERIOD_NS * np.arange(N)
     found = tracker()
     got = found.push_block(stamps_of('zeros', true_ns, None), motion((true_ns - START) * 1e-9)[0])
-    assert found.line.word == IRREGULAR and found.doubt and found.n_without > N - 400 and np.all(got == 0.0)
+    assert (
+        found.line.word == IRREGULAR
+        and found.doubt
+        and found.n_without > N - 400
+        and np.all(got == 0.0)
+    )
 
 
 @pytest.mark.parametrize('taps', (2, 4, 9, 40))
@@ -127,12 +177,24 @@ def test_irregular_stamps_give_the_least_squares_slope_over_them(taps):
     stamps = START + np.cumsum(rng.exponential(PERIOD_NS, 4000)).astype(np.int64)
     derivative = CausalDerivative(taps, PERIOD_NS * 1e-9)
     line, noise = TimedDerivative(derivative), TimedDerivative(derivative)
-    slopes = np.array([line.push(int(stamp), *(1e-9 * (stamp - START) * np.array([2.0, -3.0, 0.5]))) for stamp in stamps])
-    np.testing.assert_allclose(slopes[200:], np.broadcast_to([2.0, -3.0, 0.5], (3800, 3)), rtol=1e-6)
-    noisy = np.array([noise.push(int(stamp), *values) for stamp, values in zip(stamps, rng.normal(size=(4000, 3)))])
+    slopes = np.array(
+        [
+            line.push(int(stamp), *(1e-9 * (stamp - START) * np.array([2.0, -3.0, 0.5])))
+            for stamp in stamps
+        ]
+    )
+    np.testing.assert_allclose(
+        slopes[200:], np.broadcast_to([2.0, -3.0, 0.5], (3800, 3)), rtol=1e-6
+    )
+    noisy = np.array(
+        [
+            noise.push(int(stamp), *values)
+            for stamp, values in zip(stamps, rng.normal(size=(4000, 3)))
+        ]
+    )
     assert 0.4 < noisy[200:].std() / derivative.noise_sd(1.0) < 1.05
-    assert noise.push(int(stamps[-2]), 9.0, 9.0, 9.0) == tuple(noisy[-1])   # an earlier stamp
-    assert noise.push(int(stamps[-1]) + 10**9, 9.0, 9.0, 9.0) == (0.0, 0.0, 0.0)   # behind a pause
+    assert noise.push(int(stamps[-2]), 9.0, 9.0, 9.0) == tuple(noisy[-1])  # an earlier stamp
+    assert noise.push(int(stamps[-1]) + 10**9, 9.0, 9.0, 9.0) == (0.0, 0.0, 0.0)  # behind a pause
 
 
 def world(kind, seed=0, lively=1.0, arm=ARM, period_ns=PERIOD_NS):
@@ -147,11 +209,29 @@ def world(kind, seed=0, lively=1.0, arm=ARM, period_ns=PERIOD_NS):
     alpha = lively * alpha
     arms = calibration.value('accelerometer', 'accel_size_effect')
     force = np.array([0.0, 0.0, 9.8]) + np.zeros((N, 3))
-    felt = force + np.stack([(np.cross(alpha, arm) + np.cross(rate, np.cross(rate, arm)))[:, k] for k, arm in enumerate(arms)], axis=1)
+    felt = force + np.stack(
+        [
+            (np.cross(alpha, arm) + np.cross(rate, np.cross(rate, arm)))[:, k]
+            for k, arm in enumerate(arms)
+        ],
+        axis=1,
+    )
     force_sd, rate_sd = (calibration.noise(sensor)[0] for sensor in ('accelerometer', 'gyroscope'))
-    measured = felt @ calibration.value('accelerometer', 'matrix').T + calibration.value('accelerometer', 'bias') + force_sd * rng.normal(size=(N, 3))
-    turned = rate @ calibration.value('gyroscope', 'matrix').T + calibration.value('gyroscope', 'bias') + rate_sd * rng.normal(size=(N, 3))
-    return calibration, ImuSamples(stamps_of(kind, true_ns, rng), measured, turned, 'imu_link'), force
+    measured = (
+        felt @ calibration.value('accelerometer', 'matrix').T
+        + calibration.value('accelerometer', 'bias')
+        + force_sd * rng.normal(size=(N, 3))
+    )
+    turned = (
+        rate @ calibration.value('gyroscope', 'matrix').T
+        + calibration.value('gyroscope', 'bias')
+        + rate_sd * rng.normal(size=(N, 3))
+    )
+    return (
+        calibration,
+        ImuSamples(stamps_of(kind, true_ns, rng), measured, turned, 'imu_link'),
+        force,
+    )
 
 
 @pytest.mark.parametrize('kind', (*DRIVERS, 'runaway', 'irregular', 'exponential 5.0 ms'))
@@ -164,7 +244,10 @@ def test_the_covariance_that_is_published_is_that_of_the_error(kind, lively):
     for k, message in enumerate(encode_imu(imu)):
         out = parse_imu(live(message.tobytes())).doubles
         if k >= 400:
-            error, cov = np.array(out[FIELDS['force_s']]) - force[k], np.reshape(out[FIELDS['force_cov']], (3, 3))
+            error, cov = (
+                np.array(out[FIELDS['force_s']]) - force[k],
+                np.reshape(out[FIELDS['force_cov']], (3, 3)),
+            )
             ratios.append(error**2 / np.diag(cov))
         if k % 100 == 0:
             live.refresh()
@@ -173,16 +256,43 @@ def test_the_covariance_that_is_published_is_that_of_the_error(kind, lively):
     assert 0.5 < found < 1.4
 
 
-@pytest.mark.parametrize(('kind', 'period_ms'), (
-    ('normal 2.0 ms', 5), ('normal 3.0 ms', 5), ('normal 0.5 ms', 1), ('normal 8.0 ms', 5), ('normal 3.0 ms', 1), ('exponential 2.0 ms', 5),
-    ('exponential 10.0 ms', 5), ('exponential 3.0 ms', 1), ('irregular', 5), ('irregular', 10)))
+@pytest.mark.parametrize(
+    ('kind', 'period_ms'),
+    (
+        ('normal 2.0 ms', 5),
+        ('normal 3.0 ms', 5),
+        ('normal 0.5 ms', 1),
+        ('normal 8.0 ms', 5),
+        ('normal 3.0 ms', 1),
+        ('exponential 2.0 ms', 5),
+        ('exponential 10.0 ms', 5),
+        ('exponential 3.0 ms', 1),
+        ('irregular', 5),
+        ('irregular', 10),
+    ),
+)
 def test_the_lever_arm_is_corrected_though_stamps_overtake_each_other(kind, period_ms):
     """Arm of 0.5 m, an effect of 5.9 m/s^2 rms: at most 0.9 m/s^2 rms remain, as for regular stamps; jitter disabled the correction."""
-    calibration, imu, force = world(kind, seed=3, lively=0.34 if period_ms > 1 else 0.53, arm=0.5, period_ns=1_000_000 * period_ms)
+    calibration, imu, force = world(
+        kind,
+        seed=3,
+        lively=0.34 if period_ms > 1 else 0.53,
+        arm=0.5,
+        period_ns=1_000_000 * period_ms,
+    )
     live = LiveCompensation(calibration)
-    out = np.array([parse_imu(live(message.tobytes())).doubles[FIELDS['force_s']] for message in encode_imu(imu)])
-    calibrated = (imu.force_s - calibration.value('accelerometer', 'bias')) @ np.linalg.inv(calibration.value('accelerometer', 'matrix')).T
-    raw, remaining = (np.sqrt(np.mean(((values - force)[400:]**2).sum(axis=1))) for values in (calibrated, out))
+    out = np.array(
+        [
+            parse_imu(live(message.tobytes())).doubles[FIELDS['force_s']]
+            for message in encode_imu(imu)
+        ]
+    )
+    calibrated = (imu.force_s - calibration.value('accelerometer', 'bias')) @ np.linalg.inv(
+        calibration.value('accelerometer', 'matrix')
+    ).T
+    raw, remaining = (
+        np.sqrt(np.mean(((values - force)[400:] ** 2).sum(axis=1))) for values in (calibrated, out)
+    )
     print(f'{kind}, {period_ms} ms: {raw:.2f} -> {remaining:.2f}')
     assert 5.3 < raw < 6.6 and remaining <= 0.9
 
@@ -195,7 +305,11 @@ def test_samples_lost_behind_jitter_give_no_false_derivative(kind):
     keep = np.delete(np.arange(N), np.arange(1000, 1060))
     got = tracker().push_block(stamps_of(kind, true_ns, np.random.default_rng(5))[keep], rate[keep])
     assert np.abs(got[300:]).max() < 1.5 * np.abs(alpha).max()
-    np.testing.assert_allclose(got[1020:], tracker().push_block(true_ns, rate)[keep][1020:], atol=0.05 * np.abs(alpha).max())
+    np.testing.assert_allclose(
+        got[1020:],
+        tracker().push_block(true_ns, rate)[keep][1020:],
+        atol=0.05 * np.abs(alpha).max(),
+    )
 
 
 def test_offline_says_the_same_as_live():
@@ -203,11 +317,17 @@ def test_offline_says_the_same_as_live():
     live, offline = LiveCompensation(calibration), CompensationStream(calibration)
     out = [parse_imu(live(message.tobytes())).doubles for message in encode_imu(imu)]
     force = offline.correct(imu).force
-    np.testing.assert_allclose([d[FIELDS['force_s']] for d in out[600:]], force[600:], atol=0.1)   # the period from 256 or from all stamps
+    np.testing.assert_allclose(
+        [d[FIELDS['force_s']] for d in out[600:]], force[600:], atol=0.1
+    )  # the period from 256 or from all stamps
     live.refresh()
     stated = parse_imu(live(encode_imu(imu)[-1].tobytes())).doubles[FIELDS['force_cov']]
-    np.testing.assert_allclose(np.diag(np.reshape(stated, (3, 3))), np.diag(offline.propagate(None, None)[0]), rtol=0.2)
-    assert describe_stamps(imu.stamp_ns).word == COUNTED and not any('clock' in line for line in offline.warnings())
+    np.testing.assert_allclose(
+        np.diag(np.reshape(stated, (3, 3))), np.diag(offline.propagate(None, None)[0]), rtol=0.2
+    )
+    assert describe_stamps(imu.stamp_ns).word == COUNTED and not any(
+        'clock' in line for line in offline.warnings()
+    )
     calibration, imu, _ = world('zeros')
     offline = CompensationStream(calibration)
     offline.correct(imu)
@@ -225,8 +345,11 @@ def test_a_new_calibration_goes_on_with_what_is_known_of_the_stamps():
     second.prepare(first)
     second.follow(first)
     got = [second(message) for message in data[1000:]]
-    np.testing.assert_allclose([parse_imu(m).doubles[FIELDS['force_s']] for m in got],
-                               [parse_imu(m).doubles[FIELDS['force_s']] for m in expected[1000:]], atol=1e-9)
+    np.testing.assert_allclose(
+        [parse_imu(m).doubles[FIELDS['force_s']] for m in got],
+        [parse_imu(m).doubles[FIELDS['force_s']] for m in expected[1000:]],
+        atol=1e-9,
+    )
 
 
 def test_without_stamps_the_time_of_arrival_is_taken_and_told():
@@ -248,7 +371,9 @@ def test_covariances_that_are_none_are_replaced_and_noted(number):
     odd = live(patch_imu(message, rate_cov=covariance, force_cov=covariance))
     expected = plain(message)
     for name in ('rate_cov', 'force_cov'):
-        np.testing.assert_array_equal(parse_imu(odd).doubles[FIELDS[name]], parse_imu(expected).doubles[FIELDS[name]])
+        np.testing.assert_array_equal(
+            parse_imu(odd).doubles[FIELDS[name]], parse_imu(expected).doubles[FIELDS[name]]
+        )
     assert live.counts == {'covariance not finite': 1} and not plain.counts
 
 

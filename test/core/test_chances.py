@@ -7,7 +7,13 @@ from scipy import stats
 from imu_calibration.core.distributions import binom_sf, chi2_isf, chi2_sf, f_sf, norm_sf
 
 RNG = np.random.default_rng(1)
-VALUES = np.concatenate([RNG.exponential(10.0, 300), RNG.normal(0.0, 3.0, 200), [0.0, 1e-300, 1e300, np.inf, -np.inf, np.nan]])
+VALUES = np.concatenate(
+    [
+        RNG.exponential(10.0, 300),
+        RNG.normal(0.0, 3.0, 200),
+        [0.0, 1e-300, 1e300, np.inf, -np.inf, np.nan],
+    ]
+)
 CHANCES = RNG.uniform(1e-12, 1.0, 200)
 DOFS = (0.5, 1, 2, 7, 120, 1e5, 0, -1)
 
@@ -25,7 +31,9 @@ def test_chi_square_and_f_have_the_tails_of_scipy_stats(dof):
 def test_binomial_numbers_have_the_tail_of_scipy_stats():
     x, trials = np.arange(-1, 31)[:, None], np.array([1, 7, 30])
     x = np.minimum(x, trials)
-    np.testing.assert_allclose(binom_sf(x, trials, 0.3), stats.binom.sf(x, trials, 0.3), rtol=1e-12, atol=1e-300)
+    np.testing.assert_allclose(
+        binom_sf(x, trials, 0.3), stats.binom.sf(x, trials, 0.3), rtol=1e-12, atol=1e-300
+    )
 
 
 def test_gaussian_numbers_have_the_tails_of_scipy_stats():

@@ -14,7 +14,10 @@ def test_runs_are_all_that_is_true_and_apart(seed):
     assert np.all(runs[1:, 0] > runs[:-1, 1])
 
 
-@pytest.mark.parametrize(('flags', 'runs'), [([], []), ([False], []), ([True, True], [[0, 2]]), ([True, False, True], [[0, 1], [2, 3]])])
+@pytest.mark.parametrize(
+    ('flags', 'runs'),
+    [([], []), ([False], []), ([True, True], [[0, 2]]), ([True, False, True], [[0, 1], [2, 3]])],
+)
 def test_runs_reach_to_both_ends(flags, runs):
     assert runs_of(flags).tolist() == runs and runs_of(flags).shape == (len(runs), 2)
 
@@ -22,8 +25,15 @@ def test_runs_reach_to_both_ends(flags, runs):
 def test_joined_parts_are_their_concatenation():
     """Parts of any length, also empty ones, while the arrays grow; they are not those of the first part."""
     rng = np.random.default_rng(0)
-    parts = [ImuSamples(rng.integers(0, 9, n), rng.standard_normal((n, 3)), rng.standard_normal((n, 3)), f'frame {n}')
-             for n in (3, 0, 1, 500, 7, 2000)]
+    parts = [
+        ImuSamples(
+            rng.integers(0, 9, n),
+            rng.standard_normal((n, 3)),
+            rng.standard_normal((n, 3)),
+            f'frame {n}',
+        )
+        for n in (3, 0, 1, 500, 7, 2000)
+    ]
     joined, whole = JoinedParts(), ImuSamples.concatenate(parts)
     for part in parts:
         joined.add(part)

@@ -25,7 +25,14 @@ ROOT = 1e-4 * (np.eye(COUNT) + 0.5 * RNG.normal(size=(COUNT, COUNT)))
 def draw(rng):
     """Return a calibration with errors drawn from its own covariance."""
     values = MODEL.start() + ROOT @ rng.normal(size=COUNT)
-    return Calibration(MODEL, values, ROOT @ ROOT.T, (DETERMINED,) * COUNT, 'imu', {'origin': 'mount', 'axes': 'mount'})
+    return Calibration(
+        MODEL,
+        values,
+        ROOT @ ROOT.T,
+        (DETERMINED,) * COUNT,
+        'imu',
+        {'origin': 'mount', 'axes': 'mount'},
+    )
 
 
 def moved(calibration, name, by):
@@ -48,7 +55,9 @@ def test_a_calibration_agrees_with_itself():
     assert result.lines[-1] == 'the calibrations agree'
 
 
-@pytest.mark.parametrize('name', ('accelerometer.bias.y', 'gyroscope.matrix.zx', 'accelerometer.accel_size_effect.xx'))
+@pytest.mark.parametrize(
+    'name', ('accelerometer.bias.y', 'gyroscope.matrix.zx', 'accelerometer.accel_size_effect.xx')
+)
 def test_a_parameter_that_moved_is_found_and_its_group_named(name):
     one = draw(np.random.default_rng(2))
     sd = one.sd[one.param_names.index(name)]
@@ -65,7 +74,9 @@ def test_held_and_fixed_parameters_are_not_compared(status):
     """The sd of a parameter that the axes fix is zero, which makes any difference infinite."""
     one = draw(np.random.default_rng(4))
     name = 'gyroscope.matrix.xx'
-    held = replace(one, status=tuple(status if n == name else s for n, s in zip(one.param_names, one.status)))
+    held = replace(
+        one, status=tuple(status if n == name else s for n, s in zip(one.param_names, one.status))
+    )
     result = compare(moved(held, name, 1.0), one)
     assert result.agree
     assert next(row for row in result.rows if row.name == name).ratio is None
@@ -76,7 +87,14 @@ def test_only_common_parameters_are_compared_and_conventions_are_noted():
     one = draw(np.random.default_rng(5))
     small = SensorModel()
     keep = [one.param_names.index(name) for name in small.param_names]
-    other = Calibration(small, one.values[keep], one.covariance[np.ix_(keep, keep)], (DETERMINED,) * len(keep), 'other', {'origin': 'not_needed'})
+    other = Calibration(
+        small,
+        one.values[keep],
+        one.covariance[np.ix_(keep, keep)],
+        (DETERMINED,) * len(keep),
+        'other',
+        {'origin': 'not_needed'},
+    )
     result = compare(one, other)
     assert [row.name for row in result.rows] == list(small.param_names)
     assert sum(line.startswith('note:') for line in result.lines) == 2
@@ -87,6 +105,7 @@ def test_nothing_in_common_is_refused():
 
     class Foreign:
         param_names = ('camera.focal_length',)
+
     with refused(InputError, 'nothing_in_common'):
         compare(one, Foreign())
 

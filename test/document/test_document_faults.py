@@ -15,7 +15,12 @@ from imu_calibration.core import documents
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import trust
-from imu_calibration.document.calibration_text import calibration_to_text, checked_tolerances, from_mapping, to_mapping
+from imu_calibration.document.calibration_text import (
+    calibration_to_text,
+    checked_tolerances,
+    from_mapping,
+    to_mapping,
+)
 from imu_calibration.document.decision import decisions_text
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.message_compensation import LiveCompensation
@@ -25,8 +30,31 @@ from validation.imu_messages import parse_imu
 
 from worlds.compensation_cases import random_calibration
 
-WRONG = (None, True, 'text', '', '1e-3', -1, 0, 7, 1e308, -1e308, math.inf, math.nan, 10**400, [], [1.0], [[1.0] * 3] * 3, [math.nan] * 3, [None] * 3, {}, {'a': 1},
-         date(2026, 1, 1), b'bytes', 'x' * 4000)
+WRONG = (
+    None,
+    True,
+    'text',
+    '',
+    '1e-3',
+    -1,
+    0,
+    7,
+    1e308,
+    -1e308,
+    math.inf,
+    math.nan,
+    10**400,
+    [],
+    [1.0],
+    [[1.0] * 3] * 3,
+    [math.nan] * 3,
+    [None] * 3,
+    {},
+    {'a': 1},
+    date(2026, 1, 1),
+    b'bytes',
+    'x' * 4000,
+)
 """What a field is replaced by."""
 PROOF = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
 
@@ -34,17 +62,45 @@ PROOF = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'wi
 def calibration():
     """A calibration with something in every part of its document."""
     made = random_calibration(
-        3, ('accel_size_effect', 'accel_quadratic', 'accel_thermal_bias', 'accel_saturation'), ('gyro_g_sensitivity', 'gyro_thermal_scale'),
-        gauge={'origin': 'mean_of_sensitive_points', 'axes': 'mount'}, decision={'accelerometer': 'helps', 'gyroscope': 'helps'},
-        decision_reasons={'accelerometer': 'a reason', 'gyroscope': 'another'}, notes=('a note', 'next: a step'),
-        proof={'accelerometer': PROOF, 'gyroscope': PROOF | {'unit': 'rad/s'}}, provenance={'software': '1', 'bags': [{'name': 'a', 'sha256': 'b'}]},
-        undetermined=({'parameters': {'accelerometer.bias.x': 0.5}, 'needs': 'a motion'},))
+        3,
+        ('accel_size_effect', 'accel_quadratic', 'accel_thermal_bias', 'accel_saturation'),
+        ('gyro_g_sensitivity', 'gyro_thermal_scale'),
+        gauge={'origin': 'mean_of_sensitive_points', 'axes': 'mount'},
+        decision={'accelerometer': 'helps', 'gyroscope': 'helps'},
+        decision_reasons={'accelerometer': 'a reason', 'gyroscope': 'another'},
+        notes=('a note', 'next: a step'),
+        proof={'accelerometer': PROOF, 'gyroscope': PROOF | {'unit': 'rad/s'}},
+        provenance={'software': '1', 'bags': [{'name': 'a', 'sha256': 'b'}]},
+        undetermined=({'parameters': {'accelerometer.bias.x': 0.5}, 'needs': 'a motion'},),
+    )
     values = made.values.copy()
     values[made.model.slices['accelerometer', 'accel_saturation']] = 160.0
-    statistics = {sensor: part | {'between_window_sd': 1e-3, 'wander_sd': 1e-4, 'chi2_per_dof': {'spin': 1.0}} for sensor, part in made.statistics.items()}
-    statistics |= {'windows': {'static': 5}, 'samples_used': {'static': 500}, 'dropped': {}, 'preflight': []}
-    conditions = {'temperature_range_c': [20.0, 30.0], 'largest_rate': 3.0, 'largest_force': 12.0, 'gravity': 9.81, 'duration_s': 60.0, 'date': '2026-11-21'}
-    return type(made)(**{**{name: getattr(made, name) for name in made.__dataclass_fields__}, 'values': values, 'statistics': statistics, 'conditions': conditions})
+    statistics = {
+        sensor: part | {'between_window_sd': 1e-3, 'wander_sd': 1e-4, 'chi2_per_dof': {'spin': 1.0}}
+        for sensor, part in made.statistics.items()
+    }
+    statistics |= {
+        'windows': {'static': 5},
+        'samples_used': {'static': 500},
+        'dropped': {},
+        'preflight': [],
+    }
+    conditions = {
+        'temperature_range_c': [20.0, 30.0],
+        'largest_rate': 3.0,
+        'largest_force': 12.0,
+        'gravity': 9.81,
+        'duration_s': 60.0,
+        'date': '2026-11-21',
+    }
+    return type(made)(
+        **{
+            **{name: getattr(made, name) for name in made.__dataclass_fields__},
+            'values': values,
+            'statistics': statistics,
+            'conditions': conditions,
+        }
+    )
 
 
 GOOD = documents.from_text(calibration_to_text(calibration()))
@@ -53,7 +109,13 @@ GOOD = documents.from_text(calibration_to_text(calibration()))
 def places(part, path=()):
     """Yield the path of every field; of a list the first and the last entry stand for all."""
     yield path
-    items = part.items() if isinstance(part, dict) else list(enumerate(part)) if isinstance(part, list) else []
+    items = (
+        part.items()
+        if isinstance(part, dict)
+        else list(enumerate(part))
+        if isinstance(part, list)
+        else []
+    )
     for key, value in items if isinstance(part, dict) else items[:1] + items[1:][-1:]:
         yield from places(value, (*path, key))
 
@@ -72,9 +134,17 @@ def _changed(part, path, value):
 
 
 PLACES = list(places(GOOD))
-MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(
-    10**18 + 5_000_000 * np.arange(30), np.column_stack([np.linspace(-20, 20, 30), np.ones(30), np.full(30, 9.8)]),
-    np.column_stack([np.sin(np.arange(30)), np.linspace(-5, 5, 30), np.zeros(30)]), 'imu_link'))]
+MESSAGES = [
+    row.tobytes()
+    for row in encode_imu(
+        ImuSamples(
+            10**18 + 5_000_000 * np.arange(30),
+            np.column_stack([np.linspace(-20, 20, 30), np.ones(30), np.full(30, 9.8)]),
+            np.column_stack([np.sin(np.arange(30)), np.linspace(-5, 5, 30), np.zeros(30)]),
+            'imu_link',
+        )
+    )
+]
 
 
 KNOWN_TO_WORK = set()
@@ -84,11 +154,20 @@ KNOWN_TO_WORK = set()
 def use(found):
     """Do with a calibration all that a robot does; fails with any error and with any number that is not finite."""
     refused = list(trust.refused_sensors(found, live=True))
-    against = refused, trust.caveats(found), decisions_text(found.decisions), outside_conditions(found, 3**0.5, [25.0])
+    against = (
+        refused,
+        trust.caveats(found),
+        decisions_text(found.decisions),
+        outside_conditions(found, 3**0.5, [25.0]),
+    )
     assert '\n' not in ''.join(line for part in against for line in part)
     assert to_mapping(found)
     noise = [found.noise(sensor) for sensor in ('accelerometer', 'gyroscope')]
-    numbers = (found.values.tobytes(), found.covariance.tobytes(), repr((found.model.param_names, found.model.temperature_ref_c, noise)))
+    numbers = (
+        found.values.tobytes(),
+        found.covariance.tobytes(),
+        repr((found.model.param_names, found.model.temperature_ref_c, noise)),
+    )
     if against[0] or numbers in KNOWN_TO_WORK:
         return
     KNOWN_TO_WORK.add(numbers)
@@ -110,7 +189,9 @@ def test_the_document_that_is_damaged_is_whole():
     assert to_mapping(found).keys() == GOOD.keys() and not trust.refused_sensors(found, live=True)
 
 
-@pytest.mark.parametrize('part', sorted({path[:1] for path in PLACES}), ids=lambda path: path[0] if path else 'whole')
+@pytest.mark.parametrize(
+    'part', sorted({path[:1] for path in PLACES}), ids=lambda path: path[0] if path else 'whole'
+)
 def test_no_damaged_field_gets_through(part):
     refused = used = 0
     for path in PLACES:
@@ -126,13 +207,15 @@ def test_no_damaged_field_gets_through(part):
             try:
                 use(found)
             except Exception as error:
-                raise AssertionError(f'{path} = {value!r}: {type(error).__name__}: {error}') from error
+                raise AssertionError(
+                    f'{path} = {value!r}: {type(error).__name__}: {error}'
+                ) from error
             used += 1
     print(f'{part}: {refused} refused, {used} without harm')
     assert refused or part == ('provenance',)
 
 
-ATTACKS = '''
+ATTACKS = """
 import resource
 resource.setrlimit(resource.RLIMIT_AS, (2 * 10**9, 2 * 10**9))
 from imu_calibration.document.calibration_text import calibration_from_text
@@ -152,24 +235,57 @@ for name, text in texts.items():
     except InputError as error:
         print('' if '\\n' not in str(error) and len(str(error)) < 500 else f'{name}: {error}', end='')
 print('done')
-'''
+"""
 
 
 @pytest.mark.live
 def test_texts_that_would_take_all_memory_or_end_the_process_are_refused_in_one_line():
     """Under a limit of 2 GB for the whole process; most of them took minutes, gigabytes or the process."""
-    done = subprocess.run([sys.executable, '-c', ATTACKS], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, '-c', ATTACKS], capture_output=True, text=True, timeout=120
+    )
     assert (done.returncode, done.stdout) == (0, 'done\n'), done.stdout + done.stderr
 
 
-TABLE = {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'inner', 'axis': [1, 0, 0], 'xyz': [0.0, 0.0, 0.1], 'rpy_deg': [0, 0, 0],
-                     'range_deg': [-90, 90], 'speed_deg_s': 60.0}, {'name': 'slide', 'axis': [1, 0, 0], 'type': 'prismatic', 'range_m': [0, 1]},
-                    {'name': 'follower', 'axis': [0, 1, 0], 'mimic': {'joint': 'outer', 'multiplier': 2.0, 'offset': 0.1}}], 'up': [0, 0, 1], 'gravity': 9.81,
-         'gravity_sd': 0.001, 'latitude': 48.0, 'height': 300.0, 'azimuth_deg': 10.0, 'joint_noise_rad': 1e-5, 'mount': {'rpy_deg': [0, 0, 0], 'xyz': [0, 0, 0]}}
-TOLERANCES = {'accelerometer': {'bias': 0.01, 'matrix': 1e-3}, 'gyroscope': {'bias': 1e-4}, 'reference': {'table_tilt': 1e-4}}
+TABLE = {
+    'joints': [
+        {'name': 'outer', 'axis': [0, 0, 1]},
+        {
+            'name': 'inner',
+            'axis': [1, 0, 0],
+            'xyz': [0.0, 0.0, 0.1],
+            'rpy_deg': [0, 0, 0],
+            'range_deg': [-90, 90],
+            'speed_deg_s': 60.0,
+        },
+        {'name': 'slide', 'axis': [1, 0, 0], 'type': 'prismatic', 'range_m': [0, 1]},
+        {
+            'name': 'follower',
+            'axis': [0, 1, 0],
+            'mimic': {'joint': 'outer', 'multiplier': 2.0, 'offset': 0.1},
+        },
+    ],
+    'up': [0, 0, 1],
+    'gravity': 9.81,
+    'gravity_sd': 0.001,
+    'latitude': 48.0,
+    'height': 300.0,
+    'azimuth_deg': 10.0,
+    'joint_noise_rad': 1e-5,
+    'mount': {'rpy_deg': [0, 0, 0], 'xyz': [0, 0, 0]},
+}
+TOLERANCES = {
+    'accelerometer': {'bias': 0.01, 'matrix': 1e-3},
+    'gyroscope': {'bias': 1e-4},
+    'reference': {'table_tilt': 1e-4},
+}
 
 
-@pytest.mark.parametrize(('good', 'read'), ((TABLE, Table.from_mapping), (TOLERANCES, checked_tolerances)), ids=('table', 'tolerances'))
+@pytest.mark.parametrize(
+    ('good', 'read'),
+    ((TABLE, Table.from_mapping), (TOLERANCES, checked_tolerances)),
+    ids=('table', 'tolerances'),
+)
 def test_damaged_tables_and_tolerances_are_refused_in_one_line_or_can_be_used(good, read):
     refused = 0
     for path in list(places(good))[1:]:
@@ -181,7 +297,11 @@ def test_damaged_tables_and_tolerances_are_refused_in_one_line_or_can_be_used(go
                 refused += 1
                 continue
             if isinstance(found, Table):
-                assert 1.0 < found.gravity_value < 30.0 and np.all(np.isfinite(found.mat_nb)) and np.all(np.isfinite(found.mat_sl))
+                assert (
+                    1.0 < found.gravity_value < 30.0
+                    and np.all(np.isfinite(found.mat_nb))
+                    and np.all(np.isfinite(found.mat_sl))
+                )
     assert refused > 50
 
 

@@ -24,8 +24,22 @@ from worlds.misfit_worlds import SHAFT, sweeps
 from worlds.physics import make_session
 
 VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
-PROOF = {'accelerometer': {'before': 0.2, 'after': 0.01, 'ci95': [0.03, 0.08], 'unit': 'm/s^2', 'windows': 8},
-         'gyroscope': {'before': 0.02, 'after': 0.001, 'ci95': [0.03, 0.08], 'unit': 'rad/s', 'windows': 8}}
+PROOF = {
+    'accelerometer': {
+        'before': 0.2,
+        'after': 0.01,
+        'ci95': [0.03, 0.08],
+        'unit': 'm/s^2',
+        'windows': 8,
+    },
+    'gyroscope': {
+        'before': 0.02,
+        'after': 0.001,
+        'ci95': [0.03, 0.08],
+        'unit': 'rad/s',
+        'windows': 8,
+    },
+}
 HARMS = {'after': 0.3, 'ci95': [1.2, 1.8]}
 GOOD = random_calibration(1, proof=PROOF)
 
@@ -52,7 +66,11 @@ def harmed(sensor, **changes):
 def test_each_sensor_has_its_own_decision(yaw):
     """The accelerometer, whose errors are below what one attitude shows, is not helped."""
     calibration = yaw.calibration
-    assert calibration.decisions['gyroscope'] is HELPS and calibration.decisions['accelerometer'] is not HELPS and yaw.exit_code == 3
+    assert (
+        calibration.decisions['gyroscope'] is HELPS
+        and calibration.decisions['accelerometer'] is not HELPS
+        and yaw.exit_code == 3
+    )
     read = calibration_from_text(calibration_to_text(calibration))
     assert read.decisions == calibration.decisions
     for text in (str(yaw), yaw.report, repr(read)):
@@ -64,16 +82,37 @@ def test_compensate_corrects_the_one_and_leaves_the_other(yaw, block, tmp_path, 
     values = known.values.copy()
     values[known.model.part('accelerometer', Role.OFFSET)] = 0.1
     known = replace(known, values=values)
-    before, after, whole = block.imu, imu.compensate(block, known), imu.compensate(block, known, anyway=True)
+    before, after, whole = (
+        block.imu,
+        imu.compensate(block, known),
+        imu.compensate(block, known, anyway=True),
+    )
     np.testing.assert_array_equal(after.imu.force_s, before.force_s)
     np.testing.assert_allclose(after.imu.rate_s, whole.imu.rate_s, rtol=0, atol=1e-12)
-    assert np.abs(after.imu.rate_s - before.rate_s).max() > 1e-3 and np.abs(whole.imu.force_s - before.force_s).max() > 1e-4
-    assert after.refused.keys() == {'accelerometer'} and after.refused['accelerometer'].startswith(HARMFUL)
+    assert (
+        np.abs(after.imu.rate_s - before.rate_s).max() > 1e-3
+        and np.abs(whole.imu.force_s - before.force_s).max() > 1e-4
+    )
+    assert after.refused.keys() == {'accelerometer'} and after.refused['accelerometer'].startswith(
+        HARMFUL
+    )
     assert after.refused['accelerometer'] in after.warnings[0]
     assert not whole.refused and len(whole.cautions) == 1 and whole.exit_code == 3
     write_session(tmp_path / 'bag', block.imu, block.joints)
     files.write_text(tmp_path / 'calibration.yaml', calibration_to_text(known))
-    assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(tmp_path / 'calibration.yaml'), '--output', str(tmp_path / 'out')]) == 3
+    assert (
+        main(
+            [
+                'compensate',
+                str(tmp_path / 'bag'),
+                '--calibration',
+                str(tmp_path / 'calibration.yaml'),
+                '--output',
+                str(tmp_path / 'out'),
+            ]
+        )
+        == 3
+    )
     printed = capsys.readouterr().out
     assert printed.count(after.refused['accelerometer']) == 1 and str(tmp_path / 'out') in printed
 
@@ -82,10 +121,25 @@ def test_other_programs_get_nominal_numbers_for_the_sensor_that_is_refused(tmp_p
     known = harmed('accelerometer')
     whole, found = (export(known, find_target('px4'), anyway=anyway) for anyway in (True, False))
     plain = export(with_nominal(known, ['accelerometer']), find_target('px4'), anyway=True)
-    assert found.numbers == plain.numbers != whole.numbers and found.numbers.keys() == whole.numbers.keys()
-    assert found.refused.keys() == {'accelerometer'} and any(found.refused['accelerometer'] in line for line in found.lines) and found.exit_code == 3 and whole.exit_code == 0
+    assert (
+        found.numbers == plain.numbers != whole.numbers
+        and found.numbers.keys() == whole.numbers.keys()
+    )
+    assert (
+        found.refused.keys() == {'accelerometer'}
+        and any(found.refused['accelerometer'] in line for line in found.lines)
+        and found.exit_code == 3
+        and whole.exit_code == 0
+    )
     files.write_text(tmp_path / 'calibration.yaml', calibration_to_text(known))
-    command = ['export', str(tmp_path / 'calibration.yaml'), '--to', 'px4', '--output', str(tmp_path / 'px4.params')]
+    command = [
+        'export',
+        str(tmp_path / 'calibration.yaml'),
+        '--to',
+        'px4',
+        '--output',
+        str(tmp_path / 'px4.params'),
+    ]
     assert main(command) == 3
     printed = capsys.readouterr().out
     assert all(line in printed for line in found.lines) and main([*command, '--anyway']) == 0
@@ -95,25 +149,48 @@ def test_the_loss_of_a_refused_sensor_is_its_whole_error():
     """It was reported as none, because the full compensation of nominal parameters changes nothing."""
     known = harmed('accelerometer')
     whole, found = (export(known, find_target('px4'), anyway=anyway) for anyway in (True, False))
-    assert found.loss.left['accelerometer'] == pytest.approx(found.loss.raw['accelerometer'], rel=1e-9)
-    assert found.loss.raw['accelerometer'] == pytest.approx(whole.loss.raw['accelerometer'], rel=1e-9) and whole.loss.raw['accelerometer'] > 1e-3
-    assert found.loss.left['gyroscope'] == pytest.approx(whole.loss.left['gyroscope'], rel=1e-9) and not found.loss.nothing
+    assert found.loss.left['accelerometer'] == pytest.approx(
+        found.loss.raw['accelerometer'], rel=1e-9
+    )
+    assert (
+        found.loss.raw['accelerometer'] == pytest.approx(whole.loss.raw['accelerometer'], rel=1e-9)
+        and whole.loss.raw['accelerometer'] > 1e-3
+    )
+    assert (
+        found.loss.left['gyroscope'] == pytest.approx(whole.loss.left['gyroscope'], rel=1e-9)
+        and not found.loss.nothing
+    )
 
 
 def test_what_the_refused_sensor_would_correct_goes_as_well():
-    rich = random_calibration(2, ('accel_size_effect', 'accel_quadratic'), ('gyro_g_sensitivity', 'gyro_quadratic'))
+    rich = random_calibration(
+        2, ('accel_size_effect', 'accel_quadratic'), ('gyro_g_sensitivity', 'gyro_quadratic')
+    )
     still, blind = (with_nominal(rich, [sensor]).model for sensor in SENSORS)
-    assert still.accelerometer == ('bias', 'matrix') and still.gyroscope == ('bias', 'matrix', 'gyro_quadratic')
-    assert blind.accelerometer == ('bias', 'matrix', 'accel_quadratic') and blind.gyroscope == ('bias', 'matrix')
+    assert still.accelerometer == ('bias', 'matrix') and still.gyroscope == (
+        'bias',
+        'matrix',
+        'gyro_quadratic',
+    )
+    assert blind.accelerometer == ('bias', 'matrix', 'accel_quadratic') and blind.gyroscope == (
+        'bias',
+        'matrix',
+    )
 
 
 def test_the_covariance_of_what_is_left_alone_is_that_of_a_data_sheet():
     found = with_nominal(GOOD, ['accelerometer'])
     for role in (Role.OFFSET, Role.LINEAR):
-        effect, part = found.model.find('accelerometer', role), found.model.part('accelerometer', role)
+        effect, part = (
+            found.model.find('accelerometer', role),
+            found.model.part('accelerometer', role),
+        )
         np.testing.assert_array_equal(found.values[part], effect.prior_values())
         np.testing.assert_allclose(found.sd[part], effect.prior_sds())
-        assert set(found.status[part]) == {'held'} and not np.delete(found.covariance[part], np.r_[part], axis=1).any()
+        assert (
+            set(found.status[part]) == {'held'}
+            and not np.delete(found.covariance[part], np.r_[part], axis=1).any()
+        )
         kept, was = found.model.part('gyroscope', role), GOOD.model.part('gyroscope', role)
         np.testing.assert_array_equal(found.covariance[kept, kept], GOOD.covariance[was, was])
 
@@ -124,7 +201,11 @@ def test_check_says_which_sensor_it_helps(yaw, block):
     found = imu.check(block, replace(yaw.calibration, values=values), Table.from_mapping(VERTICAL))
     assert list(found.helped) == ['gyroscope'] and found.exit_code == 3
     first, *lines = str(found).splitlines()
-    assert 'gyroscope' in first and 'accelerometer' not in first and any('gyroscope' in line and HELPS in line for line in lines)
+    assert (
+        'gyroscope' in first
+        and 'accelerometer' not in first
+        and any('gyroscope' in line and HELPS in line for line in lines)
+    )
 
 
 @pytest.mark.long
@@ -135,15 +216,31 @@ def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     table = files.read_table(folder / 'table.yaml')
     with open_recording(folder) as recording:
         blocks = list(recording.blocks(table.joint_names))
-    whole = [kind.concatenate([part for block in blocks if (part := getattr(block, name)) is not None])
-             for kind, name in ((ImuSamples, 'imu'), (JointSamples, 'joints'))]
+    whole = [
+        kind.concatenate([part for block in blocks if (part := getattr(block, name)) is not None])
+        for kind, name in ((ImuSamples, 'imu'), (JointSamples, 'joints'))
+    ]
     middle = int(whole[0].stamp_ns[len(whole[0]) // 2])
-    first, second = (SampleBlock(*(each.select((each.stamp_ns < middle) == early) for each in whole)) for early in (True, False))
+    first, second = (
+        SampleBlock(*(each.select((each.stamp_ns < middle) == early) for each in whole))
+        for early in (True, False)
+    )
     found = imu.calibrate(first, table)
-    assert found.calibration.decisions['gyroscope'] is HELPS and found.calibration.decisions['accelerometer'] is UNPROVEN and found.exit_code == 3
-    used = trust.usable(replace(found.calibration, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}))
+    assert (
+        found.calibration.decisions['gyroscope'] is HELPS
+        and found.calibration.decisions['accelerometer'] is UNPROVEN
+        and found.exit_code == 3
+    )
+    used = trust.usable(
+        replace(found.calibration, decision={'accelerometer': 'harms', 'gyroscope': 'helps'})
+    )
     here = imu.check(second, found.calibration, table)
-    assert list(here.helped) == ['accelerometer', 'gyroscope'] and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
+    assert (
+        list(here.helped) == ['accelerometer', 'gyroscope']
+        and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
+    )
     left = imu.check(second, used.calibration, table).proof
-    assert left['accelerometer']['after'] == pytest.approx(left['accelerometer']['before'], rel=0.02)
+    assert left['accelerometer']['after'] == pytest.approx(
+        left['accelerometer']['before'], rel=0.02
+    )
     assert left['gyroscope']['after'] == pytest.approx(here.proof['gyroscope']['after'], rel=0.02)

@@ -23,7 +23,11 @@ from imu_calibration.document.calibration_text import calibration_from_text, cal
 from imu_calibration.effects.base import Effect
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue, from_definition, term
 from imu_calibration.effects.expressions import ColumnGroup
-from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, sensor_output
+from imu_calibration.effects.forward_equations import (
+    coefficient_jacobian,
+    coefficients,
+    sensor_output,
+)
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import Reference
 from tools.tolerance_file import rendered
@@ -31,7 +35,12 @@ from tools.tolerance_file import rendered
 ROOT = Path(__file__).resolve().parents[2]
 ALSO_WORDS = {'bias', 'matrix'}
 """Names that are plain words too: keys of documents and headings use them."""
-KEYS_ELSEWHERE = {'allan': {'time_constant'}, 'core': {'time_constant'}, 'estimation': {'earth_rate'}, 'targets': {'time_offset'}}
+KEYS_ELSEWHERE = {
+    'allan': {'time_constant'},
+    'core': {'time_constant'},
+    'estimation': {'earth_rate'},
+    'targets': {'time_offset'},
+}
 """Package -> words that are keys in its own documents, of noise, of units, of terms of a variance and of other programs, and speak of no effect there."""
 
 
@@ -39,31 +48,65 @@ def spoken_of(path):
     """Return the words of a module in which an effect's name stands, or with which a name would be asked what it says."""
     names = {name for _, name in CATALOGUE.effects()}
     cuts = [(name, k) for name in names for k, letter in enumerate(name) if letter == '_']
-    parts = {name[k:] for name, k in cuts} | {name[:k + 1] for name, k in cuts} | {'time_constant'}
+    parts = {name[k:] for name, k in cuts} | {name[: k + 1] for name, k in cuts} | {'time_constant'}
     found, tree = [], ast.parse(path.read_text())
-    asked = {id(node.left) for node in ast.walk(tree) if isinstance(node, ast.Compare) and isinstance(node.ops[0], (ast.In, ast.NotIn))
-             and getattr(node.comparators[0], 'attr', '') not in ('uses', 'needs')}
+    asked = {
+        id(node.left)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Compare)
+        and isinstance(node.ops[0], (ast.In, ast.NotIn))
+        and getattr(node.comparators[0], 'attr', '') not in ('uses', 'needs')
+    }
     for node in ast.walk(tree):
         text = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else ''
         if not re.fullmatch(r'[\w.+:@]+', text):
             continue
         words = re.split('[+.:@]', text)
         known = set(words) & names if words[0] not in ALSO_WORDS else set(words[1:]) & names
-        if known or set(words) & parts or id(node) in asked and len(text) > 3 and any(text in name for name in names - {text}):
+        if (
+            known
+            or set(words) & parts
+            or id(node) in asked
+            and len(text) > 3
+            and any(text in name for name in names - {text})
+        ):
             found.append(f'{path.relative_to(ROOT)}:{node.lineno}: {text}')
     return found
 
 
 def test_no_effect_is_known_by_name_outside_its_package():
-    files = [path for path in (ROOT / 'imu_calibration').rglob('*.py') if path.relative_to(ROOT).parts[1] != 'effects']
+    files = [
+        path
+        for path in (ROOT / 'imu_calibration').rglob('*.py')
+        if path.relative_to(ROOT).parts[1] != 'effects'
+    ]
     found = [(path.parent.name, line) for path in files for line in spoken_of(path)]
-    assert not [line for package, line in found if line.rpartition(': ')[2] not in KEYS_ELSEWHERE.get(package, ())]
-    looked_up = re.compile(rf"(slices|value|has|with_effect|find)[(\[][^()\[\]]*'({'|'.join(ALSO_WORDS)})'|== '({'|'.join(ALSO_WORDS)})'")
-    assert not [f'{path.name}: {found[0]}' for path in files if (found := looked_up.search(path.read_text()))]
+    assert not [
+        line
+        for package, line in found
+        if line.rpartition(': ')[2] not in KEYS_ELSEWHERE.get(package, ())
+    ]
+    looked_up = re.compile(
+        rf"(slices|value|has|with_effect|find)[(\[][^()\[\]]*'({'|'.join(ALSO_WORDS)})'|== '({'|'.join(ALSO_WORDS)})'"
+    )
+    assert not [
+        f'{path.name}: {found[0]}'
+        for path in files
+        if (found := looked_up.search(path.read_text()))
+    ]
 
 
-@pytest.mark.parametrize('line', ["x.endswith('_bias_drift')", "name == 'lever_arm'", "'gyro_' + name", "['bias+matrix+accel_cubic']",
-                                  "c.param_names.index('gyroscope.matrix.xx')", "'thermal' in text"])
+@pytest.mark.parametrize(
+    'line',
+    [
+        "x.endswith('_bias_drift')",
+        "name == 'lever_arm'",
+        "'gyro_' + name",
+        "['bias+matrix+accel_cubic']",
+        "c.param_names.index('gyroscope.matrix.xx')",
+        "'thermal' in text",
+    ],
+)
 def test_the_search_for_names_finds_them(tmp_path, monkeypatch, line):
     monkeypatch.setattr(sys.modules[__name__], 'ROOT', tmp_path)
     (tmp_path / 'module.py').write_text(line)
@@ -74,17 +117,36 @@ def test_the_search_for_names_finds_them(tmp_path, monkeypatch, line):
 # the accelerometers respond to all three components at once; and the gyroscopes' scale factors settle after turn-on.
 MILLI_G = 9.80665e-3
 ADDED = {
-    'gyro_anisoelasticity': {'sensor': 'gyroscope', 'column': ['f_y * f_z', 'f_z * f_x', 'f_x * f_y'], 'unit': '(rad/s)/(m/s^2)^2',
-                             'tolerance': 1e-6, 'largest': 1e-4, 'text': 'The gyroscopes respond to products of specific force.'},
-    'accel_triple_product': {'sensor': 'accelerometer', 'column': 'f_x * f_y * f_z', 'unit': '(m/s^2)^-2', 'tolerance': 2e-5,
-                             'largest': 1e-3,
-                             'text': 'The accelerometers respond to the product of all three components.'},
-    'gyro_scale_settling': {'sensor': 'gyroscope', 'column': ['w_x * exp(-time / tau)', 'w_y * exp(-time / tau)', 'w_z * exp(-time / tau)'],
-                            'unit': '1', 'tolerance': 1e-3, 'largest': 0.05, 'text': 'The gyroscope scale factors settle after turn-on.'},
+    'gyro_anisoelasticity': {
+        'sensor': 'gyroscope',
+        'column': ['f_y * f_z', 'f_z * f_x', 'f_x * f_y'],
+        'unit': '(rad/s)/(m/s^2)^2',
+        'tolerance': 1e-6,
+        'largest': 1e-4,
+        'text': 'The gyroscopes respond to products of specific force.',
+    },
+    'accel_triple_product': {
+        'sensor': 'accelerometer',
+        'column': 'f_x * f_y * f_z',
+        'unit': '(m/s^2)^-2',
+        'tolerance': 2e-5,
+        'largest': 1e-3,
+        'text': 'The accelerometers respond to the product of all three components.',
+    },
+    'gyro_scale_settling': {
+        'sensor': 'gyroscope',
+        'column': ['w_x * exp(-time / tau)', 'w_y * exp(-time / tau)', 'w_z * exp(-time / tau)'],
+        'unit': '1',
+        'tolerance': 1e-3,
+        'largest': 0.05,
+        'text': 'The gyroscope scale factors settle after turn-on.',
+    },
 }
 MINE = CATALOGUE.with_effects(*(term(name, **definition) for name, definition in ADDED.items()))
 FORMULA = {
-    'gyro_anisoelasticity': lambda f, w, t, v: v * np.stack([f[:, 1] * f[:, 2], f[:, 2] * f[:, 0], f[:, 0] * f[:, 1]], axis=1),
+    'gyro_anisoelasticity': lambda f, w, t, v: (
+        v * np.stack([f[:, 1] * f[:, 2], f[:, 2] * f[:, 0], f[:, 0] * f[:, 1]], axis=1)
+    ),
     'accel_triple_product': lambda f, w, t, v: f.prod(axis=1)[:, None] * v,
     'gyro_scale_settling': lambda f, w, t, v: v[:3] * w * np.exp(-t / v[3])[:, None],
 }
@@ -95,7 +157,13 @@ SENSOR = {name: definition['sensor'] for name, definition in ADDED.items()}
 def motion(n=40):
     rng = np.random.default_rng(3)
     vectors = [rng.normal(0.0, size, (n, 3)) for size in (8.0, 2.0, 5.0)]
-    return Reference(np.linspace(0.0, 400.0, n), np.broadcast_to(np.eye(3), (n, 3, 3)), *vectors, 9.8, np.full(n, 30.0))
+    return Reference(
+        np.linspace(0.0, 400.0, n),
+        np.broadcast_to(np.eye(3), (n, 3, 3)),
+        *vectors,
+        9.8,
+        np.full(n, 30.0),
+    )
 
 
 def with_values(name, share=1.0):
@@ -111,44 +179,66 @@ def with_values(name, share=1.0):
 def test_an_added_effect_does_what_its_text_says(name):
     (model, values), ref, sensor = with_values(name), motion(), SENSOR[name]
     plain = SensorModel()
-    change = sensor_output(model, sensor, values, ref=ref) - sensor_output(plain, sensor, plain.start(), ref=ref)
-    np.testing.assert_allclose(change, FORMULA[name](ref.force_s, ref.rate_s, ref.time, values[model.slices[sensor, name]]), rtol=1e-9,
-                               atol=1e-12)
+    change = sensor_output(model, sensor, values, ref=ref) - sensor_output(
+        plain, sensor, plain.start(), ref=ref
+    )
+    np.testing.assert_allclose(
+        change,
+        FORMULA[name](ref.force_s, ref.rate_s, ref.time, values[model.slices[sensor, name]]),
+        rtol=1e-9,
+        atol=1e-12,
+    )
 
 
 @pytest.mark.parametrize('name', ADDED)
 def test_its_derivative_is_that_of_differences(name):
     (model, values), ref, sensor = with_values(name), motion(), SENSOR[name]
     at = model.at(values)
-    design = np.concatenate([group.columns(ref, at.full_point()) for group in at.layout(sensor).groups.values()], axis=1)
+    design = np.concatenate(
+        [group.columns(ref, at.full_point()) for group in at.layout(sensor).groups.values()], axis=1
+    )
     slopes = np.einsum('nc,cap->nap', design, coefficient_jacobian(at, sensor, values))
     for k in range(model.slices[sensor, name].start, model.slices[sensor, name].stop):
         step = np.zeros(len(values))
         step[k] = 1e-4 * max(abs(values[k]), 1e-3)
-        ends = [sensor_output(model.at(values + sign * step), sensor, values + sign * step, ref=ref) for sign in (1, -1)]
-        np.testing.assert_allclose(slopes[:, :, k], (ends[0] - ends[1]) / (2 * step[k]), rtol=1e-6, atol=1e-9)
+        ends = [
+            sensor_output(model.at(values + sign * step), sensor, values + sign * step, ref=ref)
+            for sign in (1, -1)
+        ]
+        np.testing.assert_allclose(
+            slopes[:, :, k], (ends[0] - ends[1]) / (2 * step[k]), rtol=1e-6, atol=1e-9
+        )
 
 
 @lru_cache(maxsize=None)
 def session(*names):
     """Return a simulated session of an IMU with added effects."""
-    return imu.simulate('quick', effects=names, size=0.5, seed=5, catalogue=MINE, imu_rate=50.0, joint_rate=50.0)
+    return imu.simulate(
+        'quick', effects=names, size=0.5, seed=5, catalogue=MINE, imu_rate=50.0, joint_rate=50.0
+    )
 
 
 ASKED = {'accelerometer': 'bias+matrix+accel_size_effect', 'gyroscope': 'bias+matrix'}
 
 
 def models(*names):
-    return {f'{sensor}_model': '+'.join([base, *(name for name in names if SENSOR[name] == sensor)]) for sensor, base in ASKED.items()}
+    return {
+        f'{sensor}_model': '+'.join([base, *(name for name in names if SENSOR[name] == sensor)])
+        for sensor, base in ASKED.items()
+    }
 
 
 @pytest.mark.long
 def test_they_are_simulated_calibrated_and_reported():
     made = session(*ADDED)
-    found = imu.calibrate(made.samples, made.table, catalogue=MINE, model_as_asked=True, **models(*ADDED))
+    found = imu.calibrate(
+        made.samples, made.table, catalogue=MINE, model_as_asked=True, **models(*ADDED)
+    )
     page = found.report
     for name in ADDED:
-        value, truth = (calibration.value(SENSOR[name], name) for calibration in (found.calibration, made.truth))
+        value, truth = (
+            calibration.value(SENSOR[name], name) for calibration in (found.calibration, made.truth)
+        )
         sd = found.calibration.sd[found.calibration.model.slices[SENSOR[name], name]]
         assert np.all(np.abs(value - truth) < 4 * sd) and np.all(sd < 0.2 * np.abs(truth)), name
         assert name in page and ADDED[name]['text'] in page
@@ -162,15 +252,20 @@ def test_compensation_takes_it_out_offline_and_live():
     from msg_adapters.imu import FIELDS
     from msg_adapters.write import encode_imu
     from validation.imu_messages import parse_imu
+
     truth = replace(session(*INVERTED).truth, frame_id='')
     ref = motion(400)
     model, values = truth.model, truth.values
-    measured = [sensor_output(model, sensor, values, ref=replace(ref, alpha_s=np.zeros((400, 3)))) for sensor in ('accelerometer',
-                                                                                                                  'gyroscope')]
+    measured = [
+        sensor_output(model, sensor, values, ref=replace(ref, alpha_s=np.zeros((400, 3))))
+        for sensor in ('accelerometer', 'gyroscope')
+    ]
     kernel = make_kernel(truth)
     got = np.array([kernel(*f, *w, 0.0, 0.0, 0.0, 0.0) for f, w in zip(*measured, strict=True)])
     np.testing.assert_allclose(got, np.hstack([ref.force_s, ref.rate_s]), atol=1e-9)
-    still = replace(truth, values=np.where(['size' in n for n in model.param_names], 0.0, values))   # without arms no slope is needed
+    still = replace(
+        truth, values=np.where(['size' in n for n in model.param_names], 0.0, values)
+    )  # without arms no slope is needed
     samples = ImuSamples(10**18 + 10**7 * np.arange(400), *measured, '')
     live = LiveCompensation(still)
     out = [parse_imu(live(row.tobytes())).doubles for row in encode_imu(samples)]
@@ -180,13 +275,27 @@ def test_compensation_takes_it_out_offline_and_live():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', ['gyro_anisoelasticity', *(pytest.param(name, marks=pytest.mark.long) for name in ('accel_triple_product', 'gyro_scale_settling'))])
+@pytest.mark.parametrize(
+    'name',
+    [
+        'gyro_anisoelasticity',
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in ('accel_triple_product', 'gyro_scale_settling')
+        ),
+    ],
+)
 def test_diagnosis_finds_and_names_it(name):
     made = session(name)
-    found = imu.diagnose(made.samples, made.table, catalogue=MINE, accelerometer_model=ASKED['accelerometer'])
+    found = imu.diagnose(
+        made.samples, made.table, catalogue=MINE, accelerometer_model=ASKED['accelerometer']
+    )
     assert [finding.effect for finding in found.findings] == [name]
     truth, model = made.truth.value(SENSOR[name], name), found.calibration.model
-    value, sd = found.calibration.value(SENSOR[name], name), found.calibration.sd[model.slices[SENSOR[name], name]]
+    value, sd = (
+        found.calibration.value(SENSOR[name], name),
+        found.calibration.sd[model.slices[SENSOR[name], name]],
+    )
     assert np.all(np.abs(value - truth) < 4 * sd)
     assert ADDED[name]['text'] in found.report
 
@@ -196,12 +305,20 @@ def test_diagnosis_finds_and_names_it(name):
 def test_by_hand_it_is_found_too(name):
     made = session(name)
     samples = SampleBlock(made.samples.imu)
-    calibrated = imu.calibrate(samples, catalogue=MINE,
-                               **{key: text.replace('+accel_size_effect', '') for key, text in models(name).items()})
+    calibrated = imu.calibrate(
+        samples,
+        catalogue=MINE,
+        **{key: text.replace('+accel_size_effect', '') for key, text in models(name).items()},
+    )
     truth = made.truth.value(SENSOR[name], name)
-    assert np.all(np.abs(calibrated.calibration.value(SENSOR[name], name) - truth) < 0.2 * np.abs(truth))
+    assert np.all(
+        np.abs(calibrated.calibration.value(SENSOR[name], name) - truth) < 0.2 * np.abs(truth)
+    )
     found = imu.diagnose(samples, catalogue=MINE)
-    assert name in [finding.effect for finding in found.findings] and ADDED[name]['text'] in found.report
+    assert (
+        name in [finding.effect for finding in found.findings]
+        and ADDED[name]['text'] in found.report
+    )
 
 
 @pytest.mark.live
@@ -212,11 +329,18 @@ def test_documents_and_processes_carry_it(tmp_path):
     assert calibration_to_text(again) == text
     assert 'gyro_scale_settling' not in text, 'only what the model has travels'
     (tmp_path / 'calibration.yaml').write_text(text)
-    program = ('import sys, numpy as np, imu_calibration as imu\n'
-               "force, rate = imu.load(sys.argv[1]).compensate([[1., 2., 9.]], [[.1, .2, .3]], time=[0.])\n"
-               'print(repr(np.hstack([force, rate])[0].tolist()))')
-    done = subprocess.run([sys.executable, '-c', program, tmp_path / 'calibration.yaml'], capture_output=True, text=True, cwd=ROOT,
-                          timeout=60)
+    program = (
+        'import sys, numpy as np, imu_calibration as imu\n'
+        'force, rate = imu.load(sys.argv[1]).compensate([[1., 2., 9.]], [[.1, .2, .3]], time=[0.])\n'
+        'print(repr(np.hstack([force, rate])[0].tolist()))'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', program, tmp_path / 'calibration.yaml'],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=60,
+    )
     here = np.hstack(truth.compensate([[1.0, 2.0, 9.0]], [[0.1, 0.2, 0.3]], time=[0.0]))[0]
     np.testing.assert_allclose(ast.literal_eval(done.stdout), here, rtol=1e-12)
 
@@ -225,13 +349,25 @@ def test_pickles_and_saved_sessions_carry_it():
     model, values = with_values('gyro_scale_settling')
     sent = pickle.loads(pickle.dumps(model.at(values)))
     assert sent.definitions == model.definitions and sent.param_names == model.param_names
-    np.testing.assert_array_equal(coefficients(sent, 'gyroscope', values), coefficients(model.at(values), 'gyroscope', values))
+    np.testing.assert_array_equal(
+        coefficients(sent, 'gyroscope', values), coefficients(model.at(values), 'gyroscope', values)
+    )
     made = session('gyro_anisoelasticity')
-    found = imu.calibrate(made.samples, made.table, catalogue=MINE, model_as_asked=True, **models('gyro_anisoelasticity')).result
+    found = imu.calibrate(
+        made.samples,
+        made.table,
+        catalogue=MINE,
+        model_as_asked=True,
+        **models('gyro_anisoelasticity'),
+    ).result
     data = to_bytes(found.gathered, found.gathered_model)
     assert len(from_bytes(data)[0].accumulator.rows) == len(found.gathered.accumulator.rows)
-    other = replace(found.gathered_model,
-                    catalogue=CATALOGUE.with_effects(term('gyro_anisoelasticity', **ADDED['gyro_anisoelasticity'] | {'unit': '1'})))
+    other = replace(
+        found.gathered_model,
+        catalogue=CATALOGUE.with_effects(
+            term('gyro_anisoelasticity', **ADDED['gyro_anisoelasticity'] | {'unit': '1'})
+        ),
+    )
     with refused(DocumentError, 'other_model'):
         require_columns(from_bytes(data)[1], other)
 
@@ -242,20 +378,47 @@ def test_the_package_knows_nothing_of_what_others_added():
         SensorModel().with_effect('gyroscope', 'gyro_anisoelasticity').param_names  # noqa: B018
 
 
-@pytest.mark.parametrize('column', ["__import__('os').system('true')", 'f_x.real', 'f_x[0]', '(lambda: f_x)()', 'f_x if f_y else f_z',
-                                    'f_w', 'f_x ** 99',
-                                    'f_x ** f_y', 'abs(f_x, f_y)', "'f_x'", 'f_x and f_y', 'f_x < 3', '[f_x]', 'print(f_x)', '1e999',
-                                    '+'.join(['f_x'] * 300),
-                                    '(' * 300 + 'f_x' + ')' * 300, '', 'f_x := 2', 'True'])
+@pytest.mark.parametrize(
+    'column',
+    [
+        "__import__('os').system('true')",
+        'f_x.real',
+        'f_x[0]',
+        '(lambda: f_x)()',
+        'f_x if f_y else f_z',
+        'f_w',
+        'f_x ** 99',
+        'f_x ** f_y',
+        'abs(f_x, f_y)',
+        "'f_x'",
+        'f_x and f_y',
+        'f_x < 3',
+        '[f_x]',
+        'print(f_x)',
+        '1e999',
+        '+'.join(['f_x'] * 300),
+        '(' * 300 + 'f_x' + ')' * 300,
+        '',
+        'f_x := 2',
+        'True',
+    ],
+)
 def test_a_column_is_arithmetic_and_nothing_else(column):
     with refused(InputError, 'not_arithmetic', 'mine'):
         term('mine', sensor='gyroscope', column=column, unit='1', tolerance=1.0, text='')
 
 
-@pytest.mark.parametrize('changed, code, value', [
-    ({'sensor': 'thermometer'}, 'sensor_unknown', 'thermometer'), ({'column': ['f_x', 'f_y']}, 'column_count', 2),
-    ({'tolerance': -1.0}, 'tolerance_value', -1.0), ({'tolerance': '1'}, 'tolerance_value', "'1'"),
-    ({'unit': None}, 'not_a_text', None), ({'colour': 'red'}, 'definition_keys', 'colour')])
+@pytest.mark.parametrize(
+    'changed, code, value',
+    [
+        ({'sensor': 'thermometer'}, 'sensor_unknown', 'thermometer'),
+        ({'column': ['f_x', 'f_y']}, 'column_count', 2),
+        ({'tolerance': -1.0}, 'tolerance_value', -1.0),
+        ({'tolerance': '1'}, 'tolerance_value', "'1'"),
+        ({'unit': None}, 'not_a_text', None),
+        ({'colour': 'red'}, 'definition_keys', 'colour'),
+    ],
+)
 def test_a_definition_is_refused_in_one_line(changed, code, value):
     with refused(InputError, code, 'mine', value) as caught:
         CATALOGUE.with_definitions({'mine': ADDED['gyro_anisoelasticity'] | changed})
@@ -270,10 +433,20 @@ def test_a_name_must_be_free(name):
 
 def by_code(**changed):
     """Return an effect that is made of code, to be undone, with one column."""
-    fields = {'name': 'mine', 'sensor': 'gyroscope', 'components': ('all',), 'shape': (1,), 'unit': '1', 'tolerance': 1.0, 'prior_sd': 1.0,
-              'explanation': '',
-              'motion': ('static_poses',), 'compensation': 'exact', 'groups': (ColumnGroup('mine', ('f_x * w_x',)),),
-              'coefficients': lambda effect, values, point: {'mine': np.tile(values['mine'], 3)[None]}}
+    fields = {
+        'name': 'mine',
+        'sensor': 'gyroscope',
+        'components': ('all',),
+        'shape': (1,),
+        'unit': '1',
+        'tolerance': 1.0,
+        'prior_sd': 1.0,
+        'explanation': '',
+        'motion': ('static_poses',),
+        'compensation': 'exact',
+        'groups': (ColumnGroup('mine', ('f_x * w_x',)),),
+        'coefficients': lambda effect, values, point: {'mine': np.tile(values['mine'], 3)[None]},
+    }
     return Effect(**fields | changed)
 
 
@@ -290,7 +463,10 @@ def test_what_a_single_sample_does_not_tell_cannot_be_undone():
 
 
 def test_one_name_for_two_kinds_of_columns_is_refused():
-    clash = by_code(groups=(ColumnGroup('rate', ('f_x',)),), coefficients=lambda effect, values, point: {'rate': np.tile(values['mine'], 3)[None]})
+    clash = by_code(
+        groups=(ColumnGroup('rate', ('f_x',)),),
+        coefficients=lambda effect, values, point: {'rate': np.tile(values['mine'], 3)[None]},
+    )
     model = SensorModel(catalogue=CATALOGUE.with_effects(clash)).with_effect('gyroscope', 'mine')
     with refused(InputError, 'column_name_taken', 'rate'):
         model.layout('gyroscope')
@@ -304,7 +480,10 @@ def test_an_effect_of_code_cannot_be_written_into_a_document():
 def test_a_definition_says_all():
     for name, definition in ADDED.items():
         again = from_definition(name, from_definition(name, definition).definition)
-        assert again.definition.items() >= definition.items() and again.groups == term(name, **definition).groups
+        assert (
+            again.definition.items() >= definition.items()
+            and again.groups == term(name, **definition).groups
+        )
 
 
 def test_the_file_of_tolerances_is_the_catalogue():

@@ -23,7 +23,12 @@ from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, hidden_effect, random_values, simulate
+from imu_calibration.simulation.session import (
+    SimulationOptions,
+    hidden_effect,
+    random_values,
+    simulate,
+)
 from imu_calibration.use_cases.calibrate import calibrate
 
 from worlds.stands import stand
@@ -51,41 +56,108 @@ def mine(tmp_path):
 def reference(n=50):
     rng = np.random.default_rng(1)
     vectors = [rng.normal(0.0, size, (n, 3)) for size in (8.0, 2.0, 5.0)]
-    return Reference(np.linspace(0.0, 400.0, n), np.broadcast_to(np.eye(3), (n, 3, 3)), *vectors, 9.8, np.full(n, 30.0))
+    return Reference(
+        np.linspace(0.0, 400.0, n),
+        np.broadcast_to(np.eye(3), (n, 3, 3)),
+        *vectors,
+        9.8,
+        np.full(n, 30.0),
+    )
 
 
 @pytest.mark.long
-def test_it_is_simulated_calibrated_compensated_and_checked_from_files_alone(mine, tmp_path, capsys):
+def test_it_is_simulated_calibrated_compensated_and_checked_from_files_alone(
+    mine, tmp_path, capsys
+):
     bag, out = tmp_path / 'bag', tmp_path / 'out'
-    assert main(['simulate', '--effects', str(mine), '--effect', 'gyro_warm_force', '--size', '0.5', '--profile', 'quick', '--seed', '5',
-                 '--output', str(bag)]) == 0
+    assert (
+        main(
+            [
+                'simulate',
+                '--effects',
+                str(mine),
+                '--effect',
+                'gyro_warm_force',
+                '--size',
+                '0.5',
+                '--profile',
+                'quick',
+                '--seed',
+                '5',
+                '--output',
+                str(bag),
+            ]
+        )
+        == 0
+    )
     model = ['--effects', str(mine), '--gyroscope-model', 'bias+matrix+gyro_warm_force']
     table = ['--table', str(bag / 'table.yaml')]
     assert main(['calibrate', str(bag), *table, *model, '--output', str(out)]) in (0, 3)
-    mine.unlink()   # from here on the calibration is all there is
-    found, truth = (files.read_calibration(path) for path in (out / 'calibration.yaml', bag / 'truth.yaml'))
+    mine.unlink()  # from here on the calibration is all there is
+    found, truth = (
+        files.read_calibration(path) for path in (out / 'calibration.yaml', bag / 'truth.yaml')
+    )
     value, true = (each.value('gyroscope', 'gyro_warm_force') for each in (found, truth))
-    np.testing.assert_allclose(value, true, atol=4 * found.sd[found.model.slices['gyroscope', 'gyro_warm_force']].max())
-    assert np.abs(true).min() > 20 * found.sd[found.model.slices['gyroscope', 'gyro_warm_force']].max()
-    assert main(['compensate', str(bag), '--calibration', str(out / 'calibration.yaml'), '--anyway', '--output', str(tmp_path / 'bag2')]) in (0, 3)
+    np.testing.assert_allclose(
+        value, true, atol=4 * found.sd[found.model.slices['gyroscope', 'gyro_warm_force']].max()
+    )
+    assert (
+        np.abs(true).min() > 20 * found.sd[found.model.slices['gyroscope', 'gyro_warm_force']].max()
+    )
+    assert main(
+        [
+            'compensate',
+            str(bag),
+            '--calibration',
+            str(out / 'calibration.yaml'),
+            '--anyway',
+            '--output',
+            str(tmp_path / 'bag2'),
+        ]
+    ) in (0, 3)
     assert main(['check', str(bag), '--calibration', str(out / 'calibration.yaml'), *table]) == 0
     again = tmp_path / 'again'
-    assert main(['calibrate', str(bag), *table, '--effects', str(out / 'calibration.yaml'), *model[2:], '--output', str(again)]) in (0, 3)
-    np.testing.assert_array_equal(files.read_calibration(again / 'calibration.yaml').values, found.values)
+    assert main(
+        [
+            'calibrate',
+            str(bag),
+            *table,
+            '--effects',
+            str(out / 'calibration.yaml'),
+            *model[2:],
+            '--output',
+            str(again),
+        ]
+    ) in (0, 3)
+    np.testing.assert_array_equal(
+        files.read_calibration(again / 'calibration.yaml').values, found.values
+    )
     assert 'gyro_warm_force' in (out / 'report.html').read_text()
     assert 'Traceback' not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('text, code, values', [
-    ('a: 1', 'effects_file', ['a']), ('effects: 3', 'effects_count', [3]), ('effects: [1]', 'effects_count', ['[1]']),
-    ('effects:\n  mine: 3', 'definition_keys', ["'mine'", 3]),
-    ('effects:\n  effects: ' + MINE[10:].split(':', 1)[0], 'definition_keys', ["'effects'"]),
-    (MINE.replace('f_x', 'f_q'), 'not_arithmetic', ["'gyro_warm_force'", "'f_q'", ' 1: ', "'f_q * (temperature_c - 25)'"]),
-    (MINE.replace('- 25', '- 25 ** 0.5'), 'not_arithmetic', [' 9 ', ' 30: ']), (MINE.replace('- 25)', '- 25'), 'not_arithmetic', [' 7: ']),
-    (MINE.replace('gyro_warm_force', 'gyro_quadratic'), 'effect_name', ["'gyro_quadratic'"]),
-    (MINE.replace('gyro_warm_force', 'effects'), 'effect_name', ["'effects'"]),
-    (MINE + 'other: 1', 'effects_file', ['other']), (MINE.replace('tolerance', 'tolerence'), 'definition_keys', ['tolerence']),
-    ('effects:\n' + ''.join(f'  e{k}: {{}}\n' for k in range(60)), 'effects_count', [50, 60])])
+@pytest.mark.parametrize(
+    'text, code, values',
+    [
+        ('a: 1', 'effects_file', ['a']),
+        ('effects: 3', 'effects_count', [3]),
+        ('effects: [1]', 'effects_count', ['[1]']),
+        ('effects:\n  mine: 3', 'definition_keys', ["'mine'", 3]),
+        ('effects:\n  effects: ' + MINE[10:].split(':', 1)[0], 'definition_keys', ["'effects'"]),
+        (
+            MINE.replace('f_x', 'f_q'),
+            'not_arithmetic',
+            ["'gyro_warm_force'", "'f_q'", ' 1: ', "'f_q * (temperature_c - 25)'"],
+        ),
+        (MINE.replace('- 25', '- 25 ** 0.5'), 'not_arithmetic', [' 9 ', ' 30: ']),
+        (MINE.replace('- 25)', '- 25'), 'not_arithmetic', [' 7: ']),
+        (MINE.replace('gyro_warm_force', 'gyro_quadratic'), 'effect_name', ["'gyro_quadratic'"]),
+        (MINE.replace('gyro_warm_force', 'effects'), 'effect_name', ["'effects'"]),
+        (MINE + 'other: 1', 'effects_file', ['other']),
+        (MINE.replace('tolerance', 'tolerence'), 'definition_keys', ['tolerence']),
+        ('effects:\n' + ''.join(f'  e{k}: {{}}\n' for k in range(60)), 'effects_count', [50, 60]),
+    ],
+)
 def test_a_file_is_refused_in_one_line_that_names_it(tmp_path, text, code, values):
     (tmp_path / 'wrong.yaml').write_text(text)
     with refused(InputError, code, 'wrong.yaml', *values) as caught:
@@ -93,44 +165,94 @@ def test_a_file_is_refused_in_one_line_that_names_it(tmp_path, text, code, value
     assert '\n' not in str(caught.value)
 
 
-@pytest.mark.parametrize('text, shown', [('A remark without its stop', 'A remark without its stop.'), ('Said in full.', 'Said in full.'),
-                                         ('', 'The gyroscope output follows f_x.')])
+@pytest.mark.parametrize(
+    'text, shown',
+    [
+        ('A remark without its stop', 'A remark without its stop.'),
+        ('Said in full.', 'Said in full.'),
+        ('', 'The gyroscope output follows f_x.'),
+    ],
+)
 def test_what_is_said_of_it_is_a_sentence(text, shown):
-    effect = term('mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text=text)
-    assert sentence(effect, {'gyroscope.mine.x': (2.7902e-4, 3.1e-7, 'strange')}, None) == f'{shown} Its size is 0.00027902 +- 0.00000031 strange.'
+    effect = term(
+        'mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text=text
+    )
+    assert (
+        sentence(effect, {'gyroscope.mine.x': (2.7902e-4, 3.1e-7, 'strange')}, None)
+        == f'{shown} Its size is 0.00027902 +- 0.00000031 strange.'
+    )
 
 
-@pytest.mark.parametrize('z_of_y, said', [(5.0, 'Its size is 5.0 +- 1.0 strange (largest: y).'),
-                                          (1.5, 'Its size is known here in combinations only, none of its values by itself: ')])
+@pytest.mark.parametrize(
+    'z_of_y, said',
+    [
+        (5.0, 'Its size is 5.0 +- 1.0 strange (largest: y).'),
+        (1.5, 'Its size is known here in combinations only, none of its values by itself: '),
+    ],
+)
 def test_what_cannot_be_told_from_another_is_no_size(z_of_y, said):
     """Of an asymmetry on one axis that a recording holds against the bias, 40 +- 90 was told, and the 5 +- 1 of the other axis was not."""
     effect = term('mine', sensor='gyroscope', column='w_x', unit='1', tolerance=1e-6, text='Mine.')
-    values = {f'gyroscope.mine.{axis}': (value, sd, 'strange') for axis, value, sd in zip('xyz', (40.0, z_of_y, 0.1), (90.0, 1.0, 3.0))}
+    values = {
+        f'gyroscope.mine.{axis}': (value, sd, 'strange')
+        for axis, value, sd in zip('xyz', (40.0, z_of_y, 0.1), (90.0, 1.0, 3.0))
+    }
     assert said in sentence(effect, values, None)
 
 
 def test_one_of_unknown_size_cannot_be_simulated_by_name_and_what_to_write_is_said():
-    catalogue = CATALOGUE.with_effects(term('mine', sensor='gyroscope', column='f_x', unit='(rad/s)/(m/s^2)', tolerance=1e-6, text='Mine.'))
+    catalogue = CATALOGUE.with_effects(
+        term(
+            'mine',
+            sensor='gyroscope',
+            column='f_x',
+            unit='(rad/s)/(m/s^2)',
+            tolerance=1e-6,
+            text='Mine.',
+        )
+    )
     with refused(InputError, 'size_unknown', 'mine'):
         hidden_effect(SensorModel(catalogue=catalogue), 'mine')
 
 
 def test_a_choice_may_be_a_mapping_too():
     from imu_calibration.use_cases.choices import catalogue_of
+
     found = catalogue_of(documents.from_text(MINE)['effects'])
     assert ('gyroscope', 'gyro_warm_force') in found.effects() and catalogue_of(None) is not found
     assert catalogue_of(CATALOGUE) is CATALOGUE
 
 
-@pytest.mark.parametrize('column', ['9**9**9', '(((9**9)**9)**9)**9', '1/0', 'f_x / (1 - 1)', '1e300 * 1e300', 'log(-1)', 'sqrt(0 - 2)',
-                                    'exp(999)', '1' * 200])
+@pytest.mark.parametrize(
+    'column',
+    [
+        '9**9**9',
+        '(((9**9)**9)**9)**9',
+        '1/0',
+        'f_x / (1 - 1)',
+        '1e300 * 1e300',
+        'log(-1)',
+        'sqrt(0 - 2)',
+        'exp(999)',
+        '1' * 200,
+    ],
+)
 def test_numbers_cannot_grow_without_end(column):
     with refused(InputError, 'not_arithmetic'):
         read(column)
 
 
-@pytest.mark.parametrize('column', ['f_x / (time - time)', 'log(f_x)', 'sqrt(f_x)', '1 / (temperature_ref_c - temperature_ref_c)',
-                                    'exp(exp(f_x ** 9))', 'f_x / (w_x - w_x)'])
+@pytest.mark.parametrize(
+    'column',
+    [
+        'f_x / (time - time)',
+        'log(f_x)',
+        'sqrt(f_x)',
+        '1 / (temperature_ref_c - temperature_ref_c)',
+        'exp(exp(f_x ** 9))',
+        'f_x / (w_x - w_x)',
+    ],
+)
 def test_a_column_without_a_value_is_refused_in_one_line(column):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
@@ -140,13 +262,55 @@ def test_a_column_without_a_value_is_refused_in_one_line(column):
 
 def _random_column(rng):
     """Return arithmetic, Python, and noise, mixed."""
-    atoms = [*PLACES, '1', '2.5', '1e9', '__import__', "'os'", 'eval', 'open', 'lambda', 'f_x.real', '__builtins__', '[', ']', '{', '}', ':=',
-             'if', 'else', 'for', 'in', 'abs', 'sqrt', 'exp', '0x10', '1j', 'True', 'None', '"', '#', '\\', '\n', ';', '\x00', 'é', '９']
+    atoms = [
+        *PLACES,
+        '1',
+        '2.5',
+        '1e9',
+        '__import__',
+        "'os'",
+        'eval',
+        'open',
+        'lambda',
+        'f_x.real',
+        '__builtins__',
+        '[',
+        ']',
+        '{',
+        '}',
+        ':=',
+        'if',
+        'else',
+        'for',
+        'in',
+        'abs',
+        'sqrt',
+        'exp',
+        '0x10',
+        '1j',
+        'True',
+        'None',
+        '"',
+        '#',
+        '\\',
+        '\n',
+        ';',
+        '\x00',
+        'é',
+        '９',
+    ]
     glue = ['+', '-', '*', '/', '**', '(', ')', ',', ' ', '.', '=', '<', '@', '//', '%', '~', '&']
     if rng.random() < 0.3:
         return ''.join(rng.choice(string.printable) for _ in range(rng.randint(0, 40)))
     if rng.random() < 0.5:
-        return ''.join(rng.choice(list(PLACES)) + rng.choice(['+', '-', '*', '/', '**2*', '*sin(2)+', '+(', ')*', '**']) for _ in range(rng.randint(1, 12))) + '1'
+        return (
+            ''.join(
+                rng.choice(list(PLACES))
+                + rng.choice(['+', '-', '*', '/', '**2*', '*sin(2)+', '+(', ')*', '**'])
+                for _ in range(rng.randint(1, 12))
+            )
+            + '1'
+        )
     return ''.join(rng.choice(rng.choice([atoms, glue])) for _ in range(rng.randint(1, 30)))
 
 
@@ -155,8 +319,17 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
     called, armed = [], False
 
     def watch(event, _arguments):
-        if armed and event.split('.')[0] in ('open', 'import', 'os', 'subprocess', 'socket', 'shutil', 'ctypes'):
+        if armed and event.split('.')[0] in (
+            'open',
+            'import',
+            'os',
+            'subprocess',
+            'socket',
+            'shutil',
+            'ctypes',
+        ):
             called.append(event)
+
     sys.addaudithook(watch)
     rng, ref, passed = random.Random(1), reference(), 0
     point = {'mine': np.array([0.0, 0.0, 0.0, 300.0])}
@@ -179,32 +352,56 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
 
 @pytest.mark.live
 def test_the_node_reads_the_file(mine):
-    program = ('import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
-               'from imu_calibration.use_cases.resources import config_file\n'
-               'given = {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n'
-               '         "gyroscope_model": "bias+matrix+gyro_warm_force"}\n'
-               'rclpy.init(args=["--ros-args", *(part for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\n'
-               'node = CalibrationNode()\n'
-               'print(node._options.catalogue.definitions(["gyro_warm_force"]).keys())\n'
-               'node.close(); node.destroy_node(); rclpy.shutdown()')
-    done = subprocess.run([sys.executable, '-c', program, str(mine)], capture_output=True, text=True, timeout=120)
+    program = (
+        'import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
+        'from imu_calibration.use_cases.resources import config_file\n'
+        'given = {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n'
+        '         "gyroscope_model": "bias+matrix+gyro_warm_force"}\n'
+        'rclpy.init(args=["--ros-args", *(part for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\n'
+        'node = CalibrationNode()\n'
+        'print(node._options.catalogue.definitions(["gyro_warm_force"]).keys())\n'
+        'node.close(); node.destroy_node(); rclpy.shutdown()'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', program, str(mine)], capture_output=True, text=True, timeout=120
+    )
     assert "dict_keys(['gyro_warm_force'])" in done.stdout, done.stderr
 
 
 def test_the_example_file_is_a_catalogue_whose_effects_are_found():
     """Each effect of the example, hidden in a session on a table, is added by a calibration that knows the file, with its true values."""
-    example, table = Path(__file__).resolve().parents[2] / 'config/effects_example.yaml', stand('three axes')
+    example, table = (
+        Path(__file__).resolve().parents[2] / 'config/effects_example.yaml',
+        stand('three axes'),
+    )
     catalogue = files.read_effects(example)
     names = {effect.name: effect.sensor for effect in catalogue.added}
-    assert len(names) == 2 and all(effect.tolerance < 1e-3 for effect in catalogue.added)   # 2e-6 is a number
-    model = SensorModel((*BASE, 'accel_rate_coupling'), (*BASE, 'gyro_scale_by_force'), joint_names=table.joint_names,
-                        catalogue=catalogue)
+    assert len(names) == 2 and all(
+        effect.tolerance < 1e-3 for effect in catalogue.added
+    )  # 2e-6 is a number
+    model = SensorModel(
+        (*BASE, 'accel_rate_coupling'),
+        (*BASE, 'gyro_scale_by_force'),
+        joint_names=table.joint_names,
+        catalogue=catalogue,
+    )
     truth = random_values(model, 'industrial', 3)
     for name in names:
-        truth[model.slices[hidden_effect(model, name, 3)[0], name]] = hidden_effect(model, name, 3)[1]
-    samples = simulate(model, truth, table, profile=make_profile('quick', 3, table), options=SimulationOptions(noise=GRADES['industrial'].noise), seed=3)
+        truth[model.slices[hidden_effect(model, name, 3)[0], name]] = hidden_effect(model, name, 3)[
+            1
+        ]
+    samples = simulate(
+        model,
+        truth,
+        table,
+        profile=make_profile('quick', 3, table),
+        options=SimulationOptions(noise=GRADES['industrial'].noise),
+        seed=3,
+    )
     found = calibrate(SampleBlock(*samples), table, catalogue=example).calibration
     for name, sensor in names.items():
         where = found.model.slices[sensor, name]
-        np.testing.assert_allclose(found.values[where], truth[model.slices[sensor, name]], atol=4 * found.sd[where].max())
+        np.testing.assert_allclose(
+            found.values[where], truth[model.slices[sensor, name]], atol=4 * found.sd[where].max()
+        )
         assert found.sd[where].max() < 0.1 * np.abs(found.values[where]).max()

@@ -13,7 +13,14 @@ from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 
-TABLE = Table.from_mapping({'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1], 'gravity': 9.80665, 'latitude': None})
+TABLE = Table.from_mapping(
+    {
+        'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}],
+        'up': [0, 0, 1],
+        'gravity': 9.80665,
+        'latitude': None,
+    }
+)
 MODEL = SensorModel(joint_names=('shaft',))
 GAIN, NOISE = 1.02, 0.01
 
@@ -25,12 +32,16 @@ def sweeps(rng, fast_gain, n_windows=12, length=1500):
         time = 20.0 * number + 0.01 * np.arange(length)
         slow, fast = 2 * np.pi * 0.3, 2 * np.pi * 11.13
         terms = [(1.0, slow, 0.0), (0.01, fast, 0.4)]
-        parts = [[a * w**k * np.sin(w * time + p + k * np.pi / 2) for k in range(4)] for a, w, p in terms]
+        parts = [
+            [a * w**k * np.sin(w * time + p + k * np.pi / 2) for k in range(4)] for a, w, p in terms
+        ]
         motion = JointMotion(time, *(sum(part[k] for part in parts)[:, None] for k in range(4)))
         rate = rng.normal(0, NOISE, (length, 3))
         rate[:, 2] += GAIN * parts[0][1] + fast_gain * parts[1][1]
         force = np.array([0.0, 0.0, 9.80665]) + rng.normal(0, 0.02, (length, 3))
-        windows.append(Window('dynamic', (time * 1e9).astype(np.int64), time, force, rate, motion, None))
+        windows.append(
+            Window('dynamic', (time * 1e9).astype(np.int64), time, force, rate, motion, None)
+        )
     return windows
 
 
@@ -68,7 +79,7 @@ def test_nothing_is_thrown_away_where_the_reference_is_right():
         value, sd, noise = solved(windows)
         assert np.all(noise.slow_weight('dynamic') == 0.0)
         errors.append((value - GAIN) / sd)
-    power = sum(((w.motion.rate[:, 0] - w.motion.rate[:, 0].mean())**2).sum() for w in windows)
+    power = sum(((w.motion.rate[:, 0] - w.motion.rate[:, 0].mean()) ** 2).sum() for w in windows)
     assert 0.95 < sd * np.sqrt(power) / NOISE < 1.1
     assert 0.6 < np.mean(np.square(errors)) < 1.6
 
@@ -86,8 +97,14 @@ def test_white_noise_has_the_same_variance_in_both_parts():
 
 def test_weights_of_slow_and_of_all_rows_give_each_part_its_own():
     fast, slow = np.full(3, 5.0), np.full(3, 2.0)
-    noise = NoiseModel(np.full(3, 0.1), np.full(3, 2.0), moving={'apart': MovingFactors(fast, slow), 'alike': MovingFactors(slow, slow)})
-    np.testing.assert_allclose(1 / noise.row_variance('apart') + noise.slow_weight('apart')**2, 1 / (0.2 * slow))
+    noise = NoiseModel(
+        np.full(3, 0.1),
+        np.full(3, 2.0),
+        moving={'apart': MovingFactors(fast, slow), 'alike': MovingFactors(slow, slow)},
+    )
+    np.testing.assert_allclose(
+        1 / noise.row_variance('apart') + noise.slow_weight('apart') ** 2, 1 / (0.2 * slow)
+    )
     np.testing.assert_array_equal(noise.slow_weight('alike'), 0.0)
 
 
@@ -107,6 +124,11 @@ def test_variance_along_the_columns_is_that_of_noise_and_shows_what_is_no_noise(
 
 def test_the_slow_misfit_of_few_pieces_is_taken_larger():
     """By two standard deviations of a variance from so many: parts are told apart where that is sure, and weighed by what is sure."""
-    few, many = (band_misfit(np.full(3, 3.0 * (9 * dof) + dof), 10 * dof, np.full(3, float(dof)), dof_slow=dof) for dof in (8, 800))
+    few, many = (
+        band_misfit(
+            np.full(3, 3.0 * (9 * dof) + dof), 10 * dof, np.full(3, float(dof)), dof_slow=dof
+        )
+        for dof in (8, 800)
+    )
     assert not few.apart.any() and many.apart.all()
     np.testing.assert_allclose(many.slow, 1 + 2 * np.sqrt(2 / 800))

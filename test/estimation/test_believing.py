@@ -41,9 +41,20 @@ def read(windows, table, model, values, *, ripple=0.0, seed=1):
     rng, made = np.random.default_rng(seed), []
     for window in windows:
         force, rate = predict(model, values, table, motion=window.motion)
-        moves, turns = (np.broadcast_to(part[:, 0], len(window.time)) for part in (window.motion.position, window.motion.rate))
-        force = force + ripple * np.outer((np.abs(turns) > 1.0) * (1.0 + np.sin(7 * moves)), [1.0, 0.0, 0.0])
-        made.append(replace(window, force_s=force + rng.normal(0, 0.02, (len(window.time), 3)), rate_s=rate + rng.normal(0, 2e-3, (len(window.time), 3))))
+        moves, turns = (
+            np.broadcast_to(part[:, 0], len(window.time))
+            for part in (window.motion.position, window.motion.rate)
+        )
+        force = force + ripple * np.outer(
+            (np.abs(turns) > 1.0) * (1.0 + np.sin(7 * moves)), [1.0, 0.0, 0.0]
+        )
+        made.append(
+            replace(
+                window,
+                force_s=force + rng.normal(0, 0.02, (len(window.time), 3)),
+                rate_s=rate + rng.normal(0, 2e-3, (len(window.time), 3)),
+            )
+        )
     return made
 
 
@@ -55,7 +66,9 @@ def test_a_scale_that_only_misfit_gives_is_held_and_named(upright):
     found = solved(read(windows, table, model, model.start(), ripple=0.5), model, table)
     names = [name for name in found.not_believed if name.startswith('accelerometer.matrix')]
     assert names and all(found.held[model.param_names.index(name)] for name in names)
-    assert all(found.values[model.param_names.index(name)] == float(name[-1] == name[-2]) for name in names)
+    assert all(
+        found.values[model.param_names.index(name)] == float(name[-1] == name[-2]) for name in names
+    )
 
 
 def test_a_wrong_full_scale_setting_is_no_misfit():
@@ -63,23 +76,34 @@ def test_a_wrong_full_scale_setting_is_no_misfit():
     session = make_pair(None, 11).first
     table, found = Table.from_mapping(TABLES['three_axis']), calibrated(session)
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
-    doubled = solved([replace(window, rate_s=2 * window.rate_s) for window in found.windows], model, table)
+    doubled = solved(
+        [replace(window, rate_s=2 * window.rate_s) for window in found.windows], model, table
+    )
     assert not doubled.not_believed
-    np.testing.assert_allclose(np.diag(doubled.values[model.slices['gyroscope', 'matrix']].reshape(3, 3)), 2.0, atol=0.05)
+    np.testing.assert_allclose(
+        np.diag(doubled.values[model.slices['gyroscope', 'matrix']].reshape(3, 3)), 2.0, atol=0.05
+    )
 
 
 def test_the_earth_turns_only_where_the_table_says_where_it_stands():
     """Without a latitude the Earth's rate is not modelled; with one and without an azimuth it is."""
     table = Table.from_mapping({**TABLES['three_axis'], 'latitude': None, 'gravity': 9.81})
-    somewhere = Table.from_mapping({**TABLES['three_axis'], 'latitude': 50.0, 'height': 0.0, 'azimuth_deg': None})
+    somewhere = Table.from_mapping(
+        {**TABLES['three_axis'], 'latitude': 50.0, 'height': 0.0, 'azimuth_deg': None}
+    )
     assert 'earth_rate' not in parse_reference(None, table)
     assert 'earth_rate' in parse_reference(None, somewhere)
 
 
 def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
     """Arms that are not there go most of the way to zero, plain ones stay, and the standard deviations are what they were."""
-    windows, table = calibrated(make_pair(None, 11).first).windows, Table.from_mapping(TABLES['three_axis'])
-    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(table.joint_names))
+    windows, table = (
+        calibrated(make_pair(None, 11).first).windows,
+        Table.from_mapping(TABLES['three_axis']),
+    )
+    model = SensorModel(
+        accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(table.joint_names)
+    )
     part = model.slices['accelerometer', 'accel_size_effect']
     moved = []
     for size in (0.0, 0.02):
@@ -96,8 +120,17 @@ def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
 def test_options_know_what_is_there_unasked():
     """A size effect that was asked for does not shrink."""
     from imu_calibration.calibration.table_calibration import _by_default
-    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), reference=('table_tilt', 'time_offset'))
-    asked = CalibrationOptions(accelerometer_model='size_effect', reference_model='table_tilt+time_offset')
+
+    model = SensorModel(
+        accelerometer=('bias', 'matrix', 'accel_size_effect'),
+        reference=('table_tilt', 'time_offset'),
+    )
+    asked = CalibrationOptions(
+        accelerometer_model='size_effect', reference_model='table_tilt+time_offset'
+    )
     assert _by_default(model, asked) == []
     unasked = CalibrationOptions(added=(('reference', 'time_offset'),))
-    assert _by_default(model, unasked) == [model.slices['accelerometer', 'accel_size_effect'], model.slices['reference', 'table_tilt']]
+    assert _by_default(model, unasked) == [
+        model.slices['accelerometer', 'accel_size_effect'],
+        model.slices['reference', 'table_tilt'],
+    ]

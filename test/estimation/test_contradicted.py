@@ -46,33 +46,60 @@ def numbers(windows, kind):
 
 def leaned(windows, numbers):
     """Return the windows, some of them read while somebody leaned on the table."""
-    return [replace(window, force_s=window.force_s + LEAN) if number in numbers else window for number, window in enumerate(windows)]
+    return [
+        replace(window, force_s=window.force_s + LEAN) if number in numbers else window
+        for number, window in enumerate(windows)
+    ]
 
 
 def struck(windows, number):
     """Return the windows with a blow on the IMU in one of them, ringing down in half a second."""
     window = windows[number]
     since = window.time - window.time[len(window) // 2]
-    ringing = np.where(since >= 0, np.exp(-np.maximum(since, 0) / 0.2) * np.sin(2 * np.pi * 4 * since), 0.0)
-    return [*windows[:number], replace(window, force_s=window.force_s + np.outer(ringing, [BUMP, 0, -BUMP])), *windows[number + 1:]]
+    ringing = np.where(
+        since >= 0, np.exp(-np.maximum(since, 0) / 0.2) * np.sin(2 * np.pi * 4 * since), 0.0
+    )
+    return [
+        *windows[:number],
+        replace(window, force_s=window.force_s + np.outer(ringing, [BUMP, 0, -BUMP])),
+        *windows[number + 1 :],
+    ]
 
 
 def bias_error(solution, truth):
     """Return the rms error of the accelerometer's biases, m/s^2."""
-    return np.sqrt(np.mean((solution.values[solution.model.slices['accelerometer', 'bias']] - truth['accelerometer'].bias)**2))
+    return np.sqrt(
+        np.mean(
+            (
+                solution.values[solution.model.slices['accelerometer', 'bias']]
+                - truth['accelerometer'].bias
+            )
+            ** 2
+        )
+    )
 
 
 def test_clean_sessions_keep_all_windows(session):
     assert not any(noise.left_out for noise in session.solution.noise.values())
 
 
-@pytest.mark.parametrize('spoil', [lambda windows: leaned(windows, numbers(windows, WindowKind.STATIC)[5:6]),
-                                   lambda windows: leaned(windows, numbers(windows, WindowKind.STATIC)[4:9:4]),
-                                   lambda windows: struck(windows, max(numbers(windows, WindowKind.DYNAMIC), key=lambda at: len(windows[at])))],
-                         ids=('one pose', 'two poses', 'a blow in motion'))
+@pytest.mark.parametrize(
+    'spoil',
+    [
+        lambda windows: leaned(windows, numbers(windows, WindowKind.STATIC)[5:6]),
+        lambda windows: leaned(windows, numbers(windows, WindowKind.STATIC)[4:9:4]),
+        lambda windows: struck(
+            windows, max(numbers(windows, WindowKind.DYNAMIC), key=lambda at: len(windows[at]))
+        ),
+    ],
+    ids=('one pose', 'two poses', 'a blow in motion'),
+)
 def test_what_others_contradict_costs_nothing(session, spoil):
     """Biases stay as good and as certain as without it; the fit that believes all windows is ten times as uncertain of poses."""
-    clean, spoilt = solve(accumulated(session.windows), MODEL), solve(accumulated(spoil(session.windows)), MODEL)
+    clean, spoilt = (
+        solve(accumulated(session.windows), MODEL),
+        solve(accumulated(spoil(session.windows)), MODEL),
+    )
     part = MODEL.slices['accelerometer', 'bias']
     assert len(spoilt.noise['accelerometer'].left_out) >= 1
     assert not spoilt.noise['gyroscope'].left_out
@@ -83,7 +110,10 @@ def test_what_others_contradict_costs_nothing(session, spoil):
 def test_what_is_frequent_is_how_the_recording_is(session):
     """A quarter of all poses read otherwise are no outliers: they widen the standard deviations."""
     some = numbers(session.windows, WindowKind.STATIC)[::4]
-    found, part = solve(accumulated(leaned(session.windows, some)), MODEL), MODEL.slices['accelerometer', 'bias']
+    found, part = (
+        solve(accumulated(leaned(session.windows, some)), MODEL),
+        MODEL.slices['accelerometer', 'bias'],
+    )
     assert len(found.noise['accelerometer'].left_out) < len(some) / 2
     assert np.all(found.sd[part] > 3 * session.solution.sd[part])
 

@@ -40,7 +40,10 @@ def test_badly_scaled_columns_are_solved_where_normal_equations_fail():
     truth = np.array([1e6, 1e3, 1, 1e-3, 1e-6])
     solution = solve_linear(design, design @ truth, tuple('abcde'))
     normal = np.linalg.solve(design.T @ design, design.T @ (design @ truth))
-    error, normal_error = np.max(np.abs(solution.values / truth - 1)), np.max(np.abs(normal / truth - 1))
+    error, normal_error = (
+        np.max(np.abs(solution.values / truth - 1)),
+        np.max(np.abs(normal / truth - 1)),
+    )
     print(f'scaled SVD relative error {error:.1e}, normal equations {normal_error:.1e}')
     assert error < 1e-10 < normal_error
 
@@ -49,7 +52,9 @@ def test_covariance_equals_the_inverse_normal_matrix_and_the_weights_enter():
     rng = np.random.default_rng(2)
     design, weights = vandermonde(rng), rng.uniform(0.5, 4, 12)
     solution = solve_linear(design, rng.normal(size=12), NAMES, weights=weights)
-    np.testing.assert_allclose(solution.unit_covariance, np.linalg.inv(design.T @ (weights[:, None] * design)), rtol=1e-11)
+    np.testing.assert_allclose(
+        solution.unit_covariance, np.linalg.inv(design.T @ (weights[:, None] * design)), rtol=1e-11
+    )
     np.testing.assert_allclose(design.T @ (weights * solution.residuals), 0, atol=1e-12)
     np.testing.assert_allclose(predicted_sd(design, weights), solution.unit_sd, rtol=1e-12)
 
@@ -66,14 +71,23 @@ def test_reported_sd_is_the_scatter_over_many_draws():
 def test_units_of_a_parameter_do_not_change_eqcond_or_the_fit():
     rng = np.random.default_rng(4)
     design, outputs, units = vandermonde(rng), rng.normal(size=12), np.array([1, 1e5, 1e-7])
-    plain, scaled = solve_linear(design, outputs, NAMES), solve_linear(design * units, outputs, NAMES)
+    plain, scaled = (
+        solve_linear(design, outputs, NAMES),
+        solve_linear(design * units, outputs, NAMES),
+    )
     np.testing.assert_allclose(scaled.values * units, plain.values, rtol=1e-12)
     assert scaled.eqcond == pytest.approx(plain.eqcond, rel=1e-12)
     assert scaled.cond > 1e10 * plain.cond
 
 
-@pytest.mark.parametrize('column, expected', [
-    (np.zeros(12), {'curve'}), (np.sin(np.pi * np.arange(12)), {'curve'}), (None, {'slope', 'curve'})])
+@pytest.mark.parametrize(
+    'column, expected',
+    [
+        (np.zeros(12), {'curve'}),
+        (np.sin(np.pi * np.arange(12)), {'curve'}),
+        (None, {'slope', 'curve'}),
+    ],
+)
 def test_singular_design_is_refused_by_parameter_name(column, expected):
     rng = np.random.default_rng(5)
     design = vandermonde(rng)
@@ -98,12 +112,15 @@ def test_too_few_rows_and_an_empty_design_are_refused():
     assert null_directions(np.eye(3), NAMES) == []
 
 
-@pytest.mark.parametrize('design, outputs, weights', [
-    (np.ones((3, 2)), np.ones(3), None),
-    (np.eye(3), np.ones(4), None),
-    (np.eye(3), np.ones(3), [1, -1, 1]),
-    (np.diag([1, np.nan, 1]), np.ones(3), None),
-])
+@pytest.mark.parametrize(
+    'design, outputs, weights',
+    [
+        (np.ones((3, 2)), np.ones(3), None),
+        (np.eye(3), np.ones(4), None),
+        (np.eye(3), np.ones(3), [1, -1, 1]),
+        (np.diag([1, np.nan, 1]), np.ones(3), None),
+    ],
+)
 def test_wrong_input_is_refused(design, outputs, weights):
     with pytest.raises(InputError):
         solve_linear(design, outputs, NAMES, weights=weights)
@@ -124,6 +141,11 @@ def test_tolerance_scaling_of_design_and_covariance_agree():
     design, tolerances = vandermonde(rng), np.array([0.1, 2.0, 0.5])
     covariance = 0.3**2 * solve_linear(design, np.ones(12), NAMES).unit_covariance
     by_design = tolerance_scaled(design, tolerances, 0.3)
-    np.testing.assert_allclose(tolerance_scaled_singular_values(np.linalg.inv(covariance), tolerances), by_design.singular_values,
-                               rtol=1e-9)
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)) / tolerances, by_design.sd_over_tolerance, rtol=1e-10)
+    np.testing.assert_allclose(
+        tolerance_scaled_singular_values(np.linalg.inv(covariance), tolerances),
+        by_design.singular_values,
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(covariance)) / tolerances, by_design.sd_over_tolerance, rtol=1e-10
+    )

@@ -25,9 +25,19 @@ from worlds.physics import make_session
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
-                                       {'name': 'inner', 'axis': [1, 0, 0]}],
-                            'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'outer', 'axis': [0, 0, 1]},
+            {'name': 'middle', 'axis': [0, 1, 0]},
+            {'name': 'inner', 'axis': [1, 0, 0]},
+        ],
+        'up': [0, 0, 1],
+        'latitude': 48.8,
+        'height': 150.0,
+        'azimuth_deg': 0.0,
+    }
+)
 MODEL = SensorModel()
 SENSORS = ('accelerometer', 'gyroscope')
 SDS = {'accelerometer': 0.01, 'gyroscope': 0.001}
@@ -42,7 +52,10 @@ def motion():
     imu, joints, _ = simulate(MODEL, MODEL.start(), TABLE, profile=profile, options=options, seed=0)
     gatherer = MotionGatherer(TABLE)
     windows = gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()
-    return [(window, {s: columns(References(MODEL, TABLE, window.motion), s) for s in SENSORS}) for window in windows]
+    return [
+        (window, {s: columns(References(MODEL, TABLE, window.motion), s) for s in SENSORS})
+        for window in windows
+    ]
 
 
 def recordings(motion, values, steps, rng):
@@ -51,40 +64,65 @@ def recordings(motion, values, steps, rng):
     for session, step in enumerate(steps):
         part = Accumulator()
         for window, designs in motion:
-            outputs = [designs[s] @ coefficients(MODEL, s, values) + step[s] + rng.normal(0, SDS[s],
-                                                                                          (len(window.time), 3)) for s in SENSORS]
+            outputs = [
+                designs[s] @ coefficients(MODEL, s, values)
+                + step[s]
+                + rng.normal(0, SDS[s], (len(window.time), 3))
+                for s in SENSORS
+            ]
             measured = Window(**{**vars(window), 'force_s': outputs[0], 'rate_s': outputs[1]})
-            part.add(*reduce_windows([measured], MODEL, TABLE, session=session,
-                                     column_function=lambda references, sensor, known=designs: known[sensor]))
+            part.add(
+                *reduce_windows(
+                    [measured],
+                    MODEL,
+                    TABLE,
+                    session=session,
+                    column_function=lambda references, sensor, known=designs: known[sensor],
+                )
+            )
         total.merge(part)
     return total
 
 
 def bias_sds(motion):
     """Return the standard deviation of the biases of one recording alone, (3,) per sensor."""
-    alone = solve(recordings(motion, MODEL.start(), [{s: np.zeros(3) for s in SENSORS}], np.random.default_rng(3)), MODEL)
+    alone = solve(
+        recordings(
+            motion, MODEL.start(), [{s: np.zeros(3) for s in SENSORS}], np.random.default_rng(3)
+        ),
+        MODEL,
+    )
     return {s: alone.sd[MODEL.slices[s, 'bias']] for s in SENSORS}
 
 
 def test_biases_that_differ_get_a_value_each(motion):
     """Steps of five standard deviations between two recordings are found, and each recording's bias comes out."""
     sds, values = bias_sds(motion), random_values(MODEL, 'industrial', 1)
-    steps = [{s: sign * 2.5 * np.sqrt(2) * sds[s] * np.array([1, -1, 1]) for s in SENSORS} for sign in (1, -1)]
+    steps = [
+        {s: sign * 2.5 * np.sqrt(2) * sds[s] * np.array([1, -1, 1]) for s in SENSORS}
+        for sign in (1, -1)
+    ]
     solution = solve(recordings(motion, values, steps, np.random.default_rng(0)), MODEL)
     for sensor in SENSORS:
         part = MODEL.slices[sensor, 'bias']
         assert solution.noise[sensor].session_sd > 0
         error = solution.session_biases[sensor] - [values[part] + step[sensor] for step in steps]
         assert np.max(np.abs(error) / sds[sensor]) < 4.5
-        assert np.all(solution.sd[part] > 2 * sds[sensor]), 'the mean of two biases is no better known than they agree'
+        assert np.all(solution.sd[part] > 2 * sds[sensor]), (
+            'the mean of two biases is no better known than they agree'
+        )
 
 
 def test_biases_that_agree_stay_one(motion):
     """Without steps, eight pairs of recordings are taken as one, and the bias is known better than from one alone."""
     sds = bias_sds(motion)
     for seed in range(8):
-        system = recordings(motion, random_values(MODEL, 'industrial', seed), [{s: np.zeros(3) for s in SENSORS}] * 2,
-                            np.random.default_rng([seed, 1]))
+        system = recordings(
+            motion,
+            random_values(MODEL, 'industrial', seed),
+            [{s: np.zeros(3) for s in SENSORS}] * 2,
+            np.random.default_rng([seed, 1]),
+        )
         solution = solve(system, MODEL)
         for sensor in SENSORS:
             assert solution.noise[sensor].session_sd == 0.0
@@ -106,8 +144,10 @@ def test_standard_deviations_hold_when_biases_differ(motion):
         steps = [{s: rng.normal(0, 5 * sds[s].mean(), 3) for s in SENSORS} for _ in range(4)]
         solution = solve(recordings(motion, values, steps, rng), MODEL)
         errors.append((solution.values - values) / solution.sd)
-    square = np.array(errors)**2
-    biases = np.concatenate([np.arange(len(MODEL.param_names))[MODEL.slices[s, 'bias']] for s in SENSORS])
+    square = np.array(errors) ** 2
+    biases = np.concatenate(
+        [np.arange(len(MODEL.param_names))[MODEL.slices[s, 'bias']] for s in SENSORS]
+    )
     assert 0.6 < square[:, biases].mean() < 1.5
     assert 0.8 < np.delete(square, biases, axis=1).mean() < 1.2
 
@@ -116,17 +156,29 @@ def test_standard_deviations_hold_when_biases_differ(motion):
 def test_what_a_smaller_recording_shows_is_taken_in():
     """Long rests show no delay; two minutes of motion with the same IMU and a driver that is 12 ms late do."""
     pair = make_pair('driver_lag', 31)
-    resting = make_session(63, noise='realistic', grade='industrial', profile='static_only', unit=31)
+    resting = make_session(
+        63, noise='realistic', grade='industrial', profile='static_only', unit=31
+    )
     table = Table.from_mapping(pair.table)
     found = imu_calibration.calibrate([pair.first.block, resting.block], table)
     assert 'time_offset' in found.calibration.statistics['added']
-    assert float(found.calibration.value('reference', 'time_offset')) == pytest.approx(0.012, abs=1e-3)
-    sizes = [sum(found.result.gathered.accumulator.samples[kind] for kind in kinds) for kinds in (('static',), ('spin', 'dynamic'))]
+    assert float(found.calibration.value('reference', 'time_offset')) == pytest.approx(
+        0.012, abs=1e-3
+    )
+    sizes = [
+        sum(found.result.gathered.accumulator.samples[kind] for kind in kinds)
+        for kinds in (('static',), ('spin', 'dynamic'))
+    ]
     assert sizes[0] > sizes[1], 'the recording of rests is the largest'
 
 
 def test_what_other_recordings_name_comes_once_and_beside_what_the_largest_names():
     def found(*named):
-        return SimpleNamespace(adopted=[SimpleNamespace(effect=SimpleNamespace(key=('gyroscope', name))) for name in named])
+        return SimpleNamespace(
+            adopted=[
+                SimpleNamespace(effect=SimpleNamespace(key=('gyroscope', name))) for name in named
+            ]
+        )
+
     more = _named_elsewhere(found('a'), [found('a', 'b'), found('b', 'c')])
     assert [question.effect.key[1] for question in more] == ['b', 'c']

@@ -10,7 +10,12 @@ from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import accumulator as accumulator_module
 from imu_calibration.estimation.accumulator import Accumulator, restrict
-from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, NO_BIAS, CosineScores, errors_of_waves
+from imu_calibration.estimation.model_error import (
+    MIN_SCATTER_BLOCKS,
+    NO_BIAS,
+    CosineScores,
+    errors_of_waves,
+)
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
@@ -37,8 +42,10 @@ def measured(windows, change_of, seed):
     for window in windows:
         values = MODEL.start()
         values[MODEL.param_names.index(YAW)] += change_of(window.time.mean() / end)
-        outputs = [out + rng.normal(0, sd, (len(window.time), 3)) for out,
-                   sd in zip(predict(MODEL, values, TABLE, motion=window.motion), (2e-2, 2e-3))]
+        outputs = [
+            out + rng.normal(0, sd, (len(window.time), 3))
+            for out, sd in zip(predict(MODEL, values, TABLE, motion=window.motion), (2e-2, 2e-3))
+        ]
         found.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
     return found
 
@@ -63,7 +70,9 @@ def grown(solution):
 
 def test_clean_sessions_stay_as_they_are(windows):
     """Where the model holds nothing is wider, but by the chance that the tests leave."""
-    ratios = np.array([grown(solved(measured(windows, lambda share: 0.0, seed))) for seed in range(12)])
+    ratios = np.array(
+        [grown(solved(measured(windows, lambda share: 0.0, seed))) for seed in range(12)]
+    )
     assert np.median(ratios) == 1.0
     assert np.quantile(ratios, 0.95) < 1.3
 
@@ -72,7 +81,9 @@ def test_a_parameter_that_drifts_has_a_standard_deviation_that_repeats(windows):
     """A cross term that walks by 2e-3 during the session is not known to 2e-5; what is another sensor's stays."""
     rng = np.random.default_rng(3)
     walk = np.cumsum(rng.normal(0, 1, 50)) * 2e-3 / np.sqrt(50)
-    found = solved(measured(windows, lambda share: np.interp(share, np.linspace(0, 1, 50), walk), 1))
+    found = solved(
+        measured(windows, lambda share: np.interp(share, np.linspace(0, 1, 50), walk), 1)
+    )
     place = MODEL.param_names.index(YAW)
     assert base_sd(found)[place] < 1e-4
     assert 3e-4 < found.sd[place] < 6e-3
@@ -83,15 +94,23 @@ def test_a_parameter_that_drifts_has_a_standard_deviation_that_repeats(windows):
 def test_errors_that_go_with_the_motion_are_in_the_standard_deviations(cause):
     """With noise alone the errors of matrices are many standard deviations; with what the blocks show they are as large as they should be."""
     errors = [errors_in_sd(calibrated(make_pair(cause, seed).first)) for seed in (21, 22)]
-    alone, with_it = (np.concatenate([error[what, group] for error in errors for group in ('accelerometer.matrix', 'gyroscope.matrix')])
-                      for what in ('noise alone', 'reported'))
+    alone, with_it = (
+        np.concatenate(
+            [
+                error[what, group]
+                for error in errors
+                for group in ('accelerometer.matrix', 'gyroscope.matrix')
+            ]
+        )
+        for what in ('noise alone', 'reported')
+    )
     assert np.sqrt(np.mean(alone**2)) > 3.0
     assert np.sqrt(np.mean(with_it**2)) < 1.7
 
 
 def test_few_blocks_say_nothing(windows):
     """Scatter of fewer blocks than it takes is not looked at."""
-    few = solved(measured(windows, lambda share: 0.01 * share, 1)[:MIN_SCATTER_BLOCKS - 1])
+    few = solved(measured(windows, lambda share: 0.01 * share, 1)[: MIN_SCATTER_BLOCKS - 1])
     assert np.all(grown(few) == 1.0)
 
 
@@ -104,8 +123,14 @@ def test_blocks_are_bounded_and_hold_all_rows(windows, monkeypatch):
     narrow = SensorModel(accelerometer=('bias', 'matrix'), joint_names=MODEL.joint_names)
     for found in (total, restrict(total, MODEL, narrow)):
         for key, factor in found.within.items():
-            parts = sum(block.within[key].T @ block.within[key] for block in found.blocks if key in block.within)
-            np.testing.assert_allclose(parts, factor.T @ factor, rtol=1e-9, atol=1e-9 * np.max(factor.T @ factor))
+            parts = sum(
+                block.within[key].T @ block.within[key]
+                for block in found.blocks
+                if key in block.within
+            )
+            np.testing.assert_allclose(
+                parts, factor.T @ factor, rtol=1e-9, atol=1e-9 * np.max(factor.T @ factor)
+            )
 
 
 def test_blocks_hold_all_rows_when_means_are_joined(windows, monkeypatch):
@@ -113,8 +138,12 @@ def test_blocks_hold_all_rows_when_means_are_joined(windows, monkeypatch):
     monkeypatch.setattr(accumulator_module, 'MAX_MEAN_ROWS', 20)
     total = accumulated(windows)
     key = ('gyroscope', 'static')
-    parts = sum(block.within[key].T @ block.within[key] for block in total.blocks if key in block.within)
-    np.testing.assert_allclose(parts, total.within[key].T @ total.within[key], rtol=1e-9, atol=1e-9 * np.max(parts))
+    parts = sum(
+        block.within[key].T @ block.within[key] for block in total.blocks if key in block.within
+    )
+    np.testing.assert_allclose(
+        parts, total.within[key].T @ total.within[key], rtol=1e-9, atol=1e-9 * np.max(parts)
+    )
 
 
 def test_copies_and_merged_systems_go_their_own_way(windows):
@@ -126,7 +155,11 @@ def test_copies_and_merged_systems_go_their_own_way(windows):
     first.block_length = 20
     first.add(reduce_windows(windows[9:10], MODEL, TABLE)[0])
     assert sum(block.windows for block in first.blocks) == 10
-    assert [block.windows for block in total.blocks] == before == [block.windows for block in twin.blocks]
+    assert (
+        [block.windows for block in total.blocks]
+        == before
+        == [block.windows for block in twin.blocks]
+    )
 
 
 def test_blocks_survive_a_restart(windows):
@@ -153,14 +186,23 @@ def test_accumulators_of_one_recording_share_its_memory(windows, monkeypatch):
 def test_biases_carry_what_goes_with_the_attitude_as_offsets_or_as_a_bias_too_fast_to_be_one():
     """A flexible mount is even in the attitude: the mean of what it adds is as large as its scatter, which the noise takes for a process of 6 s here."""
     found = calibrated(make_pair('flexible_mount', 9313).first)
-    noise, part = found.solution.noise['accelerometer'], found.solution.model.slices['accelerometer', 'bias']
-    assert any(process.time < NO_BIAS and process.sd > 2 * noise.offset_sd for process in noise.bias_processes)
-    error = (found.solution.values[part] - found.truth['accelerometer'].bias) / found.solution.sd[part]
+    noise, part = (
+        found.solution.noise['accelerometer'],
+        found.solution.model.slices['accelerometer', 'bias'],
+    )
+    assert any(
+        process.time < NO_BIAS and process.sd > 2 * noise.offset_sd
+        for process in noise.bias_processes
+    )
+    error = (found.solution.values[part] - found.truth['accelerometer'].bias) / found.solution.sd[
+        part
+    ]
     assert np.abs(error).max() < 2.0
 
 
 def test_a_drift_shows_beside_noise_that_was_taken_too_large():
     """Ripple that is fast and not white is taken for noise; a drift of 1.7 such deviations counts where the fast cosines scatter by a third of one, and not by all."""
+
     def waves(fast):
         rng = np.random.default_rng(5)
         moved = fast * rng.choice([-1.0, 1.0], (12, 3))
@@ -176,7 +218,9 @@ def test_parts_that_ask_for_more_than_noise_explains_widen_by_half_more_than_the
     """Twelve cosines, each of two sds: the excess of three variances counts 1.5 times."""
     moved = 2.0 * np.random.default_rng(6).choice([-1.0, 1.0], (12, 3))
     own = SensorModel().slices['gyroscope', 'bias']
-    waves = CosineScores(np.arange(own.start, own.stop), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3))
+    waves = CosineScores(
+        np.arange(own.start, own.stop), moved, np.tile(np.eye(3), (12, 1, 1)), covariance=np.eye(3)
+    )
     found, misfits = errors_of_waves(waves, SensorModel())
     assert misfits == {'gyroscope'}
     np.testing.assert_allclose(found.factor[own], np.sqrt(1 + 1.5 * 3))

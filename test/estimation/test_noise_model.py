@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from imu_calibration.core.samples import rounding_variance
-from imu_calibration.estimation.noise_model import BiasProcess, MovingFactors, NoiseModel, ReferenceNoise, dof_factor
+from imu_calibration.estimation.noise_model import (
+    BiasProcess,
+    MovingFactors,
+    NoiseModel,
+    ReferenceNoise,
+    dof_factor,
+)
 from imu_calibration.estimation.session_noise import least_misfit, misfit_along, white_noise
 from imu_calibration.selection.saturation import noise_at_rest
 from imu_calibration.simulation.sensor_noise import gauss_markov
@@ -14,14 +20,22 @@ from imu_calibration.simulation.sensor_noise import gauss_markov
 
 def rest(variance, inflation=1.0, count=1000):
     """Statistics of a static window."""
-    sensor = SimpleNamespace(noise_variance=np.full(3, variance), inflation=np.full(3, inflation), mean=np.ones(6))
+    sensor = SimpleNamespace(
+        noise_variance=np.full(3, variance), inflation=np.full(3, inflation), mean=np.ones(6)
+    )
     return SimpleNamespace(kind='static', sensors={'gyroscope': sensor}, count=count)
 
 
 def test_means_scatter_by_the_noise_at_low_frequency_over_their_number():
     """Var(mean) = white * inflation / n, times what moving windows scatter beyond."""
-    noise = NoiseModel(np.full(3, 4.0), np.full(3, 2.5), moving={'spin': MovingFactors(*[np.ones(3)] * 2, means=np.full(3, 3.0))})
-    np.testing.assert_allclose(noise.mean_variance(['static', 'spin'], np.array([100, 50])), [[0.1] * 3, [0.6] * 3])
+    noise = NoiseModel(
+        np.full(3, 4.0),
+        np.full(3, 2.5),
+        moving={'spin': MovingFactors(*[np.ones(3)] * 2, means=np.full(3, 3.0))},
+    )
+    np.testing.assert_allclose(
+        noise.mean_variance(['static', 'spin'], np.array([100, 50])), [[0.1] * 3, [0.6] * 3]
+    )
     np.testing.assert_allclose(noise.row_variance('static'), 10.0)
 
 
@@ -38,8 +52,13 @@ def test_a_code_that_is_constant_at_rest_has_the_noise_of_rounding():
     white, _ = white_noise([rest(0.0), rest(0.0), moving], 'gyroscope')
     np.testing.assert_allclose(white, 0.08**2 / 12, rtol=1e-9)
     np.testing.assert_array_equal(rounding_variance(np.ones((5, 2))), 0.0)
-    still, turning = (SimpleNamespace(kind=kind, time=np.arange(len(rate)), rate_s=rate) for kind, rate in
-                      (('static', np.ones((20, 3))), ('dynamic', 0.08 * np.repeat(np.arange(30.0)[:, None], 3, axis=1))))
+    still, turning = (
+        SimpleNamespace(kind=kind, time=np.arange(len(rate)), rate_s=rate)
+        for kind, rate in (
+            ('static', np.ones((20, 3))),
+            ('dynamic', 0.08 * np.repeat(np.arange(30.0)[:, None], 3, axis=1)),
+        )
+    )
     np.testing.assert_allclose(noise_at_rest([still, turning], 'gyroscope'), 0.08 / np.sqrt(12))
 
 
@@ -55,7 +74,11 @@ def test_misfit_along_the_columns_shows_how_correlated_it_is(smooth, least, most
     for _ in range(60):
         time = np.linspace(0, 1, 200)
         design = np.column_stack([np.cos(np.pi * k * time) for k in range(4)])
-        misfit = np.cos(np.pi * rng.uniform(0, 3) * time + rng.uniform(0, 6)) * np.sqrt(2) if smooth else rng.normal(size=200)
+        misfit = (
+            np.cos(np.pi * rng.uniform(0, 3) * time + rng.uniform(0, 6)) * np.sqrt(2)
+            if smooth
+            else rng.normal(size=200)
+        )
         rows = np.column_stack([design, misfit])
         products.append(rows.T @ rows)
     squares, dimensions = misfit_along(np.array(products))
@@ -81,7 +104,11 @@ def test_a_mean_over_a_window_differs_from_the_bias_in_its_middle_by_what_it_wan
     noise = NoiseModel(np.zeros(3), np.ones(3), bias_processes=(process,))
     for count in (41, 161):
         drawn = (bias[:count].mean(axis=0) - bias[count // 2]).var()
-        np.testing.assert_allclose(noise.variance_beside_bias(['dynamic'], [count], np.array([0.1 * count])), drawn, rtol=0.1)
+        np.testing.assert_allclose(
+            noise.variance_beside_bias(['dynamic'], [count], np.array([0.1 * count])),
+            drawn,
+            rtol=0.1,
+        )
 
 
 def test_angles_that_are_read_in_steps_tilt_gravity_at_rest_and_not_in_motion():
@@ -90,7 +117,13 @@ def test_angles_that_are_read_in_steps_tilt_gravity_at_rest_and_not_in_motion():
     axes, gravity = rng.normal(size=(2, 20000, 3))
     axes, gravity = (rows / np.linalg.norm(rows, axis=1)[:, None] for rows in (axes, gravity))
     seen = 9.80665 * np.cross(rng.uniform(-0.5e-3, 0.5e-3, 20000)[:, None] * axes, gravity)
-    still, moving = ReferenceNoise.of_steps(1e-3, 'accelerometer').variance(['static', 'spin'], np.full(2, 5.0))
+    still, moving = ReferenceNoise.of_steps(1e-3, 'accelerometer').variance(
+        ['static', 'spin'], np.full(2, 5.0)
+    )
     # all directions are alike here; a joint's axis across gravity, as tables have them, turns half as much again into two components
     assert seen.var() < still < 4 * seen.var() and moving == 0.0
-    assert not ReferenceNoise.of_steps(0.0, 'gyroscope').variance(['static', 'spin'], np.full(2, 5.0)).any()
+    assert (
+        not ReferenceNoise.of_steps(0.0, 'gyroscope')
+        .variance(['static', 'spin'], np.full(2, 5.0))
+        .any()
+    )

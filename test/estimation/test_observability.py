@@ -22,9 +22,15 @@ from imu_calibration.estimation.weighted_system import make_prior
 GRAVITY = 9.81
 MODEL = SensorModel()
 NAMES = list(MODEL.param_names)
-NOISE = {sensor: NoiseModel(np.array([1.0, 4.0, 9.0]) * variance, np.full(3, 2.0), 1e-4,
-                            (BiasProcess(2e-4, 100.0), BiasProcess(1e-4, 10.0)))
-         for sensor, variance in (('accelerometer', 1e-4), ('gyroscope', 1e-6))}
+NOISE = {
+    sensor: NoiseModel(
+        np.array([1.0, 4.0, 9.0]) * variance,
+        np.full(3, 2.0),
+        1e-4,
+        (BiasProcess(2e-4, 100.0), BiasProcess(1e-4, 10.0)),
+    )
+    for sensor, variance in (('accelerometer', 1e-4), ('gyroscope', 1e-6))
+}
 BY_NAME = {motion.name: motion for motion in MOTIONS}
 
 
@@ -38,11 +44,18 @@ def test_a_rest_adds_what_means_of_five_seconds_say():
     for axis in range(3):
         noise = NOISE['accelerometer']
         variance = 2.0 * noise.white_variance[axis] / 500 + 1e-8 + 4e-8 + 1e-8
-        bias, scale = NAMES.index(f'accelerometer.bias.{"xyz"[axis]}'), NAMES.index(f'accelerometer.matrix.{"xyz"[axis] * 2}')
+        bias, scale = (
+            NAMES.index(f'accelerometer.bias.{"xyz"[axis]}'),
+            NAMES.index(f'accelerometer.matrix.{"xyz"[axis] * 2}'),
+        )
         forces = np.array([piece.force_s[0, axis] for piece in pieces])
         np.testing.assert_allclose(information[bias, bias], len(pieces) / variance, rtol=1e-9)
-        np.testing.assert_allclose(information[scale, scale], (forces**2).sum() / variance, rtol=1e-9)
-        np.testing.assert_allclose(information[bias, scale], forces.sum() / variance, rtol=1e-9, atol=1e-3)
+        np.testing.assert_allclose(
+            information[scale, scale], (forces**2).sum() / variance, rtol=1e-9
+        )
+        np.testing.assert_allclose(
+            information[bias, scale], forces.sum() / variance, rtol=1e-9, atol=1e-3
+        )
 
 
 def test_a_rest_says_nothing_of_the_gyroscopes_scale_and_a_spin_about_an_axis_that_of_its_column():
@@ -58,7 +71,10 @@ def test_samples_in_motion_count_beside_their_mean():
     noise = {s: replace(n, offset_sd=1e3) for s, n in NOISE.items()}
     place = NAMES.index('gyroscope.matrix.zz')
     pieces = BY_NAME['oscillate_z'].make(GRAVITY)
-    within = sum(2.0 * ((piece.rate_s[:, 2] - piece.rate_s[:, 2].mean())**2).sum() for piece in pieces) / NOISE['gyroscope'].low_variance[2]
+    within = (
+        sum(2.0 * ((piece.rate_s[:, 2] - piece.rate_s[:, 2].mean()) ** 2).sum() for piece in pieces)
+        / NOISE['gyroscope'].low_variance[2]
+    )
     np.testing.assert_allclose(added('oscillate_z', noise=noise)[place, place], within, rtol=1e-6)
     assert within > 0.5 * added('oscillate_z')[place, place]
 
@@ -71,19 +87,41 @@ def test_singular_values_are_tolerances_over_standard_deviations():
 
 def test_a_weak_direction_names_its_members_although_each_information_entry_is_large():
     """Two parameters whose difference is unknown: full rank, each sd three tolerances."""
-    tolerances, sum_, difference = np.array([1e-3, 1e-2, 1.0]), np.array([1, 1, 0]) / np.sqrt(2), np.array([1, -1, 0]) / np.sqrt(2)
-    scaled = 0.01 * np.outer(sum_, sum_) + 9.0 * np.outer(difference, difference) + np.diag([0, 0, 0.5])
+    tolerances, sum_, difference = (
+        np.array([1e-3, 1e-2, 1.0]),
+        np.array([1, 1, 0]) / np.sqrt(2),
+        np.array([1, -1, 0]) / np.sqrt(2),
+    )
+    scaled = (
+        0.01 * np.outer(sum_, sum_) + 9.0 * np.outer(difference, difference) + np.diag([0, 0, 0.5])
+    )
     found = weak_directions(scaled * np.outer(tolerances, tolerances), tolerances, ('a', 'b', 'c'))
     assert len(found) == 1 and set(found[0]) == {'a', 'b'}
-    assert found[0]['a'] == pytest.approx(-found[0]['b'], abs=1e-3) and abs(found[0]['a']) == pytest.approx(np.sqrt(0.5), abs=1e-3)
-    assert weak_directions(0.1 * scaled * np.outer(tolerances, tolerances), tolerances, ('a', 'b', 'c')) == []
+    assert found[0]['a'] == pytest.approx(-found[0]['b'], abs=1e-3) and abs(
+        found[0]['a']
+    ) == pytest.approx(np.sqrt(0.5), abs=1e-3)
+    assert (
+        weak_directions(
+            0.1 * scaled * np.outer(tolerances, tolerances), tolerances, ('a', 'b', 'c')
+        )
+        == []
+    )
 
 
 def solution(information, model=MODEL):
     """Return a Solution with this information of the data and the prior's."""
     sd = make_prior(model).sd
     covariance = np.linalg.inv(information + np.diag(sd**-2.0))
-    return Solution(model, model.start(), {'noise': covariance}, np.zeros(len(sd), bool), NOISE, {}, information, {})
+    return Solution(
+        model,
+        model.start(),
+        {'noise': covariance},
+        np.zeros(len(sd), bool),
+        NOISE,
+        {},
+        information,
+        {},
+    )
 
 
 def test_the_motion_that_is_needed_is_the_one_that_helps_most_with_the_sd_it_will_have():
@@ -101,19 +139,39 @@ def test_the_motion_that_is_needed_is_the_one_that_helps_most_with_the_sd_it_wil
 
 
 def test_nothing_is_needed_where_everything_is_determined():
-    assert needed_motions(solution(added('three_speeds') + added('static_poses')), np.full(len(NAMES), np.inf), GRAVITY,
-                          prior_sd=make_prior(MODEL).sd) == {}
+    assert (
+        needed_motions(
+            solution(added('three_speeds') + added('static_poses')),
+            np.full(len(NAMES), np.inf),
+            GRAVITY,
+            prior_sd=make_prior(MODEL).sd,
+        )
+        == {}
+    )
 
 
 def test_where_no_motion_of_the_sensor_helps_that_of_the_table_is_named():
     model = SensorModel(reference=('table_tilt',))
     tolerances = np.where(['table_tilt' in name for name in model.param_names], 1e-9, np.inf)
-    needed = needed_motions(solution(added('static_poses', model), model), tolerances, GRAVITY, prior_sd=make_prior(model).sd)
+    needed = needed_motions(
+        solution(added('static_poses', model), model),
+        tolerances,
+        GRAVITY,
+        prior_sd=make_prior(model).sd,
+    )
     assert {text for text, _ in needed.values()} == {TABLE_MOTIONS['turn_about_vertical']}
     assert all(np.isnan(sd) for _, sd in needed.values())
 
 
 def test_standard_motions_are_what_they_say():
     spin = BY_NAME['spin_z'].make(GRAVITY)
-    assert sorted({round(float(piece.rate_s[0, 2] / DEG)) for piece in spin}) == [-200, -100, 100, 200]
-    assert all(np.linalg.norm(piece.force_s[0]) == pytest.approx(GRAVITY) for piece in BY_NAME['static_dense'].make(GRAVITY))
+    assert sorted({round(float(piece.rate_s[0, 2] / DEG)) for piece in spin}) == [
+        -200,
+        -100,
+        100,
+        200,
+    ]
+    assert all(
+        np.linalg.norm(piece.force_s[0]) == pytest.approx(GRAVITY)
+        for piece in BY_NAME['static_dense'].make(GRAVITY)
+    )

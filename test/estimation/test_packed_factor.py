@@ -15,4 +15,4 @@ def test_packed_factors_come_back_bit_by_bit():
     assert together.shape == (4, 7, 7)
     for factor, each, padded in zip(factors, every, together):
         assert np.array_equal(unpacked([each], 7)[0], factor)
-        assert np.array_equal(padded[:len(factor)], factor) and not padded[len(factor):].any()
+        assert np.array_equal(padded[: len(factor)], factor) and not padded[len(factor) :].any()

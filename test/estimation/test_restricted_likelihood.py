@@ -7,7 +7,12 @@ from imu_calibration.estimation import scaled_solve
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, dof_factor
 from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.scaled_solve import triangular, triangular_of_band
-from imu_calibration.estimation.whitening import RestrictedLikelihood, Whitening, predict_session_offsets, profile
+from imu_calibration.estimation.whitening import (
+    RestrictedLikelihood,
+    Whitening,
+    predict_session_offsets,
+    profile,
+)
 
 STEP = 1.3
 """Standard deviation of the bias from recording to recording."""
@@ -16,7 +21,9 @@ STEP = 1.3
 @pytest.fixture(params=[1, 2, 3], ids='{} processes'.format)
 def processes(request):
     """Return bias processes that are far from and close to one another."""
-    return (BiasProcess(0.7, 60.0), BiasProcess(1.1, 15.0), BiasProcess(0.4, 1000.0))[:request.param]
+    return (BiasProcess(0.7, 60.0), BiasProcess(1.1, 15.0), BiasProcess(0.4, 1000.0))[
+        : request.param
+    ]
 
 
 @pytest.fixture
@@ -25,7 +32,12 @@ def rows():
     rng = np.random.default_rng(5)
     numbers = np.repeat([0, 1, 2], [9, 7, 4])
     times, variance = np.sort(rng.uniform(0, 500, 20)), rng.uniform(0.5, 2, (20, 3))
-    return rng.normal(size=(20, 3, 4)), times, variance, [np.flatnonzero(numbers == k) for k in range(3)]
+    return (
+        rng.normal(size=(20, 3, 4)),
+        times,
+        variance,
+        [np.flatnonzero(numbers == k) for k in range(3)],
+    )
 
 
 def value(likelihood, *noise):
@@ -40,14 +52,18 @@ def dense(times, variance, sessions, processes):
     for k, index in enumerate(sessions):
         number[index] = k
     steps = np.abs(times[:, None] - times)
-    kernel = (number[:, None] == number) * (sum(p.sd**2 * np.exp(-steps / p.time) for p in processes) + STEP**2)
+    kernel = (number[:, None] == number) * (
+        sum(p.sd**2 * np.exp(-steps / p.time) for p in processes) + STEP**2
+    )
     return [kernel + np.diag(variance[:, axis]) for axis in range(3)]
 
 
 def test_whitening_inverts_the_covariance(rows, processes):
     """Products of whitened rows are products weighted with the inverse covariance (to rounding)."""
     values, times, variance, sessions = rows
-    white = Whitening(variance, times, sessions, processes=processes, session_variance=STEP**2)(values)
+    white = Whitening(variance, times, sessions, processes=processes, session_variance=STEP**2)(
+        values
+    )
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
         expected = values[:, axis].T @ np.linalg.solve(covariance, values[:, axis])
         np.testing.assert_allclose(white[:, axis].T @ white[:, axis], expected, rtol=1e-10)
@@ -56,7 +72,10 @@ def test_whitening_inverts_the_covariance(rows, processes):
 def test_a_row_is_whitened_with_earlier_rows_only(rows, processes):
     """What is locked away later in time cannot reach what was whitened before it."""
     values, times, variance, _ = rows
-    whitening, spoilt = Whitening(variance, times, [np.arange(20)], processes=processes), values.copy()
+    whitening, spoilt = (
+        Whitening(variance, times, [np.arange(20)], processes=processes),
+        values.copy(),
+    )
     spoilt[12:] += 100.0
     np.testing.assert_array_equal(whitening(spoilt)[:12], whitening(values)[:12])
     assert np.all(np.abs(whitening(spoilt)[12:] - whitening(values)[12:]).max(axis=(1, 2)) > 1.0)
@@ -67,24 +86,42 @@ def test_whitening_and_its_adjoint_are_the_inverse_covariance(rows, processes):
     whitening = Whitening(variance, times, sessions, processes=processes, session_variance=STEP**2)
     found = whitening.adjoint(whitening(values))
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
-        np.testing.assert_allclose(found[:, axis], np.linalg.solve(covariance, values[:, axis]), rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(
+            found[:, axis], np.linalg.solve(covariance, values[:, axis]), rtol=1e-9, atol=1e-11
+        )
 
 
 def test_one_process_in_two_halves_is_the_same_process(rows):
     values, times, variance, sessions = rows
-    one, two = (BiasProcess(0.7, 60.0),), (BiasProcess(0.7 * 0.6, 60.0), BiasProcess(0.7 * 0.8, 60.0))
-    np.testing.assert_allclose(Whitening(variance, times, sessions, processes=one)(values),
-                               Whitening(variance, times, sessions, processes=two)(values), rtol=1e-9)
+    one, two = (
+        (BiasProcess(0.7, 60.0),),
+        (BiasProcess(0.7 * 0.6, 60.0), BiasProcess(0.7 * 0.8, 60.0)),
+    )
+    np.testing.assert_allclose(
+        Whitening(variance, times, sessions, processes=one)(values),
+        Whitening(variance, times, sessions, processes=two)(values),
+        rtol=1e-9,
+    )
 
 
 def test_likelihood_is_that_of_the_dense_covariance(rows, processes):
     """Log determinant and normal matrix in linear time equal the dense ones."""
     values, times, variance, sessions = rows
-    logs, normal = RestrictedLikelihood(values, times, sessions).whitened(variance, processes, STEP**2)
+    logs, normal = RestrictedLikelihood(values, times, sessions).whitened(
+        variance, processes, STEP**2
+    )
     matrices = dense(times, variance, sessions, processes)
-    np.testing.assert_allclose(logs, sum(np.linalg.slogdet(matrix)[1] for matrix in matrices), rtol=1e-10)
-    np.testing.assert_allclose(normal, sum(values[:, a].T @ np.linalg.solve(matrix, values[:, a]) for a, matrix in enumerate(matrices)),
-                               rtol=1e-9)
+    np.testing.assert_allclose(
+        logs, sum(np.linalg.slogdet(matrix)[1] for matrix in matrices), rtol=1e-10
+    )
+    np.testing.assert_allclose(
+        normal,
+        sum(
+            values[:, a].T @ np.linalg.solve(matrix, values[:, a])
+            for a, matrix in enumerate(matrices)
+        ),
+        rtol=1e-9,
+    )
 
 
 def test_the_restricted_likelihood_is_that_of_contrasts_free_of_the_parameters(rows, processes):
@@ -97,7 +134,7 @@ def test_the_restricted_likelihood_is_that_of_contrasts_free_of_the_parameters(r
         found.append(value(likelihood, factor * variance, processes, STEP**2))
         whole = np.zeros((60, 60))
         for axis, matrix in enumerate(dense(times, factor * variance, sessions, processes)):
-            whole[20 * axis:20 * axis + 20, 20 * axis:20 * axis + 20] = matrix
+            whole[20 * axis : 20 * axis + 20, 20 * axis : 20 * axis + 20] = matrix
         inner, rest = contrasts.T @ whole @ contrasts, contrasts.T @ values[:, :, -1].T.ravel()
         expected.append(np.linalg.slogdet(inner)[1] + rest @ np.linalg.solve(inner, rest))
     np.testing.assert_allclose(found[1] - found[0], expected[1] - expected[0], rtol=1e-8)
@@ -107,18 +144,27 @@ def test_offsets_of_sessions_are_conditional_means(rows, processes):
     """The prediction equals the regression of the offsets on the residuals."""
     values, times, variance, sessions = rows
     misfit = values[:, :, 0]
-    noise = NoiseModel(np.ones(3), np.ones(3), bias_processes=processes, session_sd=STEP, session_variance=STEP**2)
+    noise = NoiseModel(
+        np.ones(3), np.ones(3), bias_processes=processes, session_sd=STEP, session_variance=STEP**2
+    )
     found = predict_session_offsets(misfit, variance, times, sessions=sessions, noise=noise)
     for axis, covariance in enumerate(dense(times, variance, sessions, processes)):
         weighted = np.linalg.solve(covariance, misfit[:, axis])
-        np.testing.assert_allclose(found[:, axis], [STEP**2 * weighted[index].sum() for index in sessions], rtol=1e-9)
+        np.testing.assert_allclose(
+            found[:, axis], [STEP**2 * weighted[index].sum() for index in sessions], rtol=1e-9
+        )
 
 
 def test_fewer_parameters_are_fewer_columns_of_the_same_normal_matrix(rows):
     values, times, variance, sessions = rows
     shape = (0.3, 0.5, 60.0)
-    few, all_columns = (NoiseLikelihood(v, variance, times, sessions=sessions) for v in (values[:, :, [0, 2, 3]], values))
-    np.testing.assert_allclose(all_columns.loss(shape, np.array([0, 2])), few.loss(shape), rtol=1e-9)
+    few, all_columns = (
+        NoiseLikelihood(v, variance, times, sessions=sessions)
+        for v in (values[:, :, [0, 2, 3]], values)
+    )
+    np.testing.assert_allclose(
+        all_columns.loss(shape, np.array([0, 2])), few.loss(shape), rtol=1e-9
+    )
     assert all_columns.loss(shape) < all_columns.loss(shape, np.array([0, 2])) + 20
 
 
@@ -147,14 +193,21 @@ def test_scoring_is_the_derivative_of_the_likelihood(rows):
 
     at, step = np.array([0.5, 1.0, 2.0]), 1e-5 * np.eye(3)
     score, information = likelihood.scoring(variance(at), members)
-    slopes = [-0.5 * (value(likelihood, variance(at + h)) - value(likelihood, variance(at - h))) / 2e-5 for h in step]
+    slopes = [
+        -0.5 * (value(likelihood, variance(at + h)) - value(likelihood, variance(at - h))) / 2e-5
+        for h in step
+    ]
     np.testing.assert_allclose(score, slopes, rtol=1e-5)
     rng, scores = np.random.default_rng(1), []
     for _ in range(4000):
         drawn = values.copy()
         drawn[:, :, -1] = rng.normal(size=(20, 3)) * np.sqrt(variance(at))
-        scores.append(RestrictedLikelihood(drawn, times, sessions).scoring(variance(at), members)[0])
-    np.testing.assert_allclose(np.cov(np.array(scores).T), information, rtol=0.12, atol=0.03 * information.max())
+        scores.append(
+            RestrictedLikelihood(drawn, times, sessions).scoring(variance(at), members)[0]
+        )
+    np.testing.assert_allclose(
+        np.cov(np.array(scores).T), information, rtol=0.12, atol=0.03 * information.max()
+    )
 
 
 def test_factor_along_a_band_is_that_of_all_rows():
@@ -162,12 +215,14 @@ def test_factor_along_a_band_is_that_of_all_rows():
     rng, n_poses, largest = np.random.default_rng(8), 40, []
     rows = np.zeros((n_poses, 12, 5 * n_poses + 7))
     for pose in range(n_poses - 1):
-        rows[pose, :, 5 * pose:5 * pose + 10] = rng.normal(size=(12, 10))
+        rows[pose, :, 5 * pose : 5 * pose + 10] = rng.normal(size=(12, 10))
     rows[:, :, -7:] = rng.normal(size=(n_poses, 12, 7))
     rows[:, :, 30:35] = 0.0
     rows = rng.permutation(rows.reshape(-1, rows.shape[2]))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scaled_solve, 'triangular', lambda part: largest.append(part.size) or triangular(part))
+        patch.setattr(
+            scaled_solve, 'triangular', lambda part: largest.append(part.size) or triangular(part)
+        )
         factor = triangular_of_band(rows)
     np.testing.assert_allclose(factor.T @ factor, rows.T @ rows, rtol=1e-12, atol=1e-12 * n_poses)
     assert not np.tril(factor, -1).any()

@@ -5,18 +5,97 @@ import re
 import struct
 import zipfile
 
-NUMBERS = [0, 1, 2, 3, 0x7f, 0x80, 0xff, 0x7fff, 0xffff, 1 << 24, 0x7fffffff, 0x80000000, 0xffffffff, 1 << 45, (1 << 63) - 1, (1 << 64) - 1]
-TOKENS = ['nan', '.nan', 'inf', '-.inf', '1e400', '-1', '0', '9' * 400, '1' * 5000, '1:59:59', '0x10', 'null', '~', 'true', '[]', '{}', '[[]]', '{a: 1}',
-          '""', "'", '"', '&a ', '*a', '<<: ', '!!python/object:os.system ', '!!binary x', '---\n', '\n', '\r', '\t', '\0', '\x1b[2J', '\ufeff', '\u2028',
-          '\ud800', '%', '#', ': ', '- ', ',', ';', '[' * 50, '{' * 50, '<a>', '</', '<!--', '&amp;', '&x;', '<![CDATA[', '=cmd|x', '../../x', '/', 'x' * 3000,
-          '2000-99-99', '1e308', '-1e-320', 'NaN', 'Infinity', 'imu_link', 'outer']
+NUMBERS = [
+    0,
+    1,
+    2,
+    3,
+    0x7F,
+    0x80,
+    0xFF,
+    0x7FFF,
+    0xFFFF,
+    1 << 24,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFF,
+    1 << 45,
+    (1 << 63) - 1,
+    (1 << 64) - 1,
+]
+TOKENS = [
+    'nan',
+    '.nan',
+    'inf',
+    '-.inf',
+    '1e400',
+    '-1',
+    '0',
+    '9' * 400,
+    '1' * 5000,
+    '1:59:59',
+    '0x10',
+    'null',
+    '~',
+    'true',
+    '[]',
+    '{}',
+    '[[]]',
+    '{a: 1}',
+    '""',
+    "'",
+    '"',
+    '&a ',
+    '*a',
+    '<<: ',
+    '!!python/object:os.system ',
+    '!!binary x',
+    '---\n',
+    '\n',
+    '\r',
+    '\t',
+    '\0',
+    '\x1b[2J',
+    '\ufeff',
+    '\u2028',
+    '\ud800',
+    '%',
+    '#',
+    ': ',
+    '- ',
+    ',',
+    ';',
+    '[' * 50,
+    '{' * 50,
+    '<a>',
+    '</',
+    '<!--',
+    '&amp;',
+    '&x;',
+    '<![CDATA[',
+    '=cmd|x',
+    '../../x',
+    '/',
+    'x' * 3000,
+    '2000-99-99',
+    '1e308',
+    '-1e-320',
+    'NaN',
+    'Infinity',
+    'imu_link',
+    'outer',
+]
 TOKEN = re.compile(r'[^\W_][\w.+-]*|[^\w\s]')
 
 
 def mutated(data, others, rng, text=False):
     """Return the data with one to four random changes; pieces of the `others` are spliced in."""
     for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4))):
-        data = _changed_text(data, others, rng) if text and rng.random() < 0.75 else _changed_bytes(data, others, rng)
+        data = (
+            _changed_text(data, others, rng)
+            if text and rng.random() < 0.75
+            else _changed_bytes(data, others, rng)
+        )
     return data
 
 
@@ -31,9 +110,13 @@ def mutated_archive(data, others, rng):
         del members[name]
     elif kind < 0.2:
         members[name] = members[rng.choice(sorted(members))]
-    else:   # headers are text behind the first 128 bytes
+    else:  # headers are text behind the first 128 bytes
         head, body = members[name][:128], members[name][128:]
-        members[name] = mutated(head, [head], rng) + body if rng.random() < 0.3 else head + mutated(body, [body], rng, name == 'header.npy')
+        members[name] = (
+            mutated(head, [head], rng) + body
+            if rng.random() < 0.3
+            else head + mutated(body, [body], rng, name == 'header.npy')
+        )
     target = io.BytesIO()
     with zipfile.ZipFile(target, 'w') as archive:
         for name, content in members.items():
@@ -45,23 +128,23 @@ def _changed_bytes(data, others, rng):
     at, kind = rng.randrange(len(data) + 1), rng.randrange(7)
     if kind == 0 and data:
         at = min(at, len(data) - 1)
-        return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1:]
+        return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
     if kind == 1:
         number = struct.pack(rng.choice('<>') + 'Q', rng.choice(NUMBERS))
         size = rng.choice((1, 2, 4, 8))
         number = number[:size] if rng.random() < 0.5 else number[-size:]
-        return data[:at] + number + data[at + size:]
+        return data[:at] + number + data[at + size :]
     length = rng.choice((1, 4, 16, 256, 4096, len(data)))
     if kind == 2:
-        return data[:at] + data[at + length:]
+        return data[:at] + data[at + length :]
     if kind == 3:
-        return data[:at + length] + data[at:]
+        return data[: at + length] + data[at:]
     if kind == 4:
-        return data[:at] + rng.randbytes(min(length, 64)) + data[at + rng.choice((0, length)):]
+        return data[:at] + rng.randbytes(min(length, 64)) + data[at + rng.choice((0, length)) :]
     other = rng.choice(others)
     start = rng.randrange(len(other) + 1)
     if kind == 5:
-        return data[:at] + other[start:start + length] + data[at + rng.choice((0, length)):]
+        return data[:at] + other[start : start + length] + data[at + rng.choice((0, length)) :]
     return data[:at]
 
 
@@ -69,12 +152,21 @@ def _changed_text(data, others, rng):
     text = data.decode(errors='replace')
     lines = text.splitlines(keepends=True)
     if rng.random() < 0.3 and lines:
-        at, other = rng.randrange(len(lines)), rng.choice(others).decode(errors='replace').splitlines(keepends=True)
-        lines[at:at + rng.randrange(3)] = rng.choice(([], [lines[at]] * 2, [rng.choice(lines)], [rng.choice(other)] if other else []))
+        at, other = (
+            rng.randrange(len(lines)),
+            rng.choice(others).decode(errors='replace').splitlines(keepends=True),
+        )
+        lines[at : at + rng.randrange(3)] = rng.choice(
+            ([], [lines[at]] * 2, [rng.choice(lines)], [rng.choice(other)] if other else [])
+        )
         text = ''.join(lines)
     else:
         places = [found.span() for found in TOKEN.finditer(text)]
         start, end = rng.choice(places) if places else (0, 0)
         words = [text[slice(*rng.choice(places))]] if places else ['']
-        text = text[:start] + rng.choice((rng.choice(TOKENS), rng.choice(TOKENS), words[0], '')) + text[rng.choice((start, end, end, end)):]
+        text = (
+            text[:start]
+            + rng.choice((rng.choice(TOKENS), rng.choice(TOKENS), words[0], ''))
+            + text[rng.choice((start, end, end, end)) :]
+        )
     return text.encode(errors='surrogatepass')

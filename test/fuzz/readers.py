@@ -63,14 +63,23 @@ class Reader:
 def small_session(n=60):
     """Return an IMU, joints and temperatures of 0.3 s."""
     stamp_ns, wave = 1_700_000_000_000_000_000 + STEP_NS * np.arange(n), 1e-3 * np.sin(np.arange(n))
-    imu = ImuSamples(stamp_ns, np.column_stack([wave, -wave, 9.81 + wave]), np.column_stack([wave, wave, -wave]), 'imu_link')
-    return imu, JointSamples(stamp_ns, wave[:, None], wave[:, None], ('outer',)), TemperatureSamples(stamp_ns[::20], 30.0 + wave[::20])
+    imu = ImuSamples(
+        stamp_ns,
+        np.column_stack([wave, -wave, 9.81 + wave]),
+        np.column_stack([wave, wave, -wave]),
+        'imu_link',
+    )
+    return (
+        imu,
+        JointSamples(stamp_ns, wave[:, None], wave[:, None], ('outer',)),
+        TemperatureSamples(stamp_ns[::20], 30.0 + wave[::20]),
+    )
 
 
 def _bags(folder, name, suffix, **options):
     imu, joints, temperature = small_session()
     write_session(folder / name, imu, joints, temperature=temperature, **options)
-    path, = (folder / name).glob(f'*{suffix}')
+    (path,) = (folder / name).glob(f'*{suffix}')
     return path.read_bytes()
 
 
@@ -78,11 +87,18 @@ def mcap_seeds(folder):
     """Uncompressed, zstd and lz4 chunks, and a recording with a robot description."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with Writer(folder / 'described', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for topic, kind, data in (('/imu/data_raw', IMU_TYPE, encode_imu(small_session(1)[0])[0].tobytes()), *_general_messages()):
+        for topic, kind, data in (
+            ('/imu/data_raw', IMU_TYPE, encode_imu(small_session(1)[0])[0].tobytes()),
+            *_general_messages(),
+        ):
             writer.write(writer.add_connection(topic, kind, typestore=store), 1, data)
-    described, = (folder / 'described').glob('*.mcap')
-    return [_bags(folder, 'plain', '.mcap', storage='mcap', compression=''), _bags(folder, 'zstd', '.mcap', storage='mcap', compression='zstd'),
-            _bags(folder, 'lz4', '.mcap', storage='mcap', compression='lz4'), described.read_bytes()]
+    (described,) = (folder / 'described').glob('*.mcap')
+    return [
+        _bags(folder, 'plain', '.mcap', storage='mcap', compression=''),
+        _bags(folder, 'zstd', '.mcap', storage='mcap', compression='zstd'),
+        _bags(folder, 'lz4', '.mcap', storage='mcap', compression='lz4'),
+        described.read_bytes(),
+    ]
 
 
 def _general_messages():
@@ -90,9 +106,17 @@ def _general_messages():
     kinds = store.types
     stamp = kinds['builtin_interfaces/msg/Time'](1, 2)
     header = kinds['std_msgs/msg/Header'](stamp, 'tool')
-    turn = kinds['geometry_msgs/msg/Transform'](kinds['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.1), kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0))
-    transforms = kinds[TF_TYPE]([kinds['geometry_msgs/msg/TransformStamped'](header, 'imu_link', turn)])
-    for topic, kind, message in (('/robot_description', STRING_TYPE, kinds[STRING_TYPE](SIX_AXES)), ('/tf_static', TF_TYPE, transforms)):
+    turn = kinds['geometry_msgs/msg/Transform'](
+        kinds['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.1),
+        kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
+    )
+    transforms = kinds[TF_TYPE](
+        [kinds['geometry_msgs/msg/TransformStamped'](header, 'imu_link', turn)]
+    )
+    for topic, kind, message in (
+        ('/robot_description', STRING_TYPE, kinds[STRING_TYPE](SIX_AXES)),
+        ('/tf_static', TF_TYPE, transforms),
+    ):
         yield topic, kind, bytes(store.serialize_cdr(message, kind))
 
 
@@ -116,6 +140,7 @@ def _file_reader(name, read):
         path = folder / name
         path.write_bytes(data)
         read(path)
+
     return with_file
 
 
@@ -132,8 +157,18 @@ def ros1_seeds(folder):
         with writer:
             topic = writer.add_connection('/imu/data_raw', IMU_TYPE, typestore=store)
             for k in range(40):
-                header = kinds['std_msgs/msg/Header'](k, kinds['builtin_interfaces/msg/Time'](1, STEP_NS * k), 'imu_link')
-                message = kinds[IMU_TYPE](header, kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), zeros, vector, zeros, vector, zeros)
+                header = kinds['std_msgs/msg/Header'](
+                    k, kinds['builtin_interfaces/msg/Time'](1, STEP_NS * k), 'imu_link'
+                )
+                message = kinds[IMU_TYPE](
+                    header,
+                    kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
+                    zeros,
+                    vector,
+                    zeros,
+                    vector,
+                    zeros,
+                )
                 writer.write(topic, 10**9 + STEP_NS * k, store.serialize_ros1(message, IMU_TYPE))
         found.append(path.read_bytes())
     return found
@@ -156,15 +191,23 @@ def read_metadata(data, folder):
 def cdr_seeds(_folder):
     """One message of each type."""
     imu, joints, temperature = small_session(1)
-    return [encode(samples)[0].tobytes() for encode, samples in ((encode_imu, imu), (encode_joints, joints), (encode_temperature, temperature))] + [
-        data for _, _, data in _general_messages()]
+    return [
+        encode(samples)[0].tobytes()
+        for encode, samples in (
+            (encode_imu, imu),
+            (encode_joints, joints),
+            (encode_temperature, temperature),
+        )
+    ] + [data for _, _, data in _general_messages()]
 
 
 def read_cdr(data, _folder):
     """Decode a message as every type, by layout and by definition."""
     for kind in (IMU_TYPE, JOINT_STATE_TYPE, TEMPERATURE_TYPE):
         for general in (None, _general(kind)):
-            decoder = JointDecoder(None, general) if kind == JOINT_STATE_TYPE else Decoder(kind, general)
+            decoder = (
+                JointDecoder(None, general) if kind == JOINT_STATE_TYPE else Decoder(kind, general)
+            )
             decoder.decode(Packed.join([data, data]))
             decoder.decode(Packed.join([data, b'']), lambda: np.array([1, 2]))
 
@@ -176,7 +219,10 @@ def _general(kind):
 
 def definition_seeds(_folder):
     """The definitions of the types that are read."""
-    return [standard_definition(kind).text.encode() for kind in (IMU_TYPE, JOINT_STATE_TYPE, TEMPERATURE_TYPE)]
+    return [
+        standard_definition(kind).text.encode()
+        for kind in (IMU_TYPE, JOINT_STATE_TYPE, TEMPERATURE_TYPE)
+    ]
 
 
 @cache
@@ -190,14 +236,16 @@ def read_definition(data, _folder):
     is_standard(IMU_TYPE, 'ros2msg', text)
     try:
         general = deserializer(IMU_TYPE, {IMU_TYPE: ('ros2msg', text)})
-    except Exception:   # `Recording.deserializer` makes one line of each
+    except Exception:  # `Recording.deserializer` makes one line of each
         return
     Decoder(IMU_TYPE, general).decode(Packed.join(_messages()))
 
 
 def accumulator_seeds(_folder):
     """A saved session of a table."""
-    live = LiveCalibration(Table.from_mapping(yaml.safe_load((ROOT / 'config' / 'table_simulated.yaml').read_text())))
+    live = LiveCalibration(
+        Table.from_mapping(yaml.safe_load((ROOT / 'config' / 'table_simulated.yaml').read_text()))
+    )
     imu, joints, *_ = make_session(1, 25.0, seconds=60.0)
     live.push(SampleBlock(imu, joints, None))
     return [to_bytes(live.gathered(pending=True), live.model)]
@@ -218,22 +266,60 @@ def samples_seeds(_folder):
 def csv_seeds(_folder):
     """Logs with commas and with semicolons."""
     rows = [(0.005 * k, 0.01, 0.02, 9.81 + 1e-3 * k, 0.1, 0.2, 0.3, 25.0) for k in range(40)]
-    return [(delimiter.join(names) + '\n' + ''.join(delimiter.join(f'{value:.6g}' for value in row) + '\n' for row in rows)).encode()
-            for delimiter, names in ((',', ['time [s]', *(f'acc_{a} [m/s^2]' for a in 'xyz'), *(f'gyr_{a} [rad/s]' for a in 'xyz'), 'temperature [C]']),
-                                     (';', ['time [ms]', *(f'acc_{a} [g]' for a in 'xyz'), *(f'gyr_{a} [deg/s]' for a in 'xyz'), 'temperature [K]']))]
+    return [
+        (
+            delimiter.join(names)
+            + '\n'
+            + ''.join(delimiter.join(f'{value:.6g}' for value in row) + '\n' for row in rows)
+        ).encode()
+        for delimiter, names in (
+            (
+                ',',
+                [
+                    'time [s]',
+                    *(f'acc_{a} [m/s^2]' for a in 'xyz'),
+                    *(f'gyr_{a} [rad/s]' for a in 'xyz'),
+                    'temperature [C]',
+                ],
+            ),
+            (
+                ';',
+                [
+                    'time [ms]',
+                    *(f'acc_{a} [g]' for a in 'xyz'),
+                    *(f'gyr_{a} [deg/s]' for a in 'xyz'),
+                    'temperature [K]',
+                ],
+            ),
+        )
+    ]
 
 
 def noise_seeds(_folder):
     """Noise of a record of 24 s at rest."""
     rng, n = np.random.default_rng(0), 1200
-    readings = np.array([0.0, 0.0, 9.81, 0.0, 0.0, 0.0]) + rng.normal(0, [2e-3] * 3 + [1e-4] * 3, (n, 6))
-    imu = ImuSamples(10**9 + 20_000_000 * np.arange(n), readings[:, :3], readings[:, 3:], 'imu_link')
-    return [noise_to_text(figures_of(identify_noise(lambda: [SampleBlock(imu, None, None)])), 3600.0).encode()]
+    readings = np.array([0.0, 0.0, 9.81, 0.0, 0.0, 0.0]) + rng.normal(
+        0, [2e-3] * 3 + [1e-4] * 3, (n, 6)
+    )
+    imu = ImuSamples(
+        10**9 + 20_000_000 * np.arange(n), readings[:, :3], readings[:, 3:], 'imu_link'
+    )
+    return [
+        noise_to_text(
+            figures_of(identify_noise(lambda: [SampleBlock(imu, None, None)])), 3600.0
+        ).encode()
+    ]
 
 
 def calibration_seeds(_folder):
     """A plain calibration and one with further effects."""
-    return [calibration_to_text(calibration).encode() for calibration in (IMU, random_calibration(1, ('accel_size_effect',), ('gyro_g_sensitivity',)))]
+    return [
+        calibration_to_text(calibration).encode()
+        for calibration in (
+            IMU,
+            random_calibration(1, ('accel_size_effect',), ('gyro_g_sensitivity',)),
+        )
+    ]
 
 
 def read_calibration(data, _folder):
@@ -250,26 +336,55 @@ def _import_reader(target):
     def seeds(_folder):
         content = export(IMU, target, rate=200.0).content
         return [content.encode() if isinstance(content, str) else content]
-    return Reader(seeds, lambda data, folder: import_file(target, data, folder / 'absent', frame_id='imu_link'), text=target.name != 'mat')
+
+    return Reader(
+        seeds,
+        lambda data, folder: import_file(target, data, folder / 'absent', frame_id='imu_link'),
+        text=target.name != 'mat',
+    )
 
 
 EFFECTS = b"effects:\n  mine: {sensor: accelerometer, column: 'f_x * abs(f_x)', unit: 's^2/m', tolerance: 0.001, text: 'mine'}\n"
 READERS = {
     'mcap': Reader(mcap_seeds, _file_reader('x.mcap', read_bag)),
-    'sqlite3': Reader(lambda folder: [_bags(folder, 'bag', '.db3')], _file_reader('x.db3', read_bag)),
+    'sqlite3': Reader(
+        lambda folder: [_bags(folder, 'bag', '.db3')], _file_reader('x.db3', read_bag)
+    ),
     'ROS 1 bag': Reader(ros1_seeds, _file_reader('x.bag', read_bag)),
     'metadata': Reader(metadata_seeds, read_metadata, text=True),
     'CDR': Reader(cdr_seeds, read_cdr),
     'definition': Reader(definition_seeds, read_definition, text=True),
     'CSV': Reader(csv_seeds, _file_reader('x.csv', read_csv), text=True),
     'npz of a session': Reader(accumulator_seeds, read_accumulator, mutate=mutated_archive),
-    'npz of samples': Reader(samples_seeds, lambda data, _folder: HandStore(1000).load(data), mutate=mutated_archive),
-    'URDF': Reader(lambda _folder: [SIX_AXES.encode()], _text_of(lambda text: (root_of(text), table_from_urdf(text, 'imu_link'))), text=True),
-    'YAML of a table': Reader(lambda _folder: [re.sub(rb'(?m)^gravity:.*', b'gravity: 9.81', path.read_bytes()) for path in sorted((ROOT / 'config').glob('table_*.yaml'))],
-                              _text_of(lambda text: Table.from_mapping(from_text(text))), text=True),
+    'npz of samples': Reader(
+        samples_seeds, lambda data, _folder: HandStore(1000).load(data), mutate=mutated_archive
+    ),
+    'URDF': Reader(
+        lambda _folder: [SIX_AXES.encode()],
+        _text_of(lambda text: (root_of(text), table_from_urdf(text, 'imu_link'))),
+        text=True,
+    ),
+    'YAML of a table': Reader(
+        lambda _folder: [
+            re.sub(rb'(?m)^gravity:.*', b'gravity: 9.81', path.read_bytes())
+            for path in sorted((ROOT / 'config').glob('table_*.yaml'))
+        ],
+        _text_of(lambda text: Table.from_mapping(from_text(text))),
+        text=True,
+    ),
     'YAML of a calibration': Reader(calibration_seeds, read_calibration, text=True),
     'YAML of noise': Reader(noise_seeds, _text_of(noise_from_text), text=True),
-    'YAML of effects': Reader(lambda _folder: [EFFECTS], _file_reader('x.yaml', files.read_effects), text=True),
-    'YAML of tolerances': Reader(lambda _folder: [(ROOT / 'config' / 'tolerances.yaml').read_bytes()], _file_reader('x.yaml', files.read_tolerances), text=True),
-    **{f'import from {target.name}': _import_reader(target) for target in all_targets().values() if target.read and target.write},
+    'YAML of effects': Reader(
+        lambda _folder: [EFFECTS], _file_reader('x.yaml', files.read_effects), text=True
+    ),
+    'YAML of tolerances': Reader(
+        lambda _folder: [(ROOT / 'config' / 'tolerances.yaml').read_bytes()],
+        _file_reader('x.yaml', files.read_tolerances),
+        text=True,
+    ),
+    **{
+        f'import from {target.name}': _import_reader(target)
+        for target in all_targets().values()
+        if target.read and target.write
+    },
 }

@@ -51,16 +51,24 @@ class Record:
         """Add the inputs of another process."""
         self.n_read, self.n_refused = self.n_read + other.n_read, self.n_refused + other.n_refused
         self.findings = other.findings | self.findings
-        self.megabytes, self.seconds = max(self.megabytes, other.megabytes), max(self.seconds, other.seconds)
+        self.megabytes, self.seconds = (
+            max(self.megabytes, other.megabytes),
+            max(self.seconds, other.seconds),
+        )
 
 
 def read_inputs(reader, seeds, seed, folder, *, goes_on, before=lambda data: None):
     """Read mutations of `seeds` while `goes_on(record)` holds; `before` is called with each input. Return the Record."""
     from imu_calibration.core.errors import ImuCalibrationError
+
     rng, record = random.Random(seed), Record()
     inputs = list(seeds)
     while inputs or goes_on(record):
-        data = inputs.pop() if inputs else reader.mutate(rng.choice(seeds), seeds, rng, *((True,) if reader.text else ()))
+        data = (
+            inputs.pop()
+            if inputs
+            else reader.mutate(rng.choice(seeds), seeds, rng, *((True,) if reader.text else ()))
+        )
         before(data)
         _one(reader, data, folder, record, ImuCalibrationError)
     return record
@@ -77,12 +85,16 @@ def _one(reader, data, folder, record, refusal):
         record.n_refused += 1
     except Exception as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]
-        record.findings.setdefault(f'{type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}', (traceback.format_exc(), data))
+        record.findings.setdefault(
+            f'{type(error).__name__} in {Path(frame.filename).name}:{frame.lineno}',
+            (traceback.format_exc(), data),
+        )
     record.seconds = max(record.seconds, time.process_time() - start)
 
 
 def _child(pipe, name, seeds, seed, seconds):
     from fuzz.readers import READERS  # imported by the parent already
+
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     size = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
@@ -105,15 +117,22 @@ def _child(pipe, name, seeds, seed, seconds):
 
         def before(data):
             last.write_bytes(data)
-            signal.setitimer(signal.ITIMER_PROF, HANG)   # whose signal ends the process, in library code too
+            signal.setitimer(
+                signal.ITIMER_PROF, HANG
+            )  # whose signal ends the process, in library code too
+
         pipe.send(str(last))
-        report(read_inputs(READERS[name], seeds, seed, Path(folder), goes_on=goes_on, before=before))
+        report(
+            read_inputs(READERS[name], seeds, seed, Path(folder), goes_on=goes_on, before=before)
+        )
     pipe.send(None)
 
 
 def fuzz_slice(name, seeds, seed, seconds):
     """Read inputs in a process of its own for some seconds; return the Record."""
-    context = multiprocessing.get_context('fork')   # the parent has one thread and has imported the readers
+    context = multiprocessing.get_context(
+        'fork'
+    )  # the parent has one thread and has imported the readers
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_child, args=(theirs, name, seeds, seed, seconds))
     process.start()
@@ -128,7 +147,10 @@ def fuzz_slice(name, seeds, seed, seconds):
     except EOFError:
         process.join()
         data = Path(last).read_bytes() if last and Path(last).exists() else b''
-        record.findings[f'process ended by signal {-(process.exitcode or 0)}'] = (f'exit code {process.exitcode}: hang or too much memory', data)
+        record.findings[f'process ended by signal {-(process.exitcode or 0)}'] = (
+            f'exit code {process.exitcode}: hang or too much memory',
+            data,
+        )
     if process.is_alive():
         data = Path(last).read_bytes() if last and Path(last).exists() else b''
         process.kill()
@@ -140,11 +162,16 @@ def main():
     """Run, print a table, return 1 where there is a finding."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--minutes', type=float, default=10.0)
-    parser.add_argument('--seed', type=int, default=None, help='default: a new one, which is printed')
+    parser.add_argument(
+        '--seed', type=int, default=None, help='default: a new one, which is printed'
+    )
     parser.add_argument('--only', default='', help='part of the name of a reader')
-    parser.add_argument('--output', type=Path, default=Path('out/fuzz'), help='folder for inputs with a finding')
+    parser.add_argument(
+        '--output', type=Path, default=Path('out/fuzz'), help='folder for inputs with a finding'
+    )
     options = parser.parse_args()
     from fuzz.readers import READERS
+
     seed = secrets.randbits(32) if options.seed is None else options.seed
     records = {name: Record() for name in READERS if options.only in name}
     seeds = {}
@@ -159,15 +186,21 @@ def main():
             if turn == 0 or time.monotonic() < until:
                 record.add(fuzz_slice(name, seeds[name], f'{seed} {name} {turn}', seconds))
         turn += 1
-    print(f'{"reader":24} {"inputs":>8} {"read":>8} {"refused":>8} {"findings":>8} {"MB":>6} {"longest s":>9}')
+    print(
+        f'{"reader":24} {"inputs":>8} {"read":>8} {"refused":>8} {"findings":>8} {"MB":>6} {"longest s":>9}'
+    )
     for name, record in records.items():
         n_inputs = record.n_read + record.n_refused
-        print(f'{name:24} {n_inputs:8d} {record.n_read:8d} {record.n_refused:8d} {len(record.findings):8d} {record.megabytes:6.0f} {record.seconds:9.2f}')
+        print(
+            f'{name:24} {n_inputs:8d} {record.n_read:8d} {record.n_refused:8d} {len(record.findings):8d} {record.megabytes:6.0f} {record.seconds:9.2f}'
+        )
     print(f'{"all":24} {sum(record.n_read + record.n_refused for record in records.values()):8d}')
     for name, record in records.items():
         for place, (text, data) in record.findings.items():
             options.output.mkdir(parents=True, exist_ok=True)
-            path = options.output / f'{name.replace(" ", "_")}-{hashlib.sha256(data).hexdigest()[:12]}'
+            path = (
+                options.output / f'{name.replace(" ", "_")}-{hashlib.sha256(data).hexdigest()[:12]}'
+            )
             path.write_bytes(data)
             print(f'\n{name}: {place}\ninput: {path}\n{text}')
     return 1 if any(record.findings for record in records.values()) else 0

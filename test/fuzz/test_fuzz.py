@@ -11,7 +11,13 @@ N_INPUTS = 40
 @pytest.mark.parametrize('name', readers.READERS)
 def test_mutated_inputs_are_read_or_refused(tmp_path, name):
     reader = readers.READERS[name]
-    record = run.read_inputs(reader, reader.seeds(tmp_path), name, tmp_path, goes_on=lambda record: record.n_read + record.n_refused < N_INPUTS)
+    record = run.read_inputs(
+        reader,
+        reader.seeds(tmp_path),
+        name,
+        tmp_path,
+        goes_on=lambda record: record.n_read + record.n_refused < N_INPUTS,
+    )
     assert record.n_read > 0
     assert not record.findings, next(iter(record.findings.values()))[0]
 
@@ -24,6 +30,7 @@ def refuse(data, _folder):
 def warn(data, _folder):
     """A reader that warns."""
     import warnings
+
     warnings.warn('odd', stacklevel=1)
 
 
@@ -38,8 +45,16 @@ def fill_memory(data, _folder):
     bytearray(2 * run.MEMORY)
 
 
-@pytest.mark.live   # each in a process with limits
-@pytest.mark.parametrize('read, finding', [(refuse, None), (warn, 'UserWarning'), (read_without_end, 'signal 27'), (fill_memory, 'MemoryError')])
+@pytest.mark.live  # each in a process with limits
+@pytest.mark.parametrize(
+    'read, finding',
+    [
+        (refuse, None),
+        (warn, 'UserWarning'),
+        (read_without_end, 'signal 27'),
+        (fill_memory, 'MemoryError'),
+    ],
+)
 def test_faults_of_a_reader_are_findings(monkeypatch, read, finding):
     monkeypatch.setattr(run, 'HANG', 0.2)
     monkeypatch.setitem(readers.READERS, 'broken', readers.Reader(lambda folder: [], read))

@@ -12,7 +12,9 @@ def oscillation(time, frequency=12.0):
     """Two joints that swing at a frequency, amplitude one."""
     w = 2 * np.pi * frequency
     phase = w * time[:, None] + np.array([0.3, 1.2])
-    return JointMotion(time, np.sin(phase), w * np.cos(phase), -w**2 * np.sin(phase), -w**3 * np.cos(phase))
+    return JointMotion(
+        time, np.sin(phase), w * np.cos(phase), -(w**2) * np.sin(phase), -(w**3) * np.cos(phase)
+    )
 
 
 @pytest.mark.parametrize('delay', [0.0123, 0.061, -0.0077])
@@ -23,7 +25,9 @@ def test_ripple_at_an_eighth_of_the_stamps_frequency_is_shifted_whole(delay):
     inside = (time - delay > time[0]) & (time - delay < time[-1])
     for name, bound in zip(NAMES, (1e-7, 1e-6, 3e-5, 1e-3)):
         unit = np.abs(getattr(true, name)).max()
-        np.testing.assert_allclose(getattr(late, name)[inside], getattr(true, name)[inside], atol=bound * unit)
+        np.testing.assert_allclose(
+            getattr(late, name)[inside], getattr(true, name)[inside], atol=bound * unit
+        )
     np.testing.assert_array_equal(late.time, time)
 
 
@@ -31,9 +35,13 @@ def test_before_the_first_stamp_the_series_goes_from_there():
     """Of delay^4 / 24 times the fourth derivative."""
     time = 5.0 + 0.01 * np.arange(20)
     late, true = shifted(oscillation(time, 2.0), 0.004), oscillation(time - 0.004, 2.0)
-    np.testing.assert_allclose(late.position[0], true.position[0], atol=0.004**4 / 24 * (4 * np.pi)**4)
+    np.testing.assert_allclose(
+        late.position[0], true.position[0], atol=0.004**4 / 24 * (4 * np.pi) ** 4
+    )
     early, ahead = shifted(oscillation(time, 2.0), -0.004), oscillation(time + 0.004, 2.0)
-    np.testing.assert_allclose(early.position[-1], ahead.position[-1], atol=0.004**4 / 24 * (4 * np.pi)**4)
+    np.testing.assert_allclose(
+        early.position[-1], ahead.position[-1], atol=0.004**4 / 24 * (4 * np.pi) ** 4
+    )
 
 
 def test_nothing_is_drawn_across_a_hole():
@@ -41,7 +49,13 @@ def test_nothing_is_drawn_across_a_hole():
     time = np.concatenate([0.01 * np.arange(10), 3.0 + 0.01 * np.arange(10), [7.0]])
     motion = oscillation(time, 1.0)
     resting = (time > 6.0)[:, None]
-    rest = JointMotion(time, *(np.where(resting, 0.5 if name == 'position' else 0.0, getattr(motion, name)) for name in NAMES))
+    rest = JointMotion(
+        time,
+        *(
+            np.where(resting, 0.5 if name == 'position' else 0.0, getattr(motion, name))
+            for name in NAMES
+        ),
+    )
     for delay in (0.013, -0.013):
         late, true = shifted(rest, delay), oscillation(time - delay, 1.0)
         np.testing.assert_allclose(late.position[:-1], true.position[:-1], atol=1e-5)
@@ -53,8 +67,14 @@ def test_the_shift_is_smooth_in_the_delay():
     motion = oscillation(0.01 * np.arange(100))
     step = 1e-5
     for delay in (0.01, 0.0100001, 0.015, 0.02):
-        slope = (shifted(motion, delay + step).rate - shifted(motion, delay - step).rate)[10:] / (2 * step)
-        np.testing.assert_allclose(slope, -oscillation(motion.time - delay).acceleration[10:], atol=1e-4 * np.abs(motion.acceleration).max())
+        slope = (shifted(motion, delay + step).rate - shifted(motion, delay - step).rate)[10:] / (
+            2 * step
+        )
+        np.testing.assert_allclose(
+            slope,
+            -oscillation(motion.time - delay).acceleration[10:],
+            atol=1e-4 * np.abs(motion.acceleration).max(),
+        )
 
 
 def test_one_row_and_rows_out_of_order_take_the_series_of_their_own():
@@ -71,6 +91,11 @@ def test_each_stamp_may_have_its_own_delay():
     motion, delay = oscillation(time, 2.0), np.where(time > time[60], 0.012, -0.004)
     late, parts = shifted(motion, delay), [shifted(motion, value) for value in (0.012, -0.004)]
     for name in NAMES:
-        np.testing.assert_array_equal(getattr(late, name), np.where((delay > 0)[:, None], *(getattr(part, name) for part in parts)))
+        np.testing.assert_array_equal(
+            getattr(late, name),
+            np.where((delay > 0)[:, None], *(getattr(part, name) for part in parts)),
+        )
     alone = oscillation(time[:1], 2.0)
-    np.testing.assert_array_equal(shifted(alone, delay[:1]).position, shifted(alone, -0.004).position)
+    np.testing.assert_array_equal(
+        shifted(alone, delay[:1]).position, shifted(alone, -0.004).position
+    )

@@ -22,26 +22,35 @@ ARMS = zhang.TABLE_3_ARMS
 
 def reference_of(motion, gravity=G):
     mat_sn = np.swapaxes(motion.mat_ns, 1, 2)
-    return Reference(motion.time, mat_sn, mat_sn @ np.array([0, 0, gravity]), motion.rate, motion.alpha, gravity)
+    return Reference(
+        motion.time, mat_sn, mat_sn @ np.array([0, 0, gravity]), motion.rate, motion.alpha, gravity
+    )
 
 
 def test_attitude_of_a_constant_turn_is_exact_and_stays_orthonormal():
     time = np.linspace(0, 20, 4001)
     rate = np.array([0.4, -1.1, 0.7])
     mat_ns = strapdown.integrate_attitude(time, np.tile(rate, (len(time), 1)))
-    np.testing.assert_allclose(mat_ns, Rotation.from_rotvec(np.outer(time, rate)).as_matrix(), atol=1e-11)
+    np.testing.assert_allclose(
+        mat_ns, Rotation.from_rotvec(np.outer(time, rate)).as_matrix(), atol=1e-11
+    )
     np.testing.assert_allclose(mat_ns[-1] @ mat_ns[-1].T, np.eye(3), atol=1e-11)
 
 
 def test_attitude_of_coning_converges_with_the_square_of_the_step():
     """A cone of half angle 0.3 rad, known in closed form; the trapezoid's own error is (spin step)^2 / 12 = 4e-4."""
+
     def error(step):
         time = np.arange(0, 2 + step / 2, step)
         half, spin = 0.3, 7.0
         tip = np.column_stack([np.cos(spin * time), np.sin(spin * time), 0 * time])
         exact = Rotation.from_rotvec(half * tip).as_matrix()
-        across = np.sin(half) * np.column_stack([-np.sin(spin * time), np.cos(spin * time), 0 * time])
-        mat_ns = strapdown.integrate_attitude(time, spin * (across - [0, 0, 1 - np.cos(half)]), exact[0])
+        across = np.sin(half) * np.column_stack(
+            [-np.sin(spin * time), np.cos(spin * time), 0 * time]
+        )
+        mat_ns = strapdown.integrate_attitude(
+            time, spin * (across - [0, 0, 1 - np.cos(half)]), exact[0]
+        )
         return np.max(np.abs(mat_ns - exact))
 
     coarse, fine = error(0.02), error(0.01)
@@ -63,13 +72,25 @@ def test_dead_reckoning_of_constant_and_circular_motion():
 def test_drift_is_zero_for_perfect_samples_and_follows_one_fault():
     motion = zhang.tumble((20, 20, 20), (0.3, 0.4, 0.5), seconds=20, sample_rate=100)
     reference = reference_of(motion)
-    assert not np.any(strapdown.dead_reckoning_errors(reference, reference.force_s, reference.rate_s))
-    still = Reference(np.arange(0, 100.01, 0.01), np.tile(np.eye(3), (10001, 1, 1)), np.tile([0, 0, G], (10001, 1)),
-                      np.zeros((10001, 3)), np.zeros((10001, 3)), G)
-    velocity, position = strapdown.dead_reckoning_errors(still, still.force_s + [0.01, 0, 0], still.rate_s)
+    assert not np.any(
+        strapdown.dead_reckoning_errors(reference, reference.force_s, reference.rate_s)
+    )
+    still = Reference(
+        np.arange(0, 100.01, 0.01),
+        np.tile(np.eye(3), (10001, 1, 1)),
+        np.tile([0, 0, G], (10001, 1)),
+        np.zeros((10001, 3)),
+        np.zeros((10001, 3)),
+        G,
+    )
+    velocity, position = strapdown.dead_reckoning_errors(
+        still, still.force_s + [0.01, 0, 0], still.rate_s
+    )
     np.testing.assert_allclose((velocity[-1], position[-1]), [[1.0, 0, 0], [50.0, 0, 0]], rtol=1e-9)
     turned = strapdown.dead_reckoning_errors(still, still.force_s, still.rate_s + [0, 1e-5, 0])[0]
-    np.testing.assert_allclose(turned[-1, 0], G * 1e-5 * 100**2 / 2, rtol=1e-6)   # g times the integral of the angle, small angles
+    np.testing.assert_allclose(
+        turned[-1, 0], G * 1e-5 * 100**2 / 2, rtol=1e-6
+    )  # g times the integral of the angle, small angles
 
 
 def test_wrong_times_are_refused():
@@ -102,8 +123,18 @@ def test_n1_table_2_explains_the_printed_curve():
 def test_n2_a_spin_about_a_body_axis_does_not_drift():
     growth = zhang.spin_growth(COSINES, ARMS, (1, 0, 0))
     level, body = strapdown.largest(growth['level'][0]), strapdown.largest(growth['body'][0])
-    show('N2', 'x spin 100 deg/s, 100 s: level frame, body sum, m/s', [level, body], '0.048 3.69 (+-2 %)')
-    show('N2', 'positions, m', [strapdown.largest(growth['level'][1]), strapdown.largest(growth['body'][1])], '2.4 185')
+    show(
+        'N2',
+        'x spin 100 deg/s, 100 s: level frame, body sum, m/s',
+        [level, body],
+        '0.048 3.69 (+-2 %)',
+    )
+    show(
+        'N2',
+        'positions, m',
+        [strapdown.largest(growth['level'][1]), strapdown.largest(growth['body'][1])],
+        '2.4 185',
+    )
     assert (level, body) == (pytest.approx(0.048, rel=0.02), pytest.approx(3.69, rel=0.02))
 
 
@@ -119,7 +150,9 @@ def test_n3_tumbling_uncompensated_and_with_arms_estimated_without_noise():
     responses = zhang.arm_responses(zhang.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
     velocity, position = zhang.peaks(responses, ARMS)[:, 0]
     runs, sensors = zhang_designs.design_runs('M'), np.column_stack([np.zeros(3), COSINES, ARMS])
-    estimated = zhang_designs.fit_triad(runs, np.column_stack([zhang_designs.predict(runs, sensor) for sensor in sensors]))[1]
+    estimated = zhang_designs.fit_triad(
+        runs, np.column_stack([zhang_designs.predict(runs, sensor) for sensor in sensors])
+    )[1]
     exact = zhang.peaks(responses, estimated - ARMS)[0, 0]
     nearly = zhang.peaks(responses, estimated - ARMS * (1 + 1e-6))[0, 0]
     show('N3', 'uncompensated m/s, m', [velocity, position], '5.256 179.6 (+-0.5 %)')
@@ -128,13 +161,22 @@ def test_n3_tumbling_uncompensated_and_with_arms_estimated_without_noise():
     assert exact < 1e-9 < nearly
 
 
-@pytest.mark.parametrize('design, wanted', [('M', '>= 100 (146/152)'), ('O', '>= 80 (115)'), ('Z60', '(41)'), ('Z0', '<= 3 (1.0)')])
+@pytest.mark.parametrize(
+    'design, wanted',
+    [('M', '>= 100 (146/152)'), ('O', '>= 80 (115)'), ('Z60', '(41)'), ('Z0', '<= 3 (1.0)')],
+)
 def test_n3_tumbling_with_estimated_arms(design, wanted):
     """300 draws of the arms from the design's full covariance, 0.1 mg means."""
     rng = np.random.default_rng(13)
     runs = zhang_designs.design_runs(design)
     responses = zhang.arm_responses(zhang.tumble((60, 45, 30), (0.7, 0.9, 1.1)), COSINES)
-    wrong = np.stack([zhang_designs.arm_errors(runs, COSINES[i], ARMS[i], rng=rng, n_draws=300) for i in range(3)], axis=1)
+    wrong = np.stack(
+        [
+            zhang_designs.arm_errors(runs, COSINES[i], ARMS[i], rng=rng, n_draws=300)
+            for i in range(3)
+        ],
+        axis=1,
+    )
     gains = zhang.peaks(responses, ARMS)[:, :1] / zhang.peaks(responses, wrong)
     velocity, position = np.median(gains, axis=1)
     show('N3', f'{design}: median improvement, velocity, position', [velocity, position], wanted)

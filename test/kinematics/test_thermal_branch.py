@@ -17,14 +17,30 @@ from worlds.hiding import record
 from worlds.physics import make_session
 
 HYSTERESIS = ('accel_thermal_hysteresis', 'gyro_thermal_hysteresis')
-FEW = (*HYSTERESIS, 'accel_thermal_bias', 'gyro_thermal_bias', 'gyro_thermal_scale', 'accel_bias_drift', 'gyro_bias_drift', 'gyro_g_sensitivity')
-SHORT = {'profile': 'random_short', 'duration': 180.0, 'imu_rate': 50.0, 'joint_rate': 50.0, 'temperature': 'cycle'}
+FEW = (
+    *HYSTERESIS,
+    'accel_thermal_bias',
+    'gyro_thermal_bias',
+    'gyro_thermal_scale',
+    'accel_bias_drift',
+    'gyro_bias_drift',
+    'gyro_g_sensitivity',
+)
+SHORT = {
+    'profile': 'random_short',
+    'duration': 180.0,
+    'imu_rate': 50.0,
+    'joint_rate': 50.0,
+    'temperature': 'cycle',
+}
 
 
 def test_the_branch_is_one_where_it_warms_up_and_minus_one_where_it_cools_however_fast():
     up, down = np.arange(20.0, 30.0, 0.1), np.arange(30.0, 20.0, -0.1)
     branch = ThermalBranch().of(np.concatenate([up, down]))
-    assert branch[0] == 0.0 and branch[100] == pytest.approx(1.0) and branch[-1] == pytest.approx(-1.0)
+    assert (
+        branch[0] == 0.0 and branch[100] == pytest.approx(1.0) and branch[-1] == pytest.approx(-1.0)
+    )
     between = np.searchsorted(-branch[100:], 0.0)
     assert abs((30.0 - down[between]) - HALF_WIDTH) < 0.11, 'half way after one half width'
     slow = ThermalBranch().of(np.concatenate([np.repeat(up, 3), np.repeat(down, 3)]))
@@ -36,7 +52,9 @@ def test_noise_and_a_glance_back_change_no_branch():
     warm = np.linspace(20.0, 40.0, 500)
     assert np.all(ThermalBranch().of(warm + rng.normal(0.0, 0.05, 500))[100:] > 0.6)
     parts = ThermalBranch()
-    np.testing.assert_array_equal(np.concatenate([parts.of(warm[:17]), parts.of(warm[17:])]), ThermalBranch().of(warm))
+    np.testing.assert_array_equal(
+        np.concatenate([parts.of(warm[:17]), parts.of(warm[17:])]), ThermalBranch().of(warm)
+    )
 
 
 @pytest.fixture(scope='module')
@@ -50,9 +68,13 @@ def test_windows_carry_the_branch_however_the_stream_is_cut(cycled):
     def gathered(edges):
         gatherer, windows = MotionGatherer(table), []
         for first, stop in zip(edges, edges[1:]):
-            parts = [s.select((s.stamp_ns >= first) & (s.stamp_ns < stop)) for s in (cycled.imu, cycled.joints, cycled.temperature)]
+            parts = [
+                s.select((s.stamp_ns >= first) & (s.stamp_ns < stop))
+                for s in (cycled.imu, cycled.joints, cycled.temperature)
+            ]
             windows += gatherer.push(SampleBlock(*parts))
         return windows + gatherer.finish()
+
     start, stop = int(cycled.joints.stamp_ns[0]) - 10**9, int(cycled.imu.stamp_ns[-1]) + 10**9
     whole, cut = gathered([start, stop]), gathered(list(range(start, stop + 7 * 10**9, 7 * 10**9)))
     assert len(whole) == len(cut) > 5
@@ -74,8 +96,11 @@ def test_compensation_live_and_of_a_recording_take_the_branch_out(cycled):
         live.set_temperature(warmth)
         rows.append(live.correct(int(stamps[k]), *imu.rate_s[k], *imu.force_s[k]))
     np.testing.assert_allclose(rows, np.column_stack([whole.rate, whole.force]), atol=1e-12)
-    between = whole.force[215] - whole.force[160]   # the same temperature, cooling and warming up
-    matrix, size = calibration.value('accelerometer', 'matrix'), calibration.value('accelerometer', 'accel_thermal_hysteresis')
+    between = whole.force[215] - whole.force[160]  # the same temperature, cooling and warming up
+    matrix, size = (
+        calibration.value('accelerometer', 'matrix'),
+        calibration.value('accelerometer', 'accel_thermal_hysteresis'),
+    )
     assert abs(temperature.temperature_c[215] - temperature.temperature_c[160]) < 1e-9
     np.testing.assert_allclose(between, 2.0 * np.linalg.solve(matrix, size), rtol=1e-6)
     later = SampleCompensation(random_calibration(5, ('accel_thermal_hysteresis',)))
@@ -87,11 +112,21 @@ def test_compensation_live_and_of_a_recording_take_the_branch_out(cycled):
 def test_it_is_asked_only_where_the_temperature_turned(cycled):
     table = Table.from_mapping(cycled.table)
     for temperature, asked in (('cycle', True), ('warm_up', False)):
-        session = cycled if asked else make_session(21210, None, 'white', **SHORT | {'temperature': temperature})
+        session = (
+            cycled
+            if asked
+            else make_session(21210, None, 'white', **SHORT | {'temperature': temperature})
+        )
         gatherer = MotionGatherer(table)
-        known, lacking = asked_of(SensorModel(joint_names=tuple(table.joint_names)), table, gatherer.push(session.block) + gatherer.finish())
+        known, lacking = asked_of(
+            SensorModel(joint_names=tuple(table.joint_names)),
+            table,
+            gatherer.push(session.block) + gatherer.finish(),
+        )
         assert (set(HYSTERESIS) <= {effect.name for effect in known}) is asked
-        assert asked or {entry['why'] for entry in lacking if entry['effect'] in HYSTERESIS} == {'the temperature did not reverse: one branch only'}
+        assert asked or {entry['why'] for entry in lacking if entry['effect'] in HYSTERESIS} == {
+            'the temperature did not reverse: one branch only'
+        }
 
 
 @pytest.mark.usefixtures('few_candidates')
@@ -99,7 +134,12 @@ def test_it_is_asked_only_where_the_temperature_turned(cycled):
 def test_it_is_found_and_told_from_what_follows_the_temperature(hidden):
     recording = record(21212, {hidden: None}, through_bag=False, temperature='cycle')
     found = diagnose(recording.windows, recording.table, recording.model)
-    assert [finding.effect for finding in found.findings] == [hidden] and not found.findings[0].indistinguishable_from
+    assert [finding.effect for finding in found.findings] == [hidden] and not found.findings[
+        0
+    ].indistinguishable_from
     true = recording.truth[hidden]
     # One play stands for grains of unlike friction: to six hundredths.
-    assert all(abs(value - t) < 5 * sd + 0.06 * abs(t) for (value, sd, _), t in zip(found.findings[0].parameters.values(), true))
+    assert all(
+        abs(value - t) < 5 * sd + 0.06 * abs(t)
+        for (value, sd, _), t in zip(found.findings[0].parameters.values(), true)
+    )

@@ -22,9 +22,18 @@ from msg_adapters.sqlite_file import PAGE_SIZE
 from msg_adapters.write import encode_imu, encode_joints, write_session
 
 N = 9000
-KINDS = {'sqlite3': {'storage': 'sqlite3'}, 'mcap': {'storage': 'mcap'}, 'mcap_zstd': {'storage': 'mcap', 'compression': 'zstd'},
-         'mcap_lz4': {'storage': 'mcap', 'compression': 'lz4'}}
-quick = settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+KINDS = {
+    'sqlite3': {'storage': 'sqlite3'},
+    'mcap': {'storage': 'mcap'},
+    'mcap_zstd': {'storage': 'mcap', 'compression': 'zstd'},
+    'mcap_lz4': {'storage': 'mcap', 'compression': 'lz4'},
+}
+quick = settings(
+    max_examples=25,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 
 
 @pytest.fixture(scope='module')
@@ -43,8 +52,12 @@ def bags(session, tmp_path_factory):
     plain.with_suffix('.db3.zstd').write_bytes(zstd().compress(plain.read_bytes()))
     plain.unlink()
     metadata = folder / 'sqlite3_zstd' / 'metadata.yaml'
-    metadata.write_text(metadata.read_text().replace("compression_format: ''", 'compression_format: zstd').replace(
-        "compression_mode: ''", 'compression_mode: FILE').replace('sqlite3_0.db3', 'sqlite3_0.db3.zstd'))
+    metadata.write_text(
+        metadata.read_text()
+        .replace("compression_format: ''", 'compression_format: zstd')
+        .replace("compression_mode: ''", 'compression_mode: FILE')
+        .replace('sqlite3_0.db3', 'sqlite3_0.db3.zstd')
+    )
     return folder
 
 
@@ -55,7 +68,11 @@ def read(path, **options):
         lost = recording.lost
     imu = [block.imu for block in blocks if block.imu is not None]
     joints = [block.joints for block in blocks if block.joints is not None]
-    return ImuSamples.concatenate(imu) if imu else None, JointSamples.concatenate(joints) if joints else None, lost
+    return (
+        ImuSamples.concatenate(imu) if imu else None,
+        JointSamples.concatenate(joints) if joints else None,
+        lost,
+    )
 
 
 def storage_file(folder):
@@ -90,11 +107,15 @@ def test_every_kind_is_read_whole(bags, session, kind):
 
 @pytest.mark.parametrize('kind', [*KINDS, 'sqlite3_zstd'])
 @pytest.mark.parametrize('with_metadata', [True, False])
-def test_a_bag_cut_off_anywhere_gives_what_came_before(bags, session, tmp_path, kind, with_metadata):
+def test_a_bag_cut_off_anywhere_gives_what_came_before(
+    bags, session, tmp_path, kind, with_metadata
+):
     @quick
     @given(st.floats(0, 0.999))
     def check(share):
-        path = damaged_copy(bags, kind, tmp_path / 'cut', lambda data: data[:int(share * len(data))])
+        path = damaged_copy(
+            bags, kind, tmp_path / 'cut', lambda data: data[: int(share * len(data))]
+        )
         if not with_metadata:
             (path / 'metadata.yaml').unlink()
         try:
@@ -114,7 +135,8 @@ def test_a_bag_cut_off_anywhere_gives_what_came_before(bags, session, tmp_path, 
         announced = 'messages that the metadata announce and the files do not hold'
         if with_metadata and announced in lost:
             n_read = found + (0 if joints is None else len(joints))
-            assert abs(lost[announced] + n_read - (N + N // 5)) <= 9   # the temperatures
+            assert abs(lost[announced] + n_read - (N + N // 5)) <= 9  # the temperatures
+
     check()
 
 
@@ -125,24 +147,27 @@ def test_bytes_overwritten_anywhere_never_crash(bags, session, tmp_path, kind):
     def check(share, noise):
         def overwrite(data):
             start = int(share * len(data))
-            return data[:start] + noise[:len(data) - start] + data[start + len(noise):]
+            return data[:start] + noise[: len(data) - start] + data[start + len(noise) :]
+
         path = damaged_copy(bags, kind, tmp_path / 'noise', overwrite)
         try:
             imu, _, _ = read(path)
         except InputError:
             return
         assert imu is None or len(imu) <= N
+
     check()
 
 
 def test_a_damaged_page_costs_only_its_own_rows(bags, session, tmp_path):
     def overwrite(data):
         page = len(data) // PAGE_SIZE // 2
-        while data[PAGE_SIZE * page] != 0x0D:   # a table leaf
+        while data[PAGE_SIZE * page] != 0x0D:  # a table leaf
             page += 1
-        return data[:PAGE_SIZE * page] + bytes(PAGE_SIZE) + data[PAGE_SIZE * (page + 1):]
+        return data[: PAGE_SIZE * page] + bytes(PAGE_SIZE) + data[PAGE_SIZE * (page + 1) :]
+
     imu, _, lost = read(damaged_copy(bags, 'sqlite3', tmp_path / 'bag', overwrite))
-    most = PAGE_SIZE // 300   # bytes of an Imu message
+    most = PAGE_SIZE // 300  # bytes of an Imu message
     assert N - most < len(imu) < N
     assert_true_samples(imu, session[0], ('stamp_ns', 'force_s'))
     assert lost['unreadable pages of sqlite3_0.db3'] == 1
@@ -153,7 +178,8 @@ def test_a_damaged_page_costs_only_its_own_rows(bags, session, tmp_path):
 def test_a_chunk_whose_checksum_fails_is_left_out(bags, session, tmp_path, kind):
     def flip(data):
         middle = len(data) // 2
-        return data[:middle] + bytes([data[middle] ^ 0x10]) + data[middle + 1:]
+        return data[:middle] + bytes([data[middle] ^ 0x10]) + data[middle + 1 :]
+
     imu, _, lost = read(damaged_copy(bags, kind, tmp_path / 'bag', flip))
     assert N / 2 < len(imu) < N
     assert_true_samples(imu, session[0], ('stamp_ns', 'force_s', 'rate_s'))
@@ -163,13 +189,21 @@ def test_a_chunk_whose_checksum_fails_is_left_out(bags, session, tmp_path, kind)
 @pytest.mark.parametrize('kind', KINDS)
 def test_a_bare_file_and_a_folder_without_metadata(bags, session, tmp_path, kind):
     with open_recording(storage_file(bags / kind)) as recording:
-        assert recording.message_counts == {'/imu/data_raw': N, '/joint_states': N // 5, '/imu/temperature': 9}
-        assert recording.duration == pytest.approx((session[0].stamp_ns[-1] - session[0].stamp_ns[0]) * 1e-9)
+        assert recording.message_counts == {
+            '/imu/data_raw': N,
+            '/joint_states': N // 5,
+            '/imu/temperature': 9,
+        }
+        assert recording.duration == pytest.approx(
+            (session[0].stamp_ns[-1] - session[0].stamp_ns[0]) * 1e-9
+        )
         assert sum(len(block.imu) for block in recording.blocks()) == N and not recording.lost
     folder = tmp_path / 'folder'
     folder.mkdir()
     for number in (10, 9):
-        shutil.copy(storage_file(bags / kind), folder / f'x_{number}{storage_file(bags / kind).suffix}')
+        shutil.copy(
+            storage_file(bags / kind), folder / f'x_{number}{storage_file(bags / kind).suffix}'
+        )
     imu, _, lost = read(folder)
     assert len(imu) == 2 * N and not lost
 
@@ -178,11 +212,18 @@ def test_a_missing_or_broken_part_of_a_split_bag_costs_only_itself(bags, session
     folder = tmp_path / 'split'
     shutil.copytree(bags / 'sqlite3', folder)
     text = (folder / 'metadata.yaml').read_text()
-    (folder / 'metadata.yaml').write_text(text.replace('- sqlite3_0.db3\n', '- missing_0.db3\n  - broken_1.db3\n  - sqlite3_0.db3\n', 1))
+    (folder / 'metadata.yaml').write_text(
+        text.replace(
+            '- sqlite3_0.db3\n', '- missing_0.db3\n  - broken_1.db3\n  - sqlite3_0.db3\n', 1
+        )
+    )
     (folder / 'broken_1.db3').write_bytes(b'SQLite format 3\0' + bytes(5000))
     imu, _, lost = read(folder)
     assert len(imu) == N
-    assert sorted(reason.split(' that')[0] for reason in lost) == ['file broken_1.db3', 'file missing_0.db3']
+    assert sorted(reason.split(' that')[0] for reason in lost) == [
+        'file broken_1.db3',
+        'file missing_0.db3',
+    ]
 
 
 def test_a_receive_time_that_is_no_number_leaves_the_duration_unknown(bags, tmp_path):
@@ -213,23 +254,35 @@ def test_messages_in_overflow_pages_and_of_other_types(tmp_path, session):
     """Long names make JointState larger than a page; other topics hold anything."""
     names = tuple('joint_' + 200 * c for c in 'abcdefghijklmnopqrstuvwx')
     rng = np.random.default_rng(5)
-    joints = JointSamples(session[1].stamp_ns[:40], rng.normal(size=(40, 24)), rng.normal(size=(40, 24)), names)
+    joints = JointSamples(
+        session[1].stamp_ns[:40], rng.normal(size=(40, 24)), rng.normal(size=(40, 24)), names
+    )
     write_session(tmp_path / 'bag', session[0].select(slice(0, 200)), joints)
     connection = sqlite3.connect(storage_file(tmp_path / 'bag'))
-    connection.execute("INSERT INTO topics VALUES (77, '/text', 'std_msgs/msg/String', 'cdr', '', '')")
+    connection.execute(
+        "INSERT INTO topics VALUES (77, '/text', 'std_msgs/msg/String', 'cdr', '', '')"
+    )
     for k in range(300):
-        connection.execute('INSERT INTO messages (topic_id, timestamp, data) VALUES (77, ?, ?)', (-k, rng.bytes(37 * k)))
+        connection.execute(
+            'INSERT INTO messages (topic_id, timestamp, data) VALUES (77, ?, ?)',
+            (-k, rng.bytes(37 * k)),
+        )
     connection.commit()
     connection.close()
     with open_recording(tmp_path / 'bag') as recording:
         blocks = list(recording.blocks(names[::-1]))
         assert not recording.lost
-    np.testing.assert_array_equal(np.concatenate([block.joints.position for block in blocks]), joints.position[:, ::-1])
+    np.testing.assert_array_equal(
+        np.concatenate([block.joints.position for block in blocks]), joints.position[:, ::-1]
+    )
     assert sum(len(block.imu) for block in blocks) == 200
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-@pytest.mark.parametrize('mode', [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE])
+@pytest.mark.parametrize(
+    'mode',
+    [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE],
+)
 def test_bags_of_another_writer(tmp_path, session, storage, mode):
     """Compressed in every way; a few frames and the joint order change, byte order too, and types are mixed in the middle."""
     if storage is StoragePlugin.SQLITE3 and mode is CompressionMode.STORAGE:
@@ -237,22 +290,34 @@ def test_bags_of_another_writer(tmp_path, session, storage, mode):
     store = get_typestore(Stores.ROS2_HUMBLE)
     imu, joints, _ = session
     imu, joints = imu.select(slice(0, 600)), joints.select(slice(0, 120))
-    swapped = JointSamples(joints.stamp_ns, joints.position[:, ::-1], joints.velocity[:, ::-1], joints.names[::-1])
+    swapped = JointSamples(
+        joints.stamp_ns, joints.position[:, ::-1], joints.velocity[:, ::-1], joints.names[::-1]
+    )
     plain = [encode_imu(replace(imu, frame_id=frame)) for frame in ('a', 'another_frame')]
     joint_rows = encode_joints(joints), encode_joints(swapped, with_velocity=False)
     writer = Writer(tmp_path / 'bag', version=8, storage_plugin=storage)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
-        topics = [writer.add_connection(name, kind, typestore=store) for name, kind in (
-            ('/imu/data_raw', 'sensor_msgs/msg/Imu'), ('/joint_states', 'sensor_msgs/msg/JointState'), ('/other', 'sensor_msgs/msg/Imu'))]
+        topics = [
+            writer.add_connection(name, kind, typestore=store)
+            for name, kind in (
+                ('/imu/data_raw', 'sensor_msgs/msg/Imu'),
+                ('/joint_states', 'sensor_msgs/msg/JointState'),
+                ('/other', 'sensor_msgs/msg/Imu'),
+            )
+        ]
         for k in range(600):
             data = plain[250 <= k < 265][k].tobytes()
             if 400 <= k < 420:
                 message = store.deserialize_cdr(data, 'sensor_msgs/msg/Imu')
-                data = bytes(store.serialize_cdr(message, 'sensor_msgs/msg/Imu', little_endian=False))
+                data = bytes(
+                    store.serialize_cdr(message, 'sensor_msgs/msg/Imu', little_endian=False)
+                )
             writer.write(topics[0], int(imu.stamp_ns[k]), data)
             if k % 5 == 0:
-                writer.write(topics[1], int(imu.stamp_ns[k]), joint_rows[k >= 333][k // 5].tobytes())
+                writer.write(
+                    topics[1], int(imu.stamp_ns[k]), joint_rows[k >= 333][k // 5].tobytes()
+                )
             if k % 7 == 0:
                 writer.write(topics[2], int(imu.stamp_ns[k]), plain[0][k].tobytes())
     found, found_joints, lost = read(tmp_path / 'bag')
@@ -272,11 +337,20 @@ def test_another_definition_of_a_type_takes_the_general_path(tmp_path, session, 
     store.register(get_types_from_msg(definition, 'sensor_msgs/msg/Imu'))
     full = get_typestore(Stores.ROS2_JAZZY)
     with Writer(tmp_path / 'bag', version=9) as writer:
-        topic = writer.add_connection('/imu/data_raw', 'sensor_msgs/msg/Imu', msgdef=definition if usable else text, rihs01='x')
+        topic = writer.add_connection(
+            '/imu/data_raw',
+            'sensor_msgs/msg/Imu',
+            msgdef=definition if usable else text,
+            rihs01='x',
+        )
         for row in encode_imu(session[0].select(slice(0, 30))):
             message = full.deserialize_cdr(row.tobytes(), 'sensor_msgs/msg/Imu')
             for name in ('orientation', 'angular_velocity', 'linear_acceleration'):
-                setattr(message, f'{name}_covariance', getattr(message, f'{name}_covariance').astype(np.float32))
+                setattr(
+                    message,
+                    f'{name}_covariance',
+                    getattr(message, f'{name}_covariance').astype(np.float32),
+                )
             writer.write(topic, 0, bytes(store.serialize_cdr(message, 'sensor_msgs/msg/Imu')))
     if usable:
         np.testing.assert_array_equal(read(tmp_path / 'bag')[0].rate_s, session[0].rate_s[:30])

@@ -24,12 +24,23 @@ def message(channel, stamp_ns, data):
 
 def topic_records(number, name, message_type):
     definition = standard_definition(message_type)
-    return (record(0x03, struct.pack('<H', number), text(definition.type), text('ros2msg'), text(definition.text))
-            + record(0x04, struct.pack('<HH', number, number), text(name), text('cdr'), text(b'')))
+    return record(
+        0x03,
+        struct.pack('<H', number),
+        text(definition.type),
+        text('ros2msg'),
+        text(definition.text),
+    ) + record(0x04, struct.pack('<HH', number, number), text(name), text('cdr'), text(b''))
 
 
 def chunk(content):
-    return record(0x06, struct.pack('<QQQI', 0, 0, len(content), 0), text(''), struct.pack('<Q', len(content)), content)
+    return record(
+        0x06,
+        struct.pack('<QQQI', 0, 0, len(content), 0),
+        text(''),
+        struct.pack('<Q', len(content)),
+        content,
+    )
 
 
 def write_file(path, data_section, finished=True):
@@ -48,29 +59,48 @@ def parts():
         messages.append(message(1, int(imu.stamp_ns[k]), row.tobytes()))
         if k % 5 == 0 and k < 2000:
             messages.append(message(2, int(imu.stamp_ns[k]), joint_rows[k // 5].tobytes()))
-    return imu, joints, topic_records(1, '/imu/data_raw', IMU_TYPE) + topic_records(2, '/joint_states', JOINT_STATE_TYPE), messages
+    return (
+        imu,
+        joints,
+        topic_records(1, '/imu/data_raw', IMU_TYPE)
+        + topic_records(2, '/joint_states', JOINT_STATE_TYPE),
+        messages,
+    )
 
 
 def check(path, imu, joints, lost=False, counted=True):
     with open_recording(path) as recording:
-        assert not counted or recording.message_counts == {'/imu/data_raw': 3000, '/joint_states': 400}
+        assert not counted or recording.message_counts == {
+            '/imu/data_raw': 3000,
+            '/joint_states': 400,
+        }
         blocks = list(recording.blocks())
         assert bool(recording.lost) == lost
     read = ImuSamples.concatenate(block.imu for block in blocks)
     np.testing.assert_array_equal(read.force_s, imu.force_s)
-    np.testing.assert_array_equal(np.concatenate([block.joints.position for block in blocks if block.joints]), joints.position[:400])
+    np.testing.assert_array_equal(
+        np.concatenate([block.joints.position for block in blocks if block.joints]),
+        joints.position[:400],
+    )
 
 
 @pytest.mark.parametrize('finished', [True, False])
 def test_messages_outside_of_chunks(tmp_path, parts, finished):
     imu, joints, definitions, messages = parts
-    check(write_file(tmp_path / 'x.mcap', definitions + b''.join(messages), finished), imu, joints, not finished)
+    check(
+        write_file(tmp_path / 'x.mcap', definitions + b''.join(messages), finished),
+        imu,
+        joints,
+        not finished,
+    )
 
 
 def test_chunks_without_indexes_and_definitions_in_the_middle(tmp_path, parts):
     imu, joints, definitions, messages = parts
     cut = len(messages) // 3
-    first, middle, last = (b''.join(messages[part]) for part in (slice(cut), slice(cut, 2 * cut), slice(2 * cut, None)))
+    first, middle, last = (
+        b''.join(messages[part]) for part in (slice(cut), slice(cut, 2 * cut), slice(2 * cut, None))
+    )
     data = chunk(definitions + first) + middle + chunk(definitions + last)
     private = record(0x80, b'of an application')
     check(write_file(tmp_path / 'x.mcap', private + data), imu, joints)
@@ -79,16 +109,30 @@ def test_chunks_without_indexes_and_definitions_in_the_middle(tmp_path, parts):
 def test_an_index_that_is_wrong_is_not_believed(tmp_path, parts):
     imu, joints, definitions, messages = parts
     offsets = np.cumsum([0, *map(len, messages[:-1])])
-    entries = np.stack([offsets, offsets + 1], axis=1)   # every offset one too large, and channel 2 forgotten
+    entries = np.stack(
+        [offsets, offsets + 1], axis=1
+    )  # every offset one too large, and channel 2 forgotten
     index = record(0x07, struct.pack('<H', 1), text(entries.astype('<u8').tobytes()))
-    check(write_file(tmp_path / 'x.mcap', definitions + chunk(b''.join(messages)) + index + chunk(definitions)), imu, joints,
-          counted=False)
+    check(
+        write_file(
+            tmp_path / 'x.mcap',
+            definitions + chunk(b''.join(messages)) + index + chunk(definitions),
+        ),
+        imu,
+        joints,
+        counted=False,
+    )
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 40), st.integers(1, 40)), max_size=20), st.integers(0, 30))
+@given(
+    st.lists(st.tuples(st.integers(1, 3), st.integers(0, 40), st.integers(1, 40)), max_size=20),
+    st.integers(0, 30),
+)
 def test_walking_finds_every_message_whatever_the_pattern(runs, cut):
-    records = [message(channel, 7, bytes(size)) for channel, size, count in runs for _ in range(count)]
+    records = [
+        message(channel, 7, bytes(size)) for channel, size, count in runs for _ in range(count)
+    ]
     content = b''.join(records) + record(0x0C, b'')
     whole = np.frombuffer(content, np.uint8)
     (channel, found), others, end = walk(whole)
@@ -98,8 +142,10 @@ def test_walking_finds_every_message_whatever_the_pattern(runs, cut):
     np.testing.assert_array_equal(found.start, expected)
     np.testing.assert_array_equal(found.size, [len(data) - 31 for data in records])
     cut = min(cut, len(content))
-    (_, shorter), _, end = walk(whole[:len(content) - cut])
-    assert end <= len(content) - cut and len(shorter.start) == int((found.start + found.size <= end).sum())
+    (_, shorter), _, end = walk(whole[: len(content) - cut])
+    assert end <= len(content) - cut and len(shorter.start) == int(
+        (found.start + found.size <= end).sum()
+    )
     offsets = {number: found.start[channel == number] - 31 for number in (3, 1, 2)}
     indexed = indexed_messages(whole[:-9], list(offsets.items()))
     if records:

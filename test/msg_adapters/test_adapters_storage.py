@@ -30,12 +30,22 @@ class LinesWriter:
     def add_topic(self, topic_id, name, definition, *, qos):
         """Declare a topic."""
         assert isinstance(qos, str)
-        print(json.dumps(['topic', topic_id, name, definition.type, definition.encoding, definition.text]), file=self.file)
+        print(
+            json.dumps(
+                ['topic', topic_id, name, definition.type, definition.encoding, definition.text]
+            ),
+            file=self.file,
+        )
 
     def write(self, topic_ids, received_ns, messages):
         """Append messages."""
-        for topic_id, received, data in zip(topic_ids.tolist(), received_ns.tolist(), messages.views(), strict=True):
-            print(json.dumps(['message', topic_id, received, b64encode(data).decode()]), file=self.file)
+        for topic_id, received, data in zip(
+            topic_ids.tolist(), received_ns.tolist(), messages.views(), strict=True
+        ):
+            print(
+                json.dumps(['message', topic_id, received, b64encode(data).decode()]),
+                file=self.file,
+            )
 
     def close(self, _information, _metadata):
         """Close."""
@@ -72,7 +82,11 @@ class LinesFile(StorageFile):
     def _stretches(self, _topics):
         topic_ids, received, data = zip(*self.messages, strict=True)
         packed = Packed.join([b64decode(text) for text in data])
-        yield Stretch(np.array(topic_ids), lambda index: (index, packed.select(index)), lambda index: np.array(received)[index])
+        yield Stretch(
+            np.array(topic_ids),
+            lambda index: (index, packed.select(index)),
+            lambda index: np.array(received)[index],
+        )
 
 
 @pytest.fixture
@@ -86,8 +100,12 @@ def lines():
 def session(count=300):
     """A short recording."""
     rng, stamp_ns = np.random.default_rng(1), 1_700_000_000_000_000_000 + 10**7 * np.arange(count)
-    return (ImuSamples(stamp_ns, rng.normal(size=(count, 3)), rng.normal(size=(count, 3)), 'imu_link'),
-            JointSamples(stamp_ns, rng.normal(size=(count, 1)), rng.normal(size=(count, 1)), ('inner',)))
+    return (
+        ImuSamples(stamp_ns, rng.normal(size=(count, 3)), rng.normal(size=(count, 3)), 'imu_link'),
+        JointSamples(
+            stamp_ns, rng.normal(size=(count, 1)), rng.normal(size=(count, 1)), ('inner',)
+        ),
+    )
 
 
 @pytest.mark.usefixtures('lines')
@@ -95,22 +113,48 @@ def test_a_new_storage_is_written_read_and_copied(tmp_path):
     imu, joints = session()
     write_session(tmp_path / 'bag', imu, joints, storage='lines')
     assert (tmp_path / 'bag/bag_0.lines').exists() and is_bag(tmp_path / 'bag')
-    copy_with_corrected(tmp_path / 'bag', tmp_path / 'copy', '/imu/data_raw', corrected_topic='/imu/data_corrected',
-                        correct=lambda part: type('Corrected', (),
-                                                  {'force': part.force_s + 1, 'rate': part.rate_s, 'marks': np.zeros((len(part), 2))}))
-    (tmp_path / 'copy/metadata.yaml').unlink()   # then the files say how many messages there are
-    for path, topic, shift in ((tmp_path / 'bag', None, 0.0), (tmp_path / 'copy', '/imu/data_corrected', 1.0),
-                               (tmp_path / 'bag/bag_0.lines', None, 0.0)):
+    copy_with_corrected(
+        tmp_path / 'bag',
+        tmp_path / 'copy',
+        '/imu/data_raw',
+        corrected_topic='/imu/data_corrected',
+        correct=lambda part: type(
+            'Corrected',
+            (),
+            {'force': part.force_s + 1, 'rate': part.rate_s, 'marks': np.zeros((len(part), 2))},
+        ),
+    )
+    (tmp_path / 'copy/metadata.yaml').unlink()  # then the files say how many messages there are
+    for path, topic, shift in (
+        (tmp_path / 'bag', None, 0.0),
+        (tmp_path / 'copy', '/imu/data_corrected', 1.0),
+        (tmp_path / 'bag/bag_0.lines', None, 0.0),
+    ):
         with open_recording(path, imu_topic=topic) as recording:
-            block, = recording.blocks()
+            (block,) = recording.blocks()
         np.testing.assert_array_equal(block.imu.force_s, imu.force_s + shift)
         np.testing.assert_array_equal(block.joints.position, joints.position)
-        assert recording.source.storage == 'lines' and recording.message_counts[recording.imu_topic] == len(imu)
+        assert recording.source.storage == 'lines' and recording.message_counts[
+            recording.imu_topic
+        ] == len(imu)
 
 
 @pytest.mark.usefixtures('lines')
 def test_the_command_line_offers_it(tmp_path, capsys):
-    assert main(['simulate', '--profile', 'quick', '--storage', 'lines', '--output', str(tmp_path / 'bag')]) == 0
+    assert (
+        main(
+            [
+                'simulate',
+                '--profile',
+                'quick',
+                '--storage',
+                'lines',
+                '--output',
+                str(tmp_path / 'bag'),
+            ]
+        )
+        == 0
+    )
     assert main(['inspect', str(tmp_path / 'bag')]) == 0
     assert 'force unit' in capsys.readouterr().out
 

@@ -26,7 +26,9 @@ def imu():
 
 def write(path, header, *columns, delimiter=','):
     """Write columns as text."""
-    np.savetxt(path, np.column_stack(columns), delimiter=delimiter, header=header, comments='', fmt='%.12g')
+    np.savetxt(
+        path, np.column_stack(columns), delimiter=delimiter, header=header, comments='', fmt='%.12g'
+    )
     return path
 
 
@@ -38,46 +40,124 @@ def seconds(imu):
 def assert_read(log, imu):
     """The samples are those that were written."""
     read = log.imu
-    np.testing.assert_allclose(read.stamp_ns - read.stamp_ns[0], imu.stamp_ns - imu.stamp_ns[0], atol=1e3)
+    np.testing.assert_allclose(
+        read.stamp_ns - read.stamp_ns[0], imu.stamp_ns - imu.stamp_ns[0], atol=1e3
+    )
     np.testing.assert_allclose(read.force_s, imu.force_s, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(read.rate_s, imu.rate_s, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize(('force_size', 'force_unit'), [(1.0, 'm/s^2'), (STANDARD_GRAVITY, 'g'), (1e-3 * STANDARD_GRAVITY, 'mg')])
-@pytest.mark.parametrize(('rate_size', 'rate_unit'), [(1.0, 'rad/s'), (DEG, 'deg/s'), (1e-3 * DEG, 'mdeg/s')])
-@pytest.mark.parametrize(('time_size', 'time_unit'), [(1.0, 's'), (1e-3, 'ms'), (1e-6, 'us'), (1e-9, 'ns')])
-def test_units_follow_from_the_values(tmp_path, imu, force_size, force_unit, rate_size, rate_unit, time_size, time_unit):
-    log = read_csv(write(tmp_path / 'log.csv', PLAIN, seconds(imu) / time_size, imu.force_s / force_size, imu.rate_s / rate_size))
+@pytest.mark.parametrize(
+    ('force_size', 'force_unit'),
+    [(1.0, 'm/s^2'), (STANDARD_GRAVITY, 'g'), (1e-3 * STANDARD_GRAVITY, 'mg')],
+)
+@pytest.mark.parametrize(
+    ('rate_size', 'rate_unit'), [(1.0, 'rad/s'), (DEG, 'deg/s'), (1e-3 * DEG, 'mdeg/s')]
+)
+@pytest.mark.parametrize(
+    ('time_size', 'time_unit'), [(1.0, 's'), (1e-3, 'ms'), (1e-6, 'us'), (1e-9, 'ns')]
+)
+def test_units_follow_from_the_values(
+    tmp_path, imu, force_size, force_unit, rate_size, rate_unit, time_size, time_unit
+):
+    log = read_csv(
+        write(
+            tmp_path / 'log.csv',
+            PLAIN,
+            seconds(imu) / time_size,
+            imu.force_s / force_size,
+            imu.rate_s / rate_size,
+        )
+    )
     assert [(each.quantity, each.unit, each.origin) for each in log.columns] == [
-        ('time', time_unit, 'values'), ('force', force_unit, 'values'), ('rate', rate_unit, 'values')]
+        ('time', time_unit, 'values'),
+        ('force', force_unit, 'values'),
+        ('rate', rate_unit, 'values'),
+    ]
     assert_read(log, imu)
 
 
-@pytest.mark.parametrize(('header', 'force_size', 'rate_size', 'time_size', 'delimiter'), [
-    ('Timestamp (ms);AccX [g];AccY [g];AccZ [g];GyroX [deg/s];GyroY [deg/s];GyroZ [deg/s]', STANDARD_GRAVITY, DEG, 1e-3, ';'),
-    ('loggingTime(s),accelerometerAccelerationX(G),accelerometerAccelerationY(G),accelerometerAccelerationZ(G),gyroRotationX(rad/s),'
-     'gyroRotationY(rad/s),gyroRotationZ(rad/s)', STANDARD_GRAVITY, 1.0, 1.0, ','),
-    ('__time\t/imu/linear_acceleration/x\t/imu/linear_acceleration/y\t/imu/linear_acceleration/z\t/imu/angular_velocity/x\t'
-     '/imu/angular_velocity/y\t/imu/angular_velocity/z', 1.0, 1.0, 1.0, '\t'),
-    ('# t_us acc_x_mg acc_y_mg acc_z_mg gyro_x_dps gyro_y_dps gyro_z_dps', 1e-3 * STANDARD_GRAVITY, DEG, 1e-6, ' '),
-    ('Time since start in ms ,X_accel,Y_accel,Z_accel,X_gyro,Y_gyro,Z_gyro', 1.0, 1.0, 1e-3, ','),
-], ids=['brackets', 'camel case', 'paths', 'suffixes', 'axis first'])
-def test_headers_name_columns_and_units(tmp_path, imu, header, force_size, rate_size, time_size, delimiter):
-    path = write(tmp_path / 'log.csv', header, seconds(imu) / time_size, imu.force_s / force_size, imu.rate_s / rate_size, delimiter=delimiter)
+@pytest.mark.parametrize(
+    ('header', 'force_size', 'rate_size', 'time_size', 'delimiter'),
+    [
+        (
+            'Timestamp (ms);AccX [g];AccY [g];AccZ [g];GyroX [deg/s];GyroY [deg/s];GyroZ [deg/s]',
+            STANDARD_GRAVITY,
+            DEG,
+            1e-3,
+            ';',
+        ),
+        (
+            'loggingTime(s),accelerometerAccelerationX(G),accelerometerAccelerationY(G),accelerometerAccelerationZ(G),gyroRotationX(rad/s),'
+            'gyroRotationY(rad/s),gyroRotationZ(rad/s)',
+            STANDARD_GRAVITY,
+            1.0,
+            1.0,
+            ',',
+        ),
+        (
+            '__time\t/imu/linear_acceleration/x\t/imu/linear_acceleration/y\t/imu/linear_acceleration/z\t/imu/angular_velocity/x\t'
+            '/imu/angular_velocity/y\t/imu/angular_velocity/z',
+            1.0,
+            1.0,
+            1.0,
+            '\t',
+        ),
+        (
+            '# t_us acc_x_mg acc_y_mg acc_z_mg gyro_x_dps gyro_y_dps gyro_z_dps',
+            1e-3 * STANDARD_GRAVITY,
+            DEG,
+            1e-6,
+            ' ',
+        ),
+        (
+            'Time since start in ms ,X_accel,Y_accel,Z_accel,X_gyro,Y_gyro,Z_gyro',
+            1.0,
+            1.0,
+            1e-3,
+            ',',
+        ),
+    ],
+    ids=['brackets', 'camel case', 'paths', 'suffixes', 'axis first'],
+)
+def test_headers_name_columns_and_units(
+    tmp_path, imu, header, force_size, rate_size, time_size, delimiter
+):
+    path = write(
+        tmp_path / 'log.csv',
+        header,
+        seconds(imu) / time_size,
+        imu.force_s / force_size,
+        imu.rate_s / rate_size,
+        delimiter=delimiter,
+    )
     assert_read(read_csv(path), imu)
 
 
 def test_columns_in_another_order_with_rate_first_and_a_row_of_units(tmp_path, imu):
     header = 'timestamp,w_RS_S_x,w_RS_S_y,w_RS_S_z,a_RS_S_x,a_RS_S_y,a_RS_S_z,temp\nns,rad s^-1,rad s^-1,rad s^-1,m s^-2,m s^-2,m s^-2,C'
-    log = read_csv(write(tmp_path / 'log.csv', header, imu.stamp_ns, imu.rate_s, imu.force_s, np.full(len(imu), 31.5)))
+    log = read_csv(
+        write(
+            tmp_path / 'log.csv',
+            header,
+            imu.stamp_ns,
+            imu.rate_s,
+            imu.force_s,
+            np.full(len(imu), 31.5),
+        )
+    )
     assert_read(log, imu)
     assert np.all(log.temperature.temperature_c == 31.5)
 
 
 def test_dates_and_decimal_commas_and_empty_cells(tmp_path, imu):
-    stamps = np.datetime_as_string((imu.stamp_ns // 1000 * 1000).astype('datetime64[ns]'), unit='us')
-    rows = [';'.join([stamp.replace('T', ' '), *(f'{value:.12g}'.replace('.', ',') for value in row)])
-            for stamp, row in zip(stamps, np.column_stack([imu.force_s, imu.rate_s]).tolist())]
+    stamps = np.datetime_as_string(
+        (imu.stamp_ns // 1000 * 1000).astype('datetime64[ns]'), unit='us'
+    )
+    rows = [
+        ';'.join([stamp.replace('T', ' '), *(f'{value:.12g}'.replace('.', ',') for value in row)])
+        for stamp, row in zip(stamps, np.column_stack([imu.force_s, imu.rate_s]).tolist())
+    ]
     rows[5] = ';'.join([rows[5].split(';')[0], '', *rows[5].split(';')[2:]])
     (tmp_path / 'log.csv').write_text('\n'.join([PLAIN.replace(',', ';'), *rows]))
     read = read_csv(tmp_path / 'log.csv').imu
@@ -87,19 +167,29 @@ def test_dates_and_decimal_commas_and_empty_cells(tmp_path, imu):
 
 
 def test_given_columns_replace_the_guess(tmp_path, imu):
-    path = write(tmp_path / 'log.csv', 'when,p,q,r,gx,gy,gz,enc', seconds(imu), -imu.force_s, imu.rate_s, np.full(len(imu), 90.0))
+    path = write(
+        tmp_path / 'log.csv',
+        'when,p,q,r,gx,gy,gz,enc',
+        seconds(imu),
+        -imu.force_s,
+        imu.rate_s,
+        np.full(len(imu), 90.0),
+    )
     log = read_csv(path, ['time=when:s', 'force=-2,-q,-r', 'joint.shaft=enc:deg'])
     assert_read(log, imu)
     assert log.joints.names == ('shaft',)
     np.testing.assert_allclose(log.joints.position, np.pi / 2)
 
 
-@pytest.mark.parametrize(('header', 'columns', 'words'), [
-    ('foo,ax,ay,az,gx,gy,gz', [], ('time',)),
-    (PLAIN, ['force=ax,ay'], ("'force=ax,ay'",)),
-    (PLAIN, ['force=ax,ay,az:ft/s^2'], ("'ft/s^2'",)),
-    (PLAIN, ['force=ax,ay,up'], ("'up'",)),
-])
+@pytest.mark.parametrize(
+    ('header', 'columns', 'words'),
+    [
+        ('foo,ax,ay,az,gx,gy,gz', [], ('time',)),
+        (PLAIN, ['force=ax,ay'], ("'force=ax,ay'",)),
+        (PLAIN, ['force=ax,ay,az:ft/s^2'], ("'ft/s^2'",)),
+        (PLAIN, ['force=ax,ay,up'], ("'up'",)),
+    ],
+)
 def test_what_is_missing_or_wrong_is_refused(tmp_path, imu, header, columns, words):
     path = write(tmp_path / 'log.csv', header, seconds(imu), imu.force_s, imu.rate_s)
     with pytest.raises(InputError) as error:
@@ -108,15 +198,30 @@ def test_what_is_missing_or_wrong_is_refused(tmp_path, imu, header, columns, wor
 
 
 def test_two_accelerometers_and_a_rate_without_turns_are_ambiguous(tmp_path, imu):
-    two = write(tmp_path / 'two.csv', PLAIN + ',acc_x,acc_y,acc_z', seconds(imu), imu.force_s, imu.rate_s, imu.force_s)
-    still = write(tmp_path / 'still.csv', PLAIN, seconds(imu), np.tile([0, 0, 9.81], (len(imu), 1)), np.full((len(imu), 3), 0.01))
+    two = write(
+        tmp_path / 'two.csv',
+        PLAIN + ',acc_x,acc_y,acc_z',
+        seconds(imu),
+        imu.force_s,
+        imu.rate_s,
+        imu.force_s,
+    )
+    still = write(
+        tmp_path / 'still.csv',
+        PLAIN,
+        seconds(imu),
+        np.tile([0, 0, 9.81], (len(imu), 1)),
+        np.full((len(imu), 3), 0.01),
+    )
     for path in (two, still):
         with pytest.raises(InputError):
             open_recording(path)
     assert read_csv(still, ['rate=gx,gy,gz:deg/s']).imu.rate_s[0, 0] == pytest.approx(0.01 * DEG)
 
 
-@pytest.mark.parametrize('content', [b'', b'\x00\x01\x02' * 50, b'one\ntwo\nthree\n', b'time,ax,ay,az,gx,gy,gz\n'])
+@pytest.mark.parametrize(
+    'content', [b'', b'\x00\x01\x02' * 50, b'one\ntwo\nthree\n', b'time,ax,ay,az,gx,gy,gz\n']
+)
 def test_files_that_are_no_logs_end_with_one_line(tmp_path, capsys, content):
     (tmp_path / 'log.csv').write_bytes(content)
     assert main(['inspect', str(tmp_path / 'log.csv')]) == 1
@@ -129,7 +234,9 @@ def test_verbs_read_logs_and_convert_writes_the_same_bag(tmp_path, imu, capsys):
     assert 'ax,ay,az' in capsys.readouterr().out
     from_log = imu_calibration.calibrate(path, gravity=STANDARD_GRAVITY).calibration
     from_bag = imu_calibration.calibrate(tmp_path / 'bag', gravity=STANDARD_GRAVITY).calibration
-    from_arrays = imu_calibration.calibrate(time=seconds(imu), force=imu.force_s, rate=imu.rate_s, gravity=STANDARD_GRAVITY).calibration
+    from_arrays = imu_calibration.calibrate(
+        time=seconds(imu), force=imu.force_s, rate=imu.rate_s, gravity=STANDARD_GRAVITY
+    ).calibration
     for other in (from_bag, from_arrays):
         np.testing.assert_allclose(other.values, from_log.values, rtol=1e-6, atol=1e-9)
 
@@ -141,7 +248,9 @@ def test_arrays_of_other_shapes_are_refused():
         imu_calibration.calibrate(time=np.arange(5.0))
 
 
-def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_user(tmp_path, imu, monkeypatch):
+def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_user(
+    tmp_path, imu, monkeypatch
+):
     path = write(tmp_path / 'log.csv', PLAIN, seconds(imu), imu.force_s, imu.rate_s)
     reads = []
     monkeypatch.setattr(csv_log, 'read_csv', lambda path: reads.append(path) or read_csv(path))
@@ -157,6 +266,8 @@ def test_an_unchanged_log_is_converted_once_and_its_bag_removed_with_its_last_us
 def test_times_beyond_64_bits_are_refused_without_a_warning(tmp_path, number):
     rows = [(0.005 * k, 0.0, 0.0, 9.81, 1e308, 0.0, 0.0) for k in range(40)]
     lines = [','.join(map(str, row)) for row in rows] + [f'{number},0,0,9.81,0,0,0', 'short']
-    (tmp_path / 'x.csv').write_text('\n'.join(['time [s],ax [g],ay [g],az [g],gx [deg/s],gy [deg/s],gz [deg/s]', *lines]) + '\n')
+    (tmp_path / 'x.csv').write_text(
+        '\n'.join(['time [s],ax [g],ay [g],az [g],gx [deg/s],gy [deg/s],gz [deg/s]', *lines]) + '\n'
+    )
     with refused(InputError, 'csv_time', '4e+09', 1):
         read_csv(tmp_path / 'x.csv')

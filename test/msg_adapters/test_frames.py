@@ -26,15 +26,25 @@ def two(tmp_path_factory):
     path = tmp_path_factory.mktemp('frames') / 'bag'
     with BagWriter(path) as bag:
         topic = bag.add_topic('/imus', standard_definition(IMU_TYPE))
-        messages = [Packed.of_rows(encode_imu(ImuSamples(imu.stamp_ns, imu.force_s + [shift, 0, 0], imu.rate_s, frame))).views()
-                    for frame, shift in (('front', 0.0), ('rear', 1.0))]
-        bag.write(np.full(2 * len(imu), topic), np.repeat(imu.stamp_ns, 2), Packed.join([each for pair in zip(*messages) for each in pair]))
+        messages = [
+            Packed.of_rows(
+                encode_imu(ImuSamples(imu.stamp_ns, imu.force_s + [shift, 0, 0], imu.rate_s, frame))
+            ).views()
+            for frame, shift in (('front', 0.0), ('rear', 1.0))
+        ]
+        bag.write(
+            np.full(2 * len(imu), topic),
+            np.repeat(imu.stamp_ns, 2),
+            Packed.join([each for pair in zip(*messages) for each in pair]),
+        )
     return path, imu
 
 
 def read(path, **choice):
     with open_recording(path, want_joints=False, **choice) as recording:
-        return ImuSamples.concatenate([block.imu for block in recording.blocks() if block.imu is not None])
+        return ImuSamples.concatenate(
+            [block.imu for block in recording.blocks() if block.imu is not None]
+        )
 
 
 @pytest.mark.parametrize(('frame', 'shift'), [('front', 0.0), ('rear', 1.0)])
@@ -65,14 +75,22 @@ def test_a_few_messages_of_another_frame_are_damage():
 def test_the_option_selects_the_frame_and_its_absence_is_one_line(capsys, two, tmp_path):
     out = tmp_path / 'out'
     assert main(['calibrate', str(two[0]), '--output', str(out), '--no-report']) == 1
-    line, = capsys.readouterr().err.splitlines()
+    (line,) = capsys.readouterr().err.splitlines()
     assert '--frame-id' in line and not out.exists()
-    assert main(['calibrate', str(two[0]), '--frame-id', 'rear', '--output', str(out), '--no-report']) in (0, 3)
+    assert main(
+        ['calibrate', str(two[0]), '--frame-id', 'rear', '--output', str(out), '--no-report']
+    ) in (0, 3)
     assert 'frame_id: rear' in (out / 'calibration.yaml').read_text()
     with refused(InputError, 'frame_ambiguous'):
         compensate(two[0], out / 'calibration.yaml', output=tmp_path / 'refused', anyway=True)
     assert not (tmp_path / 'refused').exists()
-    found = compensate(two[0], out / 'calibration.yaml', output=tmp_path / 'corrected', frame_id='rear', anyway=True)
+    found = compensate(
+        two[0],
+        out / 'calibration.yaml',
+        output=tmp_path / 'corrected',
+        frame_id='rear',
+        anyway=True,
+    )
     corrected = read(tmp_path / 'corrected', imu_topic='/imu/data_corrected')
     assert found.count == len(corrected) == len(two[1]) and corrected.frame_id == 'rear'
 
@@ -87,8 +105,23 @@ def test_inspect_lists_both(capsys, two):
 
 def test_arm_refuses_one_imu_twice(capsys, two):
     for words in ([], ['--frame-id', 'rear', '--frame-id', 'rear'], ['--frame-id', 'rear']):
-        assert main(['arm', str(two[0]), '--imu-topic', '/imus', '--imu-topic', '/imus', *words]) == 1
-        line, = capsys.readouterr().err.splitlines()
+        assert (
+            main(['arm', str(two[0]), '--imu-topic', '/imus', '--imu-topic', '/imus', *words]) == 1
+        )
+        (line,) = capsys.readouterr().err.splitlines()
         assert 'twice' in line
-    assert main(['arm', str(two[0]), '--imu-topic', '/imus', '--imu-topic', '/imus', '--frame-id', 'front', '--frame-id', 'rear']) in (0, 1, 3)
+    assert main(
+        [
+            'arm',
+            str(two[0]),
+            '--imu-topic',
+            '/imus',
+            '--imu-topic',
+            '/imus',
+            '--frame-id',
+            'front',
+            '--frame-id',
+            'rear',
+        ]
+    ) in (0, 1, 3)
     assert 'twice' not in capsys.readouterr().err

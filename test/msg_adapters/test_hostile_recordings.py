@@ -26,7 +26,7 @@ from msg_adapters.write import encode_imu, encode_joints
 from worlds.limited import limited, refused, survived
 from worlds.small_bags import write_small_bag
 
-pytestmark = pytest.mark.live   # each input is read in a process with limits
+pytestmark = pytest.mark.live  # each input is read in a process with limits
 SEPARATOR = '=' * 80 + '\n'
 
 
@@ -61,6 +61,7 @@ def zeros(n_bytes):
 
 # Decompression
 
+
 @pytest.mark.parametrize('compression', ['zstd', 'lz4', 'lz4 that claims 2^45 bytes'])
 @pytest.mark.parametrize('declared', [1000, LARGEST_CHUNK, 5 << 30, 2**63])
 def test_a_chunk_expands_to_its_declared_size_at_most(tmp_path, compression, declared):
@@ -71,7 +72,12 @@ def test_a_chunk_expands_to_its_declared_size_at_most(tmp_path, compression, dec
         packed = lz4.frame.compress(bytes(1 << 27), store_size=True)
         if 'claims' in compression:
             packed = packed[:6] + struct.pack('<Q', 2**45) + packed[14:]
-    content = struct.pack('<QQQI', 0, 1, declared, 0) + text(compression[:4]) + struct.pack('<Q', len(packed)) + packed
+    content = (
+        struct.pack('<QQQI', 0, 1, declared, 0)
+        + text(compression[:4])
+        + struct.pack('<Q', len(packed))
+        + packed
+    )
     write_file(tmp_path / 'x.mcap', record(0x06, content) * 3)
     refused('inspect', tmp_path / 'x.mcap')
 
@@ -87,13 +93,17 @@ def test_frames_without_content_do_not_take_quadratic_time(tmp_path):
     (tmp_path / 'x.mcap.zstd').write_bytes(zstd().compress(b'') * 300_000)
     refused('inspect', tmp_path / 'x.mcap.zstd')
     packed = zstd().compress(b'') * 300_000
-    content = struct.pack('<QQQI', 0, 1, 1000, 0) + text('zstd') + struct.pack('<Q', len(packed)) + packed
+    content = (
+        struct.pack('<QQQI', 0, 1, 1000, 0) + text('zstd') + struct.pack('<Q', len(packed)) + packed
+    )
     write_file(tmp_path / 'x.mcap', record(0x06, content))
     refused('inspect', tmp_path / 'x.mcap')
 
 
 def test_messages_that_expand_far_are_lost_and_counted(bag):
-    rewrite_metadata(bag, lambda metadata: metadata.update(compression_mode='message', compression_format='zstd'))
+    rewrite_metadata(
+        bag, lambda metadata: metadata.update(compression_mode='message', compression_format='zstd')
+    )
     data = zstd().compress(bytes(60 << 20))
     connection = sqlite3.connect(next(bag.glob('*.db3')))
     connection.execute('UPDATE messages SET data = ?', (data,))
@@ -107,20 +117,23 @@ def test_messages_that_expand_far_are_lost_and_counted(bag):
 
 # Storage
 
+
 def test_a_page_that_lists_itself_is_read_once(bag):
     """1000 pointers of a page to itself were followed to the 20th power."""
     path = next(bag.glob('*.db3'))
     connection = sqlite3.connect(path)
-    root, = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
-    size, = connection.execute('PRAGMA page_size').fetchone()
+    (root,) = connection.execute(
+        "SELECT rootpage FROM sqlite_master WHERE name = 'messages'"
+    ).fetchone()
+    (size,) = connection.execute('PRAGMA page_size').fetchone()
     connection.close()
-    page = bytearray(path.read_bytes()[(root - 1) * size:root * size])
+    page = bytearray(path.read_bytes()[(root - 1) * size : root * size])
     n_cells = (size - 100) // 2
     cells = np.full(n_cells, size - 8, '>u2').tobytes()
-    page[:12 + len(cells)] = struct.pack('>BHHHBI', 0x05, 0, n_cells, size - 8, 0, root) + cells
-    page[size - 8:size - 4] = struct.pack('>I', root)
+    page[: 12 + len(cells)] = struct.pack('>BHHHBI', 0x05, 0, n_cells, size - 8, 0, root) + cells
+    page[size - 8 : size - 4] = struct.pack('>I', root)
     data = bytearray(path.read_bytes())
-    data[(root - 1) * size:root * size] = page
+    data[(root - 1) * size : root * size] = page
     path.write_bytes(data)
     survived('inspect', bag)
 
@@ -128,34 +141,74 @@ def test_a_page_that_lists_itself_is_read_once(bag):
 ENDLESS = 'WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n)'
 
 
-@pytest.mark.parametrize('statements', [
-    ('ALTER TABLE topics RENAME TO t', f"CREATE VIEW topics AS {ENDLESS} SELECT k AS id, 'x' || k AS name, 'std_msgs/msg/String' AS type, "
-     "'cdr' AS serialization_format, '' AS offered_qos_profiles FROM n"),
-    ('ALTER TABLE messages RENAME TO m', f'CREATE VIEW messages AS {ENDLESS} SELECT k AS id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n'),
-    ('ALTER TABLE messages RENAME TO m', 'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
-     "data AS (zeroblob(900000000)))", 'INSERT INTO messages(id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM m'),
-    ('DROP TABLE message_definitions', f"CREATE VIEW message_definitions AS {ENDLESS} SELECT 'a' || k AS topic_type, 'ros2msg' AS encoding, "
-     "hex(zeroblob(1000)) AS encoded_message_definition FROM n")], ids=['topics', 'messages', 'generated column', 'definitions'])
+@pytest.mark.parametrize(
+    'statements',
+    [
+        (
+            'ALTER TABLE topics RENAME TO t',
+            f"CREATE VIEW topics AS {ENDLESS} SELECT k AS id, 'x' || k AS name, 'std_msgs/msg/String' AS type, "
+            "'cdr' AS serialization_format, '' AS offered_qos_profiles FROM n",
+        ),
+        (
+            'ALTER TABLE messages RENAME TO m',
+            f'CREATE VIEW messages AS {ENDLESS} SELECT k AS id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n',
+        ),
+        (
+            'ALTER TABLE messages RENAME TO m',
+            'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
+            'data AS (zeroblob(900000000)))',
+            'INSERT INTO messages(id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM m',
+        ),
+        (
+            'DROP TABLE message_definitions',
+            f"CREATE VIEW message_definitions AS {ENDLESS} SELECT 'a' || k AS topic_type, 'ros2msg' AS encoding, "
+            'hex(zeroblob(1000)) AS encoded_message_definition FROM n',
+        ),
+    ],
+    ids=['topics', 'messages', 'generated column', 'definitions'],
+)
 def test_views_and_generated_columns_in_place_of_tables_are_refused(bag, statements):
     os.remove(bag / 'metadata.yaml')
     change_database(bag, *statements)
     printed = refused('inspect', bag).err
-    assert any(f"'{name}'" in printed for name in ('topics', 'messages', 'message_definitions')) and 'columns' in printed
+    assert (
+        any(f"'{name}'" in printed for name in ('topics', 'messages', 'message_definitions'))
+        and 'columns' in printed
+    )
 
 
-@pytest.mark.parametrize('change', ["UPDATE topics SET name = NULL", "UPDATE topics SET name = x'ff00'", "UPDATE topics SET type = x'00'",
-                                    "UPDATE topics SET serialization_format = NULL", "UPDATE message_definitions SET topic_type = NULL",
-                                    "UPDATE messages SET data = NULL", "UPDATE messages SET data = 7", "UPDATE messages SET timestamp = 'noon'",
-                                    "UPDATE messages SET topic_id = 'x'", "UPDATE messages SET data = 'text'", 'DROP TABLE messages'])
+@pytest.mark.parametrize(
+    'change',
+    [
+        'UPDATE topics SET name = NULL',
+        "UPDATE topics SET name = x'ff00'",
+        "UPDATE topics SET type = x'00'",
+        'UPDATE topics SET serialization_format = NULL',
+        'UPDATE message_definitions SET topic_type = NULL',
+        'UPDATE messages SET data = NULL',
+        'UPDATE messages SET data = 7',
+        "UPDATE messages SET timestamp = 'noon'",
+        "UPDATE messages SET topic_id = 'x'",
+        "UPDATE messages SET data = 'text'",
+        'DROP TABLE messages',
+    ],
+)
 @pytest.mark.parametrize('columns', [False, True])
 def test_values_of_other_kinds_are_one_line(bag, change, columns):
-    if columns:   # then rows are read by SQL
+    if columns:  # then rows are read by SQL
         change_database(bag, 'ALTER TABLE messages ADD COLUMN more INTEGER')
     else:
         os.remove(bag / 'metadata.yaml')
-    table = next(name for name in ('topics', 'messages', 'message_definitions') if f' {name}' in change)
-    if 'UPDATE' in change:   # a copy has no constraints
-        change_database(bag, f'CREATE TABLE t AS SELECT * FROM {table}', f'DROP TABLE {table}', f'ALTER TABLE t RENAME TO {table}')
+    table = next(
+        name for name in ('topics', 'messages', 'message_definitions') if f' {name}' in change
+    )
+    if 'UPDATE' in change:  # a copy has no constraints
+        change_database(
+            bag,
+            f'CREATE TABLE t AS SELECT * FROM {table}',
+            f'DROP TABLE {table}',
+            f'ALTER TABLE t RENAME TO {table}',
+        )
     change_database(bag, change)
     survived('inspect', bag)
 
@@ -163,7 +216,9 @@ def test_values_of_other_kinds_are_one_line(bag, change, columns):
 def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_path):
     """60,000 chunk starts that overlap, each of a chunk that claims to end behind the file: all the rest was read for each."""
     one = struct.pack('<BQ', 0x06, 2**40) + bytes(51)
-    starts = b''.join(record(0x08, struct.pack('<QQQ', 0, 0, 8 + 60 * k) + bytes(40)) for k in range(60_000))
+    starts = b''.join(
+        record(0x08, struct.pack('<QQQ', 0, 0, 8 + 60 * k) + bytes(40)) for k in range(60_000)
+    )
     data = b'\x89MCAP0\r\n' + one * 60_000
     footer = record(0x02, struct.pack('<QQI', len(data), 0, 0))
     (tmp_path / 'x.mcap').write_bytes(data + starts + footer + b'\x89MCAP0\r\n')
@@ -174,9 +229,12 @@ def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_pat
 
 # Definitions
 
+
 def doubling(n_levels, last):
     """A definition with 2^n fields."""
-    levels = [f'MSG: sensor_msgs/T{k}\nT{k + 1} a\nT{k + 1} b\n' for k in range(1, n_levels)] + [f'MSG: sensor_msgs/T{n_levels}\n{last}\n']
+    levels = [f'MSG: sensor_msgs/T{k}\nT{k + 1} a\nT{k + 1} b\n' for k in range(1, n_levels)] + [
+        f'MSG: sensor_msgs/T{n_levels}\n{last}\n'
+    ]
     return 'T1 a\nT1 b\n' + ''.join(SEPARATOR + level for level in levels)
 
 
@@ -188,12 +246,18 @@ def test_a_definition_with_far_too_many_fields_is_neither_standard_nor_used(last
     assert ('10000' in ended.code) == (last == 'float64 x') and ended.code, ended
 
 
-@pytest.mark.parametrize('definition, reason', [
-    ('string[2000000000] x', '10000 '), ('float64[2000000000] x', '10000 '),
-    ('Header[99999] x\n' + SEPARATOR + 'MSG: std_msgs/Header\nuint32 seq\n', '10000 '),
-    ('E[] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', IMU_TYPE),
-    ('E[4] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', IMU_TYPE),
-    ('E x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nE x\n', 'sensor_msgs/msg/E'), ('int32 x\n' * 200_000, '100000')])
+@pytest.mark.parametrize(
+    'definition, reason',
+    [
+        ('string[2000000000] x', '10000 '),
+        ('float64[2000000000] x', '10000 '),
+        ('Header[99999] x\n' + SEPARATOR + 'MSG: std_msgs/Header\nuint32 seq\n', '10000 '),
+        ('E[] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', IMU_TYPE),
+        ('E[4] x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nint32 X=3\n', IMU_TYPE),
+        ('E x\n' + SEPARATOR + 'MSG: sensor_msgs/E\nE x\n', 'sensor_msgs/msg/E'),
+        ('int32 x\n' * 200_000, '100000'),
+    ],
+)
 def test_definitions_of_endless_messages_are_refused(definition, reason):
     told = limited(refusal_of, definition).code
     assert reason in told and ('10000 ' in told) == (reason == '10000 ')
@@ -214,21 +278,40 @@ def refusal_of(definition):
 
 # Metadata
 
-@pytest.mark.parametrize('value', ['{<<: [&a {x: 1}, *a]}', '&a [*a]', '[' * 100 + ']' * 100, '1' + ':59' * 100_000, '!!int "1' + ':59' * 100_000 + '"', '9' * 5000,
-                                   '[' + '[],' * 70_000 + ']', '2000-99-99', '.inf'])
+
+@pytest.mark.parametrize(
+    'value',
+    [
+        '{<<: [&a {x: 1}, *a]}',
+        '&a [*a]',
+        '[' * 100 + ']' * 100,
+        '1' + ':59' * 100_000,
+        '!!int "1' + ':59' * 100_000 + '"',
+        '9' * 5000,
+        '[' + '[],' * 70_000 + ']',
+        '2000-99-99',
+        '.inf',
+    ],
+)
 def test_metadata_that_cost_more_than_they_say_are_left_out(bag, value):
-    (bag / 'metadata.yaml').write_text((bag / 'metadata.yaml').read_text().replace('custom_data: null', f'custom_data: {value}')
-                                       + f'hostile: {value}\n')
+    (bag / 'metadata.yaml').write_text(
+        (bag / 'metadata.yaml').read_text().replace('custom_data: null', f'custom_data: {value}')
+        + f'hostile: {value}\n'
+    )
     assert survived('inspect', bag).code != 1
     assert spelled_out(value) == []
-    if value != '.inf':   # a number like others
+    if value != '.inf':  # a number like others
         with pytest.raises(InputError):
             parsed(value, 'metadata', aliases=True)
 
 
 def test_nested_aliases_in_metadata_are_not_expanded(bag):
-    lines = ['custom_data: &a0 [x, x]'] + [f'  c{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 20)]
-    (bag / 'metadata.yaml').write_text((bag / 'metadata.yaml').read_text().replace('custom_data: null', '\n'.join(lines)))
+    lines = ['custom_data: &a0 [x, x]'] + [
+        f'  c{k}: &a{k} [{", ".join([f"*a{k - 1}"] * 9)}]' for k in range(1, 20)
+    ]
+    (bag / 'metadata.yaml').write_text(
+        (bag / 'metadata.yaml').read_text().replace('custom_data: null', '\n'.join(lines))
+    )
     assert survived('inspect', bag).code != 1
     with pytest.raises(InputError):
         parsed('\n'.join(line.strip() for line in lines), 'metadata', aliases=True)
@@ -252,17 +335,24 @@ def test_members_that_never_end_or_come_again_are_left_out(bag, tmp_path):
 
 def test_a_file_that_is_listed_again_and_again_is_read_once(bag):
     before = sum(topic.count for topic in list_topics(bag))
-    rewrite_metadata(bag, lambda metadata: metadata.update(relative_file_paths=metadata['relative_file_paths'] * 2000,
-                                                           topics_with_message_count=[]))
+    rewrite_metadata(
+        bag,
+        lambda metadata: metadata.update(
+            relative_file_paths=metadata['relative_file_paths'] * 2000, topics_with_message_count=[]
+        ),
+    )
     assert sum(topic.count for topic in list_topics(bag)) == before
     survived('inspect', bag)
 
 
 # Messages
 
+
 def test_long_names_take_no_quadratic_time():
     """A frame_id of 4 MiB took 50 s to compare; four live messages blocked a node for 31 s."""
-    imu = SimpleNamespace(stamp_ns=np.arange(4), force_s=np.ones((4, 3)), rate_s=np.ones((4, 3)), frame_id='')
+    imu = SimpleNamespace(
+        stamp_ns=np.arange(4), force_s=np.ones((4, 3)), rate_s=np.ones((4, 3)), frame_id=''
+    )
     ended = limited(decode_long_names, imu)
     assert ended.code == 0 and ended.seconds < 10 and ended.megabytes < 500, ended
 
@@ -270,22 +360,34 @@ def test_long_names_take_no_quadratic_time():
 def decode_long_names(imu):
     """Decode messages of long names; return 0."""
     from imu_calibration.core.samples import ImuSamples, JointSamples
+
     imu = ImuSamples(imu.stamp_ns, imu.force_s, imu.rate_s)
-    messages = [encode_imu(replace(imu.select(slice(k, k + 1)), frame_id='x' * (1 << 22) + str(k)))[0].tobytes() for k in range(4)]
+    messages = [
+        encode_imu(replace(imu.select(slice(k, k + 1)), frame_id='x' * (1 << 22) + str(k)))[
+            0
+        ].tobytes()
+        for k in range(4)
+    ]
     decoder = Decoder(IMU_TYPE)
     assert decoder.decode(Packed.join(messages)) is None and sum(decoder.dropped.values()) == 4
     names = tuple(f'joint_{k}' for k in range(100_000))
     values = np.zeros((1, len(names)))
     many = encode_joints(JointSamples(np.array([1]), values, values, names))[0].tobytes()
-    one = encode_joints(JointSamples(np.array([1]), values[:, :1], values[:, :1], ('x' * (1 << 22),)))[0].tobytes()
+    one = encode_joints(
+        JointSamples(np.array([1]), values[:, :1], values[:, :1], ('x' * (1 << 22),))
+    )[0].tobytes()
     for data in (many, one):
         decoder = JointDecoder()
-        assert decoder.decode(Packed.join([data] * 4)) is None and sum(decoder.dropped.values()) == 4
+        assert (
+            decoder.decode(Packed.join([data] * 4)) is None and sum(decoder.dropped.values()) == 4
+        )
     return 0
 
 
 def test_a_name_cannot_pose_as_markup_or_as_a_line(tmp_path):
-    bag = write_small_bag(tmp_path / 'bag', frame_id='imu\n[/nope]\x1b[2J', imu_topic='/[/nope]', storage='mcap')
+    bag = write_small_bag(
+        tmp_path / 'bag', frame_id='imu\n[/nope]\x1b[2J', imu_topic='/[/nope]', storage='mcap'
+    )
     ended = survived('inspect', bag)
     assert ended.code != 1 and '\x1b[2J' not in ended.out and '/[/nope]' in ended.out
     refused('inspect', tmp_path / 'x\x1b[2J\n')

@@ -34,6 +34,7 @@ def test_an_error_is_raised_at_its_place():
     def failing():
         yield 1
         raise OSError('damaged')
+
     reading = read_ahead(failing())
     assert next(reading) == 1
     with pytest.raises(OSError, match='damaged'):
@@ -42,7 +43,12 @@ def test_an_error_is_raised_at_its_place():
 
 def test_an_interruption_while_the_thread_starts_is_passed_on(monkeypatch):
     """The thread is within the generator then, and closing it at once raised a ValueError in place of the interruption."""
-    start, hold, closed, inside = threading.Thread.start, threading.Event(), threading.Event(), threading.Event()
+    start, hold, closed, inside = (
+        threading.Thread.start,
+        threading.Event(),
+        threading.Event(),
+        threading.Event(),
+    )
 
     def interrupted(thread):
         monkeypatch.setattr(threading.Thread, 'start', start)
@@ -54,6 +60,7 @@ def test_an_interruption_while_the_thread_starts_is_passed_on(monkeypatch):
     def signalled():
         inside.set()
         yield from pieces(closed, hold)
+
     monkeypatch.setattr(threading.Thread, 'start', interrupted)
     with pytest.raises(KeyboardInterrupt):
         next(read_ahead(signalled()))

@@ -56,7 +56,9 @@ def _named(node, prefix, scope=None):
             yield prefix + child.name, child, scope or child
             yield from _named(child, f'{prefix}{child.name}.', scope or child)
         elif isinstance(child, ast.stmt):
-            if isinstance(child, (ast.Assign, ast.AnnAssign)) and isinstance(node, (ast.Module, ast.ClassDef)):
+            if isinstance(child, (ast.Assign, ast.AnnAssign)) and isinstance(
+                node, (ast.Module, ast.ClassDef)
+            ):
                 yield from ((prefix + name, value, None) for name, value in _constants(child))
             yield from _named(child, prefix, scope)
 
@@ -67,15 +69,28 @@ def _constants(assignment):
         if isinstance(target, ast.Name) and assignment.value:
             yield target.id, assignment.value
         elif isinstance(target, ast.Tuple) and isinstance(assignment.value, ast.Tuple):
-            yield from ((each.id, value) for each, value in zip(target.elts, assignment.value.elts) if isinstance(each, ast.Name))
+            yield from (
+                (each.id, value)
+                for each, value in zip(target.elts, assignment.value.elts)
+                if isinstance(each, ast.Name)
+            )
 
 
 def local_names(function):
     """Return the names of arguments and variables of a function and of the functions inside it."""
     nodes = list(ast.walk(function))
     names = {node.arg for node in nodes if isinstance(node, ast.arg)}
-    names |= {node.id for node in nodes if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load)}
-    shared = {name for node in nodes if isinstance(node, (ast.Global, ast.Nonlocal)) for name in node.names}
+    names |= {
+        node.id
+        for node in nodes
+        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load)
+    }
+    shared = {
+        name
+        for node in nodes
+        if isinstance(node, (ast.Global, ast.Nonlocal))
+        for name in node.names
+    }
     return names - shared - {'self', 'cls'}
 
 
@@ -86,7 +101,9 @@ def parsed(*texts):
     except SyntaxError:
         bodies = [ast.parse(text).body for text in texts]
     if any(len(body) != 1 for body in bodies):
-        raise ValueError(f'a pattern and its replacement must be one expression or one statement each, got {texts}')
+        raise ValueError(
+            f'a pattern and its replacement must be one expression or one statement each, got {texts}'
+        )
     return [body[0] for body in bodies]
 
 
@@ -107,10 +124,19 @@ class _Match:
     def equal(self, pattern, node):
         """Return whether a node fits; fills `names` and `any`."""
         if isinstance(pattern, list):
-            if isinstance(node, list) and _is_any_block(pattern) and node and isinstance(node[0], ast.stmt):
+            if (
+                isinstance(node, list)
+                and _is_any_block(pattern)
+                and node
+                and isinstance(node[0], ast.stmt)
+            ):
                 self.any.append(node)
                 return True
-            return isinstance(node, list) and len(pattern) == len(node) and all(map(self.equal, pattern, node))
+            return (
+                isinstance(node, list)
+                and len(pattern) == len(node)
+                and all(map(self.equal, pattern, node))
+            )
         if not isinstance(pattern, ast.AST):
             return type(pattern) is type(node) and pattern == node
         if _is_any(pattern) and isinstance(node, ast.expr):
@@ -121,8 +147,16 @@ class _Match:
         name = {ast.Name: 'id', ast.arg: 'arg'}.get(type(pattern))
         if name and PLACEHOLDER.match(getattr(pattern, name)):
             known = self.names.setdefault(getattr(pattern, name), getattr(node, name))
-            return known == getattr(node, name) and known in self.locals and len(set(self.names.values())) == len(self.names)
-        return all(self.equal(getattr(pattern, field), getattr(node, field)) for field in pattern._fields if field not in ('ctx', 'type_comment'))
+            return (
+                known == getattr(node, name)
+                and known in self.locals
+                and len(set(self.names.values())) == len(self.names)
+            )
+        return all(
+            self.equal(getattr(pattern, field), getattr(node, field))
+            for field in pattern._fields
+            if field not in ('ctx', 'type_comment')
+        )
 
 
 class _Fill(ast.NodeTransformer):
@@ -135,7 +169,9 @@ class _Fill(ast.NodeTransformer):
         if isinstance(node, ast.Constant) and _is_any(node):
             return copy.deepcopy(next(self.any))
         for name in ('id', 'arg'):
-            if isinstance(node, (ast.Name, ast.arg)) and PLACEHOLDER.match(getattr(node, name, None) or ''):
+            if isinstance(node, (ast.Name, ast.arg)) and PLACEHOLDER.match(
+                getattr(node, name, None) or ''
+            ):
                 setattr(node, name, self.names[getattr(node, name)])
         for name, value in ast.iter_fields(node):
             if isinstance(value, list) and _is_any_block(value):
@@ -149,7 +185,10 @@ def matches(root, place, pattern, replacement):
     fitting = []
     for each in places(root).get(place, ()):
         if each.scope:
-            names, nodes = local_names(each.scope), [node for node in ast.walk(each.node) if node is not each.node]
+            names, nodes = (
+                local_names(each.scope),
+                [node for node in ast.walk(each.node) if node is not each.node],
+            )
         else:
             names, nodes = set(), [each.node] if pattern == '...' else list(ast.walk(each.node))
         for node in nodes:
@@ -179,8 +218,10 @@ def mutated(root, place, pattern, replacement):
     """
     fitting = matches(root, place, pattern, replacement)
     if len(fitting) != 1:
-        raise NotFound(f'{place} is defined {len(places(root).get(place, ()))} times, and {pattern!r} fits {len(fitting)} nodes there')
-    (where, node, new), = fitting
+        raise NotFound(
+            f'{place} is defined {len(places(root).get(place, ()))} times, and {pattern!r} fits {len(fitting)} nodes there'
+        )
+    ((where, node, new),) = fitting
     if ast.dump(node) == ast.dump(new):
         raise NotFound(f'{place}: {pattern!r} is already {replacement!r}')
     copies = {}

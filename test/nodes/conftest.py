@@ -22,6 +22,7 @@ def made_once(tmp_path_factory, name):
 def built(tmp_path_factory):
     """A workspace with this tree built in it, which nothing may change."""
     from ros.workspace import build
+
     with made_once(tmp_path_factory, 'workspace') as place:
         if not (place / 'install').is_dir():
             build(place)
@@ -32,6 +33,7 @@ def built(tmp_path_factory):
 def with_ros2(tmp_path_factory):
     """The environment of a shell with the real `ros2`."""
     from ros.workspace import with_ros2
+
     with made_once(tmp_path_factory, 'ros2') as place:
         return with_ros2(place)
 
@@ -41,6 +43,7 @@ def bench(monkeypatch):
     """Nodes in the process of the test."""
     pytest.importorskip('rclpy')
     from ros.one_process import OneProcess
+
     with OneProcess(monkeypatch) as made:
         yield made
 
@@ -48,4 +51,6 @@ def bench(monkeypatch):
 @pytest.fixture
 def executor_only(monkeypatch):
     """Messages pass through the executor of the test, not through the loop of the relay."""
-    monkeypatch.setattr(pytest.importorskip('imu_calibration.nodes.relay_loop'), 'available', lambda: False)
+    monkeypatch.setattr(
+        pytest.importorskip('imu_calibration.nodes.relay_loop'), 'available', lambda: False
+    )

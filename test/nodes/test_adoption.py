@@ -19,9 +19,24 @@ SETTINGS = CompensatorSettings()
 
 def test_another_sensor_does_not_take_the_place_of_this_one():
     before = adopt(calibration_to_text(GOOD), 'a file', SETTINGS, frames=None)
-    assert adopt(calibration_to_text(replace(GOOD, values=GOOD.values + 1e-4)), 'the topic', SETTINGS, frames=None, before=before).source == 'the topic'
+    assert (
+        adopt(
+            calibration_to_text(replace(GOOD, values=GOOD.values + 1e-4)),
+            'the topic',
+            SETTINGS,
+            frames=None,
+            before=before,
+        ).source
+        == 'the topic'
+    )
     with refused(DocumentError, 'other_sensor', 'imu_link', 'another_link'):
-        adopt(calibration_to_text(replace(GOOD, frame_id='another_link')), 'the topic', SETTINGS, frames=None, before=before)
+        adopt(
+            calibration_to_text(replace(GOOD, frame_id='another_link')),
+            'the topic',
+            SETTINGS,
+            frames=None,
+            before=before,
+        )
 
 
 HELPS = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
@@ -31,11 +46,15 @@ UNPROVEN, HARMS = ({'after': 0.1, 'ci95': [0.8, 1.2]}, {'after': 0.2, 'ci95': [1
 def test_an_unproven_sensor_needs_consent_and_a_harmful_one_is_never_corrected():
     insisting = replace(SETTINGS, anyway=True)
     for change, excluded in ((UNPROVEN, set()), (HARMS, {'accelerometer'})):
-        text = calibration_to_text(replace(GOOD, proof={'accelerometer': HELPS | change, 'gyroscope': HELPS}))
+        text = calibration_to_text(
+            replace(GOOD, proof={'accelerometer': HELPS | change, 'gyroscope': HELPS})
+        )
         assert adopt(text, 'a file', SETTINGS, frames=None).used.refused.keys() == {'accelerometer'}
         found = adopt(text, 'a file', insisting, frames=None)
         assert found.used.refused.keys() == excluded and len(found.caveats) == 1
-    both = calibration_to_text(replace(GOOD, proof={'accelerometer': HELPS | HARMS, 'gyroscope': HELPS | HARMS}))
+    both = calibration_to_text(
+        replace(GOOD, proof={'accelerometer': HELPS | HARMS, 'gyroscope': HELPS | HARMS})
+    )
     for settings in (SETTINGS, insisting):
         with refused(DocumentError, 'no_sensor_helps') as refusal:
             adopt(both, 'a file', settings, frames=None)
@@ -43,15 +62,28 @@ def test_an_unproven_sensor_needs_consent_and_a_harmful_one_is_never_corrected()
 
 
 def test_a_refused_sensor_is_not_corrected_and_the_other_one_is():
-    text = calibration_to_text(replace(GOOD, proof={'accelerometer': HELPS | UNPROVEN, 'gyroscope': HELPS}))
-    adopted, whole = (adopt(text, 'a file', replace(SETTINGS, anyway=flag), frames=None) for flag in (False, True))
-    assert adopted.used.refused.keys() == {'accelerometer'} and adopted.used.refused['accelerometer'].startswith('unproven')
+    text = calibration_to_text(
+        replace(GOOD, proof={'accelerometer': HELPS | UNPROVEN, 'gyroscope': HELPS})
+    )
+    adopted, whole = (
+        adopt(text, 'a file', replace(SETTINGS, anyway=flag), frames=None) for flag in (False, True)
+    )
+    assert adopted.used.refused.keys() == {'accelerometer'} and adopted.used.refused[
+        'accelerometer'
+    ].startswith('unproven')
     assert adopted.used.refused['accelerometer'] in adopted.caveats[0]
-    assert not whole.used.refused and whole.caveats[0] == whole.used.cautions[0] and adopted.says_more_than(whole)
+    assert (
+        not whole.used.refused
+        and whole.caveats[0] == whole.used.cautions[0]
+        and adopted.says_more_than(whole)
+    )
     sample = (0, 0.1, 0.2, 0.3, 1.0, 2.0, 9.0)
     corrected, both = (each.compensation.correct(*sample) for each in (adopted, whole))
     np.testing.assert_allclose(corrected[3:], sample[4:], rtol=0, atol=1e-12)
-    assert np.abs(np.subtract(both[3:], sample[4:])).max() > 1e-3 and np.abs(np.subtract(corrected[:3], sample[1:4])).max() > 1e-4
+    assert (
+        np.abs(np.subtract(both[3:], sample[4:])).max() > 1e-3
+        and np.abs(np.subtract(corrected[:3], sample[1:4])).max() > 1e-4
+    )
     assert again(adopted, SETTINGS, None).used is adopted.used
 
 
@@ -65,14 +97,26 @@ def changed(sensor, effect, values):
     return calibration_to_text(replace(GOOD, values=new, proof=PROVEN))
 
 
-@pytest.mark.parametrize(('sensor', 'effect', 'values'), (
-    ('gyroscope', 'matrix', -np.eye(3)), ('gyroscope', 'matrix', 3 * np.eye(3)), ('accelerometer', 'matrix', np.diag([1.0, 1.0, 0.1])),
-    ('accelerometer', 'matrix', np.eye(3) + 0.6 * np.eye(3, k=1)), ('accelerometer', 'bias', [0, 0, 200.0]), ('gyroscope', 'bias', [80.0, 0, 0])))
+@pytest.mark.parametrize(
+    ('sensor', 'effect', 'values'),
+    (
+        ('gyroscope', 'matrix', -np.eye(3)),
+        ('gyroscope', 'matrix', 3 * np.eye(3)),
+        ('accelerometer', 'matrix', np.diag([1.0, 1.0, 0.1])),
+        ('accelerometer', 'matrix', np.eye(3) + 0.6 * np.eye(3, k=1)),
+        ('accelerometer', 'bias', [0, 0, 200.0]),
+        ('gyroscope', 'bias', [80.0, 0, 0]),
+    ),
+)
 @pytest.mark.parametrize('source', ('file a', 'topic a'))
-def test_values_of_no_instrument_are_refused_per_sensor_whatever_the_proof(sensor, effect, values, source):
+def test_values_of_no_instrument_are_refused_per_sensor_whatever_the_proof(
+    sensor, effect, values, source
+):
     """A gyroscope matrix of -I with a copied proof was adopted as proven."""
     for settings in (SETTINGS, replace(SETTINGS, anyway=True)):
-        assert adopt(changed(sensor, effect, values), source, settings, frames=None).used.refused.keys() == {sensor}
+        assert adopt(
+            changed(sensor, effect, values), source, settings, frames=None
+        ).used.refused.keys() == {sensor}
 
 
 def test_a_document_whose_sensors_both_have_values_of_no_instrument_is_refused():
@@ -84,10 +128,14 @@ def test_a_document_whose_sensors_both_have_values_of_no_instrument_is_refused()
 
 def test_an_unproven_document_with_most_parameters_undetermined_is_not_adopted_with_consent_either():
     for share, adopted in ((0.4, True), (0.6, False)):
-        status = tuple('weak' if k % 10 < 10 * share else 'determined' for k in range(len(GOOD.status)))
+        status = tuple(
+            'weak' if k % 10 < 10 * share else 'determined' for k in range(len(GOOD.status))
+        )
         text = calibration_to_text(replace(GOOD, status=status, decision={}))
         if adopted:
-            assert not adopt(text, 'a file', replace(SETTINGS, anyway=True), frames=None).used.refused
+            assert not adopt(
+                text, 'a file', replace(SETTINGS, anyway=True), frames=None
+            ).used.refused
         else:
             with refused(DocumentError, 'no_sensor_helps'):
                 adopt(text, 'a file', replace(SETTINGS, anyway=True), frames=None)
@@ -95,14 +143,27 @@ def test_an_unproven_document_with_most_parameters_undetermined_is_not_adopted_w
 
 def test_whatever_a_document_does_becomes_one_line(monkeypatch):
     """An error that nobody thought of refuses the document; it does not end the node."""
+
     def fails(*given):
         raise IndexError('list index out of range')
+
     monkeypatch.setattr(adoption, '_prepared', fails)
     with refused(DocumentError, 'not_usable', 'IndexError', 'list index out of range'):
         adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, frames=None)
 
 
 def test_only_what_changed_by_more_than_its_sd_is_worth_a_line():
-    before, sd = adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, frames=None), np.sqrt(np.diag(GOOD.covariance))
-    little, much = (adopt(calibration_to_text(replace(GOOD, values=GOOD.values + share * sd)), 'the topic', SETTINGS, frames=None) for share in (0.1, 3.0))
+    before, sd = (
+        adopt(calibration_to_text(GOOD), 'the topic', SETTINGS, frames=None),
+        np.sqrt(np.diag(GOOD.covariance)),
+    )
+    little, much = (
+        adopt(
+            calibration_to_text(replace(GOOD, values=GOOD.values + share * sd)),
+            'the topic',
+            SETTINGS,
+            frames=None,
+        )
+        for share in (0.1, 3.0)
+    )
     assert not little.says_more_than(before) and much.says_more_than(before)

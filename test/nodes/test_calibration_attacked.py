@@ -43,16 +43,32 @@ def patience(monkeypatch):
 
 def start(bench, folder, **parameters):
     """A node on the table that saves into `folder`."""
-    return bench.start(CalibrationNode, {'table_file': str(TABLE), 'save_file': str(folder / 'calibration.yaml'), 'diagnosis_period': 0.0} | parameters)
+    return bench.start(
+        CalibrationNode,
+        {
+            'table_file': str(TABLE),
+            'save_file': str(folder / 'calibration.yaml'),
+            'diagnosis_period': 0.0,
+        }
+        | parameters,
+    )
 
 
 def send(bench, imu, joints, topics=('imu/data_raw', 'joint_states')):
     """Publish samples in the order of their stamps."""
     qos = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
-    to = [bench.node.create_publisher(kind, topic, qos) for kind, topic in zip((Imu, JointState), topics)]
-    bench.until(lambda: all(publisher.get_subscription_count() for publisher in to), 'subscriptions')
-    queue = [(k / len(samples), publisher, bytes(message)) for publisher, samples, encode in zip(to, (imu, joints), (encode_imu, encode_joints))
-             for k, message in enumerate(Packed.of_rows(encode(samples)).views())]
+    to = [
+        bench.node.create_publisher(kind, topic, qos)
+        for kind, topic in zip((Imu, JointState), topics)
+    ]
+    bench.until(
+        lambda: all(publisher.get_subscription_count() for publisher in to), 'subscriptions'
+    )
+    queue = [
+        (k / len(samples), publisher, bytes(message))
+        for publisher, samples, encode in zip(to, (imu, joints), (encode_imu, encode_joints))
+        for k, message in enumerate(Packed.of_rows(encode(samples)).views())
+    ]
     for k, (_, publisher, message) in enumerate(sorted(queue, key=lambda entry: entry[0])):
         publisher.publish(message)
         if k % 100 == 0:
@@ -67,43 +83,81 @@ def gathered(bench, node):
 
 def test_a_session_is_told_line_by_line_each_once(bench, session, tmp_path):
     node = start(bench, tmp_path)
-    bench.until(lambda: (advice := advice_of(node.worker.state)) and bench.heard(advice, level='info'), 'what is missing next')
+    bench.until(
+        lambda: (advice := advice_of(node.worker.state)) and bench.heard(advice, level='info'),
+        'what is missing next',
+    )
     send(bench, *session)
     gathered(bench, node)
     answer = bench.call('/calibration_node/solve')
     assert answer.success and answer.message.startswith('helps ')
-    bench.until(lambda: bench.heard('helps', '`ros2 service call /calibration_node/save std_srvs/srv/Trigger`'), 'the verdict')
+    bench.until(
+        lambda: bench.heard(
+            'helps', '`ros2 service call /calibration_node/save std_srvs/srv/Trigger`'
+        ),
+        'the verdict',
+    )
     saved = bench.call('/calibration_node/save')
     assert saved.success and saved.message.startswith('helps')
-    assert all(f'{tmp_path}/{name}' in saved.message for name in ('calibration.yaml', 'calibration.accumulator.npz'))
-    assert calibration_from_text((tmp_path / 'calibration.yaml').read_text()).decisions == dict.fromkeys(('accelerometer', 'gyroscope'), 'helps')
-    assert bench.heard(TABLE, 'outer, middle, inner', f'{tmp_path}/calibration.yaml', level='info') == 1
-    for values in (('/imu/data_raw', '/tester', 'reliable'), ('/joint_states', '/tester', 'reliable'), ('~/save: ',)):
+    assert all(
+        f'{tmp_path}/{name}' in saved.message
+        for name in ('calibration.yaml', 'calibration.accumulator.npz')
+    )
+    assert calibration_from_text(
+        (tmp_path / 'calibration.yaml').read_text()
+    ).decisions == dict.fromkeys(('accelerometer', 'gyroscope'), 'helps')
+    assert (
+        bench.heard(TABLE, 'outer, middle, inner', f'{tmp_path}/calibration.yaml', level='info')
+        == 1
+    )
+    for values in (
+        ('/imu/data_raw', '/tester', 'reliable'),
+        ('/joint_states', '/tester', 'reliable'),
+        ('~/save: ',),
+    ):
         assert bench.heard(*values) == 1, (values, bench.said)
     assert bench.status[CALIBRATION].values and not bench.heard('Traceback')
-    assert bench.heard('--', level='info') == 0   # nobody at a node has options of the command line
+    assert bench.heard('--', level='info') == 0  # nobody at a node has options of the command line
 
 
 def test_topics_that_are_mistyped_are_told_with_the_nearest_of_the_type(bench, session, tmp_path):
     node = start(bench, tmp_path)
-    imu, joints = ((kind, bench.node.create_publisher(kind, topic, 10)) for kind, topic in ((Imu, '/imu/data_rwa'), (JointState, '/table/joint_states')))
-    bench.until(lambda: bench.heard('sensor_msgs/msg/Imu', '-r imu/data_raw:=/imu/data_rwa', level='warning'), 'the nearest Imu topic')
-    bench.until(lambda: bench.heard('-r joint_states:=/table/joint_states', level='warning'), 'the nearest JointState topic')
+    imu, joints = (
+        (kind, bench.node.create_publisher(kind, topic, 10))
+        for kind, topic in ((Imu, '/imu/data_rwa'), (JointState, '/table/joint_states'))
+    )
+    bench.until(
+        lambda: bench.heard(
+            'sensor_msgs/msg/Imu', '-r imu/data_raw:=/imu/data_rwa', level='warning'
+        ),
+        'the nearest Imu topic',
+    )
+    bench.until(
+        lambda: bench.heard('-r joint_states:=/table/joint_states', level='warning'),
+        'the nearest JointState topic',
+    )
     bench.until(lambda: bench.lines().get(STREAMS, (0, ''))[0] == ERROR, 'the same on /diagnostics')
     assert imu and joints and not node.worker.state.gathered
 
 
 @pytest.mark.parametrize('kind', ('a file as parent', 'a name too long'))
-def test_a_place_that_cannot_be_written_is_told_at_the_start_and_costs_nothing(bench, session, tmp_path, kind):
+def test_a_place_that_cannot_be_written_is_told_at_the_start_and_costs_nothing(
+    bench, session, tmp_path, kind
+):
     (tmp_path / 'file').write_text('here already')
-    place = {'a file as parent': tmp_path / 'file' / 'calibration.yaml', 'a name too long': tmp_path / ('x' * 300 + '.yaml')}[kind]
+    place = {
+        'a file as parent': tmp_path / 'file' / 'calibration.yaml',
+        'a name too long': tmp_path / ('x' * 300 + '.yaml'),
+    }[kind]
     node = start(bench, tmp_path, save_file=str(place), autosave_period=0.2)
     bench.until(lambda: bench.heard(place, level='error'), 'the place')
     send(bench, *session)
     gathered(bench, node)
     answer = bench.call('/calibration_node/save')
     assert not answer.success and str(place) in answer.message and '\n' not in answer.message
-    bench.until(lambda: bench.lines().get(CALIBRATION, (0, ''))[0] == ERROR, 'an error on /diagnostics')
+    bench.until(
+        lambda: bench.lines().get(CALIBRATION, (0, ''))[0] == ERROR, 'an error on /diagnostics'
+    )
     assert (tmp_path / 'file').read_text() == 'here already'
     if kind == 'a file as parent':
         (tmp_path / 'file').unlink()
@@ -123,9 +177,14 @@ def test_a_participant_cannot_redirect_what_save_writes(bench, session, tmp_path
     assert victim.read_text() == 'true' and (tmp_path / 'calibration.yaml').is_file()
 
 
-def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost_where_not(bench, session, tmp_path, monkeypatch):
+def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost_where_not(
+    bench, session, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
-    kept, lost = start(bench, tmp_path), bench.start(CalibrationNode, {'table_file': str(TABLE)}, namespace='/other')
+    kept, lost = (
+        start(bench, tmp_path),
+        bench.start(CalibrationNode, {'table_file': str(TABLE)}, namespace='/other'),
+    )
     send(bench, *session)
     send(bench, *session, ('/other/imu/data_raw', '/other/joint_states'))
     for node in (kept, lost):
@@ -135,25 +194,42 @@ def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost
     told = lost.close()
     assert '~/save' in told and "'save_file'" in told
     again = start(bench, tmp_path, resume=True)
-    assert again.worker.live.n_windows >= kept.worker.live.n_windows > 0   # those that were still open count as well
-    assert bench.heard(f' {again.worker.live.n_windows} ', f'{tmp_path}/calibration.accumulator.npz', level='info') == 1
+    assert (
+        again.worker.live.n_windows >= kept.worker.live.n_windows > 0
+    )  # those that were still open count as well
+    assert (
+        bench.heard(
+            f' {again.worker.live.n_windows} ',
+            f'{tmp_path}/calibration.accumulator.npz',
+            level='info',
+        )
+        == 1
+    )
     kept.close = lost.close = lambda: None
 
 
-def test_motion_of_another_model_or_a_damaged_file_is_put_aside_and_the_session_begins(bench, session, tmp_path):
+def test_motion_of_another_model_or_a_damaged_file_is_put_aside_and_the_session_begins(
+    bench, session, tmp_path
+):
     first = start(bench, tmp_path)
     send(bench, *session)
     gathered(bench, first)
     first.close()
     first.close = lambda: None
     other = start(bench, tmp_path, resume=True, accelerometer_model='bias+matrix+accel_quadratic')
-    assert other.worker.live.n_windows == 0 and (tmp_path / 'calibration.accumulator.npz.1').is_file()
+    assert (
+        other.worker.live.n_windows == 0 and (tmp_path / 'calibration.accumulator.npz.1').is_file()
+    )
     assert bench.heard(f'{tmp_path}/calibration.accumulator.npz.1', level='error') == 1
     (tmp_path / 'calibration.accumulator.npz').write_bytes(b'damaged')
     assert start(bench, tmp_path, resume=True).worker.live.n_windows == 0
     assert (tmp_path / 'calibration.accumulator.npz.2').read_bytes() == b'damaged'
-    line, = [line for level, line in bench.said if level == 'error' and f'{tmp_path}/calibration.accumulator.npz.2' in line]
-    assert ' 7 ' in line   # bytes
+    (line,) = [
+        line
+        for level, line in bench.said
+        if level == 'error' and f'{tmp_path}/calibration.accumulator.npz.2' in line
+    ]
+    assert ' 7 ' in line  # bytes
     assert not any(word in line for word in ('pickle', 'Error', 'numpy', 'without resume'))
 
 
@@ -174,13 +250,17 @@ def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, t
 
 def test_parameters_change_while_it_runs_or_say_why_not(bench, tmp_path):
     node = start(bench, tmp_path, setling=1.0)
-    line, = unknown_parameters(node)
+    (line,) = unknown_parameters(node)
     assert "'setling'" in line and "'settling'" in line
     assert node.set_parameters([Parameter('settling', value=2.0)])[0].successful
     assert node._session[WindowSettings].settling == 2.0
     for name, value in (('model_as_asked', True), ('accelerometer_model', 'bias')):
         answer = node.set_parameters([Parameter(name, value=value)])[0]
-        assert not answer.successful and name in answer.reason and node.get_parameter(name).value != value
+        assert (
+            not answer.successful
+            and name in answer.reason
+            and node.get_parameter(name).value != value
+        )
 
 
 def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session, tmp_path):
@@ -191,9 +271,15 @@ def test_joint_states_without_positions_and_zero_stamps_are_named(bench, session
     for _ in range(20):
         silent.publish(JointState(name=['outer', 'middle', 'inner']))
     bench.until(lambda: bench.heard('/joint_states', '20 ', 'JointState'), 'the empty position')
-    assert not bench.heard('outer, middle, inner', level='warning') and not bench.heard('outer, middle, inner', level='error')
+    assert not bench.heard('outer, middle, inner', level='warning') and not bench.heard(
+        'outer, middle, inner', level='error'
+    )
     to = bench.node.create_publisher(Imu, 'imu/data_raw', 1000)
     bench.until(to.get_subscription_count, 'a subscription')
-    for message in Packed.of_rows(encode_imu(replace(imu, stamp_ns=np.zeros(len(imu), np.int64)))).views():
+    for message in Packed.of_rows(
+        encode_imu(replace(imu, stamp_ns=np.zeros(len(imu), np.int64)))
+    ).views():
         to.publish(bytes(message))
-    bench.until(lambda: bench.figure(STREAMS, 'Imu zero stamp') == '400', 'the same on /diagnostics')
+    bench.until(
+        lambda: bench.figure(STREAMS, 'Imu zero stamp') == '400', 'the same on /diagnostics'
+    )

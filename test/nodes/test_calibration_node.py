@@ -40,36 +40,55 @@ def bags(tmp_path_factory):
         write_session(folder / name, imu, joints)
         if name == 'session':
             cut = imu.stamp_ns[len(imu) * 4 // 5]
-            write_session(folder / 'beginning', *(samples.select(samples.stamp_ns < cut) for samples in (imu, joints)))
-            write_session(folder / 'ending', *(samples.select(samples.stamp_ns >= cut) for samples in (imu, joints)))
+            write_session(
+                folder / 'beginning',
+                *(samples.select(samples.stamp_ns < cut) for samples in (imu, joints)),
+            )
+            write_session(
+                folder / 'ending',
+                *(samples.select(samples.stamp_ns >= cut) for samples in (imu, joints)),
+            )
     return folder
 
 
 def test_a_bag_through_both_nodes(bags, tmp_path):
     with Station() as station:
         documents = station.watch_documents()
-        corrected, residuals = station.watch_imu('imu/data_corrected'), station.watch_imu('imu/residual')
+        corrected, residuals = (
+            station.watch_imu('imu/data_corrected'),
+            station.watch_imu('imu/residual'),
+        )
         station.watch_diagnostics()
         station.calibration_node(tmp_path, resume=True)
         compensator = station.start('compensator_node')
         for part in ('beginning', 'ending'):
             player = station.play(bags / part, RATE, subscribers=1)
-            station.until(lambda: player.poll() is not None and documents, 'the end of the part and a calibration, which the residuals need')
+            station.until(
+                lambda: player.poll() is not None and documents,
+                'the end of the part and a calibration, which the residuals need',
+            )
         answer = station.call('/calibration_node/save')
         assert answer.success, answer.message
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bags / 'session') as recording:
-            expected = calibrate_by_evidence([lambda: recording.blocks(TABLE.joint_names)], TABLE, OPTIONS).result.calibration
+            expected = calibrate_by_evidence(
+                [lambda: recording.blocks(TABLE.joint_names)], TABLE, OPTIONS
+            ).result.calibration
         check_the_answer(station, live, expected)
-        assert sorted(path.name for path in tmp_path.iterdir()) == ['calibration.accumulator.npz', 'calibration.yaml']
+        assert sorted(path.name for path in tmp_path.iterdir()) == [
+            'calibration.accumulator.npz',
+            'calibration.yaml',
+        ]
 
         late = station.watch_documents()
         station.until(lambda: late, 'the latched calibration for a late joiner')
         assert late[-1] == documents[-1] == (tmp_path / 'calibration.yaml').read_text()
         check_residuals(taken(residuals), live)
 
-        corrected.flush()   # readings that were corrected with an earlier document, if any
-        station.processes.end(next(p for p in station.processes.running if 'calibration_node' in p.args[2]))
+        corrected.flush()  # readings that were corrected with an earlier document, if any
+        station.processes.end(
+            next(p for p in station.processes.running if 'calibration_node' in p.args[2])
+        )
         player = station.play(bags / 'drive', RATE, subscribers=1, topics='/imu/data_raw')
         station.until(lambda: player.poll() is not None, 'the end of the drive')
         station.spin_for(0.5)
@@ -79,12 +98,22 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
 
 def check_the_answer(station, live, expected):
     """Every message was used, and the answer is that of the offline tool on the same messages."""
-    used = {key: sum(calibration.statistics['samples_used'].values()) for key, calibration in (('live', live), ('offline', expected))}
-    assert used['live'] == used['offline'] and live.statistics['dropped'] == expected.statistics['dropped'] == {}
+    used = {
+        key: sum(calibration.statistics['samples_used'].values())
+        for key, calibration in (('live', live), ('offline', expected))
+    }
+    assert (
+        used['live'] == used['offline']
+        and live.statistics['dropped'] == expected.statistics['dropped'] == {}
+    )
     assert_same(live, expected)
-    groups = {name: status for name, status in station.status.items() if 'calibration_node: ' in name}
+    groups = {
+        name: status for name, status in station.status.items() if 'calibration_node: ' in name
+    }
     assert groups['calibration_node: accelerometer bias'].level == b'\0'
-    assert not values_of(station, 'accelerometer bias')['needs'] and any(level == 1 for _, level, _ in station.history)
+    assert not values_of(station, 'accelerometer bias')['needs'] and any(
+        level == 1 for _, level, _ in station.history
+    )
 
 
 def check_residuals(residuals, live):
@@ -109,7 +138,7 @@ def check_the_stream(corrected, bag):
 
 def means(error, length=int(SAMPLE_RATE)):
     """Means over one second."""
-    return error[:len(error) // length * length].reshape(-1, length, 3).mean(axis=1)
+    return error[: len(error) // length * length].reshape(-1, length, 3).mean(axis=1)
 
 
 def values_of(station, name):
@@ -133,25 +162,48 @@ def test_a_hidden_effect_is_named_live(tmp_path):
         documents = station.watch_documents()
         station.watch_diagnostics()
         station.calibration_node(tmp_path, table_file=tmp_path / 'table.yaml')
-        station.until(lambda: values_of(station, 'diagnosis').get('outcome') == 'waiting', 'the first diagnostics')
+        station.until(
+            lambda: values_of(station, 'diagnosis').get('outcome') == 'waiting',
+            'the first diagnostics',
+        )
         player = station.play(tmp_path / 'bag', 20.0, subscribers=1)
         station.until(lambda: player.poll() is not None, 'the end of the recording')
         asked = time.monotonic()
         assert station.call('/calibration_node/solve').success
         answered = time.monotonic() - asked
-        station.until(lambda: values_of(station, 'diagnosis').get('windows') == str(expected.windows), 'the diagnosis of all windows')
-        found, status = values_of(station, 'diagnosis'), station.status['calibration_node: diagnosis']
+        station.until(
+            lambda: values_of(station, 'diagnosis').get('windows') == str(expected.windows),
+            'the diagnosis of all windows',
+        )
+        found, status = (
+            values_of(station, 'diagnosis'),
+            station.status['calibration_node: diagnosis'],
+        )
         station.until(lambda: 'accel_quadratic' in documents[-1], 'a calibration with it')
         assert station.call('/calibration_node/save').success
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
-        station.until(lambda: 'calibration_node: accelerometer accel_quadratic' in station.status, 'its diagnostics')
+        station.until(
+            lambda: 'calibration_node: accelerometer accel_quadratic' in station.status,
+            'its diagnostics',
+        )
         group = station.status['calibration_node: accelerometer accel_quadratic']
-    assert_same(live, calibration_from_text(calibration_to_text(offline.calibration)))   # the document has the common arm last
-    assert live.statistics['added'] == offline.calibration.statistics['added'] and group.level == b'\0'
+    assert_same(
+        live, calibration_from_text(calibration_to_text(offline.calibration))
+    )  # the document has the common arm last
+    assert (
+        live.statistics['added'] == offline.calibration.statistics['added'] and group.level == b'\0'
+    )
     print(f'diagnosed live: {status.message}; solve answered after {answered:.1f} s')
     assert first.effect == 'accel_quadratic'
-    assert found['outcome'] == 'found' and found['effect'] == first.effect and found['p-value'] == f'{first.p_value:.2g}'
-    assert found['held-out reduction'] == f'{first.gain.reduction:.3f}' and found['explanation'] == first.explanation
+    assert (
+        found['outcome'] == 'found'
+        and found['effect'] == first.effect
+        and found['p-value'] == f'{first.p_value:.2g}'
+    )
+    assert (
+        found['held-out reduction'] == f'{first.gain.reduction:.3f}'
+        and found['explanation'] == first.explanation
+    )
     assert status.level == b'\1'
 
 
@@ -173,6 +225,7 @@ def test_poses_by_hand_through_the_node(tmp_path):
 def check_by_hand(bag, folder, rate, gravity=None):
     """Play a bag to a node without a table."""
     from sensor_msgs.msg import Imu
+
     options = {'table_file': '', 'gravity': gravity or 0.0}
     with Station() as station:
         documents, residuals = station.watch_documents(), station.watch_imu('imu/residual')
@@ -187,8 +240,13 @@ def check_by_hand(bag, folder, rate, gravity=None):
         assert answer.success, answer.message
         live = calibration_from_text((folder / 'calibration.yaml').read_text())
         with open_recording(bag, want_joints=False) as recording:
-            expected = calibrate_without_table([recording.blocks], replace(OPTIONS, gravity=gravity)).calibration
-        assert live.statistics['samples_used'] == expected.statistics['samples_used'] and live.gauge == expected.gauge
+            expected = calibrate_without_table(
+                [recording.blocks], replace(OPTIONS, gravity=gravity)
+            ).calibration
+        assert (
+            live.statistics['samples_used'] == expected.statistics['samples_used']
+            and live.gauge == expected.gauge
+        )
         assert live.param_names == expected.param_names and live.status == expected.status
         free = expected.sd > 0
         assert np.max(np.abs(live.values - expected.values)[free] / expected.sd[free]) < 1e-6
@@ -197,7 +255,9 @@ def check_by_hand(bag, folder, rate, gravity=None):
         resumed(station, node, folder, options, live)
         # On a busy machine the recording is over before the compensator has a document: it is played again.
         corrected = []
-        station.subscriptions.append(station.node.create_subscription(Imu, 'imu/data_corrected', corrected.append, 1000))
+        station.subscriptions.append(
+            station.node.create_subscription(Imu, 'imu/data_corrected', corrected.append, 1000)
+        )
         player = station.play(bag, rate, subscribers=2)
         station.until(lambda: len(corrected) > 100, 'corrected messages')
         station.processes.end(player)
@@ -205,15 +265,24 @@ def check_by_hand(bag, folder, rate, gravity=None):
 
 def check_the_poses(station, expected):
     """Diagnostics counted up to what the recording holds, and asked for directions on the way."""
-    messages = [message for name, _, message in station.history if name == 'calibration_node: poses']
-    assert len(messages) >= 3   # on the way
+    messages = [
+        message for name, _, message in station.history if name == 'calibration_node: poses'
+    ]
+    assert len(messages) >= 3  # on the way
     windows = expected.statistics['windows']
 
     def counted():
         figures = values_of(station, 'poses')
-        return (int(figures['poses']), int(figures['turns'])) == (windows['static'], windows['turns'])
+        return (int(figures['poses']), int(figures['turns'])) == (
+            windows['static'],
+            windows['turns'],
+        )
+
     station.until(counted, 'the poses and turns of the recording')
-    station.until(lambda: station.status['calibration_node: accelerometer bias'].level == b'\0', 'a bias that is determined')
+    station.until(
+        lambda: station.status['calibration_node: accelerometer bias'].level == b'\0',
+        'a bias that is determined',
+    )
     print(f'by hand, live: {messages[0]} ... {messages[-1]}')
 
 
@@ -222,7 +291,13 @@ def resumed(station, node, folder, options, live):
     station.processes.end(node)
     station.status.clear()
     station.calibration_node(folder, resume=True, **options)
-    station.until(lambda: station.figure('poses', 'calibration_node: poses') == live.statistics['windows']['static'], 'the poses of before')
+    station.until(
+        lambda: (
+            station.figure('poses', 'calibration_node: poses')
+            == live.statistics['windows']['static']
+        ),
+        'the poses of before',
+    )
     assert station.call('/calibration_node/solve').success
     assert station.call('/calibration_node/reset').success
     station.until(lambda: values_of(station, 'poses').get('poses') == '0', 'no poses after a reset')

@@ -26,8 +26,15 @@ def station(tmp_path, monkeypatch):
     monkeypatch.setattr(calibration_worker, 'time', SimpleNamespace(monotonic=lambda: clock.now))
     gatherer = SimpleNamespace(flush=lambda: waiting.pop() if waiting else SampleBlock())
     live = LiveCalibration(read_table(config_file('table_simulated.yaml')))
-    worker = CalibrationWorker(gatherer, live, lambda: live, place=SessionFiles(str(tmp_path / 'calibration.yaml')), autosave_period=0.0,
-                               listeners=Listeners(lambda text: None, lambda residuals: None), provenance={'serial': 'A-17'})
+    worker = CalibrationWorker(
+        gatherer,
+        live,
+        lambda: live,
+        place=SessionFiles(str(tmp_path / 'calibration.yaml')),
+        autosave_period=0.0,
+        listeners=Listeners(lambda text: None, lambda residuals: None),
+        provenance={'serial': 'A-17'},
+    )
     return worker, waiting, clock
 
 
@@ -35,13 +42,13 @@ def test_what_came_while_a_solution_was_made_is_no_silence(station):
     worker, waiting, clock = station
     waiting.append(make_session(1, profile='quick').block)
     worker._take()
-    clock.now += LONG   # a solution, on a slow machine; messages wait meanwhile
+    clock.now += LONG  # a solution, on a slow machine; messages wait meanwhile
     worker._solve_when_due()
     worker._tell()
     found = worker.live.result.calibration.provenance
     assert (found['serial'], found['mode'], found['solution']) == ('A-17', 'live', 1)
     assert worker.state.streams.silent == () and not worker._closed
-    worker._take()   # and now nothing has come
+    worker._take()  # and now nothing has come
     worker._solve_when_due()
     worker._tell()
     assert worker.state.streams.silent == ('imu', 'joints') and worker._closed

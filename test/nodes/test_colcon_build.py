@@ -12,7 +12,13 @@ import pytest
 from ros.workspace import plain_environment
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = ('calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node')
+NODES = (
+    'calibration_node',
+    'compensator_node',
+    'simulator_node',
+    'bag_player_node',
+    'planner_node',
+)
 EXECUTABLES = ('imu_calibration', *NODES)
 
 TABLE = 'table_file:={config}/table_simulated.yaml'
@@ -33,6 +39,7 @@ def workspace(built):
 def graph():
     """A node that looks at the graph of this host, in a domain of its own."""
     import rclpy
+
     with pytest.MonkeyPatch.context() as patch:
         for key, value in LOCAL.items():
             patch.setenv(key, value)
@@ -47,8 +54,15 @@ def graph():
 def sourced(workspace, *command, **options):
     """Run `command` in a shell that has sourced the workspace, away from the checkout."""
     script = f'. {workspace}/install/setup.bash && exec "$@"'
-    return subprocess.run(['bash', '-c', script, 'bash', *map(str, command)], cwd=workspace, env=plain_environment(), capture_output=True,
-                          text=True, timeout=120, **options)
+    return subprocess.run(
+        ['bash', '-c', script, 'bash', *map(str, command)],
+        cwd=workspace,
+        env=plain_environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        **options,
+    )
 
 
 def prefix(workspace):
@@ -71,13 +85,18 @@ def test_the_ament_index_finds_the_package_with_its_files(workspace):
     assert share == prefix(workspace) / 'share' / 'imu_calibration'
     for folder, pattern in (('config', '*.*'), ('launch', '*.launch.py')):
         source = sorted(path.name for path in (ROOT / folder).glob(pattern))
-        assert source and sorted(path.name for path in (share / folder).iterdir() if path.is_file()) == source
+        assert (
+            source
+            and sorted(path.name for path in (share / folder).iterdir() if path.is_file()) == source
+        )
     assert (share / 'package.xml').is_file()
 
 
 def test_the_code_and_its_files_come_from_the_workspace(workspace):
-    script = ('import imu_calibration, msg_adapters; from imu_calibration.use_cases.resources import config_file; '
-              'print(imu_calibration.__file__, msg_adapters.__file__, config_file("tolerances.yaml"))')
+    script = (
+        'import imu_calibration, msg_adapters; from imu_calibration.use_cases.resources import config_file; '
+        'print(imu_calibration.__file__, msg_adapters.__file__, config_file("tolerances.yaml"))'
+    )
     done = sourced(workspace, 'python', '-c', script)
     assert done.returncode == 0, done.stderr
     assert all(name.startswith(str(prefix(workspace))) for name in done.stdout.split())
@@ -96,12 +115,31 @@ def test_a_node_joins_the_graph_and_ends_on_sigint(workspace, graph, name):
     namespace = f'build_{uuid.uuid4().hex}'
     config = prefix(workspace) / 'share' / 'imu_calibration' / 'config'
     parameters = [word for text in PARAMETERS[name] for word in ('-p', text.format(config=config))]
-    command = [prefix(workspace) / 'lib' / 'imu_calibration' / name, '--ros-args', '-r', f'__ns:=/{namespace}', *parameters]
-    with subprocess.Popen(['bash', '-c', f'. {workspace}/install/setup.bash && exec "$@"', 'bash', *map(str, command)], cwd=workspace,
-                          env=plain_environment() | LOCAL, stderr=subprocess.PIPE, text=True) as process:
+    command = [
+        prefix(workspace) / 'lib' / 'imu_calibration' / name,
+        '--ros-args',
+        '-r',
+        f'__ns:=/{namespace}',
+        *parameters,
+    ]
+    with subprocess.Popen(
+        [
+            'bash',
+            '-c',
+            f'. {workspace}/install/setup.bash && exec "$@"',
+            'bash',
+            *map(str, command),
+        ],
+        cwd=workspace,
+        env=plain_environment() | LOCAL,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
         try:
             until = time.monotonic() + 60.0
-            while f'/{namespace}/{name}/get_type_description' not in dict(graph.get_service_names_and_types()):
+            while f'/{namespace}/{name}/get_type_description' not in dict(
+                graph.get_service_names_and_types()
+            ):
                 assert process.poll() is None, process.stderr.read()
                 assert time.monotonic() < until, f'{name} did not join the graph'
                 time.sleep(0.1)

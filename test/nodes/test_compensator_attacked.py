@@ -34,11 +34,24 @@ from ros.live_station import Station  # noqa: E402
 
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)
-PROOF = {sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12} for sensor in ('accelerometer', 'gyroscope')}
+PROOF = {
+    sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
+    for sensor in ('accelerometer', 'gyroscope')
+}
 GOOD, OTHER = (random_calibration(seed, proof=PROOF, decision={}) for seed in (1, 2))
 GOOD_TEXT, OTHER_TEXT = map(calibration_to_text, (GOOD, OTHER))
 WORSE = {sensor: part | {'after': 0.2, 'ci95': [1.5, 2.5]} for sensor, part in PROOF.items()}
-MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(10**18 + 5_000_000 * np.arange(50), np.full((50, 3), 9.8), np.full((50, 3), 0.1), 'imu_link'))]
+MESSAGES = [
+    row.tobytes()
+    for row in encode_imu(
+        ImuSamples(
+            10**18 + 5_000_000 * np.arange(50),
+            np.full((50, 3), 9.8),
+            np.full((50, 3), 0.1),
+            'imu_link',
+        )
+    )
+]
 STATUS = 'compensator_node: compensation'
 
 
@@ -84,23 +97,45 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
         bench.said.clear()
         publisher.publish(String(data=text))
         bench.until(lambda: bench.figure(STATUS, 'refused') == code, f'the refusal of {name}')
-        assert bench.shows(STATUS, version_of(GOOD_TEXT), level=ERROR) and '\n' not in bench.lines()[STATUS][1]
+        assert (
+            bench.shows(STATUS, version_of(GOOD_TEXT), level=ERROR)
+            and '\n' not in bench.lines()[STATUS][1]
+        )
         assert bench.figure(STATUS, 'calibration') == version_of(GOOD_TEXT)
-        assert [node.convert(data, {'source_timestamp': 1}) is None for data in MESSAGES] == [out is None for out in expected]
+        assert [node.convert(data, {'source_timestamp': 1}) is None for data in MESSAGES] == [
+            out is None for out in expected
+        ]
     publisher.publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.figure(STATUS, 'decision') == 'helps' and not bench.figure(STATUS, 'refused'), 'the good one')
+    bench.until(
+        lambda: bench.figure(STATUS, 'decision') == 'helps' and not bench.figure(STATUS, 'refused'),
+        'the good one',
+    )
     assert bench.heard(version_of(OTHER_TEXT), '/imu/calibration', 'helps', level='info') == 1
-    publisher.publish(String(data=OTHER_TEXT + '\n'))   # another document that says the same
+    publisher.publish(String(data=OTHER_TEXT + '\n'))  # another document that says the same
     bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT + '\n'), 'the same again')
     assert not bench.heard(version_of(OTHER_TEXT + '\n'), level='info')
     assert node.set_parameters([Parameter('anyway', value=True)])[0].successful
     publisher.publish(String(data=REFUSED['unproven'][0]))
-    bench.until(lambda: node.adopted.version == version_of(REFUSED['unproven'][0]), 'the unproven one, with consent')
-    bench.until(lambda: bench.shows(STATUS, 'accelerometer', 'unproven', level=WARN), 'a warning all the same')
+    bench.until(
+        lambda: node.adopted.version == version_of(REFUSED['unproven'][0]),
+        'the unproven one, with consent',
+    )
+    bench.until(
+        lambda: bench.shows(STATUS, 'accelerometer', 'unproven', level=WARN),
+        'a warning all the same',
+    )
     assert node.set_parameters([Parameter('anyway', value=False)])[0].successful
-    half = calibration_to_text(replace(OTHER, proof=PROOF | {'accelerometer': WORSE['accelerometer']}))
+    half = calibration_to_text(
+        replace(OTHER, proof=PROOF | {'accelerometer': WORSE['accelerometer']})
+    )
     publisher.publish(String(data=half))
-    bench.until(lambda: bench.shows(STATUS, 'accelerometer', 'harms', level=WARN) and bench.figure(STATUS, 'not corrected') == 'accelerometer', 'a word on the sensor that is left')
+    bench.until(
+        lambda: (
+            bench.shows(STATUS, 'accelerometer', 'harms', level=WARN)
+            and bench.figure(STATUS, 'not corrected') == 'accelerometer'
+        ),
+        'a word on the sensor that is left',
+    )
     assert node.adopted.version == version_of(half)
     answer = bench.call('/compensator_node/reload')
     assert answer.success and version_of(GOOD_TEXT) in answer.message
@@ -108,37 +143,60 @@ def test_nothing_bad_displaces_what_is_in_force(bench, place):
 
 def test_a_file_that_was_named_is_not_displaced_unless_asked(bench, place):
     node = bench.start(CompensatorNode, {'calibration_file': str(place)})
-    bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.heard('/imu/calibration', 'adopt', 'file_then_topic', level='warning'), 'a word about it')
+    bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(
+        String(data=OTHER_TEXT)
+    )
+    bench.until(
+        lambda: bench.heard('/imu/calibration', 'adopt', 'file_then_topic', level='warning'),
+        'a word about it',
+    )
     assert node.adopted.version == version_of(GOOD_TEXT)
     assert node.set_parameters([Parameter('adopt', value='topic')])[0].successful
-    assert node.adopted.version == version_of(OTHER_TEXT)   # what was heard meanwhile
-    assert [CompensatorSettings(calibration_file=name, adopt=adopt).takes_topic for adopt in ('file', 'topic', 'file_then_topic')
-            for name in ('', 'a.yaml')] == [False, False, True, True, True, False]
+    assert node.adopted.version == version_of(OTHER_TEXT)  # what was heard meanwhile
+    assert [
+        CompensatorSettings(calibration_file=name, adopt=adopt).takes_topic
+        for adopt in ('file', 'topic', 'file_then_topic')
+        for name in ('', 'a.yaml')
+    ] == [False, False, True, True, True, False]
 
 
 def test_parameters_change_while_it_runs_or_say_why_not(bench, place, tmp_path):
     node = bench.start(CompensatorNode, {'calibration_file': str(place)})
 
     def change(**values):
-        return node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
-    for values, words in (({'calibration_file': str(tmp_path / 'other.yaml')}, 'read-only'), ({'noise_file': '/dev/zero'}, 'read-only'),
-                          ({'adopt': 'nobody'}, 'file, topic, file_then_topic'), ({'public_executor': True}, 'public_executor'),
-                          ({'target_xyz': [1.0, 0.0, 0.0]}, 'target_frame')):
+        return node.set_parameters_atomically(
+            [Parameter(name, value=value) for name, value in values.items()]
+        )
+
+    for values, words in (
+        ({'calibration_file': str(tmp_path / 'other.yaml')}, 'read-only'),
+        ({'noise_file': '/dev/zero'}, 'read-only'),
+        ({'adopt': 'nobody'}, 'file, topic, file_then_topic'),
+        ({'public_executor': True}, 'public_executor'),
+        ({'target_xyz': [1.0, 0.0, 0.0]}, 'target_frame'),
+    ):
         answer = change(**values)
         assert not answer.successful and words in answer.reason and '\n' not in answer.reason
         assert node.adopted.version == version_of(GOOD_TEXT)
-    place.write_text(OTHER_TEXT)   # ~/reload reads the same path again
-    assert bench.call('/compensator_node/reload').success and node.adopted.version == version_of(OTHER_TEXT)
+    place.write_text(OTHER_TEXT)  # ~/reload reads the same path again
+    assert bench.call('/compensator_node/reload').success and node.adopted.version == version_of(
+        OTHER_TEXT
+    )
     place.write_text('frame_id: [')
     answer = bench.call('/compensator_node/reload')
-    assert not answer.success and node.refusal == 'not_yaml' and node.adopted.version == version_of(OTHER_TEXT)
+    assert (
+        not answer.success
+        and node.refusal == 'not_yaml'
+        and node.adopted.version == version_of(OTHER_TEXT)
+    )
     assert change(target_frame='base_link', target_xyz=[1.0, 0.0, 0.0]).successful
     assert node.compensation.transfer.frame_id == 'base_link'
 
 
 def test_a_misspelt_parameter_is_told(bench):
-    node = bench.start(CompensatorNode, {'calibration_fiel': 'a.yaml', 'reliable': True, 'covariance_rate': 2.0})
+    node = bench.start(
+        CompensatorNode, {'calibration_fiel': 'a.yaml', 'reliable': True, 'covariance_rate': 2.0}
+    )
     lines = unknown_parameters(node)
     assert len(lines) == 2 and "'calibration_fiel'" in lines[0] and "'calibration_file'" in lines[0]
     assert "'reliable'" in lines[1]
@@ -162,26 +220,41 @@ def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch
     publisher = bench.node.create_publisher(Temperature, 'imu/temperature', 10)
     bench.until(publisher.get_subscription_count, 'a subscription')
     node.convert(MESSAGES[0], {'source_timestamp': 1})
-    bench.until(lambda: bench.figure(STATUS, 'no temperature yet') == '1' and bench.shows(STATUS, 'temperature', level=WARN), 'that it waits')
+    bench.until(
+        lambda: (
+            bench.figure(STATUS, 'no temperature yet') == '1'
+            and bench.shows(STATUS, 'temperature', level=WARN)
+        ),
+        'that it waits',
+    )
     publisher.publish(Temperature(temperature=float('nan')))
     bench.until(lambda: bench.shows(STATUS, '/imu/temperature', 'finite'), 'NaN')
     publisher.publish(Temperature(temperature=28.0))
     bench.until(lambda: node.compensation.dt is not None, 'the temperature')
-    bench.until(lambda: bench.shows(STATUS, '28.0 C', '/imu/temperature', '/tester'), 'that it stopped')
+    bench.until(
+        lambda: bench.shows(STATUS, '28.0 C', '/imu/temperature', '/tester'), 'that it stopped'
+    )
 
 
 def test_any_publisher_connects_and_two_are_told(bench, place, monkeypatch):
     monkeypatch.setattr(inputs, 'SEVERAL_AFTER', 0.5)
     node = bench.start(CompensatorNode, {'calibration_file': str(place)})
-    reliable = bench.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE))
+    reliable = bench.node.create_publisher(
+        Imu, 'imu/data_raw', QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+    )
     bench.until(reliable.get_subscription_count, 'a subscription')
     bench.until(lambda: 'reliable' in node.imu.source() and node.imu.publishers, 'the publisher')
     assert node.imu.reliable
     other = bench.start(Sender)
-    best_effort = other.create_publisher(Imu, 'imu/data_raw', QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT))
+    best_effort = other.create_publisher(
+        Imu, 'imu/data_raw', QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
     bench.until(best_effort.get_subscription_count, 'its subscription')
     assert not node.imu.reliable
-    bench.until(lambda: bench.shows(STATUS, '2', '/imu/data_raw', '/sender', '/tester', level=WARN), 'that there are two')
+    bench.until(
+        lambda: bench.shows(STATUS, '2', '/imu/data_raw', '/sender', '/tester', level=WARN),
+        'that there are two',
+    )
     other.destroy_publisher(best_effort)
     bench.until(lambda: node.imu.reliable and not bench.shows(STATUS, '/sender'), 'that it is over')
 
@@ -190,14 +263,19 @@ def test_a_topic_that_is_mistyped_is_told_with_the_nearest(bench, place):
     bench.node.create_publisher(Imu, '/imu/data_rwa', 10)
     bench.start(CompensatorNode, {'calibration_file': str(place)})
     bench.until(lambda: bench.shows(STATUS, '-r imu/data_raw:=/imu/data_rwa'), 'the nearest topic')
-    bench.until(lambda: bench.heard('-r imu/data_raw:=/imu/data_rwa', level='warning'), 'the same on the terminal')
+    bench.until(
+        lambda: bench.heard('-r imu/data_raw:=/imu/data_rwa', level='warning'),
+        'the same on the terminal',
+    )
 
 
 def test_a_new_calibration_is_no_error(bench, place):
     """The counts of the one before belong to the past; an ERROR came after each new calibration."""
     node = bench.start(CompensatorNode, {'calibration_file': str(place), 'adopt': 'topic'})
     publisher = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
-    foreign = encode_imu(ImuSamples(np.array([10**18]), np.ones((1, 3)), np.ones((1, 3)), 'foreign'))[0].tobytes()
+    foreign = encode_imu(
+        ImuSamples(np.array([10**18]), np.ones((1, 3)), np.ones((1, 3)), 'foreign')
+    )[0].tobytes()
     node.convert(foreign, {'source_timestamp': 1})
     bench.until(lambda: bench.lines().get(STATUS, (0, ''))[0] == ERROR, 'the foreign frame')
     bench.until(lambda: bench.lines()[STATUS][0] != ERROR, 'that it is over')
@@ -216,7 +294,11 @@ def test_a_missing_file_ends_the_node_unless_it_is_waited_for(bench, tmp_path, m
     missing = tmp_path / 'later.yaml'
     with refused(InputError, 'calibration_missing', str(missing), 'wait_for_file'):
         bench.start(CompensatorNode, {'calibration_file': str(missing)})
-    node = bench.start(CompensatorNode, {'calibration_file': str(missing), 'wait_for_file': True}, namespace='patient')
+    node = bench.start(
+        CompensatorNode,
+        {'calibration_file': str(missing), 'wait_for_file': True},
+        namespace='patient',
+    )
     bench.until(lambda: bench.heard(missing, level='info'), 'the line')
     assert node.adopted is None
     missing.write_text(GOOD_TEXT)
@@ -229,7 +311,15 @@ def test_the_process_of_a_node_whose_file_is_missing_ends_with_code_1(tmp_path):
         assert process.wait(60) == 1
         station.processes.running.clear()
     lines = (tmp_path / 'out.txt').read_text().splitlines()
-    assert all(topic in lines[0] for topic in ('/imu/data_raw', '/imu/calibration', '/imu/temperature', '/imu/data_corrected'))
+    assert all(
+        topic in lines[0]
+        for topic in (
+            '/imu/data_raw',
+            '/imu/calibration',
+            '/imu/temperature',
+            '/imu/data_corrected',
+        )
+    )
     assert lines[1].startswith('error: ') and 'none.yaml' in lines[1] and len(lines) == 2
 
 
@@ -240,7 +330,9 @@ def test_a_temperature_in_kelvin_is_refused(bench, tmp_path):
     for temperature, used in ((298.15, None), (25.0, 25.0), (float('nan'), 25.0), (310.0, 25.0)):
         node._on_temperature(Temperature(temperature=temperature))
         assert node.diagnostics._temperature == used
-        assert node.compensation.dt == (None if used is None else used - thermal.model.temperature_ref_c)
+        assert node.compensation.dt == (
+            None if used is None else used - thermal.model.temperature_ref_c
+        )
     node.diagnostics.publish_now()
     assert bench.heard('/imu/temperature', '310.0', level='warning') == 1
 
@@ -256,7 +348,9 @@ def test_how_the_stamps_are_is_said_at_most_once_a_minute_for_each_state(bench, 
     assert bench.heard(states[0], level='info') == 3 and bench.heard(states[1], level='info') == 2
 
 
-def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_word_of_the_one_that_stays(bench):
+def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_word_of_the_one_that_stays(
+    bench,
+):
     node = bench.start(CompensatorNode, {'adopt': 'topic'})
     first = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
     bench.until(first.get_subscription_count, 'a subscription')
@@ -265,7 +359,9 @@ def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_wor
     second = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
     bench.until(second.get_subscription_count, 'another subscription')
     second.publish(String(data=OTHER_TEXT))
-    bench.until(lambda: bench.heard('/imu/calibration', '/tester, /tester', level='warning'), 'the refusal')
+    bench.until(
+        lambda: bench.heard('/imu/calibration', '/tester, /tester', level='warning'), 'the refusal'
+    )
     assert node.adopted.version == version_of(GOOD_TEXT)
     bench.node.destroy_publisher(first)
     bench.until(lambda: node.adopted.version == version_of(OTHER_TEXT), 'the one that stays')
@@ -281,13 +377,31 @@ def test_a_calibration_that_harms_at_rest_gives_way_to_the_previous_one(bench, p
     harmful = calibration_to_text(replace(GOOD, values=values))
     publisher.publish(String(data=harmful))
     bench.until(lambda: node.adopted.version == version_of(harmful), 'the harmful one')
-    readings = np.random.default_rng(1).normal(0, [[0.02] * 3 + [0.002] * 3], (1000, 6)) + [0, 0, 9.8, 0, 0, 0]
+    readings = np.random.default_rng(1).normal(0, [[0.02] * 3 + [0.002] * 3], (1000, 6)) + [
+        0,
+        0,
+        9.8,
+        0,
+        0,
+        0,
+    ]
     readings[:, 3:] += GOOD.of('gyroscope', Role.OFFSET)
-    imu = ImuSamples(10**18 + 5_000_000 * np.arange(1000), readings[:, :3] + GOOD.of('accelerometer', Role.OFFSET), readings[:, 3:], 'imu_link')
+    imu = ImuSamples(
+        10**18 + 5_000_000 * np.arange(1000),
+        readings[:, :3] + GOOD.of('accelerometer', Role.OFFSET),
+        readings[:, 3:],
+        'imu_link',
+    )
     for row in encode_imu(imu):
         node.convert(row.tobytes(), {'source_timestamp': 1})
     bench.until(lambda: node.adopted.version == version_of(GOOD_TEXT), 'the previous one')
     assert bench.heard(version_of(harmful), version_of(GOOD_TEXT), level='error') == 1
     publisher.publish(String(data=harmful))
-    bench.until(lambda: bench.figure(STATUS, 'refused') == 'increased_error' and bench.shows(STATUS, version_of(harmful), level=ERROR), 'the refusal')
+    bench.until(
+        lambda: (
+            bench.figure(STATUS, 'refused') == 'increased_error'
+            and bench.shows(STATUS, version_of(harmful), level=ERROR)
+        ),
+        'the refusal',
+    )
     assert node.adopted.version == version_of(GOOD_TEXT)

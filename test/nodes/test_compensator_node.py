@@ -64,20 +64,28 @@ def bench(tmp_path_factory):
     from std_msgs.msg import String
 
     from imu_calibration.nodes.inputs import input_qos, latched_qos, output_qos
+
     folder = tmp_path_factory.mktemp('calibrations')
     for name, text in TEXT.items():
         folder.joinpath(f'{name}.yaml').write_text(text)
     domain_id, lock = free_domain()
     harness = Harness(domain_id)
-    harness.publisher(String, '/late/imu/calibration', latched_qos()).publish(String(data=TEXT['C']))
+    harness.publisher(String, '/late/imu/calibration', latched_qos()).publish(
+        String(data=TEXT['C'])
+    )
     with NodeProcesses(domain_id) as processes:
         harness.processes, harness.by_name = processes, {}
         for name, parameters in NODES.items():
             parameters = dict(parameters)
             if 'calibration_file' in parameters:
                 parameters['calibration_file'] = folder / f'{parameters["calibration_file"]}.yaml'
-            renamed = {'own': {'imu/data_corrected': corrected('own')}, 'twice': {'imu/data_raw': corrected('own')}}.get(name)
-            harness.by_name[name] = processes.start('compensator_node', parameters, namespace=f'/{name}', remappings=renamed)
+            renamed = {
+                'own': {'imu/data_corrected': corrected('own')},
+                'twice': {'imu/data_raw': corrected('own')},
+            }.get(name)
+            harness.by_name[name] = processes.start(
+                'compensator_node', parameters, namespace=f'/{name}', remappings=renamed
+            )
         reliable, best_effort = output_qos(), input_qos()
         for name in NODES:
             harness.listen(Imu, corrected(name), input_qos(reliable=True))
@@ -86,8 +94,13 @@ def bench(tmp_path_factory):
                 harness.publisher(String, f'/{name}/imu/calibration', latched_qos())
         for name in NODES:
             if name != 'twice':
-                harness.wait(lambda: harness.connected(raw(name)), what=f'a subscription of {raw(name)}')
-            harness.wait(lambda: harness.node.count_publishers(corrected(name)) > 0, what=f'a publisher of {corrected(name)}')
+                harness.wait(
+                    lambda: harness.connected(raw(name)), what=f'a subscription of {raw(name)}'
+                )
+            harness.wait(
+                lambda: harness.node.count_publishers(corrected(name)) > 0,
+                what=f'a publisher of {corrected(name)}',
+            )
         harness.spin(1.0)
         yield harness
     harness.close()
@@ -108,13 +121,17 @@ def sent_through(bench, name, messages, expected=None):
     before = len(bench.received[corrected(name)])
     expected = len(messages) if expected is None else expected
     send(bench, name, messages)
-    bench.wait(lambda: len(bench.received[corrected(name)]) >= before + expected, what=f'{expected} messages of {name}')
+    bench.wait(
+        lambda: len(bench.received[corrected(name)]) >= before + expected,
+        what=f'{expected} messages of {name}',
+    )
     bench.spin(0.1)
     return bench.received[corrected(name)][before:]
 
 
 def publish_calibration(bench, name, text):
     from std_msgs.msg import String
+
     bench._publishers[f'/{name}/imu/calibration'].publish(String(data=text))
 
 
@@ -127,7 +144,10 @@ def force_of(data):
 
 
 def wait_for_version(bench, name, text):
-    bench.wait(lambda: bench.values(node_name(name)).get('calibration') == version_of(text), what=f'version {version_of(text)} of {name}')
+    bench.wait(
+        lambda: bench.values(node_name(name)).get('calibration') == version_of(text),
+        what=f'version {version_of(text)} of {name}',
+    )
 
 
 @pytest.mark.parametrize(('name', 'calibration'), [('own', 'A'), ('public', 'B')])
@@ -136,10 +156,16 @@ def test_each_loop_corrects_what_its_own_imu_sends(bench, name, calibration):
     out = sent_through(bench, name, messages)
     live = LiveCompensation(CALIBRATION[calibration])
     expected = [live(data) for data in messages]
-    bench.wait(lambda: 'derivative window [samples]' in bench.values(node_name(name)), what='period')
-    assert bench.values(node_name(name))['loop'] == ('wait set' if name == 'own' else 'public executor')
+    bench.wait(
+        lambda: 'derivative window [samples]' in bench.values(node_name(name)), what='period'
+    )
+    assert bench.values(node_name(name))['loop'] == (
+        'wait set' if name == 'own' else 'public executor'
+    )
     for got, wanted in zip(out, expected, strict=True):
-        np.testing.assert_allclose(parse_imu(got).doubles[13:16], parse_imu(wanted).doubles[13:16], atol=1e-12)
+        np.testing.assert_allclose(
+            parse_imu(got).doubles[13:16], parse_imu(wanted).doubles[13:16], atol=1e-12
+        )
         np.testing.assert_allclose(force_of(got), force_of(wanted), atol=1e-12)
         assert got[:12] == wanted[:12]
     assert {parse_imu(data).frame_id for data in out} == {'imu_link'}
@@ -148,9 +174,14 @@ def test_each_loop_corrects_what_its_own_imu_sends(bench, name, calibration):
 def test_without_a_calibration_nothing_is_published_and_diagnostics_say_so(bench):
     send(bench, 'waiting', imu_messages(10))
     counted = 'passed or held back without calibration'
-    bench.wait(lambda: int(bench.values(node_name('waiting')).get(counted, 0)) >= 10, what='a count of ten')
+    bench.wait(
+        lambda: int(bench.values(node_name('waiting')).get(counted, 0)) >= 10, what='a count of ten'
+    )
     assert bench.received[corrected('waiting')] == []
-    assert bench.values(node_name('waiting'))['calibration'] == 'none' and bench.statuses[node_name('waiting')].level == b'\1'
+    assert (
+        bench.values(node_name('waiting'))['calibration'] == 'none'
+        and bench.statuses[node_name('waiting')].level == b'\1'
+    )
     publish_calibration(bench, 'waiting', TEXT['C'])
     wait_for_version(bench, 'waiting', TEXT['C'])
     assert len(sent_through(bench, 'waiting', imu_messages(10, 10))) == 10
@@ -162,7 +193,10 @@ def test_with_passthrough_messages_pass_until_there_is_a_calibration(bench):
     publish_calibration(bench, 'passing', TEXT['A'])
     wait_for_version(bench, 'passing', TEXT['A'])
     later = imu_messages(5, 5)
-    assert all(before != after for before, after in zip(later, sent_through(bench, 'passing', later), strict=True))
+    assert all(
+        before != after
+        for before, after in zip(later, sent_through(bench, 'passing', later), strict=True)
+    )
 
 
 def test_a_late_joiner_gets_the_latched_calibration_and_moves_readings_to_its_target(bench):
@@ -172,22 +206,37 @@ def test_a_late_joiner_gets_the_latched_calibration_and_moves_readings_to_its_ta
     live = LiveCompensation(CALIBRATION['C'], Transfer.from_pose('base_link', *POSE))
     for got, data in zip(out, messages, strict=True):
         np.testing.assert_allclose(force_of(got), force_of(live(data)), atol=1e-12)
-        assert parse_imu(got).frame_id == 'base_link' and parse_imu(got).stamp_ns == parse_imu(data).stamp_ns
+        assert (
+            parse_imu(got).frame_id == 'base_link'
+            and parse_imu(got).stamp_ns == parse_imu(data).stamp_ns
+        )
 
 
 def test_a_new_calibration_is_taken_over_without_a_gap_and_rolled_back(bench):
     from std_srvs.srv import Trigger
+
     name, messages = 'own', imu_messages(240, 1000)
     before = len(bench.received[corrected(name)])
     send(bench, name, messages[:60])
     publish_calibration(bench, name, TEXT['C'])
     send(bench, name, messages[60:])
-    bench.wait(lambda: len(bench.received[corrected(name)]) >= before + len(messages), what='every message')
+    bench.wait(
+        lambda: len(bench.received[corrected(name)]) >= before + len(messages), what='every message'
+    )
     out = bench.received[corrected(name)][before:]
-    assert [parse_imu(data).stamp_ns for data in out] == [parse_imu(data).stamp_ns for data in messages]
+    assert [parse_imu(data).stamp_ns for data in out] == [
+        parse_imu(data).stamp_ns for data in messages
+    ]
     old, new = (LiveCompensation(CALIBRATION[calibration]) for calibration in 'AC')
-    by_old, by_new = ([np.allclose(parse_imu(got).doubles[13:16], parse_imu(live(data)).doubles[13:16], atol=1e-12)
-                       for got, data in zip(out, messages, strict=True)] for live in (old, new))
+    by_old, by_new = (
+        [
+            np.allclose(
+                parse_imu(got).doubles[13:16], parse_imu(live(data)).doubles[13:16], atol=1e-12
+            )
+            for got, data in zip(out, messages, strict=True)
+        ]
+        for live in (old, new)
+    )
     first = by_new.index(True)
     assert 55 < first < 240
     assert all(by_old[:first]) and all(by_new[first:]) and not any(by_new[:first])
@@ -199,16 +248,21 @@ def test_a_new_calibration_is_taken_over_without_a_gap_and_rolled_back(bench):
 
 def test_reload_without_a_file_says_so(bench):
     from std_srvs.srv import Trigger
+
     response = bench.call(Trigger, '/late/compensator_node/reload')
     assert not response.success and "'calibration_file'" in response.message
 
 
-@pytest.mark.parametrize(('text', 'code'), [
-    ('not: [a calibration', 'not_yaml'),
-    (TEXT['E'].replace('frame_id: imu_link', 'frame_id: other_imu'), 'other_sensor'),
-    (TEXT['E'].replace('imu_calibration/1', 'imu_calibration/7'), 'document_newer'),
-    (calibration_to_text(replace(CALIBRATION['E'], decision={})), 'no_sensor_helps'),
-], ids=['broken', 'other sensor', 'newer', 'unproven'])
+@pytest.mark.parametrize(
+    ('text', 'code'),
+    [
+        ('not: [a calibration', 'not_yaml'),
+        (TEXT['E'].replace('frame_id: imu_link', 'frame_id: other_imu'), 'other_sensor'),
+        (TEXT['E'].replace('imu_calibration/1', 'imu_calibration/7'), 'document_newer'),
+        (calibration_to_text(replace(CALIBRATION['E'], decision={})), 'no_sensor_helps'),
+    ],
+    ids=['broken', 'other sensor', 'newer', 'unproven'],
+)
 def test_a_refused_document_leaves_the_old_one(bench, text, code):
     publish_calibration(bench, 'public', text)
     bench.wait(lambda: bench.values(node_name('public')).get('refused') == code, what=code)
@@ -219,7 +273,10 @@ def test_a_refused_document_leaves_the_old_one(bench, text, code):
 
 def test_bursts_of_nan_and_messages_of_another_sensor_are_held_back(bench):
     messages = imu_messages(60, 2000)
-    broken = [patch_imu(data, force_s=(np.nan,) * 3) if 20 <= k < 30 else data for k, data in enumerate(messages)]
+    broken = [
+        patch_imu(data, force_s=(np.nan,) * 3) if 20 <= k < 30 else data
+        for k, data in enumerate(messages)
+    ]
     broken[40:45] = imu_messages(5, 2040, frame_id='somebody_else')
     out = sent_through(bench, 'own', broken, 45)
     assert len(out) == 45 and np.isfinite([parse_imu(data).doubles[13:] for data in out]).all()
@@ -236,34 +293,63 @@ def test_two_imus_at_once_do_not_mix(bench):
             bench._publishers[raw(name)].publish(data)
         bench.spin(0.005)
     for name, calibration in (('waiting', 'C'), ('passing', 'A')):
-        bench.wait(lambda: len(bench.received[corrected(name)]) >= before[name] + 20, what=f'messages of {name}')
+        bench.wait(
+            lambda: len(bench.received[corrected(name)]) >= before[name] + 20,
+            what=f'messages of {name}',
+        )
         inverse = np.linalg.inv(CALIBRATION[calibration].value('gyroscope', 'matrix'))
         bias = CALIBRATION[calibration].value('gyroscope', 'bias')
         rate = [inverse @ (np.array(parse_imu(d).doubles[13:16]) - bias) for d in messages]
-        np.testing.assert_allclose([parse_imu(d).doubles[13:16] for d in bench.received[corrected(name)][before[name]:]], rate, atol=1e-12)
+        np.testing.assert_allclose(
+            [parse_imu(d).doubles[13:16] for d in bench.received[corrected(name)][before[name] :]],
+            rate,
+            atol=1e-12,
+        )
 
 
 def test_a_stream_that_is_corrected_already_is_refused(bench):
-    bench.wait(lambda: corrected('own') in bench.lines().get(node_name('twice'), '') and bench.statuses[node_name('twice')].level == b'\2', what='the refusal')
-    bench.received[corrected('twice')].clear()   # messages that came before the mark was discovered, which takes long on a busy machine
+    bench.wait(
+        lambda: (
+            corrected('own') in bench.lines().get(node_name('twice'), '')
+            and bench.statuses[node_name('twice')].level == b'\2'
+        ),
+        what='the refusal',
+    )
+    bench.received[
+        corrected('twice')
+    ].clear()  # messages that came before the mark was discovered, which takes long on a busy machine
     assert len(sent_through(bench, 'own', imu_messages(5, 4000))) == 5
     bench.spin(0.5)
     assert bench.received[corrected('twice')] == []
-    process = bench.processes.start('compensator_node', {}, namespace='/by_name', remappings={'imu/data_raw': '/late/imu/data_corrected'})
+    process = bench.processes.start(
+        'compensator_node',
+        {},
+        namespace='/by_name',
+        remappings={'imu/data_raw': '/late/imu/data_corrected'},
+    )
     assert process.wait(timeout=30) == 1
 
 
 def test_a_value_out_of_range_ends_the_node_with_one_line(bench, tmp_path):
     with tmp_path.joinpath('log').open('w+') as log:
-        process = bench.processes.start('compensator_node', {'covariance_rate': -1.0}, namespace='/wrong', output=log)
+        process = bench.processes.start(
+            'compensator_node', {'covariance_rate': -1.0}, namespace='/wrong', output=log
+        )
         assert process.wait(timeout=30) == 1
         log.seek(0)
         text = log.read()
     assert "'covariance_rate'" in text and '-1' in text and 'Traceback' not in text
 
 
-@pytest.mark.parametrize(('name', 'number'), [('own', signal.SIGINT), ('waiting', signal.SIGTERM),
-                                              ('public', signal.SIGTERM), ('passing', signal.SIGINT)])
+@pytest.mark.parametrize(
+    ('name', 'number'),
+    [
+        ('own', signal.SIGINT),
+        ('waiting', signal.SIGTERM),
+        ('public', signal.SIGTERM),
+        ('passing', signal.SIGINT),
+    ],
+)
 def test_signals_end_the_node_with_code_zero(bench, name, number):
     start = time.monotonic()
     assert bench.processes.end(bench.by_name[name], number) == 0
@@ -275,11 +361,15 @@ def test_a_node_killed_in_the_middle_is_replaced(bench):
     bench.by_name['late'].wait()
     bench.statuses.pop(node_name('late'))
     bench.by_name['late'] = bench.processes.start('compensator_node', namespace='/late')
-    bench.wait(lambda: bench.connected(raw('late'), 2), what='the new node beside what is left of the old one')
+    bench.wait(
+        lambda: bench.connected(raw('late'), 2),
+        what='the new node beside what is left of the old one',
+    )
     wait_for_version(bench, 'late', TEXT['C'])
     before, number = len(bench.received[corrected('late')]), iter(range(1000))
 
     def came_after_one_more():
         send(bench, 'late', imu_messages(1, next(number)), rate=20.0)
         return len(bench.received[corrected('late')]) > before
+
     bench.wait(came_after_one_more, what='a corrected message')

@@ -36,8 +36,15 @@ def test_each_complaint_has_a_clock_of_its_own(now):
     complaints = Complaints(heard, lambda: now[0])
     for second in range(130):
         now[0] = 1000.0 + second
-        complaints.now('node', [f'{second} samples lost'] + ['two publishers'] * (second >= 5), ['no disk'] * (5 <= second < 50))
-    assert sum('lost' in line for line in heard) == 1 + 129 // int(REMINDER) and sum('two publishers' in line for line in heard) == 3
+        complaints.now(
+            'node',
+            [f'{second} samples lost'] + ['two publishers'] * (second >= 5),
+            ['no disk'] * (5 <= second < 50),
+        )
+    assert (
+        sum('lost' in line for line in heard) == 1 + 129 // int(REMINDER)
+        and sum('two publishers' in line for line in heard) == 3
+    )
     assert [line.split(':')[0] for line in heard if line.endswith(': no disk')] == ['error', 'info']
 
 
@@ -58,7 +65,16 @@ def test_memory_stays_bounded_whatever_is_wrong(now):
 
 
 def test_figures_that_are_not_known_are_left_out_and_no_status_is_stale():
-    group = GroupState('accelerometer', 'bias', 'held', 'accelerometer.bias.x', float('nan'), 0.01, 'm/s^2', 'turn it over')
+    group = GroupState(
+        'accelerometer',
+        'bias',
+        'held',
+        'accelerometer.bias.x',
+        float('nan'),
+        0.01,
+        'm/s^2',
+        'turn it over',
+    )
     for status in statuses_of(WorkerState(groups=[group], verdict='harms', faults=('no disk',))):
         assert all(value.value != 'nan' for value in status.values) and 'nan' not in status.message
         assert status.level != DiagnosticStatus.STALE
@@ -73,21 +89,81 @@ class Topic:
 
 
 def test_the_guide_says_every_change_once(now):
-    guide = CalibrationGuide({'imu': Topic(), 'joints': Topic()}, 'the command that saves', 'window', clock=lambda: now[0])
-    counted = StreamState('good', 'Imu messages come', {}, (), ('imu', 'joints'), stamping=StampLine(COUNTED, 5e6, 0.0, 3.5e7, 8.0))
-    states = [WorkerState(), WorkerState(streams=StreamState('good', '', {}, ('joints',), ('imu',))), WorkerState(streams=counted),
-              WorkerState(streams=counted, gathered=3, verdict='unproven', judged='unproven', lines=('bias: known less well', 'next: turn about x')),
-              WorkerState(streams=counted, gathered=5, verdict='unproven', judged='unproven', lines=('bias: known less well', 'next: turn about y')),
-              WorkerState(streams=counted, gathered=8, verdict='helps', judged='helps', complete=True, lines=('all is well',)),
-              WorkerState(streams=counted, gathered=8, verdict='helps', judged='helps', complete=True, diagnosis=LiveState('found', 'the gyroscopes feel gravity', {'effect': 'g'})),
-              WorkerState(streams=counted, gathered=9, verdict='harms', judged='harms', lines=('residuals are large',))]
+    guide = CalibrationGuide(
+        {'imu': Topic(), 'joints': Topic()},
+        'the command that saves',
+        'window',
+        clock=lambda: now[0],
+    )
+    counted = StreamState(
+        'good',
+        'Imu messages come',
+        {},
+        (),
+        ('imu', 'joints'),
+        stamping=StampLine(COUNTED, 5e6, 0.0, 3.5e7, 8.0),
+    )
+    states = [
+        WorkerState(),
+        WorkerState(streams=StreamState('good', '', {}, ('joints',), ('imu',))),
+        WorkerState(streams=counted),
+        WorkerState(
+            streams=counted,
+            gathered=3,
+            verdict='unproven',
+            judged='unproven',
+            lines=('bias: known less well', 'next: turn about x'),
+        ),
+        WorkerState(
+            streams=counted,
+            gathered=5,
+            verdict='unproven',
+            judged='unproven',
+            lines=('bias: known less well', 'next: turn about y'),
+        ),
+        WorkerState(
+            streams=counted,
+            gathered=8,
+            verdict='helps',
+            judged='helps',
+            complete=True,
+            lines=('all is well',),
+        ),
+        WorkerState(
+            streams=counted,
+            gathered=8,
+            verdict='helps',
+            judged='helps',
+            complete=True,
+            diagnosis=LiveState('found', 'the gyroscopes feel gravity', {'effect': 'g'}),
+        ),
+        WorkerState(
+            streams=counted,
+            gathered=9,
+            verdict='harms',
+            judged='harms',
+            lines=('residuals are large',),
+        ),
+    ]
     said = []
     for state in states:
         for _ in range(3):
             now[0] += MIN_ADVICE_SECONDS
             said += guide.lines(state)
-    wanted = [('Imu', '/imu', '/driver', 'reliable'), ('JointState', '/imu', '/driver', 'reliable'), ('Imu', ' 8 ', '200 Hz'), ('window',),
-              ('unproven', 'bias: known less well', 'next: turn about x'), ('next: turn about x',), ('next: turn about y',),
-              ('helps', '`the command that saves`'), ('the gyroscopes feel gravity',), ('harms', 'residuals are large')]
-    assert [[value for value in values if value not in line] for (_, line), values in zip(said, wanted, strict=True)] == [[]] * len(wanted), said
+    wanted = [
+        ('Imu', '/imu', '/driver', 'reliable'),
+        ('JointState', '/imu', '/driver', 'reliable'),
+        ('Imu', ' 8 ', '200 Hz'),
+        ('window',),
+        ('unproven', 'bias: known less well', 'next: turn about x'),
+        ('next: turn about x',),
+        ('next: turn about y',),
+        ('helps', '`the command that saves`'),
+        ('the gyroscopes feel gravity',),
+        ('harms', 'residuals are large'),
+    ]
+    assert [
+        [value for value in values if value not in line]
+        for (_, line), values in zip(said, wanted, strict=True)
+    ] == [[]] * len(wanted), said
     assert said[-1][0] == 'warning'

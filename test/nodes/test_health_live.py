@@ -31,14 +31,21 @@ def start(bench, tmp_path, conditions=None, **parameters):
     calibration = plain_calibration()
     calibration.conditions.update(conditions or {})
     (tmp_path / 'calibration.yaml').write_text(calibration_to_text(calibration))
-    return bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'calibration.yaml'), **parameters})
+    return bench.start(
+        CompensatorNode, {'calibration_file': str(tmp_path / 'calibration.yaml'), **parameters}
+    )
 
 
 def converted(node, messages=MESSAGES):
     """(rates, last covariance of the rate) of what the node makes of messages."""
-    stream, out = ImuStream(), [node.convert(message, {'source_timestamp': 1}) for message in messages]
+    stream, out = (
+        ImuStream(),
+        [node.convert(message, {'source_timestamp': 1}) for message in messages],
+    )
     stream.open(out[-1])
-    return np.array([stream.read(message)[1][:3] for message in out]), stream.covariances(out[-1])[1]
+    return np.array([stream.read(message)[1][:3] for message in out]), stream.covariances(out[-1])[
+        1
+    ]
 
 
 def test_a_drift_is_told_at_the_stops(bench, tmp_path):
@@ -47,30 +54,51 @@ def test_a_drift_is_told_at_the_stops(bench, tmp_path):
     assert bench.lines()[STATUS][0] == OK and bench.figure(STATUS, 'outcome') == 'waiting'
     converted(node)
     bench.until(lambda: bench.lines()[STATUS][0] == WARN, 'a warning')
-    assert bench.shows(STATUS, 'gyroscope', '+0.2') and bench.heard('gyroscope', '+0.2', level='warning') == 1
+    assert (
+        bench.shows(STATUS, 'gyroscope', '+0.2')
+        and bench.heard('gyroscope', '+0.2', level='warning') == 1
+    )
     assert bench.figure(STATUS, 'outcome') == 'moved' and bench.figure(STATUS, 'stops') == '9'
 
 
 def test_a_driver_that_publishes_g_is_told_the_unit(bench, tmp_path):
     node = start(bench, tmp_path)
-    converted(node, [bytes(row) for row in Packed.of_rows(encode_imu(replace(WORLD.imu, force_s=WORLD.imu.force_s / 9.80665))).views()])
+    converted(
+        node,
+        [
+            bytes(row)
+            for row in Packed.of_rows(
+                encode_imu(replace(WORLD.imu, force_s=WORLD.imu.force_s / 9.80665))
+            ).views()
+        ],
+    )
     bench.until(lambda: bench.lines().get(STATUS, (OK,))[0] == ERROR, 'an error')
-    assert bench.figure(STATUS, 'outcome') == 'unit' and bench.heard('m/s^2', level='error') == 1 and not bench.heard(level='warning')
+    assert (
+        bench.figure(STATUS, 'outcome') == 'unit'
+        and bench.heard('m/s^2', level='error') == 1
+        and not bench.heard(level='warning')
+    )
 
 
-def test_an_update_is_taken_off_where_it_is_allowed_and_its_uncertainty_is_published(bench, tmp_path):
+def test_an_update_is_taken_off_where_it_is_allowed_and_its_uncertainty_is_published(
+    bench, tmp_path
+):
     node = start(bench, tmp_path, update_gyro_bias=True)
     rates, _ = converted(node)
     left = rates[-3000:] - WORLD.imu.rate_s[-3000:] + WORLD.bias[-3000:]
     assert np.abs(left).max() < 0.25 * np.abs(WORLD.bias[-3000:]).max()
     bench.until(lambda: bench.figure(STATUS, 'outcome') == 'followed', 'word of it')
-    assert bench.lines()[STATUS][0] == OK and bench.figure(STATUS, 'bias update [deg/s]').split(', ')[2].startswith('+0.2')
+    assert bench.lines()[STATUS][0] == OK and bench.figure(STATUS, 'bias update [deg/s]').split(
+        ', '
+    )[2].startswith('+0.2')
     node.compensation.refresh()
     _, with_update = converted(node, MESSAGES[-1:])
     assert node.compensation.watch.rate_cov[2, 2] > 0
     watch = node.compensation.watch
-    assert node.set_parameters_atomically([Parameter('parameter_covariance', value=False)]).successful
-    assert node.compensation.watch is watch   # what the stops have shown is not forgotten
+    assert node.set_parameters_atomically(
+        [Parameter('parameter_covariance', value=False)]
+    ).successful
+    assert node.compensation.watch is watch  # what the stops have shown is not forgotten
     assert node.set_parameters_atomically([Parameter('update_gyro_bias', value=False)]).successful
     _, without = converted(node, MESSAGES[-1:])
     assert with_update[2, 2] > without[2, 2] + 0.9 * watch.rate_cov[2, 2]

@@ -20,7 +20,9 @@ pytestmark = pytest.mark.live
 def test_a_document_of_nested_powers_is_refused_and_the_node_lives(bench):
     """29 kB took all memory of compensator_node, which accepts documents from the topic."""
     node = bench.start(CompensatorNode, {})
-    bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(String(data=hostile_calibration()))
+    bench.node.create_publisher(String, 'imu/calibration', latched_qos()).publish(
+        String(data=hostile_calibration())
+    )
     bench.until(lambda: node.refusal == 'column_expands', 'the refusal')
     assert node.adopted is None and not bench.call('/compensator_node/reload').success
 
@@ -29,7 +31,11 @@ def test_a_pipe_as_calibration_file_does_not_block_the_node(bench, tmp_path):
     os.mkfifo(tmp_path / 'calibration.yaml')
     node = bench.start(CompensatorNode, {'calibration_file': str(tmp_path / 'calibration.yaml')})
     answer = bench.call('/compensator_node/reload')
-    assert not answer.success and 'calibration.yaml' in answer.message and node.refusal == 'file_unreadable'
+    assert (
+        not answer.success
+        and 'calibration.yaml' in answer.message
+        and node.refusal == 'file_unreadable'
+    )
 
 
 def test_lines_of_the_log_have_no_control_characters():

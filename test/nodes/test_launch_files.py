@@ -32,9 +32,16 @@ def stand_in(name):
 @pytest.fixture
 def launch(monkeypatch):
     """Stand-ins for the modules of launch."""
-    names = {'launch': ['LaunchDescription'], 'launch.actions': ['DeclareLaunchArgument'], 'launch.conditions': ['IfCondition'],
-             'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'], 'launch_ros': [], 'launch_ros.actions': ['Node'],
-             'launch_ros.parameter_descriptions': ['ParameterValue'], 'launch_ros.substitutions': ['FindPackageShare']}
+    names = {
+        'launch': ['LaunchDescription'],
+        'launch.actions': ['DeclareLaunchArgument'],
+        'launch.conditions': ['IfCondition'],
+        'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
+        'launch_ros': [],
+        'launch_ros.actions': ['Node'],
+        'launch_ros.parameter_descriptions': ['ParameterValue'],
+        'launch_ros.substitutions': ['FindPackageShare'],
+    }
     for module, classes in names.items():
         made = ModuleType(module)
         for name in classes:
@@ -43,32 +50,52 @@ def launch(monkeypatch):
     Recorded.made = []
 
 
-@pytest.mark.parametrize('path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    'path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name
+)
 def test_arguments_are_declared_and_parameters_exist(path, launch):
     spec = importlib.util.spec_from_file_location('launch_file', path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.generate_launch_description()
-    of_kind = {kind: [r for r in Recorded.made if type(r).__name__ == kind] for kind in ('DeclareLaunchArgument', 'LaunchConfiguration', 'Node')}
+    of_kind = {
+        kind: [r for r in Recorded.made if type(r).__name__ == kind]
+        for kind in ('DeclareLaunchArgument', 'LaunchConfiguration', 'Node')
+    }
     declared = [r.args[0] for r in of_kind['DeclareLaunchArgument']]
     assert sorted(declared) == sorted({r.args[0] for r in of_kind['LaunchConfiguration']})
-    tables = [r.kwargs['default_value'].args[0][1] for r in of_kind['DeclareLaunchArgument'] if r.args[0] == 'table']
-    assert tables in ([], ['table_simulated.yaml' if path.name == 'demo.launch.py' else 'table_template.yaml'])   # the template is refused
+    tables = [
+        r.kwargs['default_value'].args[0][1]
+        for r in of_kind['DeclareLaunchArgument']
+        if r.args[0] == 'table'
+    ]
+    assert tables in (
+        [],
+        ['table_simulated.yaml' if path.name == 'demo.launch.py' else 'table_template.yaml'],
+    )  # the template is refused
     for node in of_kind['Node']:
         name = node.kwargs['executable']
         if node.kwargs['package'] != 'imu_calibration':
             continue
         known = {item.name for group in settings_of(name) for item in describe(group)}
-        given = {key for group in node.kwargs['parameters'] if isinstance(group, dict) for key in group}
+        given = {
+            key for group in node.kwargs['parameters'] if isinstance(group, dict) for key in group
+        }
         assert given <= known | {'use_sim_time'}, name
 
 
 def test_the_filter_of_robot_localization_takes_what_the_compensator_publishes():
     """Its parameters are those that its ekf_node documents: fifteen flags for each input, the topic that the launch file remaps."""
-    [(node, found)] = yaml.safe_load((ROOT / 'config/robot_localization_ekf.yaml').read_text()).items()
+    [(node, found)] = yaml.safe_load(
+        (ROOT / 'config/robot_localization_ekf.yaml').read_text()
+    ).items()
     parameters = found['ros__parameters']
-    assert node == 'ekf_filter_node' and parameters['imu0'] == 'imu/data' and f"name='{node}'" in (ROOT / 'launch/compensate.launch.py').read_text()
+    assert (
+        node == 'ekf_filter_node'
+        and parameters['imu0'] == 'imu/data'
+        and f"name='{node}'" in (ROOT / 'launch/compensate.launch.py').read_text()
+    )
     assert len(parameters['imu0_config']) == len(parameters['odom0_config']) == 15
-    yaw_rate, forward = 11, 12   # of x y z, roll pitch yaw, velocities, rates, accelerations
+    yaw_rate, forward = 11, 12  # of x y z, roll pitch yaw, velocities, rates, accelerations
     assert [k for k, used in enumerate(parameters['imu0_config']) if used] == [yaw_rate, forward]
     assert parameters['imu0_remove_gravitational_acceleration'] and parameters['two_d_mode']

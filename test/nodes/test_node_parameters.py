@@ -19,22 +19,37 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize('node', NODE_NAMES)
 def test_parameter_file_is_the_declaration(node):
     written, declared = (ROOT / 'config' / f'{node}.yaml').read_text(), rendered(node)
-    difference = '\n'.join(difflib.unified_diff(written.splitlines(), declared.splitlines(), 'written', 'declared', lineterm=''))
+    difference = '\n'.join(
+        difflib.unified_diff(
+            written.splitlines(), declared.splitlines(), 'written', 'declared', lineterm=''
+        )
+    )
     assert not difference, f'run make config\n{difference}'
 
 
 @pytest.mark.parametrize('node', NODE_NAMES)
 def test_yaml_gives_the_defaults_back(node):
     values = yaml.safe_load(rendered(node))['/**']['ros__parameters'] or {}
-    defaults = {item.name: item.default for group in settings_of(node) for item in describe(group) if not item.session}
-    assert {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()} == defaults
-    assert [type(value) for value in values.values()] == [list if isinstance(value, tuple) else type(value) for value in defaults.values()]
+    defaults = {
+        item.name: item.default
+        for group in settings_of(node)
+        for item in describe(group)
+        if not item.session
+    }
+    assert {
+        name: tuple(value) if isinstance(value, list) else value for name, value in values.items()
+    } == defaults
+    assert [type(value) for value in values.values()] == [
+        list if isinstance(value, tuple) else type(value) for value in defaults.values()
+    ]
 
 
 @pytest.mark.parametrize('value', [1e-5, 1.5e-7, 0.1, 20.0, 1e22, True, 3, '', 'a: b', (0.0, 1e-9)])
 def test_values_keep_their_type(value):
     read = yaml.safe_load(value_text(value))
-    assert (tuple(read) if isinstance(value, tuple) else read) == value and isinstance(read, (type(value), list))
+    assert (tuple(read) if isinstance(value, tuple) else read) == value and isinstance(
+        read, (type(value), list)
+    )
 
 
 def test_make_config_writes_what_is_missing_and_leaves_the_rest(tmp_path, capsys):
@@ -58,10 +73,16 @@ def test_a_new_setting_is_a_parameter_and_a_line_of_its_file(monkeypatch):
 
     class Bench:
         def declare_parameter(self, name, default, descriptor):
-            return SimpleNamespace(value=3.5 if name == 'patience' else default, descriptor=descriptor)
+            return SimpleNamespace(
+                value=3.5 if name == 'patience' else default, descriptor=descriptor
+            )
 
         def add_on_set_parameters_callback(self, answer):
             self.answer = answer
+
     monkeypatch.setattr(node_module, 'CompensatorSettings', Wider)
-    assert '    # how long to wait [s], 0 to 9. When wrong: it waits too long\n    patience: 2.5\n' in rendered('compensator_node')
+    assert (
+        '    # how long to wait [s], 0 to 9. When wrong: it waits too long\n    patience: 2.5\n'
+        in rendered('compensator_node')
+    )
     assert declare_parameters(Bench(), Wider).patience == 3.5

@@ -24,7 +24,9 @@ pytestmark = pytest.mark.live
 def bench(monkeypatch, tmp_path):
     """Make benches, and close them."""
     with ExitStack() as made:
-        yield lambda *arguments, **parameters: made.enter_context(PlannerBench(monkeypatch, tmp_path, *arguments, **parameters))
+        yield lambda *arguments, **parameters: made.enter_context(
+            PlannerBench(monkeypatch, tmp_path, *arguments, **parameters)
+        )
 
 
 def test_joints_without_a_range_are_not_moved(bench):
@@ -32,7 +34,11 @@ def test_joints_without_a_range_are_not_moved(bench):
     table.looks(lambda: table.planner.driver.position is not None, 'the joints')
     for what in ('start', 'next'):
         answer = table.ask(what)
-        assert not answer.success and 'outer, inner' in answer.message and 'range_deg' in answer.message
+        assert (
+            not answer.success
+            and 'outer, inner' in answer.message
+            and 'range_deg' in answer.message
+        )
     assert not table.trajectories and table.heard('range_deg', 'outer, inner', level='warning') == 1
 
 
@@ -41,7 +47,9 @@ def test_start_answers_with_every_limit_and_its_origin(bench):
     assert table.heard('outer', 'endless', '90 deg/s', '300 deg/s^2', level='info') == 1
     table.looks(lambda: table.planner.driver.position is not None, 'the joints')
     answer = table.ask('next')
-    assert answer.success and all(value in answer.message for value in ('inner', 'endless', '-720 to 720 deg', '90 deg/s'))
+    assert answer.success and all(
+        value in answer.message for value in ('inner', 'endless', '-720 to 720 deg', '90 deg/s')
+    )
 
 
 def test_positions_that_are_not_finite_are_ignored_and_counted_by_joint(bench):
@@ -51,12 +59,18 @@ def test_positions_that_are_not_finite_are_ignored_and_counted_by_joint(bench):
         for _ in range(3):
             table.look()
     table.position[1] = 0.0
-    table.rate = [float('nan'), float('inf')]   # not measured, which is usual
+    table.rate = [float('nan'), float('inf')]  # not measured, which is usual
     seen = table.planner.driver._heard
     table.looks(lambda: table.planner.driver._heard > seen, 'the next joint state')
-    assert table.planner.driver.ignored == {'inner': 6} and table.planner.driver.state is DriveState.MOVING
+    assert (
+        table.planner.driver.ignored == {'inner': 6}
+        and table.planner.driver.state is DriveState.MOVING
+    )
     assert table.heard('inner', level='warning') == 1
-    table.looks(lambda: table.figure('planner_node: drive', 'ignored joint states') == 'inner:6', 'the count')
+    table.looks(
+        lambda: table.figure('planner_node: drive', 'ignored joint states') == 'inner:6',
+        'the count',
+    )
 
 
 def test_nothing_but_positions_that_are_not_finite_keeps_the_joints_where_they_are(bench):
@@ -68,11 +82,14 @@ def test_nothing_but_positions_that_are_not_finite_keeps_the_joints_where_they_a
 
 
 @pytest.mark.parametrize('callback', ['observe', 'tick'])
-def test_an_exception_in_a_callback_stops_the_joints_and_the_node_goes_on(bench, monkeypatch, callback):
+def test_an_exception_in_a_callback_stops_the_joints_and_the_node_goes_on(
+    bench, monkeypatch, callback
+):
     table = bench().moving()
 
     def broken(*_, **__):
         raise ZeroDivisionError('by design')
+
     with monkeypatch.context() as patch:
         patch.setattr(table.planner.driver, callback, broken)
         table.looks(lambda: table.planner.driver.state is DriveState.STOPPED, 'the stop')
@@ -108,14 +125,16 @@ def test_a_second_publisher_of_trajectories_keeps_the_joints_from_being_driven(b
 def test_a_goal_of_another_client_keeps_the_joints_from_being_driven(bench):
     table = bench()
     table.looks(lambda: table.planner.driver.position is not None, 'the joints')
-    controller = table.node.create_publisher(GoalStatusArray, 'follow_joint_trajectory/_action/status', qos_profile_action_status_default)
+    controller = table.node.create_publisher(
+        GoalStatusArray, 'follow_joint_trajectory/_action/status', qos_profile_action_status_default
+    )
     goal = GoalStatus(status=GoalStatus.STATUS_EXECUTING)
     goal.goal_info.goal_id.uuid = [7] * 16
     controller.publish(GoalStatusArray(status_list=[goal]))
     table.looks(table.planner._others.found, 'the status')
     answer = table.ask('start')
     assert not answer.success and '/follow_joint_trajectory' in answer.message
-    table.planner._command.goals.add(bytes([7] * 16))   # a goal of its own
+    table.planner._command.goals.add(bytes([7] * 16))  # a goal of its own
     assert not table.planner._others.found()
     table.planner._command.goals.clear()
     goal.status = GoalStatus.STATUS_SUCCEEDED
@@ -125,13 +144,17 @@ def test_a_goal_of_another_client_keeps_the_joints_from_being_driven(bench):
 
 
 def test_another_driver_that_appears_later_stops_before_the_next_motion(bench, monkeypatch):
-    answers = ['']   # at ~/next
-    monkeypatch.setattr(OtherDrivers, 'found', lambda self: answers.pop() if answers else 'there is /rival')
+    answers = ['']  # at ~/next
+    monkeypatch.setattr(
+        OtherDrivers, 'found', lambda self: answers.pop() if answers else 'there is /rival'
+    )
     table = bench(first_reach=0.0)
     table.looks(lambda: table.planner.driver.position is not None, 'the joints')
     assert table.ask('next').success
     table.looks(lambda: table.planner.driver.state is DriveState.STOPPED, 'the stop')
-    assert '/rival' in table.planner.driver.reason and not any(message.points for message in table.trajectories)
+    assert '/rival' in table.planner.driver.reason and not any(
+        message.points for message in table.trajectories
+    )
 
 
 def test_the_first_motion_is_small_and_slow_and_says_that_collisions_are_not_checked(bench):
@@ -145,4 +168,6 @@ def test_the_first_motion_is_small_and_slow_and_says_that_collisions_are_not_che
     np.testing.assert_allclose(position[-1], 0.0, atol=1e-9)
     assert np.abs([point.velocities for point in points]).max() <= 0.3 * np.radians(100.0)
     limits = table.planner.driver.limits
-    np.testing.assert_allclose([limits.lower, limits.upper], np.add.outer(np.radians([-30, 30]), table.position))
+    np.testing.assert_allclose(
+        [limits.lower, limits.upper], np.add.outer(np.radians([-30, 30]), table.position)
+    )

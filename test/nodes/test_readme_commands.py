@@ -22,10 +22,18 @@ pytestmark = [pytest.mark.slow, pytest.mark.live]
 PATIENCE = 240.0
 PLANNER = '/planner_node/'
 """What is asked of who drives; without a table it answers why nothing moves."""
-ANSWERS = {'/calibration_node/solve': 'success=True', '/calibration_node/save': '/ws/calibration.yaml', '/calibration_node/reset': 'restarted',
-           'param describe': 'Fixed|settling', 'param set': 'Set parameter successful', 'topic echo /diagnostics': 'name: .*calibration_node: streams',
-           'imu inspect': 'gravity reads 9.78', 'imu watch': 'streams .*messages come', 'ros2 doctor': 'checks passed',
-           PLANNER: r'success=\w+, message=.\w+'}
+ANSWERS = {
+    '/calibration_node/solve': 'success=True',
+    '/calibration_node/save': '/ws/calibration.yaml',
+    '/calibration_node/reset': 'restarted',
+    'param describe': 'Fixed|settling',
+    'param set': 'Set parameter successful',
+    'topic echo /diagnostics': 'name: .*calibration_node: streams',
+    'imu inspect': 'gravity reads 9.78',
+    'imu watch': 'streams .*messages come',
+    'ros2 doctor': 'checks passed',
+    PLANNER: r'success=\w+, message=.\w+',
+}
 """Beginnings of questions -> what stands in the answer."""
 
 
@@ -37,7 +45,11 @@ def commands():
     pages = '\n'.join((ROOT / name).read_text() for name in PAGES)
     blocks = re.findall(r'^```\w*\n(.*?)^```', pages, re.DOTALL | re.MULTILINE)
     lines = '\n'.join(blocks).replace('\\\n', ' ').splitlines()
-    return list(dict.fromkeys(re.sub(r'\s+', ' ', line.split('  #')[0]).strip() for line in lines if 'ros2 ' in line))
+    return list(
+        dict.fromkeys(
+            re.sub(r'\s+', ' ', line.split('  #')[0]).strip() for line in lines if 'ros2 ' in line
+        )
+    )
 
 
 def starts(command):
@@ -48,15 +60,23 @@ def starts(command):
 def nodes_of(command):
     """Names of the nodes that a command starts."""
     which = command.split()[3].removesuffix('.launch.py')
-    return {'demo': ['simulator_node', 'calibration_node', 'compensator_node'], 'calibrate': ['calibration_node'],
-            'compensate': ['compensator_node'], 'drive': ['calibration_node', 'planner_node']}.get(which, [which])
+    return {
+        'demo': ['simulator_node', 'calibration_node', 'compensator_node'],
+        'calibrate': ['calibration_node'],
+        'compensate': ['compensator_node'],
+        'drive': ['calibration_node', 'planner_node'],
+    }.get(which, [which])
 
 
 @pytest.fixture(scope='module')
 def home(tmp_path_factory, built, with_ros2):
     """(A home folder with ws in it, the environment of its shells)."""
     folder = tmp_path_factory.mktemp('home')
-    environment = with_ros2 | STAY_LOCAL | {'HOME': str(folder), 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+    environment = (
+        with_ros2
+        | STAY_LOCAL
+        | {'HOME': str(folder), 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+    )
     (folder / 'ws').mkdir()
     for name in ('install', 'src'):
         (folder / 'ws' / name).symlink_to(built / name)
@@ -72,8 +92,15 @@ class Terminal:
         folder, environment = home
         self.command, self.log = command, folder / f'terminal_{time.monotonic_ns()}.txt'
         with open(self.log, 'wb') as stream:
-            self.process = subprocess.Popen(sourced(folder / 'ws', command), cwd=folder / 'ws', stdin=subprocess.DEVNULL, stdout=stream, stderr=stream,
-                                            env=environment | {'ROS_DOMAIN_ID': str(domain_id)}, start_new_session=True)
+            self.process = subprocess.Popen(
+                sourced(folder / 'ws', command),
+                cwd=folder / 'ws',
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=stream,
+                env=environment | {'ROS_DOMAIN_ID': str(domain_id)},
+                start_new_session=True,
+            )
 
     def shown(self):
         """What stands on it."""
@@ -83,7 +110,9 @@ class Terminal:
         """Wait until all patterns stand on it."""
         end = time.monotonic() + patience
         while missing := [pattern for pattern in patterns if not re.search(pattern, self.shown())]:
-            assert self.process.poll() is None and time.monotonic() < end, f'{self.command}\nshows no {missing}, but\n{self.shown()}'
+            assert self.process.poll() is None and time.monotonic() < end, (
+                f'{self.command}\nshows no {missing}, but\n{self.shown()}'
+            )
             time.sleep(0.1)
 
     def interrupt(self):
@@ -105,11 +134,18 @@ def terminals(home):
     def open_one(command):
         opened.append(Terminal(home, command, domain_id))
         return opened[-1]
+
     yield open_one
     for terminal in opened:
         if terminal.process.poll() is None:
             terminal.interrupt()
-    subprocess.run(sourced(home[0] / 'ws', 'ros2 daemon stop'), cwd=home[0], env=home[1] | {'ROS_DOMAIN_ID': str(domain_id)}, capture_output=True, timeout=60)
+    subprocess.run(
+        sourced(home[0] / 'ws', 'ros2 daemon stop'),
+        cwd=home[0],
+        env=home[1] | {'ROS_DOMAIN_ID': str(domain_id)},
+        capture_output=True,
+        timeout=60,
+    )
     lock.close()
 
 
@@ -118,7 +154,11 @@ THREE = STARTING[:3]
 
 
 def test_the_readme_has_commands_and_asks_of_each_kind():
-    assert len(STARTING) >= 10 and [nodes_of(command)[0] for command in THREE] == ['simulator_node', 'calibration_node', 'compensator_node']
+    assert len(STARTING) >= 10 and [nodes_of(command)[0] for command in THREE] == [
+        'simulator_node',
+        'calibration_node',
+        'compensator_node',
+    ]
     asked = [command for command in commands() if not starts(command)]
     assert asked and all(any(key in command for key in ANSWERS) for command in asked), asked
 
@@ -163,7 +203,9 @@ def answered(terminals, command):
 def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
     simulator, calibrator, compensator = map(terminals, THREE)
     calibrator.wait('/imu/data_raw from /simulator_node', 'JointState .*/simulator_node')
-    while not lists(terminals('ros2 node list'), '/calibration_node'):   # the daemon that ros2 starts finds the nodes after a while
+    while not lists(
+        terminals('ros2 node list'), '/calibration_node'
+    ):  # the daemon that ros2 starts finds the nodes after a while
         pass
     for command in commands():
         if not starts(command) and PLANNER not in command:
@@ -193,4 +235,6 @@ def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
         terminal.wait('/sample_session .*10 .*/imu/data_raw')
     code = terminal.interrupt()
     assert code == 0, f'{code}\n{terminal.shown()}'
-    assert 'Traceback' not in terminal.shown() and UNKNOWN_PARAMETER not in terminal.shown(), terminal.shown()
+    assert 'Traceback' not in terminal.shown() and UNKNOWN_PARAMETER not in terminal.shown(), (
+        terminal.shown()
+    )

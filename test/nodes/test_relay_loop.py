@@ -40,7 +40,14 @@ def test_the_ends_of_the_benchmark_still_fit_the_loop(monkeypatch):
     from benchmarks.bench_compensator import run_once
 
     from ros.live_station import STAY_LOCAL, free_domain
+
     domain_id, lock = free_domain()
-    sent, came, _ = run_once('/bench_direct', '/bench_direct', 100.0, 0.5, os.environ | STAY_LOCAL | {'ROS_DOMAIN_ID': str(domain_id)})
+    sent, came, _ = run_once(
+        '/bench_direct',
+        '/bench_direct',
+        100.0,
+        0.5,
+        os.environ | STAY_LOCAL | {'ROS_DOMAIN_ID': str(domain_id)},
+    )
     lock.close()
     assert sent['sent'] == came['came'] == 50 and came['doubled'] == 0 and 0 < came['late_us'][50]

@@ -55,21 +55,29 @@ def disturbed(samples, rng):
 def with_nan_burst(imu, start, seconds=2.0):
     """Readings that are NaN for a while."""
     force = imu.force_s.copy()
-    inside = (imu.stamp_ns >= imu.stamp_ns[0] + int(start * 1e9)) & (imu.stamp_ns < imu.stamp_ns[0] + int((start + seconds) * 1e9))
+    inside = (imu.stamp_ns >= imu.stamp_ns[0] + int(start * 1e9)) & (
+        imu.stamp_ns < imu.stamp_ns[0] + int((start + seconds) * 1e9)
+    )
     force[inside] = np.nan
     return replace(imu, force_s=force)
 
 
 def received(station):
     """Imu and JointState messages that calibration_node has used or dropped."""
-    return [station.figure(f'{name} messages', 'calibration_node: streams') for name in ('imu', 'joints')]
+    return [
+        station.figure(f'{name} messages', 'calibration_node: streams')
+        for name in ('imu', 'joints')
+    ]
 
 
 def send_all(station, publisher, imu, joints):
     """Publish, and wait until the node has everything."""
     before = received(station)
     publisher.send(imu, joints)
-    station.until(lambda: received(station) == [before[0] + len(imu), before[1] + len(joints)], 'every message to arrive')
+    station.until(
+        lambda: received(station) == [before[0] + len(imu), before[1] + len(joints)],
+        'every message to arrive',
+    )
 
 
 def answer_of(station, folder):
@@ -106,18 +114,28 @@ def check_bursts_and_foreign_frames(station, publisher, session, folder):
     """NaN and messages of another frame are dropped, counted and told; the rest gives the answer."""
     imu, joints, values, model = session
     burst = with_nan_burst(imu, 30.0)
-    foreign = replace(imu.select(slice(2000, 2200)), force_s=imu.force_s[2000:2200] + 5.0, frame_id='other_link')
+    foreign = replace(
+        imu.select(slice(2000, 2200)), force_s=imu.force_s[2000:2200] + 5.0, frame_id='other_link'
+    )
     before = received(station)
     parts = [burst.select(slice(0, 2200)), foreign, burst.select(slice(2200, None))]
     cuts = [0, 2200, 2200, len(joints)]
     for part, (first, last) in zip(parts, zip(cuts, cuts[1:])):
         publisher.send(part, joints.select(slice(first, last)))
-    station.until(lambda: received(station) == [before[0] + len(imu), before[1] + len(joints)], 'every message of the frame')
+    station.until(
+        lambda: received(station) == [before[0] + len(imu), before[1] + len(joints)],
+        'every message of the frame',
+    )
     live = answer_of(station, folder)
-    assert live.statistics['dropped']["Imu message of another frame than 'imu_link'"] == len(foreign)
+    assert live.statistics['dropped']["Imu message of another frame than 'imu_link'"] == len(
+        foreign
+    )
     assert live.statistics['dropped']['imu not finite'] == 100
     assert np.max(np.abs(errors_in_sd(live, model, values))) < SIGMA
-    station.until(lambda: any('imu_link' in message for _, level, message in station.history if level == 1), 'a warning')
+    station.until(
+        lambda: any('imu_link' in message for _, level, message in station.history if level == 1),
+        'a warning',
+    )
 
 
 def check_clock_jump_and_silence(station, publisher, session, folder):
@@ -125,7 +143,10 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     imu, joints, values, model = session
     half = imu.stamp_ns[len(imu) // 2]
     back = int(3600e9)
-    halves = [[s.select(s.stamp_ns < half) for s in (imu, joints)], [s.select(s.stamp_ns >= half) for s in (imu, joints)]]
+    halves = [
+        [s.select(s.stamp_ns < half) for s in (imu, joints)],
+        [s.select(s.stamp_ns >= half) for s in (imu, joints)],
+    ]
     halves[1] = [replace(s, stamp_ns=s.stamp_ns - back) for s in halves[1]]
     send_all(station, publisher, *halves[0])
     send_all(station, publisher, *halves[1])
@@ -133,7 +154,10 @@ def check_clock_jump_and_silence(station, publisher, session, folder):
     still = (np.repeat(values[-1:], 250, 0) for values in (imu.force_s, imu.rate_s))
     alone = ImuSamples(last + 20_000_000 * np.arange(1, 251), *still, 'imu_link')
     publisher.send(alone, joints.select(slice(0, 0)), per_second=80)
-    station.until(lambda: any('JointState' in message for _, level, message in station.history if level == 1), 'a warning')
+    station.until(
+        lambda: any('JointState' in message for _, level, message in station.history if level == 1),
+        'a warning',
+    )
     live = answer_of(station, folder)
     assert (live.statistics['stream'] | live.statistics['dropped'])['imu clock reset'] == 1
     used = sum(live.statistics['samples_used'].values())
@@ -171,16 +195,28 @@ def test_signals_in_mid_session_leave_whole_files_and_exit_code_zero(station, se
     imu, joints, _, _ = session
     topics = {'imu/data_raw': '/imu/data_raw', 'joint_states': '/joint_states'}
     numbers = {'left': signal.SIGINT, 'right': signal.SIGTERM}
-    nodes = {side: station.calibration_node(tmp_path / side, autosave_period=0.1, namespace=f'/{side}', remappings=topics)
-             for side in numbers}
+    nodes = {
+        side: station.calibration_node(
+            tmp_path / side, autosave_period=0.1, namespace=f'/{side}', remappings=topics
+        )
+        for side in numbers
+    }
     compensator = station.start('compensator_node')
     publisher = Publisher(station)
     publisher.wait(2)
     publisher.send(*(s.select(s.stamp_ns < imu.stamp_ns[0] + int(50e9)) for s in (imu, joints)))
-    station.until(lambda: all(station.figure('windows', f'{side}/calibration_node: calibration') for side in numbers), 'windows')
+    station.until(
+        lambda: all(
+            station.figure('windows', f'{side}/calibration_node: calibration') for side in numbers
+        ),
+        'windows',
+    )
     for side, number in numbers.items():
         assert station.processes.end(nodes[side], number) == 0
-        assert {path.name for path in (tmp_path / side).iterdir()} <= {'calibration.accumulator.npz', 'calibration.yaml'}
+        assert {path.name for path in (tmp_path / side).iterdir()} <= {
+            'calibration.accumulator.npz',
+            'calibration.yaml',
+        }
     assert station.processes.end(compensator, signal.SIGTERM) == 0
 
 
@@ -191,18 +227,28 @@ def test_two_imus_by_namespace_from_best_effort_publishers(station, session, tmp
     for side, (imu, joints, _, _) in sessions.items():
         station.calibration_node(tmp_path / side, namespace=f'/{side}')
         documents[side] = station.watch_documents(f'/{side}/imu/calibration')
-        sent[side] = Publisher(station, f'/{side}/imu/data_raw', f'/{side}/joint_states', reliable=False)
+        sent[side] = Publisher(
+            station, f'/{side}/imu/data_raw', f'/{side}/joint_states', reliable=False
+        )
     for publisher in sent.values():
         publisher.wait()
     for part in range(30):
         for side, (imu, joints, _, _) in sessions.items():
-            sent[side].send(*(s.select(slice(part * len(s) // 30, (part + 1) * len(s) // 30)) for s in (imu, joints)))
+            sent[side].send(
+                *(
+                    s.select(slice(part * len(s) // 30, (part + 1) * len(s) // 30))
+                    for s in (imu, joints)
+                )
+            )
     for side, (_, _, values, model) in sessions.items():
         answer = station.call(f'/{side}/calibration_node/solve')
         assert answer.success, answer.message
         station.until(lambda: documents[side], 'the document')
         live = calibration_from_text(documents[side][-1])
-        errors, others = (errors_in_sd(live, model, v) for v in (values, sessions['left' if side == 'right' else 'right'][2]))
+        errors, others = (
+            errors_in_sd(live, model, v)
+            for v in (values, sessions['left' if side == 'right' else 'right'][2])
+        )
         assert np.max(np.abs(errors)) < SIGMA < 0.1 * np.max(np.abs(others))
 
 
@@ -214,7 +260,11 @@ def test_two_thousand_imu_and_a_thousand_joint_messages_per_second_are_held(stat
     station.until(lambda: station.status, 'the node')
     player = station.play(tmp_path / 'fast', 1.0, subscribers=1)
     station.until(lambda: player.poll() is not None, 'the end of the recording')
-    station.until(lambda: received(station) == [len(imu), len(joints)], 'every message to arrive', patience=20.0)
+    station.until(
+        lambda: received(station) == [len(imu), len(joints)],
+        'every message to arrive',
+        patience=20.0,
+    )
     assert station.figure('windows') > 0
     assert station.processes.end(node) == 0
 

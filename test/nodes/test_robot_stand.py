@@ -49,7 +49,9 @@ def site(tmp_path_factory):
 def same(table, other):
     """Assert that two chains are one."""
     assert table.joint_names == other.joint_names and table.up == pytest.approx(other.up)
-    assert [(joint.name, joint.xyz, joint.limits) for joint in table.joints] == [(joint.name, joint.xyz, joint.limits) for joint in other.joints]
+    assert [(joint.name, joint.xyz, joint.limits) for joint in table.joints] == [
+        (joint.name, joint.xyz, joint.limits) for joint in other.joints
+    ]
     assert table.mount_xyz == other.mount_xyz and table.gravity_value == other.gravity_value
 
 
@@ -58,7 +60,10 @@ class Talking:
 
     def __init__(self, bench):
         self._publisher = bench.node.create_publisher(Imu, 'imu/data_raw', qos_profile_sensor_data)
-        self._end, self._thread = threading.Event(), threading.Thread(target=self._talk, daemon=True)
+        self._end, self._thread = (
+            threading.Event(),
+            threading.Thread(target=self._talk, daemon=True),
+        )
 
     def _talk(self):
         message = Imu()
@@ -76,19 +81,29 @@ class Talking:
 
 def test_the_description_and_the_link_come_from_topics(bench, site):
     publisher = bench.node.create_publisher(String, 'robot_description', latched_qos())
-    hostile = '<robot name="x"><joint name="j" type="fixed">' + '<origin>' * 5000 + '</origin>' * 5000 + '</joint></robot>'
+    hostile = (
+        '<robot name="x"><joint name="j" type="fixed">'
+        + '<origin>' * 5000
+        + '</origin>' * 5000
+        + '</joint></robot>'
+    )
     publisher.publish(String(data=hostile))
     threading.Timer(1.5, lambda: publisher.publish(String(data=SIX_AXES))).start()
     with Talking(bench):
-        calibrates, moves = (bench.start(node, {'urdf_file': 'topic', 'table_file': site}) for node in (CalibrationNode, PlannerNode))
+        calibrates, moves = (
+            bench.start(node, {'urdf_file': 'topic', 'table_file': site})
+            for node in (CalibrationNode, PlannerNode)
+        )
     expected = table_from_urdf(SIX_AXES, LINK, files.read_mapping(site, 'site'))
     same(calibrates.worker.live.table, expected)
     same(moves._table, expected)
-    assert bench.heard(level='warning') == 1   # the hostile one
+    assert bench.heard(level='warning') == 1  # the hostile one
     assert bench.heard('robot_description', 'pan, lift, elbow', level='info') == 1
 
 
-def test_an_arm_from_a_file_stands_as_static_transforms_say_and_the_noise_is_that_of_a_file(bench, tmp_path, monkeypatch):
+def test_an_arm_from_a_file_stands_as_static_transforms_say_and_the_noise_is_that_of_a_file(
+    bench, tmp_path, monkeypatch
+):
     (tmp_path / 'arm.urdf').write_text(SIX_AXES)
     transforms = StaticTransforms()
     transforms.add('map', 'base_link', xyz=(0, 0, 1), quaternion=(np.sin(0.3), 0, 0, np.cos(0.3)))
@@ -103,15 +118,33 @@ def test_an_arm_from_a_file_stands_as_static_transforms_say_and_the_noise_is_tha
         def pose(self, target, source):
             asked.append((target, source))
             return transforms.pose(target, source) if len(asked) > 1 else None
+
     monkeypatch.setattr(robot_stand, 'StaticFrames', Frames)
     robot = RobotSettings(str(tmp_path / 'arm.urdf'), 'tool', 'map')
     table = chain_of(bench.node, robot, 'none')
-    assert table.up == pytest.approx((0.0, np.sin(0.6), np.cos(0.6))) and asked == [('base_link', 'map')] * 2
+    assert (
+        table.up == pytest.approx((0.0, np.sin(0.6), np.cos(0.6)))
+        and asked == [('base_link', 'map')] * 2
+    )
     noise = noise_of_grade(GRADES['tactical'].noise, 100.0)
     monkeypatch.setattr(planner_node.files, 'read_noise', lambda path: (path, 'figures'))
-    monkeypatch.setattr(planner_node, 'expected_noise', lambda figures, grade, rate: noise if figures == (tmp_path / 'noise.yaml', 'figures') else None)
-    node = bench.start(PlannerNode, {'urdf_file': str(tmp_path / 'arm.urdf'), 'imu_link': 'tool', 'table_file': 'none', 'noise_file': str(tmp_path / 'noise.yaml')})
-    found = node._make_campaign().planner.problem.noise   # with the joints' own
+    monkeypatch.setattr(
+        planner_node,
+        'expected_noise',
+        lambda figures, grade, rate: (
+            noise if figures == (tmp_path / 'noise.yaml', 'figures') else None
+        ),
+    )
+    node = bench.start(
+        PlannerNode,
+        {
+            'urdf_file': str(tmp_path / 'arm.urdf'),
+            'imu_link': 'tool',
+            'table_file': 'none',
+            'noise_file': str(tmp_path / 'noise.yaml'),
+        },
+    )
+    found = node._make_campaign().planner.problem.noise  # with the joints' own
     assert all(found[sensor].white_variance is noise[sensor].white_variance for sensor in noise)
 
 
@@ -121,4 +154,4 @@ def test_what_cannot_be_used_is_refused_by_name(bench, tmp_path):
         chain_of(bench.node, RobotSettings(str(tmp_path / 'arm.urdf'), 'nowhere'), '')
     assert chain_of(bench.node, RobotSettings(), 'none') is None
     with refused(ImuCalibrationError, 'table_missing', 'table_file', 'urdf_file'):
-        bench.start(PlannerNode, {})   # it moves joints: no table is assumed
+        bench.start(PlannerNode, {})  # it moves joints: no table is assumed

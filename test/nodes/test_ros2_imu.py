@@ -17,7 +17,7 @@ from ros.workspace import ROOT, sourced  # noqa: E402
 pytestmark = [pytest.mark.slow, pytest.mark.live]
 TABLE = ROOT / 'bags/sample_session/table.yaml'
 TRUTH = ROOT / 'bags/sample_session/truth.yaml'
-FAULTY = '''
+FAULTY = """
 import sys, rclpy
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rclpy.time import Time
@@ -49,7 +49,7 @@ def publish():
 node.create_timer(0.005, publish_due)
 print('ready', flush=True)
 rclpy.spin(node)
-'''
+"""
 
 
 @pytest.fixture(scope='module')
@@ -61,7 +61,15 @@ def place(tmp_path_factory, built, with_ros2):
     environment = with_ros2 | STAY_LOCAL | {'ROS_DOMAIN_ID': str(domain_id)}
 
     def shell(line):
-        return subprocess.run(sourced(folder, line), cwd=folder, env=environment, capture_output=True, text=True, timeout=180, stdin=subprocess.DEVNULL)
+        return subprocess.run(
+            sourced(folder, line),
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=180,
+            stdin=subprocess.DEVNULL,
+        )
 
     yield folder, shell, environment
     shell('ros2 daemon stop')
@@ -72,25 +80,33 @@ def test_every_verb_of_the_plain_command_is_offered(place):
     _, shell, _ = place
     found = re.findall(r'^    ([a-z]+)(?: |$)', shell('ros2 imu --help').stdout, re.MULTILINE)
     assert tuple(found) == tuple(VERBS)
-    assert re.search(r'^ +imu +Calibrate, compensate and diagnose', shell('ros2 --help').stdout, re.MULTILINE)
+    assert re.search(
+        r'^ +imu +Calibrate, compensate and diagnose', shell('ros2 --help').stdout, re.MULTILINE
+    )
     assert shell('ros2 imu').returncode == 0
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('line', [
-    f'inspect {ROOT}/bags/sample_session',
-    f'inspect {ROOT}/bags/sample_session --table {TABLE}',
-    f'compare {TRUTH} {TRUTH}',
-    f'calibrate {ROOT}/bags/sample_session --table {TABLE} --output WHERE --no-report',
-    'export --list',
-    f'export {TRUTH} --to json --output WHERE.json',
-    f'compare {TRUTH} nowhere.yaml',
-    'calibrate --output WHERE',
-    'calibrat session'])
+@pytest.mark.parametrize(
+    'line',
+    [
+        f'inspect {ROOT}/bags/sample_session',
+        f'inspect {ROOT}/bags/sample_session --table {TABLE}',
+        f'compare {TRUTH} {TRUTH}',
+        f'calibrate {ROOT}/bags/sample_session --table {TABLE} --output WHERE --no-report',
+        'export --list',
+        f'export {TRUTH} --to json --output WHERE.json',
+        f'compare {TRUTH} nowhere.yaml',
+        'calibrate --output WHERE',
+        'calibrat session',
+    ],
+)
 def test_output_and_exit_code_are_those_of_the_plain_command(place, line):
     folder, shell, _ = place
     plain = shell('imu_calibration ' + line.replace('WHERE', 'result'))
-    written = {path: path.read_bytes() for path in [*folder.glob('result/*'), *folder.glob('result.json')]}
+    written = {
+        path: path.read_bytes() for path in [*folder.glob('result/*'), *folder.glob('result.json')]
+    }
     by_ros2 = shell('ros2 imu ' + line.replace('WHERE', 'result'))
     assert by_ros2.returncode == plain.returncode and by_ros2.stdout == plain.stdout
     assert by_ros2.stderr.replace('ros2 imu', 'imu_calibration') == plain.stderr
@@ -100,7 +116,14 @@ def test_output_and_exit_code_are_those_of_the_plain_command(place, line):
 @pytest.mark.long
 def test_the_doctor_names_what_is_wrong_with_imu_topics_and_leaves_a_good_one_in_peace(place):
     folder, shell, environment = place
-    with subprocess.Popen([sys.executable, '-c', FAULTY], cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as driver:
+    with subprocess.Popen(
+        [sys.executable, '-c', FAULTY],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as driver:
         try:
             assert driver.stdout.readline() == 'ready\n'
             told = shell('ros2 doctor --exclude-packages')
@@ -109,10 +132,16 @@ def test_the_doctor_names_what_is_wrong_with_imu_topics_and_leaves_a_good_one_in
             os.kill(driver.pid, signal.SIGKILL)
     lines = [line for line in told.stderr.splitlines() if 'imu_calibration' in line]
     ours = [line.partition('Warning: ')[2] for line in lines]
-    for words in ('ERROR: /bad/imu/data_raw: force unit: .*0.101972', 'ERROR: /bad/imu/data_raw: qos: .*driver .*driver: ',
-                  '/bad/imu/data_raw: frame: .*frame_id', '/bad/imu/data_raw: covariance: .*-0.0001',
-                  'ERROR: /strange/imu/data: type: .*sensor_msgs/msg/MagneticField'):
+    for words in (
+        'ERROR: /bad/imu/data_raw: force unit: .*0.101972',
+        'ERROR: /bad/imu/data_raw: qos: .*driver .*driver: ',
+        '/bad/imu/data_raw: frame: .*frame_id',
+        '/bad/imu/data_raw: covariance: .*-0.0001',
+        'ERROR: /strange/imu/data: type: .*sensor_msgs/msg/MagneticField',
+    ):
         assert any(re.match(words, line) for line in ours), (words, told.stderr)
     assert not any('/good/' in line for line in ours), told.stderr
     assert 'imu' in told.stdout.partition('Failed modules:')[2].split(), told.stdout
-    assert re.search(r'topic *: /good/imu/data_raw from /driver, reliable', report) and re.search(r'topic *: /bad/imu/data_raw from /driver, best effort', report)
+    assert re.search(r'topic *: /good/imu/data_raw from /driver, reliable', report) and re.search(
+        r'topic *: /bad/imu/data_raw from /driver, best effort', report
+    )

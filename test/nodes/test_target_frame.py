@@ -35,7 +35,17 @@ pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)
 STATUS = 'compensator_node: compensation'
 XYZ, RPY = [0.3, -0.1, 0.05], [0.2, -0.4, 1.1]
-MESSAGES = [row.tobytes() for row in encode_imu(ImuSamples(10**18 + 5_000_000 * np.arange(50), np.full((50, 3), 9.8), np.full((50, 3), 0.1), 'imu_link'))]
+MESSAGES = [
+    row.tobytes()
+    for row in encode_imu(
+        ImuSamples(
+            10**18 + 5_000_000 * np.arange(50),
+            np.full((50, 3), 9.8),
+            np.full((50, 3), 0.1),
+            'imu_link',
+        )
+    )
+]
 
 
 @pytest.fixture(scope='module')
@@ -45,8 +55,12 @@ def made_messages(tmp_path_factory):
         if why_not():
             return False
         folder = tmp_path_factory.mktemp('messages')
-        make_package(folder, 'tf2_msgs', {'TFMessage': 'geometry_msgs/TransformStamped[] transforms\n'},
-                     ('geometry_msgs', 'std_msgs', 'builtin_interfaces'))
+        make_package(
+            folder,
+            'tf2_msgs',
+            {'TFMessage': 'geometry_msgs/TransformStamped[] transforms\n'},
+            ('geometry_msgs', 'std_msgs', 'builtin_interfaces'),
+        )
         sys.path.append(str(folder))
     return True
 
@@ -67,6 +81,7 @@ class Bench(OneProcess):
                     node._frames.take(SimpleNamespace(transforms=list(self._held.values())))
             return
         from tf2_msgs.msg import TFMessage
+
         if self._publisher is None:
             self._publisher = self.node.create_publisher(TFMessage, TF_STATIC, latched_qos())
         self._publisher.publish(TFMessage(transforms=list(self._held.values())))
@@ -116,9 +131,13 @@ def test_it_waits_and_says_for_what(bench, place):
     bench.until(lambda: STATUS in bench.status, 'diagnostics')
     assert bench.shows(STATUS, "'base_link'", "'imu_link'", TF_STATIC, level=WARN)
     bench.broadcast(('map', 'odom', [0, 0, 0], [0, 0, 0, 1]))
-    bench.until(lambda: bench.shows(STATUS, "'base_link'", "'imu_link'", 'map, odom'), 'what came instead')
+    bench.until(
+        lambda: bench.shows(STATUS, "'base_link'", "'imu_link'", 'map, odom'), 'what came instead'
+    )
     assert node.adopted is None and corrected(node) == [None] * len(MESSAGES)
-    assert bench.heard("'imu_link'", 'map, odom', level='info') == 1 and node.get_subscriptions_info_by_topic(TF_STATIC)
+    assert bench.heard(
+        "'imu_link'", 'map, odom', level='info'
+    ) == 1 and node.get_subscriptions_info_by_topic(TF_STATIC)
 
 
 def test_with_the_transform_it_corrects_as_with_the_pose_in_parameters(bench, place):
@@ -129,11 +148,23 @@ def test_with_the_transform_it_corrects_as_with_the_pose_in_parameters(bench, pl
     if not bench.is_real:
         bench.broadcast(POSE)
     bench.until(lambda: node.adopted is not None, 'the transform')
-    told = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link', 'target_xyz': XYZ, 'target_rpy': RPY})
+    told = bench.start(
+        CompensatorNode,
+        {
+            'calibration_file': place,
+            'target_frame': 'base_link',
+            'target_xyz': XYZ,
+            'target_rpy': RPY,
+        },
+    )
     assert not node.awaited
-    np.testing.assert_allclose(node.compensation.transfer.mat_ts, told.compensation.transfer.mat_ts, atol=1e-12)
+    np.testing.assert_allclose(
+        node.compensation.transfer.mat_ts, told.compensation.transfer.mat_ts, atol=1e-12
+    )
     np.testing.assert_allclose(node.compensation.transfer.arm_t, XYZ)
-    assert [made[:60] for made in corrected(node)] == [made[:60] for made in corrected(told)] and b'base_link' in corrected(node)[0]
+    assert [made[:60] for made in corrected(node)] == [
+        made[:60] for made in corrected(told)
+    ] and b'base_link' in corrected(node)[0]
 
 
 def test_a_transform_that_moves_is_followed_and_one_that_is_repeated_changes_nothing(bench, place):
@@ -153,7 +184,10 @@ def test_a_transform_that_moves_is_followed_and_one_that_is_repeated_changes_not
 
 def test_a_pose_in_parameters_ends_the_waiting(bench, place):
     node = bench.start(CompensatorNode, {'calibration_file': place, 'target_frame': 'base_link'})
-    assert node.awaited and node.set_parameters_atomically([Parameter('target_xyz', value=XYZ)]).successful
+    assert (
+        node.awaited
+        and node.set_parameters_atomically([Parameter('target_xyz', value=XYZ)]).successful
+    )
     assert node.adopted is not None and not node.awaited
 
 

@@ -17,32 +17,47 @@ pytestmark = pytest.mark.live
 
 def run_example(name):
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
-    done = subprocess.run([sys.executable, '-W', 'error', str(ROOT / 'examples' / name)], capture_output=True, text=True, env=environment,
-                          timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, '-W', 'error', str(ROOT / 'examples' / name)],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=300,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-@pytest.mark.parametrize('name, lines', [
-    ('reproduce_avrutov2017.py', [
-        'Sample 1: accelerometers, n x 4, 41 runs, cond 3.76691',
-        'Sample 4: gyroscopes, n x 7, 11 runs, cond 232564',
-        'one turn about (1,1,1), n x 4            rank 3 of 4; not determined: bias, x, y, z',
-        'equal rates w, w, w, n x 4               rank 2 of 4; not determined: x, y, z',
-        'rank 14 of 14',
-        'Rows 6 and 7 of the printed result of sample 4 are exchanged',
-        'in Kyiv it puts 2.48e-04',
-    ]),
-    ('reproduce_zhang2017.py', [
-        'Table 4, spinning at 100 deg/s: printed, before -> after',
-        'not determined: r_xy, r_xz, r_yx, r_yz, r_zx, r_zy',
-        'M   spins, oscillations, two-axis    sd on axis 0.0357',
-        'one oscillation about (1,1,1): refused',
-        'norm off by 48.3 ppm',
-        'hence arms of +8.14 and +8.32 mm where -8.93 and -8.24 are printed',
-        'stays below 0.048 m/s and 2.4 m',
-    ]),
-])
+@pytest.mark.parametrize(
+    'name, lines',
+    [
+        (
+            'reproduce_avrutov2017.py',
+            [
+                'Sample 1: accelerometers, n x 4, 41 runs, cond 3.76691',
+                'Sample 4: gyroscopes, n x 7, 11 runs, cond 232564',
+                'one turn about (1,1,1), n x 4            rank 3 of 4; not determined: bias, x, y, z',
+                'equal rates w, w, w, n x 4               rank 2 of 4; not determined: x, y, z',
+                'rank 14 of 14',
+                'Rows 6 and 7 of the printed result of sample 4 are exchanged',
+                'in Kyiv it puts 2.48e-04',
+            ],
+        ),
+        (
+            'reproduce_zhang2017.py',
+            [
+                'Table 4, spinning at 100 deg/s: printed, before -> after',
+                'not determined: r_xy, r_xz, r_yx, r_yz, r_zx, r_zy',
+                'M   spins, oscillations, two-axis    sd on axis 0.0357',
+                'one oscillation about (1,1,1): refused',
+                'norm off by 48.3 ppm',
+                'hence arms of +8.14 and +8.32 mm where -8.93 and -8.24 are printed',
+                'stays below 0.048 m/s and 2.4 m',
+            ],
+        ),
+    ],
+)
 @pytest.mark.slow
 def test_example_runs_and_reports(name, lines):
     output = run_example(name)
@@ -58,14 +73,25 @@ def test_a_navigation_node_is_better_off_with_corrected_readings(tmp_path):
     pytest.importorskip('rclpy')
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
     domain_id, lock = free_domain()
-    command = [sys.executable, str(ROOT / 'examples/downstream_nav.py'), '--picture', str(tmp_path / 'paths.png'), '--domain-id', str(domain_id),
-               '--seconds', '60']
-    for _ in range(2):   # a machine that is too busy for it says so
+    command = [
+        sys.executable,
+        str(ROOT / 'examples/downstream_nav.py'),
+        '--picture',
+        str(tmp_path / 'paths.png'),
+        '--domain-id',
+        str(domain_id),
+        '--seconds',
+        '60',
+    ]
+    for _ in range(2):  # a machine that is too busy for it says so
         done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=240)
         if 'lost' not in done.stderr:
             break
     lock.close()
     assert done.returncode == 0, done.stdout + done.stderr
-    raw, corrected = (float(re.search(rf'/{topic}: \D*([\d.]+) m ', done.stdout)[1]) for topic in ('imu/data_raw', 'imu/data'))
+    raw, corrected = (
+        float(re.search(rf'/{topic}: \D*([\d.]+) m ', done.stdout)[1])
+        for topic in ('imu/data_raw', 'imu/data')
+    )
     assert corrected < 0.5 * raw and f'{raw - corrected:.2f} m' in done.stdout
     assert (tmp_path / 'paths.png').stat().st_size > 1000 and 'Traceback' not in done.stderr

@@ -14,8 +14,8 @@ from worlds.random_tables import random_table
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), count=st.integers(1, 4), ends=st.sampled_from([0.0, 0.5, 1.0]))
-@example(seed=10, count=1, ends=1.0)   # a swing that reaches an end of its joint
-@example(seed=0, count=1, ends=0.5)   # a move to where the joint is
+@example(seed=10, count=1, ends=1.0)  # a swing that reaches an end of its joint
+@example(seed=0, count=1, ends=0.5)  # a move to where the joint is
 def test_no_trajectory_leaves_the_limits_of_any_joint(seed, count, ends):
     rng = np.random.default_rng(seed)
     table = random_table(rng, count, ends)
@@ -25,13 +25,18 @@ def test_no_trajectory_leaves_the_limits_of_any_joint(seed, count, ends):
     for number in rng.permutation(len(motions))[:12]:
         points = motions[number].points(position)
         if len(points):
-            beyond, speed, acceleration = excess(trajectory_from(rest_at(position[None]), points), limits)
+            beyond, speed, acceleration = excess(
+                trajectory_from(rest_at(position[None]), points), limits
+            )
             assert beyond <= 1e-9 and speed <= 1.0 and acceleration <= 1.0, motions[number].words
             position = points.position[-1]
 
 
 def test_every_kind_of_motion_ends_at_its_own_place_for_the_next_one_to_start_from():
-    library = MotionLibrary(random_table(np.random.default_rng(1), 3, 0.5), limits_of(random_table(np.random.default_rng(1), 3, 0.5)))
+    library = MotionLibrary(
+        random_table(np.random.default_rng(1), 3, 0.5),
+        limits_of(random_table(np.random.default_rng(1), 3, 0.5)),
+    )
     for motion in library.motions:
         if motion.segments:
             away = motion.segments[-1].end - motion.place
@@ -44,9 +49,15 @@ def test_spins_come_in_both_senses_and_rests_in_many_attitudes():
     library = MotionLibrary(table, limits_of(table))
     spins = [motion for motion in library.motions if motion.kind is MotionKind.SPIN]
     rates = [spin.segments[1].rate_from for spin in spins]
-    senses = {(int(np.argmax(np.abs(rate))), float(np.sign(rate[np.argmax(np.abs(rate))]))) for rate in rates}
+    senses = {
+        (int(np.argmax(np.abs(rate))), float(np.sign(rate[np.argmax(np.abs(rate))])))
+        for rate in rates
+    }
     assert senses == {(joint, sense) for joint in range(3) for sense in (1.0, -1.0)}
-    assert len({tuple(motion.place) for motion in library.motions if motion.kind is MotionKind.POSE}) >= 20
+    assert (
+        len({tuple(motion.place) for motion in library.motions if motion.kind is MotionKind.POSE})
+        >= 20
+    )
 
 
 def test_what_points_up_at_a_place_is_what_the_accelerometer_feels_there():

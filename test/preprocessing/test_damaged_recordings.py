@@ -16,7 +16,9 @@ pytestmark = pytest.mark.usefixtures('few_candidates')
 
 TABLE_FILE = config_file('table_simulated.yaml')
 TABLE = Table.from_mapping(yaml.safe_load(TABLE_FILE.read_text(encoding='utf-8')))
-MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names))
+MODEL = SensorModel(
+    accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=tuple(TABLE.joint_names)
+)
 VALUES = random_values(MODEL, 'industrial', 6)
 STORAGES = ('sqlite3', 'mcap')
 
@@ -25,8 +27,14 @@ STORAGES = ('sqlite3', 'mcap')
 def bags(tmp_path_factory):
     """The same session as a bag of each kind."""
     folder = tmp_path_factory.mktemp('bags')
-    imu, joints, _ = simulate(MODEL, VALUES, TABLE, profile=make_profile('quick', 6, TABLE), options=SimulationOptions(200.0, 100.0),
-                              seed=6)
+    imu, joints, _ = simulate(
+        MODEL,
+        VALUES,
+        TABLE,
+        profile=make_profile('quick', 6, TABLE),
+        options=SimulationOptions(200.0, 100.0),
+        seed=6,
+    )
     for storage in STORAGES:
         write_session(folder / storage, imu, joints, storage=storage)
     return folder, len(imu)
@@ -39,15 +47,19 @@ def storage_file(bag):
 
 def calibrate(bag, output):
     """Return (exit code, calibration document)."""
-    code = main(['calibrate', str(bag), '--table', str(TABLE_FILE), '--output', str(output), '--no-report'])
+    code = main(
+        ['calibrate', str(bag), '--table', str(TABLE_FILE), '--output', str(output), '--no-report']
+    )
     return code, yaml.safe_load((output / 'calibration.yaml').read_text())
 
 
 def used(document):
     """Return how many samples came through."""
     return sum(document['statistics']['samples_used'].values()) + sum(
-        count for reason,
-        count in document['statistics']['stream'].items() if reason in ('settling', 'not quiet', 'too short', 'rest too short', 'edge of joints'))
+        count
+        for reason, count in document['statistics']['stream'].items()
+        if reason in ('settling', 'not quiet', 'too short', 'rest too short', 'edge of joints')
+    )
 
 
 def errors(document):
@@ -56,7 +68,10 @@ def errors(document):
     for sensor in ('accelerometer', 'gyroscope'):
         for effect in ('bias', 'matrix'):
             entry = document[sensor][effect]
-            found.append((np.ravel(entry['value']) - VALUES[MODEL.slices[sensor, effect]]) / np.ravel(entry['sd']))
+            found.append(
+                (np.ravel(entry['value']) - VALUES[MODEL.slices[sensor, effect]])
+                / np.ravel(entry['sd'])
+            )
     return np.abs(np.concatenate(found))
 
 
@@ -67,7 +82,7 @@ def test_a_truncated_recording_loses_its_end(bags, tmp_path, storage):
     bag = tmp_path / storage
     bag.mkdir()
     data = storage_file(folder / storage).read_bytes()
-    (bag / storage_file(folder / storage).name).write_bytes(data[:len(data) * 3 // 4])
+    (bag / storage_file(folder / storage).name).write_bytes(data[: len(data) * 3 // 4])
     code, document = calibrate(bag, tmp_path / 'out')
     assert code == 3
     assert document['statistics']['dropped']
@@ -83,7 +98,7 @@ def test_a_hole_costs_the_hole(bags, tmp_path, storage):
     bag.mkdir()
     data = bytearray(storage_file(folder / storage).read_bytes())
     middle = len(data) // 2
-    data[middle:middle + 4000] = b'\xa5' * 4000
+    data[middle : middle + 4000] = b'\xa5' * 4000
     (bag / storage_file(folder / storage).name).write_bytes(data)
     code, document = calibrate(bag, tmp_path / 'out')
     assert code == 3

@@ -45,6 +45,7 @@ def seen(monkeypatch):
     def counted_push(self, samples):
         found['cleaned'] += len(samples) if isinstance(samples, ImuSamples) else 0
         return push(self, samples)
+
     monkeypatch.setattr(Recording, 'blocks', counted_blocks)
     monkeypatch.setattr(StreamCheck, 'push', counted_push)
     return found
@@ -59,7 +60,7 @@ def test_calibration_by_hand_cleans_each_sample_once(seen):
     try:
         calibrate_without_table([source_of(BAG, Topics())])
     except ImuCalibrationError:
-        pass   # what matters here was read
+        pass  # what matters here was read
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
 
 
@@ -74,6 +75,7 @@ def test_diagnosis_takes_its_windows_from_the_pass_that_calibrates(table, seen, 
     def enough(windows, *arguments, **options):
         assert len(windows) >= 10
         raise ImuCalibrationError(code='enough')
+
     monkeypatch.setattr('imu_calibration.calibration.by_evidence.inquire', enough)
     with refused(ImuCalibrationError, 'enough'):
         diagnose_recording(source_of(BAG, Topics(), table.joint_names), table)
@@ -87,12 +89,20 @@ def counting(monkeypatch, module, name):
     def counted(*arguments, **options):
         calls.append(arguments)
         return function(*arguments, **options)
+
     monkeypatch.setattr(module, name, counted)
     return calls
 
 
 def test_verdict_and_needed_motions_are_worked_out_once_per_solution(table, monkeypatch):
-    judged, needed = counting(monkeypatch, verdict, 'judge'), counting(monkeypatch, observability, 'needed_motions')
-    result = calibrate([source_of(BAG, Topics(), table.joint_names)], table, CalibrationOptions(reference_model='table_tilt'))
+    judged, needed = (
+        counting(monkeypatch, verdict, 'judge'),
+        counting(monkeypatch, observability, 'needed_motions'),
+    )
+    result = calibrate(
+        [source_of(BAG, Topics(), table.joint_names)],
+        table,
+        CalibrationOptions(reference_model='table_tilt'),
+    )
     assert result.verdict.lines() and result.needed is not None
     assert len(judged) == len(needed) == 1

@@ -13,7 +13,12 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import _rates, standing_still
-from imu_calibration.preprocessing.on_table import _a_period_late, _candidates, same_motion, signs_or_delay
+from imu_calibration.preprocessing.on_table import (
+    _a_period_late,
+    _candidates,
+    same_motion,
+    signs_or_delay,
+)
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.use_cases.calibrate import calibrate
 from imu_calibration.use_cases.diagnose import diagnose
@@ -42,30 +47,57 @@ def later(block, seconds):
 def still(block):
     rng = np.random.default_rng(0)
     force = np.array([0.0, 0.0, 9.81]) + rng.normal(0.0, 0.01, block.imu.force_s.shape)
-    return replace(block, imu=replace(block.imu, force_s=force, rate_s=rng.normal(0.0, 1e-3, force.shape)))
+    return replace(
+        block, imu=replace(block.imu, force_s=force, rate_s=rng.normal(0.0, 1e-3, force.shape))
+    )
 
 
 def joints(block, names=None, sign=1.0):
     known = block.joints
-    return replace(block, joints=replace(known, position=sign * known.position, velocity=sign * known.velocity, names=names or known.names))
+    return replace(
+        block,
+        joints=replace(
+            known,
+            position=sign * known.position,
+            velocity=sign * known.velocity,
+            names=names or known.names,
+        ),
+    )
 
 
-@pytest.mark.parametrize(('change', 'words'), [
-    (still, ()),
-    (lambda block: joints(block, ('middle', 'outer', 'inner')), ('outer', 'middle')),
-    (lambda block: joints(block, sign=-1.0), ('outer', 'inner')),
-    (lambda block: later(block, 2.0), ('2.0 s',)),
-    (lambda block: later(block, 9.0), ()),
-], ids=('another IMU', 'exchanged joints', 'wrong signs', 'apart in time', 'farther apart than is looked for'))
-def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(gimbals, change, words):
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        (still, ()),
+        (lambda block: joints(block, ('middle', 'outer', 'inner')), ('outer', 'middle')),
+        (lambda block: joints(block, sign=-1.0), ('outer', 'inner')),
+        (lambda block: later(block, 2.0), ('2.0 s',)),
+        (lambda block: later(block, 9.0), ()),
+    ],
+    ids=(
+        'another IMU',
+        'exchanged joints',
+        'wrong signs',
+        'apart in time',
+        'farther apart than is looked for',
+    ),
+)
+def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(
+    gimbals, change, words
+):
     block, table = gimbals
     with refused(InputError, 'on_table') as caught:
         calibrate(change(block), table)
     assert all(word in str(caught.value) for word in words) and '\n' not in str(caught.value)
-    assert ('--imu-topic' in caught.value.with_hint({'imu_topic': '--imu-topic'})) == (not words)   # no joint and no delay explains it
+    assert ('--imu-topic' in caught.value.with_hint({'imu_topic': '--imu-topic'})) == (
+        not words
+    )  # no joint and no delay explains it
 
 
-@pytest.mark.parametrize(('seconds', 'delay', 'side'), [(0.5, '0.5 s', 'behind'), (-0.5, '0.5 s', 'ahead'), (2.0, '2.0 s', 'behind')])
+@pytest.mark.parametrize(
+    ('seconds', 'delay', 'side'),
+    [(0.5, '0.5 s', 'behind'), (-0.5, '0.5 s', 'ahead'), (2.0, '2.0 s', 'behind')],
+)
 def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds, delay, side):
     with refused(InputError, 'on_table', delay, side):
         calibrate(later(shaft[0], seconds), shaft[1])
@@ -80,9 +112,18 @@ def sweeps(table, measured_rate, joint_rate):
     """Return a window of 60 s on a shaft from the rates of both streams, functions of the time."""
     time = np.arange(6000) * 0.01
     zero = np.zeros((len(time), 1))
-    motion = JointMotion(time, np.cumsum(joint_rate(time))[:, None] * 0.01, joint_rate(time)[:, None], zero, zero)
+    motion = JointMotion(
+        time, np.cumsum(joint_rate(time))[:, None] * 0.01, joint_rate(time)[:, None], zero, zero
+    )
     measured = reference_motion(table, replace(motion, rate=measured_rate(time)[:, None])).rate_s
-    return Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, np.zeros_like(measured), measured, motion)
+    return Window(
+        WindowKind.DYNAMIC,
+        (1e9 * time).astype(np.int64),
+        time,
+        np.zeros_like(measured),
+        measured,
+        motion,
+    )
 
 
 PERIOD = 1.105
@@ -96,14 +137,23 @@ def ripple(time):
 
 def alternating(sign):
     """Sweeps of which every other one differs, by `sign`, in addition to a ripple that one stream has."""
+
     def rate(time):
         phase = 2.0 * np.pi * time / PERIOD
-        return np.sin(phase) + 0.2 * sign * np.sin(1.5 * phase) + (0.3 * np.sin(19.3 * phase) if sign > 0 else 0.0)
+        return (
+            np.sin(phase)
+            + 0.2 * sign * np.sin(1.5 * phase)
+            + (0.3 * np.sin(19.3 * phase) if sign > 0 else 0.0)
+        )
+
     return rate
 
 
-@pytest.mark.parametrize(('measured', 'joint'), [(lambda time: ripple(time - 0.005), ripple), (alternating(1.0), alternating(-1.0))],
-                         ids=('a lag of half a sampling period', 'both neighbours equally good'))
+@pytest.mark.parametrize(
+    ('measured', 'joint'),
+    [(lambda time: ripple(time - 0.005), ripple), (alternating(1.0), alternating(-1.0))],
+    ids=('a lag of half a sampling period', 'both neighbours equally good'),
+)
 def test_a_period_of_fast_sweeps_is_not_reported_as_a_delay(shaft, measured, joint):
     """Periods of 1.105 s at 100 Hz: without the delays between samples, or with those of one sign only, the stamps seem 1.1 s ahead."""
     table = shaft[1]
@@ -114,24 +164,40 @@ def test_a_period_of_fast_sweeps_is_not_reported_as_a_delay(shaft, measured, joi
 def test_a_real_delay_of_fast_sweeps_is_reported(shaft, delay):
     """Their size varies slowly, so that one period of delay is no repetition."""
     table = shaft[1]
+
     def rate(time):
         return (1.0 + 0.5 * np.sin(0.77 * time)) * ripple(time)
+
     found = _a_period_late([sweeps(table, lambda time: rate(time - delay), rate)], table)
-    assert found is not None and f' {abs(delay):.1f} s ' in found.text and ('behind' if delay > 0 else 'ahead') in found.text
+    assert (
+        found is not None
+        and f' {abs(delay):.1f} s ' in found.text
+        and ('behind' if delay > 0 else 'ahead') in found.text
+    )
 
 
 @pytest.mark.parametrize('swing', [0.0, 0.6])
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_differ(shaft, sign, swing):
+def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_differ(
+    shaft, sign, swing
+):
     """Sweeps of 2 s to and fro: one second of delay and a wrong sign are one thing when all are alike, and told apart when every other one is larger."""
     table, time = shaft[1], np.arange(6000) * 0.01
-    position = np.stack([(1.0 + swing * np.sin(0.77 * t)) * np.sin(np.pi * t) for t in (time, time - 1.0)])
+    position = np.stack(
+        [(1.0 + swing * np.sin(0.77 * t)) * np.sin(np.pi * t) for t in (time, time - 1.0)]
+    )
     rates = [np.gradient(each, 0.01) for each in position]
     zero = np.zeros((len(time), 1))
     motion = JointMotion(time, position[0][:, None], rates[0][:, None], zero, zero)
-    felt = reference_motion(table, replace(motion, rate=sign * rates[1 if sign > 0 else 0][:, None])).rate_s
-    window = Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, np.zeros_like(felt), felt, motion)
-    assert _a_period_late([window], table) is None, 'opposite rates are not a clock that is late by a whole period'
+    felt = reference_motion(
+        table, replace(motion, rate=sign * rates[1 if sign > 0 else 0][:, None])
+    ).rate_s
+    window = Window(
+        WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, np.zeros_like(felt), felt, motion
+    )
+    assert _a_period_late([window], table) is None, (
+        'opposite rates are not a clock that is late by a whole period'
+    )
     found = signs_or_delay([window], table)
     if swing and sign < 0:
         assert found is None
@@ -139,27 +205,53 @@ def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_diffe
         assert found.sure == (swing > 0) and ' 1.0 s' in found.words
 
 
-@pytest.mark.parametrize(('signs', 'corrected'), [((-1, 1, 1), ['outer']), ((1, -1, 1), ['middle']), ((1, 1, -1), ['inner']),
-                                                  ((-1, 1, -1), ['outer', 'inner'])])
-def test_the_joints_with_a_reversed_sign_are_named_and_no_mount_or_standstill_is(gimbals, signs, corrected):
+@pytest.mark.parametrize(
+    ('signs', 'corrected'),
+    [
+        ((-1, 1, 1), ['outer']),
+        ((1, -1, 1), ['middle']),
+        ((1, 1, -1), ['inner']),
+        ((-1, 1, -1), ['outer', 'inner']),
+    ],
+)
+def test_the_joints_with_a_reversed_sign_are_named_and_no_mount_or_standstill_is(
+    gimbals, signs, corrected
+):
     """Signs of outer and inner together are a sensor turned about y for the gyroscope; gravity separates them."""
     with refused(InputError, 'on_table') as caught:
         calibrate(joints(gimbals[0], sign=np.array(signs)), gimbals[1])
-    assert [name for name in gimbals[1].joint_names if re.search(rf'\b{name}\b', str(caught.value))] == corrected
+    assert [
+        name for name in gimbals[1].joint_names if re.search(rf'\b{name}\b', str(caught.value))
+    ] == corrected
 
 
 def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
     """With middle at 80 degrees, inner is nearly parallel to outer, and it rests: its standstill would explain the rates too."""
     table, time = gimbals[1], np.arange(6000) * 0.01
-    motion = JointMotion(time, np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3)))
+    motion = JointMotion(
+        time, np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3))
+    )
     motion.position[:, 0], motion.rate[:, 0] = np.sin(time), np.cos(time)
     motion.position[:, 1] = np.radians(-80.0)
     reference = reference_motion(table, motion)
-    reversed_outer = replace(motion, position=motion.position * [-1, 1, 1], rate=motion.rate * [-1, 1, 1])
-    window = Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, reference.force_s, reference.rate_s, reversed_outer)
+    reversed_outer = replace(
+        motion, position=motion.position * [-1, 1, 1], rate=motion.rate * [-1, 1, 1]
+    )
+    window = Window(
+        WindowKind.DYNAMIC,
+        (1e9 * time).astype(np.int64),
+        time,
+        reference.force_s,
+        reference.rate_s,
+        reversed_outer,
+    )
     assert standing_still([window], table).check == 'frozen', 'a standstill of inner explains it'
     told = reference_motion(table, reversed_outer).rate_s
-    finding, = _rates((reference.rate_s.T @ told, told.T @ told, reference.rate_s.T @ reference.rate_s), [window], table)
+    (finding,) = _rates(
+        (reference.rate_s.T @ told, told.T @ told, reference.rate_s.T @ reference.rate_s),
+        [window],
+        table,
+    )
     assert finding.check == 'on_table' and 'outer' in finding.text and 'middle' not in finding.text
 
 
@@ -169,20 +261,44 @@ def test_a_late_clock_is_no_standstill(gimbals, lag):
     table, time = gimbals[1], np.arange(1000) * 0.01
 
     def motion(time, outer, middle=0.0):
-        rate = np.stack([outer * np.sin(time), middle * np.cos(2 * time), np.full(1000, 3.0)], axis=1)
-        position = np.stack([-outer * np.cos(time), middle * np.sin(2 * time) / 2, 3.0 * time], axis=1)
+        rate = np.stack(
+            [outer * np.sin(time), middle * np.cos(2 * time), np.full(1000, 3.0)], axis=1
+        )
+        position = np.stack(
+            [-outer * np.cos(time), middle * np.sin(2 * time) / 2, 3.0 * time], axis=1
+        )
         return JointMotion(time, position, rate, np.zeros((1000, 3)), np.zeros((1000, 3)))
 
     def checked(outer, middle):
         felt = reference_motion(table, motion(time - lag, outer, middle))
-        return standing_still([Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, felt.force_s, felt.rate_s, motion(time, outer))], table)
+        return standing_still(
+            [
+                Window(
+                    WindowKind.DYNAMIC,
+                    (1e9 * time).astype(np.int64),
+                    time,
+                    felt.force_s,
+                    felt.rate_s,
+                    motion(time, outer),
+                )
+            ],
+            table,
+        )
+
     assert checked(1.5, 0.0) is None
     assert checked(0.0, 0.5).check == 'frozen'
 
 
-@pytest.mark.parametrize(('order', 'signs', 'words'), [([1, 0, 2], [1, 1, -1], "measured x is the reference's y"),
-                                                       ([0, 1, 2], [-1, -1, 1], "measured y is minus the reference's y")])
-def test_imu_axes_exchanged_in_a_part_of_the_recording_are_reported_with_the_time(gimbals, order, signs, words):
+@pytest.mark.parametrize(
+    ('order', 'signs', 'words'),
+    [
+        ([1, 0, 2], [1, 1, -1], "measured x is the reference's y"),
+        ([0, 1, 2], [-1, -1, 1], "measured y is minus the reference's y"),
+    ],
+)
+def test_imu_axes_exchanged_in_a_part_of_the_recording_are_reported_with_the_time(
+    gimbals, order, signs, words
+):
     block, table = gimbals
     force, rate = block.imu.force_s.copy(), block.imu.rate_s.copy()
     part = slice(2 * len(rate) // 5, 4 * len(rate) // 5)
@@ -190,7 +306,9 @@ def test_imu_axes_exchanged_in_a_part_of_the_recording_are_reported_with_the_tim
     with refused(InputError, 'on_table', words, ' s to ', 'the driver of the IMU') as caught:
         calibrate(replace(block, imu=replace(block.imu, force_s=force, rate_s=rate)), table)
     duration = (block.imu.stamp_ns[-1] - block.imu.stamp_ns[0]) * 1e-9
-    start, stop = (float(each) for each in re.search(r'from (\d+) s to (\d+) s', str(caught.value)).groups())
+    start, stop = (
+        float(each) for each in re.search(r'from (\d+) s to (\d+) s', str(caught.value)).groups()
+    )
     assert abs(start - 0.4 * duration) < 15.0 and abs(stop - 0.8 * duration) < 15.0
 
 
@@ -219,13 +337,16 @@ def test_a_gyroscope_that_repeats_one_reading_on_a_shaft_without_rests_is_named(
     rate = shaft[0].imu.rate_s.copy()
     moving = np.flatnonzero(np.abs(rate[:, 0]) > 1.0)
     start = moving[len(moving) // 2]
-    rate[start:start + 1000] = rate[start]
+    rate[start : start + 1000] = rate[start]
     with refused(InputError, 'frozen', 'gyroscope', ' s to '):
         calibrate(replace(shaft[0], imu=replace(shaft[0].imu, rate_s=rate)), shaft[1])
 
 
 def test_a_wrong_gain_is_no_frozen_joint(gimbals):
-    assert calibrate(replace(gimbals[0], imu=replace(gimbals[0].imu, rate_s=1.1 * gimbals[0].imu.rate_s)), gimbals[1]).calibration
+    assert calibrate(
+        replace(gimbals[0], imu=replace(gimbals[0].imu, rate_s=1.1 * gimbals[0].imu.rate_s)),
+        gimbals[1],
+    ).calibration
 
 
 def test_diagnose_refuses_the_same(gimbals):
@@ -233,7 +354,10 @@ def test_diagnose_refuses_the_same(gimbals):
         diagnose(still(gimbals[0]), gimbals[1])
 
 
-@pytest.mark.parametrize(('gain', 'noise', 'fails'), [(1.0, 0.1, False), (0.7, 0.1, False), (1e-5, 1e-3, True), (1e-5, 1.0, True), (1.0, 2.0, True)])
+@pytest.mark.parametrize(
+    ('gain', 'noise', 'fails'),
+    [(1.0, 0.1, False), (0.7, 0.1, False), (1e-5, 1e-3, True), (1e-5, 1.0, True), (1.0, 2.0, True)],
+)
 def test_gain_and_coherence_decide(gain, noise, fails):
     rng = np.random.default_rng(1)
     told = rng.normal(size=(5000, 3))
@@ -262,12 +386,27 @@ def test_a_coarse_gyroscope_may_repeat_the_reading_of_a_constant_rate_and_no_oth
     table, time = gimbals[1], np.arange(4000) * 0.01
     rate = np.zeros((4000, 3))
     rate[:, 0] = np.where(time < 20, 1.0, np.sin(time))
-    motion = JointMotion(time, np.cumsum(rate, axis=0) * 0.01, rate, np.zeros((4000, 3)), np.zeros((4000, 3)))
+    motion = JointMotion(
+        time, np.cumsum(rate, axis=0) * 0.01, rate, np.zeros((4000, 3)), np.zeros((4000, 3))
+    )
     reference = reference_motion(table, motion)
 
     def checked(changed):
         readings = 0.02 * np.round(changed / 0.02)
-        return standing_still([Window(WindowKind.DYNAMIC, (1e9 * time).astype(np.int64), time, reference.force_s, readings, motion)], table)
+        return standing_still(
+            [
+                Window(
+                    WindowKind.DYNAMIC,
+                    (1e9 * time).astype(np.int64),
+                    time,
+                    reference.force_s,
+                    readings,
+                    motion,
+                )
+            ],
+            table,
+        )
+
     assert checked(1.02 * reference.rate_s) is None
     moving, constant = reference.rate_s.copy(), reference.rate_s.copy()
     moving[2000:2110] = moving[2000]

@@ -56,7 +56,9 @@ def findings(samples, nominal=None, gravity=None, cut=None):
     imu, joints, temperature = samples
     blocks = [SampleBlock(imu, joints, temperature)]
     if cut is not None:
-        blocks = [SampleBlock(imu.select(slice(a, a + cut))) for a in range(0, len(imu), cut)] + [SampleBlock(None, joints, temperature)]
+        blocks = [SampleBlock(imu.select(slice(a, a + cut))) for a in range(0, len(imu), cut)] + [
+            SampleBlock(None, joints, temperature)
+        ]
     preflight = Preflight(gravity, strict=False)
     deque(BlockCleaner(nominal=nominal, watchers=[preflight]).all_of(blocks), maxlen=0)
     return preflight.findings
@@ -79,7 +81,15 @@ def in_mg(imu, joints, temperature):
 
 
 def in_counts(imu, joints, temperature):
-    return replace(imu, force_s=np.round(imu.force_s * 415 + 32768), rate_s=np.round(imu.rate_s * 4770 + 32768)), joints, temperature
+    return (
+        replace(
+            imu,
+            force_s=np.round(imu.force_s * 415 + 32768),
+            rate_s=np.round(imu.rate_s * 4770 + 32768),
+        ),
+        joints,
+        temperature,
+    )
 
 
 def in_degrees(imu, joints, temperature):
@@ -113,13 +123,15 @@ def dead_gyroscope(imu, joints, temperature):
 def stuck_axis(imu, joints, temperature):
     rate = imu.rate_s.copy()
     moving = np.argmax(np.convolve(np.abs(rate[:, 0]), np.ones(600), 'valid'))
-    rate[moving:moving + 600, 1] = rate[moving, 1]
+    rate[moving : moving + 600, 1] = rate[moving, 1]
     return replace(imu, rate_s=rate), joints, temperature
 
 
 def frozen(samples, start, seconds, *names):
     """Hold the readings at `start` seconds."""
-    first, last = np.searchsorted(samples.stamp_ns, samples.stamp_ns[0] + np.array([start, start + seconds]) * 10**9)
+    first, last = np.searchsorted(
+        samples.stamp_ns, samples.stamp_ns[0] + np.array([start, start + seconds]) * 10**9
+    )
     columns = {name: getattr(samples, name).copy() for name in names}
     for column in columns.values():
         column[first:last] = column[first]
@@ -142,7 +154,13 @@ def gyroscope_frozen_at_its_largest(imu, joints, temperature):
 def joints_frozen_for_a_time(imu, joints, temperature):
     moving = np.linalg.norm(imu.rate_s, axis=1) > 0.2
     longest = np.argmax(np.convolve(moving, np.ones(1000), 'valid'))
-    return imu, frozen(joints, float(imu.stamp_ns[longest] - imu.stamp_ns[0]) * 1e-9, 6, 'position', 'velocity'), temperature
+    return (
+        imu,
+        frozen(
+            joints, float(imu.stamp_ns[longest] - imu.stamp_ns[0]) * 1e-9, 6, 'position', 'velocity'
+        ),
+        temperature,
+    )
 
 
 def half_a_g_off(imu, joints, temperature):
@@ -159,7 +177,7 @@ def clipped_gyroscope(imu, joints, temperature):
 
 def repeated_stamps(imu, joints, temperature):
     stamps = imu.stamp_ns.copy()
-    stamps[50::100] = stamps[49::100][:len(stamps[50::100])]
+    stamps[50::100] = stamps[49::100][: len(stamps[50::100])]
     return replace(imu, stamp_ns=stamps), joints, temperature
 
 
@@ -175,12 +193,16 @@ def late_samples(imu, joints, temperature):
 
 def jumping_clock(imu, joints, temperature):
     stamps = imu.stamp_ns.copy()
-    stamps[len(stamps) // 2:] -= 20_000_000_000
+    stamps[len(stamps) // 2 :] -= 20_000_000_000
     return replace(imu, stamp_ns=stamps), joints, temperature
 
 
 def two_clocks(imu, joints, temperature):
-    return imu, replace(joints, stamp_ns=joints.stamp_ns - joints.stamp_ns[0] + 5_000_000_000), temperature
+    return (
+        imu,
+        replace(joints, stamp_ns=joints.stamp_ns - joints.stamp_ns[0] + 5_000_000_000),
+        temperature,
+    )
 
 
 def late_joints(imu, joints, temperature):
@@ -257,18 +279,39 @@ FAULTS = (
 )
 """Fault, check, severity, and names and numbers that a finding must have."""
 IDS = [f'{fault.__name__}-{check}' for fault, check, *_ in FAULTS]
-THROUGH_A_BAG = (gyroscope_turned, clipped_gyroscope, no_stamps, jumping_clock, not_finite, two_clocks, in_kelvin)
+THROUGH_A_BAG = (
+    gyroscope_turned,
+    clipped_gyroscope,
+    no_stamps,
+    jumping_clock,
+    not_finite,
+    two_clocks,
+    in_kelvin,
+)
 
 
 def lacks(text, wanted):
     """Return the names and numbers (to 2 %) that a text lacks."""
-    words, numbers = set(re.findall(r'[A-Za-z]+', text)), [float(number) for number in re.findall(r'\d+\.?\d*', text)]
-    return [value for value in wanted if not (value in words if isinstance(value, str) else pytest.approx(value, rel=0.02) in numbers)]
+    words, numbers = (
+        set(re.findall(r'[A-Za-z]+', text)),
+        [float(number) for number in re.findall(r'\d+\.?\d*', text)],
+    )
+    return [
+        value
+        for value in wanted
+        if not (
+            value in words if isinstance(value, str) else pytest.approx(value, rel=0.02) in numbers
+        )
+    ]
 
 
 @pytest.mark.parametrize(('fault', 'check', 'severity', 'wanted'), FAULTS, ids=IDS)
 def test_a_fault_is_named_by_its_check(session, fault, check, severity, wanted):
-    texts = [f.text for f in findings(fault(session.imu, session.joints, session.temperature)) if (f.check, f.severity) == (check, severity)]
+    texts = [
+        f.text
+        for f in findings(fault(session.imu, session.joints, session.temperature))
+        if (f.check, f.severity) == (check, severity)
+    ]
     assert texts and lacks(' '.join(texts), wanted) == []
 
 
@@ -279,38 +322,70 @@ def test_inspect_prints_the_findings_of_a_bag(capsys, tmp_path, session, fault):
     code = main(['inspect', str(tmp_path / 'bag')])
     printed, found = ' '.join(capsys.readouterr().out.split()), findings(samples)
     assert trouble(found)
-    for severity, check in {(f.severity, f.check) for f in found} & {(severity, check) for which, check, severity, _ in FAULTS if which is fault}:
-        assert all(f'{severity} {check.replace("_", " ")} {" ".join(f.text.split())}' in printed
-                   for f in found if (f.severity, f.check) == (severity, check))
+    for severity, check in {(f.severity, f.check) for f in found} & {
+        (severity, check) for which, check, severity, _ in FAULTS if which is fault
+    }:
+        assert all(
+            f'{severity} {check.replace("_", " ")} {" ".join(f.text.split())}' in printed
+            for f in found
+            if (f.severity, f.check) == (severity, check)
+        )
     assert code == (1 if REFUSE in {f.severity for f in found} else 3)
 
 
-@pytest.mark.parametrize('fault', {check: fault for fault, check, severity, _ in FAULTS if severity == REFUSE}.values())   # one of each check
-def test_calibrate_refuses_what_would_make_the_result_wrong(capsys, tmp_path, session, table, fault):
+@pytest.mark.parametrize(
+    'fault', {check: fault for fault, check, severity, _ in FAULTS if severity == REFUSE}.values()
+)  # one of each check
+def test_calibrate_refuses_what_would_make_the_result_wrong(
+    capsys, tmp_path, session, table, fault
+):
     """One line, exit code 1, nothing written: with the table and by hand."""
     imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
     write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
-    for more in (['--table', str(table)], []) if fault is not two_clocks else (['--table', str(table)],):
+    for more in (
+        (['--table', str(table)], []) if fault is not two_clocks else (['--table', str(table)],)
+    ):
         capsys.readouterr()
-        assert main(['calibrate', str(tmp_path / 'bag'), *more, '--output', str(tmp_path / 'out')]) == 1
+        assert (
+            main(['calibrate', str(tmp_path / 'bag'), *more, '--output', str(tmp_path / 'out')])
+            == 1
+        )
         printed = capsys.readouterr()
         assert printed.out == '' and len(printed.err.splitlines()) == 1
         assert ' must ' in printed.err
         assert not (tmp_path / 'out').exists()
 
 
-@pytest.mark.parametrize(('fault', 'check', 'unusable'), ((clipped_gyroscope, 'clipping', True), (wrong_gravity, 'gravity', False)))
+@pytest.mark.parametrize(
+    ('fault', 'check', 'unusable'),
+    ((clipped_gyroscope, 'clipping', True), (wrong_gravity, 'gravity', False)),
+)
 def test_calibrate_goes_on_with_a_warning(capsys, tmp_path, session, table, fault, check, unusable):
     """Said on standard error, kept in the file and the report; exit code 3 when samples are unusable."""
     imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
     write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
-    more = ['--model-as-asked', *([] if unusable else ['--no-report'])]   # one report is enough
-    code = main(['calibrate', str(tmp_path / 'bag'), '--table', str(table), '--output', str(tmp_path / 'out'), *more])
-    text, = (line for line in capsys.readouterr().err.splitlines() if line.startswith('warning: '))
+    more = ['--model-as-asked', *([] if unusable else ['--no-report'])]  # one report is enough
+    code = main(
+        [
+            'calibrate',
+            str(tmp_path / 'bag'),
+            '--table',
+            str(table),
+            '--output',
+            str(tmp_path / 'out'),
+            *more,
+        ]
+    )
+    (text,) = (
+        line for line in capsys.readouterr().err.splitlines() if line.startswith('warning: ')
+    )
     statistics = yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())['statistics']
-    found, = statistics['preflight']
+    (found,) = statistics['preflight']
     assert found['check'] == check and text == f'warning: {found["text"]}'
-    assert not unusable or found['text'].split(',')[0] in (tmp_path / 'out' / 'report.html').read_text()
+    assert (
+        not unusable
+        or found['text'].split(',')[0] in (tmp_path / 'out' / 'report.html').read_text()
+    )
     assert (statistics['unusable'] > 0) == unusable
     assert code in ((3,) if unusable else (0, 3))
 
@@ -320,27 +395,71 @@ def test_calibrate_goes_on_with_a_warning(capsys, tmp_path, session, table, faul
 
 def turned(imu):
     """The sensor turned by 90 degrees about z: its x where the table has y."""
-    return replace(imu, force_s=imu.force_s[:, [1, 0, 2]] * [1.0, -1.0, 1.0], rate_s=imu.rate_s[:, [1, 0, 2]] * [1.0, -1.0, 1.0])
+    return replace(
+        imu,
+        force_s=imu.force_s[:, [1, 0, 2]] * [1.0, -1.0, 1.0],
+        rate_s=imu.rate_s[:, [1, 0, 2]] * [1.0, -1.0, 1.0],
+    )
 
 
-def test_a_sensor_turned_against_the_table_gets_the_mount_that_fits(capsys, tmp_path, session, table):
+def test_a_sensor_turned_against_the_table_gets_the_mount_that_fits(
+    capsys, tmp_path, session, table
+):
     write_session(str(tmp_path / 'bag'), turned(session.imu), session.joints)
-    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(table), '--output', str(tmp_path / 'out')]) == 1
-    line, = capsys.readouterr().err.splitlines()
+    assert (
+        main(
+            [
+                'calibrate',
+                str(tmp_path / 'bag'),
+                '--table',
+                str(table),
+                '--output',
+                str(tmp_path / 'out'),
+            ]
+        )
+        == 1
+    )
+    (line,) = capsys.readouterr().err.splitlines()
     assert 'mount.rpy_deg' in line
     fits = yaml.safe_load(re.findall(r'\[[^]]*\]', line)[-1])
     corrected = tmp_path / 'corrected.yaml'
     corrected.write_text(yaml.safe_dump({**session.table, 'mount': {'rpy_deg': fits, 'xyz': None}}))
-    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(corrected), '--output', str(tmp_path / 'out'), '--no-report', '--model-as-asked']) in (0, 3)
+    assert main(
+        [
+            'calibrate',
+            str(tmp_path / 'bag'),
+            '--table',
+            str(corrected),
+            '--output',
+            str(tmp_path / 'out'),
+            '--no-report',
+            '--model-as-asked',
+        ]
+    ) in (0, 3)
 
 
 def test_a_joint_that_counts_backwards_is_named(capsys, tmp_path, session):
-    axes = [dict(joint, axis=[-a for a in joint['axis']]) if joint['name'] == 'inner' else joint for joint in session.table['joints']]
+    axes = [
+        dict(joint, axis=[-a for a in joint['axis']]) if joint['name'] == 'inner' else joint
+        for joint in session.table['joints']
+    ]
     wrong = tmp_path / 'table.yaml'
     wrong.write_text(yaml.safe_dump({**session.table, 'joints': axes}))
     write_bag(session, str(tmp_path / 'bag'))
-    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(wrong), '--output', str(tmp_path / 'out')]) == 1
-    line, = capsys.readouterr().err.splitlines()
+    assert (
+        main(
+            [
+                'calibrate',
+                str(tmp_path / 'bag'),
+                '--table',
+                str(wrong),
+                '--output',
+                str(tmp_path / 'out'),
+            ]
+        )
+        == 1
+    )
+    (line,) = capsys.readouterr().err.splitlines()
     assert 'inner' in line and not {'middle', 'outer'} & set(re.findall('[a-z]+', line))
 
 
@@ -350,10 +469,16 @@ def test_counts_against_the_joints(capsys, tmp_path, session, table):
     from imu_calibration.effects.sensor_model import SensorModel
     from imu_calibration.kinematics.table import Table
     from imu_calibration.preprocessing.joint_checks import against_joints
-    model, description = SensorModel(joint_names=session.joints.names), Table.from_mapping(session.table)
+
+    model, description = (
+        SensorModel(joint_names=session.joints.names),
+        Table.from_mapping(session.table),
+    )
     for factor, expected in ((1.0, []), (7.0, ['rate_unit']), (180 / np.pi, ['rate_unit'])):
         collector = Collector(description, model)
-        collector.push(SampleBlock(replace(session.imu, rate_s=factor * session.imu.rate_s), session.joints))
+        collector.push(
+            SampleBlock(replace(session.imu, rate_s=factor * session.imu.rate_s), session.joints)
+        )
         assert [f.check for f in against_joints(collector.finish(), model, description)] == expected
 
 
@@ -369,7 +494,9 @@ def test_every_exchange_of_axes_is_recognised():
     for matrix in signed_permutations():
         match = match_axes(0.017 * matrix + 1e-4)
         assert np.array_equal(match.matrix, matrix)
-        assert match.mirrored == (np.linalg.det(matrix) < 0) and match.turned == (np.linalg.det(matrix) > 0)
+        assert match.mirrored == (np.linalg.det(matrix) < 0) and match.turned == (
+            np.linalg.det(matrix) > 0
+        )
         assert match.wrong == (not np.array_equal(matrix, np.eye(3)))
 
 
@@ -383,21 +510,36 @@ def test_a_crooked_mount_is_no_exchange_of_axes(angle_deg, wrong):
 
 
 GOOD_SESSIONS = {
-    'white': {}, 'realistic': {'noise': 'realistic'}, 'consumer': {'grade': 'consumer', 'noise': 'realistic'},
+    'white': {},
+    'realistic': {'noise': 'realistic'},
+    'consumer': {'grade': 'consumer', 'noise': 'realistic'},
     'without noise': {'noise': 'none'},
-    'two axes': {'table': 'two_axis'}, 'centrifuge': {'table': 'centrifuge'}, 'no velocity': {'velocity': 'none'},
+    'two axes': {'table': 'two_axis'},
+    'centrifuge': {'table': 'centrifuge'},
+    'no velocity': {'velocity': 'none'},
     'coarse encoder': {'encoder_resolution': 1e-3},
-    'late clock': {'hidden': {'time_offset': 0.05}}, 'slow gyroscope': {'hidden': {'gyro_bandwidth': None}},
+    'late clock': {'hidden': {'time_offset': 0.05}},
+    'slow gyroscope': {'hidden': {'gyro_bandwidth': None}},
     'g-sensitive': {'hidden': {'gyro_g_sensitivity': None}},
 }
 
 
 @pytest.mark.parametrize('options', GOOD_SESSIONS.values(), ids=GOOD_SESSIONS)
 def test_good_sessions_are_left_in_peace(options):
-    good = make_session(5, **{'profile': 'quick' if 'table' not in options else 'random', **options})
+    good = make_session(
+        5, **{'profile': 'quick' if 'table' not in options else 'random', **options}
+    )
     found = findings((good.imu, good.joints, good.temperature), gravity=good.truth['gravity'])
     assert [f for f in found if f.severity != GOOD] == []
-    assert {'force_unit', 'rate_unit', 'handedness', 'gravity', 'stamps', 'sampling', 'temperature'} <= {f.check for f in found}
+    assert {
+        'force_unit',
+        'rate_unit',
+        'handedness',
+        'gravity',
+        'stamps',
+        'sampling',
+        'temperature',
+    } <= {f.check for f in found}
 
 
 @pytest.mark.parametrize('profile', ['avrutov_111', 'avrutov_rates_3', 'zhang_z60'])
@@ -415,9 +557,25 @@ def test_a_good_bag_gives_exit_code_zero_and_no_warning(capsys, tmp_path, sessio
     write_bag(session, str(tmp_path / 'bag'))
     assert main(['inspect', str(tmp_path / 'bag')]) == 0
     assert 'warning' not in capsys.readouterr().out
-    assert main(['calibrate', str(tmp_path / 'bag'), '--table', str(table), '--output', str(tmp_path / 'out'), '--no-report', '--model-as-asked']) in (0, 3)
+    assert main(
+        [
+            'calibrate',
+            str(tmp_path / 'bag'),
+            '--table',
+            str(table),
+            '--output',
+            str(tmp_path / 'out'),
+            '--no-report',
+            '--model-as-asked',
+        ]
+    ) in (0, 3)
     assert capsys.readouterr().err == ''
-    assert yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())['statistics']['preflight'] == []
+    assert (
+        yaml.safe_load((tmp_path / 'out' / 'calibration.yaml').read_text())['statistics'][
+            'preflight'
+        ]
+        == []
+    )
 
 
 def test_how_the_stream_is_cut_does_not_matter(session):
@@ -431,14 +589,24 @@ def test_how_the_stream_is_cut_does_not_matter(session):
 
 def test_a_real_range_that_was_reached_once_is_no_clipping(session):
     """The largest reading of a smooth motion comes once; many equal readings come from a rounded one, below it as above."""
-    rounded = replace(session.imu, force_s=np.round(session.imu.force_s, 1), rate_s=np.round(session.imu.rate_s, 2))
+    rounded = replace(
+        session.imu,
+        force_s=np.round(session.imu.force_s, 1),
+        rate_s=np.round(session.imu.rate_s, 2),
+    )
     assert not {'clipping', 'frozen'} & {f.check for f in findings((rounded, session.joints, None))}
-    assert ('resolution', NOTE) in [(f.check, f.severity) for f in findings((rounded, session.joints, None))]
+    assert ('resolution', NOTE) in [
+        (f.check, f.severity) for f in findings((rounded, session.joints, None))
+    ]
 
 
-@pytest.mark.parametrize('fault', (gyroscope_frozen_for_a_time, gyroscope_frozen_at_its_largest, imu_frozen_for_a_time))
+@pytest.mark.parametrize(
+    'fault', (gyroscope_frozen_for_a_time, gyroscope_frozen_at_its_largest, imu_frozen_for_a_time)
+)
 def test_what_is_frozen_does_not_clip(session, fault):
-    assert [check for check, _ in trouble(findings(fault(session.imu, session.joints, None)))] == ['frozen']
+    assert [check for check, _ in trouble(findings(fault(session.imu, session.joints, None)))] == [
+        'frozen'
+    ]
 
 
 def test_a_rate_of_nothing_is_no_end_of_the_range(session):
@@ -454,22 +622,39 @@ def several_topics(folder, session, imu=1, joints=1, temperature=1):
     """Write a bag with so many topics of each type, none of them by its default name, and return its path."""
     from rosbags.rosbag2 import Reader, Writer
     from rosbags.typesys import Stores, get_typestore
-    few = session.imu.select(slice(0, 300)), session.joints.select(slice(0, 300)), session.temperature.select(slice(0, 3))
+
+    few = (
+        session.imu.select(slice(0, 300)),
+        session.joints.select(slice(0, 300)),
+        session.temperature.select(slice(0, 3)),
+    )
     write_session(str(folder / 'plain'), *few[:2], temperature=few[2])
-    kinds = {'/imu/data_raw': ('imu', imu), '/joint_states': ('joints', joints), '/imu/temperature': ('temperature', temperature)}
+    kinds = {
+        '/imu/data_raw': ('imu', imu),
+        '/joint_states': ('joints', joints),
+        '/imu/temperature': ('temperature', temperature),
+    }
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with Reader(folder / 'plain') as reader, Writer(folder / 'bag', version=9) as writer:
-        out = {c.topic: [writer.add_connection(f'/{kinds[c.topic][0]}_{k}', c.msgtype,
-                                               typestore=typestore) for k in range(kinds[c.topic][1])]
-               for c in reader.connections}
+        out = {
+            c.topic: [
+                writer.add_connection(f'/{kinds[c.topic][0]}_{k}', c.msgtype, typestore=typestore)
+                for k in range(kinds[c.topic][1])
+            ]
+            for c in reader.connections
+        }
         for connection, stamp, data in reader.messages():
             for target in out[connection.topic]:
                 writer.write(target, stamp, data)
     return folder / 'bag'
 
 
-VERBS = {'calibrate': ['--output', 'OUT'], 'diagnose': ['--table', 'TABLE', '--output', 'OUT'],
-         'calibrate on a table': ['--table', 'TABLE', '--output', 'OUT'], 'compensate': ['--calibration', 'CALIBRATION', '--output', 'OUT']}
+VERBS = {
+    'calibrate': ['--output', 'OUT'],
+    'diagnose': ['--table', 'TABLE', '--output', 'OUT'],
+    'calibrate on a table': ['--table', 'TABLE', '--output', 'OUT'],
+    'compensate': ['--calibration', 'CALIBRATION', '--output', 'OUT'],
+}
 
 
 @pytest.fixture(scope='module')
@@ -477,13 +662,26 @@ def calibration(tmp_path_factory, session, table):
     """A calibration file."""
     folder = tmp_path_factory.mktemp('calibration')
     write_bag(session, str(folder / 'bag'))
-    assert main(['calibrate', str(folder / 'bag'), '--table', str(table), '--output', str(folder / 'out'), '--no-report', '--model-as-asked']) in (0, 3)
+    assert main(
+        [
+            'calibrate',
+            str(folder / 'bag'),
+            '--table',
+            str(table),
+            '--output',
+            str(folder / 'out'),
+            '--no-report',
+            '--model-as-asked',
+        ]
+    ) in (0, 3)
     return folder / 'out' / 'calibration.yaml'
 
 
 @pytest.mark.parametrize('kind', ('imu', 'joints', 'temperature'))
 @pytest.mark.parametrize('verb', VERBS)
-def test_two_topics_of_a_type_are_refused_with_their_names(capsys, tmp_path, session, table, calibration, verb, kind):
+def test_two_topics_of_a_type_are_refused_with_their_names(
+    capsys, tmp_path, session, table, calibration, verb, kind
+):
     bag = several_topics(tmp_path, session, **{kind: 2})
     if kind == 'joints' and verb in ('calibrate', 'compensate'):
         pytest.skip('does not read joints')
@@ -501,8 +699,12 @@ def test_inspect_looks_at_every_imu(capsys, tmp_path, session):
     listing, *looks = capsys.readouterr().out.split('\n\n')
     assert [look.splitlines()[0].strip() for look in looks] == ['/imu_0', '/imu_1']
     assert all('force unit' in look for look in looks)
-    assert {line.split()[0] for line in listing.splitlines() if line.rstrip().endswith('read')} == {'/imu_0', '/imu_1', '/joints_0',
-                                                                                                    '/temperature_0'}
+    assert {line.split()[0] for line in listing.splitlines() if line.rstrip().endswith('read')} == {
+        '/imu_0',
+        '/imu_1',
+        '/joints_0',
+        '/temperature_0',
+    }
     assert main(['inspect', str(bag), '--imu-topic', '/imu_1']) == 0
     assert '\n/imu_0\n' not in capsys.readouterr().out
 
@@ -510,18 +712,22 @@ def test_inspect_looks_at_every_imu(capsys, tmp_path, session):
 @pytest.mark.parametrize('kind', ('joints', 'temperature'))
 def test_inspect_says_which_topics_it_leaves_alone(capsys, tmp_path, session, kind):
     assert main(['inspect', str(several_topics(tmp_path, session, **{kind: 2}))]) == 0
-    line, = (line for line in capsys.readouterr().out.splitlines() if line.startswith('not read'))
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith('not read'))
     assert f'/{kind}_0, /{kind}_1' in line and line.endswith(f'(--{kind.rstrip("s")}-topic)')
 
 
 def test_inspect_says_what_the_recording_determines_by_hand(capsys, tmp_path):
     imu = hold_and_turn(3)[0]
-    for samples, words in ((imu, 'without a table, it determines, from 14 poses and 13 turns'),
-                           (imu.select(slice(0, 400)), 'not usable for calibration without a table: ')):
+    for samples, words in (
+        (imu, 'without a table, it determines, from 14 poses and 13 turns'),
+        (imu.select(slice(0, 400)), 'not usable for calibration without a table: '),
+    ):
         write_session(str(tmp_path / str(len(samples))), samples)
         assert main(['inspect', str(tmp_path / str(len(samples)))]) == 0
         printed = capsys.readouterr().out
-        assert words in printed and ('determined: accelerometer.bias.x' in printed) == (len(samples) > 400)
+        assert words in printed and ('determined: accelerometer.bias.x' in printed) == (
+            len(samples) > 400
+        )
 
 
 @pytest.mark.parametrize('bad', (0, 1))
@@ -539,14 +745,20 @@ def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, t
 def test_the_only_topic_of_a_type_is_taken_whatever_its_name(capsys, tmp_path, session):
     main(['inspect', str(several_topics(tmp_path, session))])
     out = capsys.readouterr().out
-    assert [name for name in ('/imu_0', '/joints_0',
-                              '/temperature_0') if not any(name in line and 'read' in line for line in out.splitlines())] == []
+    assert [
+        name
+        for name in ('/imu_0', '/joints_0', '/temperature_0')
+        if not any(name in line and 'read' in line for line in out.splitlines())
+    ] == []
 
 
 def test_a_bag_without_imu_lists_what_it_holds(capsys, tmp_path, session):
     assert main(['inspect', str(several_topics(tmp_path, session, imu=0))]) == 1
     line = capsys.readouterr().err
-    assert '/joints_0 (sensor_msgs/msg/JointState)' in line and '/temperature_0 (sensor_msgs/msg/Temperature)' in line
+    assert (
+        '/joints_0 (sensor_msgs/msg/JointState)' in line
+        and '/temperature_0 (sensor_msgs/msg/Temperature)' in line
+    )
 
 
 # Real recordings ----------------------------------------------------------------------------------------------------------------
@@ -557,9 +769,15 @@ REAL = {
     ('shaft_pitch_slow', '/imu_fixed/data_raw'): [('stamps', WARNING)],
     ('shaft_yaw_medium', '/imu/data_raw'): [('stamps', WARNING)],
     ('shaft_yaw_medium', '/imu_fixed/data_raw'): [('stamps', WARNING)],
-    **{(name, f'/imu_{k}/data_raw'): [('clipping', WARNING)] for name in ('array_2', 'array_5') for k in (1, 7)},
+    **{
+        (name, f'/imu_{k}/data_raw'): [('clipping', WARNING)]
+        for name in ('array_2', 'array_5')
+        for k in (1, 7)
+    },
     ('xsens_counts', None): [('force_unit', REFUSE), ('rate_unit', REFUSE)],
-    ('mpu9150_0', None): [], ('mpu9150_3', None): [], ('ferraris', None): [],
+    ('mpu9150_0', None): [],
+    ('mpu9150_3', None): [],
+    ('ferraris', None): [],
 }
 """What is known to be true of each; everything else would be a story."""
 
@@ -581,9 +799,21 @@ def test_real_recordings_get_what_is_true_of_them(recordings, name, topic):
 @pytest.mark.real_data
 def test_counts_are_in_order_once_scaled(capsys, recordings, tmp_path):
     """The factory's biases are up to 1.2 m/s^2 beside the nominal offset: taken out before gravity is compared."""
-    nominal = yaml.safe_load((recordings / 'xsens_counts' / 'reference.yaml').read_text())['nominal']
+    nominal = yaml.safe_load((recordings / 'xsens_counts' / 'reference.yaml').read_text())[
+        'nominal'
+    ]
     (tmp_path / 'nominal.yaml').write_text(yaml.safe_dump(nominal))
-    assert main(['inspect', str(recordings / 'xsens_counts'), '--nominal', str(tmp_path / 'nominal.yaml')]) == 0
+    assert (
+        main(
+            [
+                'inspect',
+                str(recordings / 'xsens_counts'),
+                '--nominal',
+                str(tmp_path / 'nominal.yaml'),
+            ]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     assert 'warning' not in printed and 'refuse' not in printed
     assert re.search(r'\b1\.7\d*\b', printed)
@@ -592,9 +822,33 @@ def test_counts_are_in_order_once_scaled(capsys, recordings, tmp_path):
 @pytest.mark.real_data
 @pytest.mark.slow
 def test_arm_warns_of_clipping_and_refuses_other_units(capsys, recordings):
-    assert main(['arm', str(recordings / 'array_2'), '--imu-topic', '/imu_1/data_raw', '--imu-topic', '/imu_7/data_raw']) == 0
+    assert (
+        main(
+            [
+                'arm',
+                str(recordings / 'array_2'),
+                '--imu-topic',
+                '/imu_1/data_raw',
+                '--imu-topic',
+                '/imu_7/data_raw',
+            ]
+        )
+        == 0
+    )
     assert capsys.readouterr().err.count('34.87 rad/s') == 2
-    assert main(['arm', str(recordings / 'xsens_counts'), '--imu-topic', '/imu/data_raw', '--imu-topic', '/imu/other']) == 1
+    assert (
+        main(
+            [
+                'arm',
+                str(recordings / 'xsens_counts'),
+                '--imu-topic',
+                '/imu/data_raw',
+                '--imu-topic',
+                '/imu/other',
+            ]
+        )
+        == 1
+    )
     assert capsys.readouterr().err.count('\n') == 1
 
 
@@ -603,13 +857,19 @@ def test_spikes_are_counted_once_among_the_samples(session):
     imu, joints, temperature = session.imu, session.joints, session.temperature
     force = imu.force_s.copy()
     force[1000::3000, 1] += 40.0
-    told = [found.text for found in findings((replace(imu, force_s=force), joints, temperature)) if found.check == 'stamps']
+    told = [
+        found.text
+        for found in findings((replace(imu, force_s=force), joints, temperature))
+        if found.check == 'stamps'
+    ]
     assert any(f'{len(force[1000::3000])} of {len(imu)} ' in text for text in told)
 
 
 def test_acceleration_without_gravity_is_no_question_of_units():
     """The remedy is another topic; a scale or offset cannot add gravity."""
-    assert [force_error(length).code for length in (0.03, 0.5, 1.0, 2.0, 980.0, 5e4)] == ['without_gravity'] * 2 + ['force_unit'] * 4
+    assert [force_error(length).code for length in (0.03, 0.5, 1.0, 2.0, 980.0, 5e4)] == [
+        'without_gravity'
+    ] * 2 + ['force_unit'] * 4
     assert force_error(0.03).key == 'imu_topic' and force_error(9.7) is None
     with refused(InputError, 'without_gravity', '0.12'):
         check_force(0.12)

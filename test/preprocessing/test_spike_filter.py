@@ -41,8 +41,12 @@ def test_noise_and_turns_hold_no_spike(session):
 
 def test_spikes_are_dropped_and_counted_and_hardly_anything_else(session):
     spoiled = with_spikes(session, 0.01, 3)
-    hit = np.any(spoiled.force_s != session.force_s, axis=1) | np.any(spoiled.rate_s != session.rate_s, axis=1)
-    large = np.any(np.abs(spoiled.force_s - session.force_s) > 1.0, axis=1) | np.any(np.abs(spoiled.rate_s - session.rate_s) > 0.3, axis=1)
+    hit = np.any(spoiled.force_s != session.force_s, axis=1) | np.any(
+        spoiled.rate_s != session.rate_s, axis=1
+    )
+    large = np.any(np.abs(spoiled.force_s - session.force_s) > 1.0, axis=1) | np.any(
+        np.abs(spoiled.rate_s - session.rate_s) > 0.3, axis=1
+    )
     dropped = np.zeros(len(session), bool)
     dropped[gone(spoiled)] = True
     assert dropped[large].mean() > 0.97
@@ -58,7 +62,9 @@ def test_how_the_stream_is_cut_does_not_matter(session):
     spoiled = with_spikes(session, 0.01, 4)
     whole = read_by_hand([SampleBlock(spoiled)])
     for size in (1, 7, 31, 500):
-        pieces = read_by_hand([SampleBlock(spoiled.select(slice(a, a + size))) for a in range(0, len(spoiled), size)])
+        pieces = read_by_hand(
+            [SampleBlock(spoiled.select(slice(a, a + size))) for a in range(0, len(spoiled), size)]
+        )
         np.testing.assert_array_equal(pieces.imu.stamp_ns, whole.imu.stamp_ns)
         assert pieces.counts == whole.counts
 
@@ -70,10 +76,12 @@ def test_a_knock_a_step_and_coarse_readings_are_no_spikes(session):
     force, rate = session.force_s.copy(), session.rate_s.copy()
     force[100:120, 0] += ringing
     rate[250:, 1] += 1.0
-    for imu in (replace(session, force_s=force, rate_s=rate),
-                replace(session, force_s=np.round(session.force_s, 1), rate_s=np.round(session.rate_s, 2)),
-                replace(session, rate_s=np.clip(session.rate_s, -0.8, 0.8))):
-        assert cleaned(imu)[1] <= 2   # of 4000; the first reading of a knock may look like one
+    for imu in (
+        replace(session, force_s=force, rate_s=rate),
+        replace(session, force_s=np.round(session.force_s, 1), rate_s=np.round(session.rate_s, 2)),
+        replace(session, rate_s=np.clip(session.rate_s, -0.8, 0.8)),
+    ):
+        assert cleaned(imu)[1] <= 2  # of 4000; the first reading of a knock may look like one
 
 
 @pytest.mark.parametrize('size', [1, 7, 31])
@@ -93,23 +101,35 @@ def test_knocks_of_one_reading_that_reach_several_axes_stay(session):
     rng, force, rate = np.random.default_rng(8), session.force_s.copy(), session.rate_s.copy()
     for at in range(60, len(session) - 60, 97):
         for values, size in ((force, 10.0), (rate, 1.0)):
-            values[at - 1:at + 3] += np.outer([-0.05, 1.0, 0.1, -0.04], size * rng.uniform(0.5, 1.0, 3) * rng.choice([-1, 1], 3))
-    assert cleaned(replace(session, force_s=force, rate_s=rate))[1] <= 3   # of 63; two thirds without the look at the other axes
+            values[at - 1 : at + 3] += np.outer(
+                [-0.05, 1.0, 0.1, -0.04], size * rng.uniform(0.5, 1.0, 3) * rng.choice([-1, 1], 3)
+            )
+    assert (
+        cleaned(replace(session, force_s=force, rate_s=rate))[1] <= 3
+    )  # of 63; two thirds without the look at the other axes
 
 
 def test_fast_twisting_at_a_low_rate_is_no_spike():
     time = 0.016 * np.arange(4000)
     rng = np.random.default_rng(2)
     twist = 20 * np.sin(2 * np.pi * 4 * time)
-    imu = ImuSamples((1e9 * time).astype(np.int64), rng.normal(0, 0.05, (4000, 3)) + 9.8, np.outer(twist, [0.3, 0.5, 0.8]) + rng.normal(0, 0.01, (4000, 3)))
+    imu = ImuSamples(
+        (1e9 * time).astype(np.int64),
+        rng.normal(0, 0.05, (4000, 3)) + 9.8,
+        np.outer(twist, [0.3, 0.5, 0.8]) + rng.normal(0, 0.01, (4000, 3)),
+    )
     assert cleaned(imu)[1] == 0
 
 
 def test_one_per_cent_of_spikes_does_not_matter_by_hand(session):
-    clean, spoiled = (calibrate_by_hand(read_by_hand([SampleBlock(imu)]).imu, HandOptions(GRAVITY))
-                      for imu in (session, with_spikes(session, 0.01, 5)))
+    clean, spoiled = (
+        calibrate_by_hand(read_by_hand([SampleBlock(imu)]).imu, HandOptions(GRAVITY))
+        for imu in (session, with_spikes(session, 0.01, 5))
+    )
     assert np.all(np.abs(spoiled.values - clean.values)[clean.sd > 0] < clean.sd[clean.sd > 0])
-    np.testing.assert_allclose(spoiled.sd[clean.sd > 0], clean.sd[clean.sd > 0], rtol=0.35)   # the scatter comes from few degrees of freedom
+    np.testing.assert_allclose(
+        spoiled.sd[clean.sd > 0], clean.sd[clean.sd > 0], rtol=0.35
+    )  # the scatter comes from few degrees of freedom
 
 
 def test_one_per_cent_of_spikes_does_not_matter_on_the_table():
@@ -117,7 +137,9 @@ def test_one_per_cent_of_spikes_does_not_matter_on_the_table():
     table = Table.from_mapping(session.table)
 
     def result(imu):
-        return calibrate([lambda: iter([SampleBlock(imu, session.joints, session.temperature)])], table).calibration
+        return calibrate(
+            [lambda: iter([SampleBlock(imu, session.joints, session.temperature)])], table
+        ).calibration
 
     clean, spoiled = result(session.imu), result(with_spikes(session.imu, 0.01, 6))
     known = clean.sd > 0

@@ -10,7 +10,13 @@ from test_rate_slope import PERIOD_NS, START, stamps_of
 
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.stamping import COUNTED, IRREGULAR, REGULAR, SampleTimes, describe_stamps
+from imu_calibration.preprocessing.stamping import (
+    COUNTED,
+    IRREGULAR,
+    REGULAR,
+    SampleTimes,
+    describe_stamps,
+)
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 N = 3000
@@ -28,12 +34,23 @@ def samples(stamp_ns, keep=slice(None)):
 def timed(imu, cuts=()):
     """(numbers of the samples, their times) as SampleTimes gives them."""
     times, bounds = SampleTimes(), [0, *cuts, len(imu)]
-    parts = [times.push(imu.select(slice(a, b))) for a, b in zip(bounds, bounds[1:]) if b > a] + [times.finish()]
+    parts = [times.push(imu.select(slice(a, b))) for a, b in zip(bounds, bounds[1:]) if b > a] + [
+        times.finish()
+    ]
     whole = ImuSamples.concatenate([part for part in parts if part is not None])
     return whole.rate_s[:, 0].astype(int), whole.stamp_ns, times
 
 
-@pytest.mark.parametrize(('kind', 'off_ms'), (('regular', 0.0), ('milliseconds', 1.0), ('usb packets', 1.0), ('arrival', 2.5), ('jitter', 2.0)))
+@pytest.mark.parametrize(
+    ('kind', 'off_ms'),
+    (
+        ('regular', 0.0),
+        ('milliseconds', 1.0),
+        ('usb packets', 1.0),
+        ('arrival', 2.5),
+        ('jitter', 2.0),
+    ),
+)
 def test_times_are_those_of_the_sampling(kind, off_ms):
     """Up to a constant, and to a share of the scatter that one block of 64 cannot average out; 8 samples at once are off by 35 ms as they come."""
     rng = np.random.default_rng(3)
@@ -41,7 +58,11 @@ def test_times_are_those_of_the_sampling(kind, off_ms):
     assert np.array_equal(number, np.arange(N))
     off = (times - TRUE).astype(float)[100:]
     assert np.quantile(np.abs(off - np.median(off)), 0.99) <= 1e6 * off_ms
-    assert state.n_rebuilt > 0.9 * N if kind == 'usb packets' else kind == 'jitter' or not state.n_rebuilt
+    assert (
+        state.n_rebuilt > 0.9 * N
+        if kind == 'usb packets'
+        else kind == 'jitter' or not state.n_rebuilt
+    )
 
 
 @pytest.mark.parametrize('lost', (8, 16, 80))
@@ -53,7 +74,10 @@ def test_packets_that_are_lost_leave_a_gap_of_their_length(lost):
     assert np.quantile(np.abs(off - np.median(off)), 0.99) < 0.2 * PERIOD_NS
 
 
-@given(st.sampled_from(('regular', 'usb packets', 'arrival', 'jitter', 'runaway', 'zeros')), st.lists(st.integers(1, 900), max_size=6))
+@given(
+    st.sampled_from(('regular', 'usb packets', 'arrival', 'jitter', 'runaway', 'zeros')),
+    st.lists(st.integers(1, 900), max_size=6),
+)
 def test_the_outcome_does_not_depend_on_how_the_stream_is_cut(kind, cuts):
     imu = samples(stamps_of(kind, TRUE[:900], np.random.default_rng(1)))
     whole, cut = timed(imu), timed(imu, sorted(cuts))
@@ -66,21 +90,29 @@ def test_stamps_that_follow_no_clock_stay_as_they_are():
     stamps = stamps_of('runaway', TRUE, rng)
     assert describe_stamps(stamps).word == IRREGULAR
     number, times, _ = timed(samples(stamps))
-    assert np.mean(times == stamps[number]) > 0.75   # by chance 256 of them may look like those of a clock
+    assert (
+        np.mean(times == stamps[number]) > 0.75
+    )  # by chance 256 of them may look like those of a clock
 
 
 @pytest.mark.parametrize('factor', (0.5, 0.8, 2.0))
 def test_a_rate_that_changes_is_followed(factor):
-    true_ns = START + np.cumsum(np.repeat([PERIOD_NS, round(factor * PERIOD_NS)], N)).astype(np.int64)
+    true_ns = START + np.cumsum(np.repeat([PERIOD_NS, round(factor * PERIOD_NS)], N)).astype(
+        np.int64
+    )
     _, times, _ = timed(samples(stamps_of('usb packets', true_ns, None)))
     step = np.diff(times)
-    assert np.median(step[:N - 200]) == pytest.approx(PERIOD_NS, rel=0.01) and np.median(step[N + 600:]) == pytest.approx(factor * PERIOD_NS, rel=0.01)
+    assert np.median(step[: N - 200]) == pytest.approx(PERIOD_NS, rel=0.01) and np.median(
+        step[N + 600 :]
+    ) == pytest.approx(factor * PERIOD_NS, rel=0.01)
 
 
 def test_lost_repeated_and_swapped_samples_are_no_fault_of_the_stamps():
     rng = np.random.default_rng(5)
     keep = np.sort(rng.choice(N, N // 2, replace=False))
-    assert describe_stamps(TRUE[keep]).word == REGULAR and describe_stamps(TRUE[keep]).period_ns == pytest.approx(PERIOD_NS, rel=1e-6)
+    assert describe_stamps(TRUE[keep]).word == REGULAR and describe_stamps(
+        TRUE[keep]
+    ).period_ns == pytest.approx(PERIOD_NS, rel=1e-6)
     swapped = TRUE.copy()
     swapped[10:1000:40], swapped[11:1000:40] = TRUE[11:1000:40], TRUE[10:1000:40]
     assert describe_stamps(swapped).word == REGULAR
@@ -92,20 +124,28 @@ def findings(imu, notes=None):
     check = Preflight(strict=False)
     cleaner = BlockCleaner(watchers=[check])
     for start in range(0, len(imu), 500):
-        cleaner.push(SampleBlock(imu.select(slice(start, start + 500)), notes=notes if not start else None))
+        cleaner.push(
+            SampleBlock(imu.select(slice(start, start + 500)), notes=notes if not start else None)
+        )
     cleaner.finish()
     return check.findings
 
 
 def test_inspect_sees_the_same():
     counted = findings(samples(stamps_of('usb packets', TRUE, None)))
-    assert any(f.check == 'jitter' and {'8', '200'} <= set(re.findall(r'\d+', f.text)) for f in counted)
+    assert any(
+        f.check == 'jitter' and {'8', '200'} <= set(re.findall(r'\d+', f.text)) for f in counted
+    )
     assert not any((f.check, f.severity) == ('sampling', 'warning') for f in counted)
     irregular = findings(samples(stamps_of('runaway', TRUE, np.random.default_rng(4))))
     assert ('jitter', 'warning') in [(f.check, f.severity) for f in irregular]
     assert not any(f.check == 'jitter' for f in findings(samples(TRUE)))
     zero = findings(samples(TRUE), {'Imu zero stamp': 400})
-    assert [f.severity for f in zero if f.check == 'stamps' and {'400', str(N)} <= set(re.findall(r'\d+', f.text))] == ['warning']
+    assert [
+        f.severity
+        for f in zero
+        if f.check == 'stamps' and {'400', str(N)} <= set(re.findall(r'\d+', f.text))
+    ] == ['warning']
     assert describe_stamps(stamps_of('usb packets', TRUE, None)).word == COUNTED
 
 
@@ -113,7 +153,10 @@ def test_inspect_sees_the_same():
 def test_symmetric_jitter_in_order_is_no_lateness(rate, draw):
     """Times went through the earliest stamps, 3 to 7 ms early, where jitter was wider than the period and no stamp overtook another."""
     for seed in range(4):
-        rng, true_ns = np.random.default_rng(seed), START + np.round(1e9 / rate * np.arange(N)).astype(np.int64)
+        rng, true_ns = (
+            np.random.default_rng(seed),
+            START + np.round(1e9 / rate * np.arange(N)).astype(np.int64),
+        )
         jitter = rng.normal(0, 3e6, N) if draw == 'normal' else rng.uniform(-3e6, 3e6, N)
         stamps = np.maximum.accumulate(true_ns + jitter.astype(np.int64)) + np.arange(N)
         number, times, state = timed(samples(stamps))

@@ -20,13 +20,22 @@ def by_hand(n_poses=8, hz=HZ, seed=0):
     rng = np.random.default_rng(seed)
     time = np.arange(0, 6 * n_poses, 1 / hz)
     part = np.clip((time % 6 - 4) / 2, 0, 1)
-    blend = np.floor(time / 6) + part ** 3 * (10 - 15 * part + 6 * part ** 2)
+    blend = np.floor(time / 6) + part**3 * (10 - 15 * part + 6 * part**2)
     angle = 1.1 * blend
-    force = 9.81 * np.stack([np.sin(angle), np.cos(angle) * np.sin(0.7 * angle), np.cos(angle) * np.cos(0.7 * angle)], axis=1)
+    force = 9.81 * np.stack(
+        [np.sin(angle), np.cos(angle) * np.sin(0.7 * angle), np.cos(angle) * np.cos(0.7 * angle)],
+        axis=1,
+    )
     tremor = (part > 0) * rng.normal(0, 1, (3, len(time)))
     force += rng.normal(0, 0.02, force.shape) + 0.3 * tremor.T
-    rate = 0.01 + rng.normal(0, 0.002, force.shape) + np.gradient(angle, time)[:, None] * [0.8, 0.1, 0.5]
-    return ImuSamples(np.round(1e9 * time).astype(np.int64), force, rate), [(6.0 * k, 6.0 * k + 4) for k in range(n_poses)]
+    rate = (
+        0.01
+        + rng.normal(0, 0.002, force.shape)
+        + np.gradient(angle, time)[:, None] * [0.8, 0.1, 0.5]
+    )
+    return ImuSamples(np.round(1e9 * time).astype(np.int64), force, rate), [
+        (6.0 * k, 6.0 * k + 4) for k in range(n_poses)
+    ]
 
 
 @pytest.mark.parametrize('hz', [50, 100, 1000])
@@ -36,20 +45,24 @@ def test_poses_are_found_whole(hz):
     assert len(found) == len(true)
     for piece, (low, high) in zip(found, true, strict=True):
         settling = 0.5 if low > 0 else 0.0
-        assert piece.start / hz == pytest.approx(low + settling, abs=0.15) and piece.stop / hz == pytest.approx(high, abs=0.15)
+        assert piece.start / hz == pytest.approx(
+            low + settling, abs=0.15
+        ) and piece.stop / hz == pytest.approx(high, abs=0.15)
         assert piece.stop / hz < high + 0.1
 
 
 def test_unit_does_not_matter():
     imu, _ = by_hand()
-    counts = ImuSamples(imu.stamp_ns, 32768 + np.round(400 * imu.force_s), 32768 + np.round(4000 * imu.rate_s))
+    counts = ImuSamples(
+        imu.stamp_ns, 32768 + np.round(400 * imu.force_s), 32768 + np.round(4000 * imu.rate_s)
+    )
     for piece, other in zip(find_still(imu), find_still(counts), strict=True):
         assert abs(piece.start - other.start) <= 2 and abs(piece.stop - other.stop) <= 2
 
 
 def test_steady_turn_about_the_vertical_is_no_rest():
     imu, true = by_hand()
-    imu.rate_s[int(6 * HZ):int(10 * HZ), 2] += 0.5
+    imu.rate_s[int(6 * HZ) : int(10 * HZ), 2] += 0.5
     assert len(find_still(imu)) == len(true) - 1
 
 
@@ -66,7 +79,11 @@ def test_shortest_rest_is_a_setting():
 
 
 def test_constant_readings_are_rest():
-    imu = ImuSamples(np.arange(500, dtype=np.int64) * 10 ** 7, np.tile([0.0, 0.0, 9.81], (500, 1)), np.zeros((500, 3)))
+    imu = ImuSamples(
+        np.arange(500, dtype=np.int64) * 10**7,
+        np.tile([0.0, 0.0, 9.81], (500, 1)),
+        np.zeros((500, 3)),
+    )
     assert find_still(imu) == [slice(0, 500)]
 
 
@@ -100,10 +117,15 @@ RECORDINGS = {
 @pytest.mark.parametrize('name', RECORDINGS)
 def test_real_recordings(recordings, name):
     from msg_adapters.bag import open_recording
+
     topic, least, most = RECORDINGS[name]
-    recording = open_recording(recordings / name, imu_topic=topic, want_joints=False, want_temperature=False)
+    recording = open_recording(
+        recordings / name, imu_topic=topic, want_joints=False, want_temperature=False
+    )
     try:
-        imu = ImuSamples.concatenate([block.imu for block in recording.blocks() if block.imu is not None])
+        imu = ImuSamples.concatenate(
+            [block.imu for block in recording.blocks() if block.imu is not None]
+        )
     finally:
         recording.close()
     (imu,), _ = clean_samples(imu)
@@ -115,5 +137,5 @@ def test_rests_end_where_the_turn_begins_even_in_vibration():
     found = find_still(imu)
     assert len(found) == len(ranges)
     late = [rest.stop - held.stop for rest, held in zip(found, ranges)]
-    assert max(late) <= 3 and min(late) >= -12   # samples of 10 ms; up to 32 by the variance alone
+    assert max(late) <= 3 and min(late) >= -12  # samples of 10 ms; up to 32 by the variance alone
     assert all(rest.start >= held.start for rest, held in zip(found, ranges))

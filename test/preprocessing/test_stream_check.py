@@ -10,7 +10,7 @@ from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 
 from worlds.cleaning import clean_samples
 
-S = 10 ** 9
+S = 10**9
 START = 1_700_000_000 * S
 
 
@@ -34,7 +34,11 @@ def test_clean_stream_passes_untouched():
     assert statistics.duration == pytest.approx(0.495)
     assert statistics.period == pytest.approx(0.005, rel=1e-12)
     assert statistics.rate == pytest.approx(200.0)
-    assert (statistics.n_gaps, statistics.gap_total, statistics.stamp_step_ns) == (0, 0.0, 5_000_000)
+    assert (statistics.n_gaps, statistics.gap_total, statistics.stamp_step_ns) == (
+        0,
+        0.0,
+        5_000_000,
+    )
 
 
 def test_not_finite_samples_are_dropped_and_counted():
@@ -83,7 +87,10 @@ def test_clock_that_learns_the_date_starts_a_new_epoch():
     assert statistics.duration == pytest.approx(0.245 + 0.495)
 
 
-@pytest.mark.parametrize('wrong, place', [(0, 0), (0, 50), (START + 7200 * S, 0), (START + 7200 * S, 50), (START - 10 * S, 50)])
+@pytest.mark.parametrize(
+    'wrong, place',
+    [(0, 0), (0, 50), (START + 7200 * S, 0), (START + 7200 * S, 50), (START - 10 * S, 50)],
+)
 def test_single_stray_stamp_is_no_reset(wrong, place):
     stamps = regular(100)
     stamps[place] = wrong
@@ -107,16 +114,24 @@ def test_slow_stream_has_no_gaps_of_its_own():
 
 
 def test_millisecond_stamps_are_recognised():
-    stamps = START + 1_000_000 * np.round(10 * np.arange(500) + np.random.default_rng(0).normal(0, 0.4, 500)).astype(np.int64)
+    stamps = START + 1_000_000 * np.round(
+        10 * np.arange(500) + np.random.default_rng(0).normal(0, 0.4, 500)
+    ).astype(np.int64)
     _, statistics = clean_samples(imu(stamps))
     assert statistics.stamp_step_ns == 1_000_000
 
 
-STEPS = st.sampled_from([5_000_000] * 12 + [0, -5_000_000, -900_000_000, -3 * S, 2 * S, 4000 * S, -4000 * S])
+STEPS = st.sampled_from(
+    [5_000_000] * 12 + [0, -5_000_000, -900_000_000, -3 * S, 2 * S, 4000 * S, -4000 * S]
+)
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
-@given(st.lists(STEPS, min_size=1, max_size=60), st.lists(st.integers(0, 60), max_size=12), st.lists(st.integers(0, 59), max_size=4))
+@given(
+    st.lists(STEPS, min_size=1, max_size=60),
+    st.lists(st.integers(0, 60), max_size=12),
+    st.lists(st.integers(0, 59), max_size=4),
+)
 def test_outcome_does_not_depend_on_the_cuts(steps, cuts, holes):
     samples = imu(START + np.cumsum(steps))
     samples.rate_s[[hole for hole in holes if hole < len(steps)]] = np.nan
@@ -133,6 +148,12 @@ def test_outcome_does_not_depend_on_the_cuts(steps, cuts, holes):
         assert np.all(np.diff(joined.stamp_ns) > 0)
     statistics = check.statistics()
     assert statistics.dropped == expected.dropped
-    assert (statistics.count, statistics.period, statistics.longest_step) == (expected.count, expected.period, expected.longest_step)
-    dropped = sum(number for reason, number in statistics.dropped.items() if reason != 'clock reset')
+    assert (statistics.count, statistics.period, statistics.longest_step) == (
+        expected.count,
+        expected.period,
+        expected.longest_step,
+    )
+    dropped = sum(
+        number for reason, number in statistics.dropped.items() if reason != 'clock reset'
+    )
     assert dropped + statistics.count == len(steps)

@@ -15,15 +15,28 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.spike_filter import SPIKE_REACH
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT
-from imu_calibration.preprocessing.window import WINDOW_GROUP_SAMPLES, StoredWindows, WindowSettings, chunks
+from imu_calibration.preprocessing.window import (
+    WINDOW_GROUP_SAMPLES,
+    StoredWindows,
+    WindowSettings,
+    chunks,
+)
 from imu_calibration.preprocessing.window_cutter import MIN_MOVING_SECONDS, WanderLimit
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
-START = 1_700_000_000 * 10 ** 9
+START = 1_700_000_000 * 10**9
 NAMES = ('outer', 'middle', 'inner')
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
-                                       {'name': 'inner', 'axis': [1, 0, 0]}], 'gravity': 9.81})
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'outer', 'axis': [0, 0, 1]},
+            {'name': 'middle', 'axis': [0, 1, 0]},
+            {'name': 'inner', 'axis': [1, 0, 0]},
+        ],
+        'gravity': 9.81,
+    }
+)
 COARSE = np.radians(0.088)
 
 
@@ -49,16 +62,31 @@ def rest(duration, angles=(0, 0, 0)):
     return Profile('rest', tuple(builder.segments[-1:]))
 
 
-def record(profile, imu_hz=200, joint_hz=100, joint_noise=1e-5, step=0.0, seed=0, phase=0.0013, force_noise=5e-3):
+def record(
+    profile,
+    imu_hz=200,
+    joint_hz=100,
+    joint_noise=1e-5,
+    step=0.0,
+    seed=0,
+    phase=0.0013,
+    force_noise=5e-3,
+):
     rng = np.random.default_rng(seed)
     imu_ns = np.round(np.arange(0, profile.duration, 1 / imu_hz) * 1e9).astype(np.int64)
-    joint_ns = np.round((phase + np.arange(0, profile.duration - phase, 1 / joint_hz)) * 1e9).astype(np.int64)
+    joint_ns = np.round(
+        (phase + np.arange(0, profile.duration - phase, 1 / joint_hz)) * 1e9
+    ).astype(np.int64)
     reference = reference_motion(TABLE, profile.at(imu_ns / 1e9))
     position = profile.at(joint_ns / 1e9).position
     position = position + joint_noise * rng.standard_normal(position.shape)
     position = np.round(position / step) * step if step else position
-    imu = ImuSamples(START + imu_ns, reference.force_s + force_noise * rng.standard_normal((len(imu_ns), 3)),
-                     reference.rate_s + 5e-4 * rng.standard_normal((len(imu_ns), 3)), 'imu_link')
+    imu = ImuSamples(
+        START + imu_ns,
+        reference.force_s + force_noise * rng.standard_normal((len(imu_ns), 3)),
+        reference.rate_s + 5e-4 * rng.standard_normal((len(imu_ns), 3)),
+        'imu_link',
+    )
     return imu, JointSamples(START + joint_ns, position, np.full(position.shape, np.nan), NAMES)
 
 
@@ -112,12 +140,22 @@ def test_every_kind_is_found_where_it_is(name):
             assert covered(found, low, high) > high - low - settling - edge
             assert covered(found, low, low + settling - edge) == 0
         total = sum(window.time[-1] - window.time[0] for window in found)
-        assert total - sum(covered(found, low, high) for low, high in true) < edge * len(true), f'{kind} outside its segments'
+        assert total - sum(covered(found, low, high) for low, high in true) < edge * len(true), (
+            f'{kind} outside its segments'
+        )
     moving = np.concatenate([profile.find(kind) for kind in ('move', 'ramp', 'oscillation')])
     dynamic = of_kind(windows, 'dynamic')
     for low, high in moving:
         assert covered(dynamic, low, high) > high - low - 0.5 - 2 * edge
-    assert set(counts) <= {'static', 'spin', 'dynamic', 'settling', 'not quiet', 'too short', 'rest too short'}
+    assert set(counts) <= {
+        'static',
+        'spin',
+        'dynamic',
+        'settling',
+        'not quiet',
+        'too short',
+        'rest too short',
+    }
     check_motion(windows, profile, *limits)
 
 
@@ -151,7 +189,9 @@ def test_unused_windows_complete_the_session():
     imu, joints = record(tour())
     imu.force_s[2000:2010] += 3.0
     windows, counts = gather(imu, joints, keep_unused=True)
-    np.testing.assert_array_equal(np.concatenate([window.stamp_ns for window in windows]), imu.stamp_ns)
+    np.testing.assert_array_equal(
+        np.concatenate([window.stamp_ns for window in windows]), imu.stamp_ns
+    )
     assert sum(counts.values()) == len(imu)
     assert {window.reason for window in windows} == {'', 'settling', 'not quiet'}
     used, _ = gather(imu, joints)
@@ -169,21 +209,23 @@ def faulty_session():
     order = np.arange(len(imu))
     order[[400, 401]] = [401, 400]
     order[700] = 699
-    stamps = START + np.arange(0, int(profile.duration), 2, dtype=np.int64) * 10 ** 9
+    stamps = START + np.arange(0, int(profile.duration), 2, dtype=np.int64) * 10**9
     return imu.select(order), joints, TemperatureSamples(stamps, 20 + 0.1 * np.arange(len(stamps)))
 
 
 def with_reset(samples, place):
     """Set the clock back by seven seconds from sample `place` on."""
     stamps = samples.stamp_ns.copy()
-    stamps[place:] -= 7 * 10 ** 9
+    stamps[place:] -= 7 * 10**9
     values = {name: getattr(samples, name) for name in type(samples).__dataclass_fields__}
     return type(samples)(**{**values, 'stamp_ns': stamps})
 
 
 def pieces(samples, cuts):
     bounds = sorted({0, len(samples), *(int(cut * len(samples)) for cut in cuts)})
-    return [samples.select(slice(low, high)) for low, high in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [
+        samples.select(slice(low, high)) for low, high in zip(bounds[:-1], bounds[1:], strict=True)
+    ]
 
 
 CUTS = st.lists(st.floats(0, 1), max_size=8)
@@ -202,15 +244,22 @@ def test_outcome_does_not_depend_on_how_the_streams_arrive(reset):
     @settings(max_examples=12, deadline=None, derandomize=True)
     @given(CUTS, CUTS, st.randoms(use_true_random=False), st.sampled_from([1, 50, 100000]))
     def check(imu_cuts, joint_cuts, random, largest):
-        queue = [('imu', part) for part in pieces(imu, imu_cuts)], [('joints', part) for part in pieces(joints, joint_cuts)]
+        queue = (
+            [('imu', part) for part in pieces(imu, imu_cuts)],
+            [('joints', part) for part in pieces(joints, joint_cuts)],
+        )
         gatherer = MotionGatherer(TABLE, WindowSettings(**changed), keep_unused=True)
         windows, told = [], 0
         while queue[0] or queue[1]:
             name, part = random.choice([q for q in queue if q]).pop(0)
             if name == 'imu' and temperature is not None:
-                known = int(np.searchsorted(temperature.stamp_ns, part.stamp_ns.max(), side='right'))
+                known = int(
+                    np.searchsorted(temperature.stamp_ns, part.stamp_ns.max(), side='right')
+                )
                 if known > told:
-                    windows += gatherer.push(SampleBlock(temperature=temperature.select(slice(told, known))))
+                    windows += gatherer.push(
+                        SampleBlock(temperature=temperature.select(slice(told, known)))
+                    )
                 told = max(told, known)
             for start in range(0, len(part), largest) if len(part) < 100 else [None]:
                 chosen = part if start is None else part.select(slice(start, start + largest))
@@ -226,7 +275,9 @@ def test_outcome_does_not_depend_on_how_the_streams_arrive(reset):
 def test_knock_stays_out_of_static_windows():
     imu, joints = record(rest(16), imu_hz=1000)
     time = seconds(imu)
-    ringing = np.where(time >= 8, np.exp(-(time - 8) / 0.02) * np.sin(2 * np.pi * 80 * (time - 8)), 0.0)
+    ringing = np.where(
+        time >= 8, np.exp(-(time - 8) / 0.02) * np.sin(2 * np.pi * 80 * (time - 8)), 0.0
+    )
     imu.force_s[:, 1] += 0.5 * ringing
     windows, counts = gather(imu, joints)
     assert [window.kind for window in windows] == ['static', 'static']
@@ -235,18 +286,31 @@ def test_knock_stays_out_of_static_windows():
     assert 0 < counts['not quiet'] < 300
 
 
-@pytest.mark.parametrize('hertz, swells, rests', [(31.0, 0.0, True), (1.5, 0.0, False), (31.0, 8.0, False)],
-                         ids=['vibration', 'hand', 'knocks'])
-def test_a_table_that_vibrates_rests_where_its_joints_stand_and_one_that_is_moved_or_knocked_does_not(hertz, swells, rests):
+@pytest.mark.parametrize(
+    'hertz, swells, rests',
+    [(31.0, 0.0, True), (1.5, 0.0, False), (31.0, 8.0, False)],
+    ids=['vibration', 'hand', 'knocks'],
+)
+def test_a_table_that_vibrates_rests_where_its_joints_stand_and_one_that_is_moved_or_knocked_does_not(
+    hertz, swells, rests
+):
     imu, joints = record(rest(20), imu_hz=200)
     time = seconds(imu)
     size = 0.5 * np.exp(-swells * (time % 0.7))
-    imu.force_s[:, 2] += np.where((time > 8) & (time < 12), size * np.sin(2 * np.pi * hertz * time), 0.0)
+    imu.force_s[:, 2] += np.where(
+        (time > 8) & (time < 12), size * np.sin(2 * np.pi * hertz * time), 0.0
+    )
     windows, _ = gather(imu, joints)
-    assert bool(covered(windows, 8, 12) > 2.0) is rests and covered(windows, 0, 8) > 7.5 and covered(windows, 12, 20) > 6.5
+    assert (
+        bool(covered(windows, 8, 12) > 2.0) is rests
+        and covered(windows, 0, 8) > 7.5
+        and covered(windows, 12, 20) > 6.5
+    )
     in_hand = find_still(imu)
-    assert not any(piece.start < 1610 and piece.stop > 2390 for piece in in_hand), 'without joints it may be a hand'
-    assert (sum(time[piece][-1] - time[piece][0] for piece in in_hand) < 16.5)
+    assert not any(piece.start < 1610 and piece.stop > 2390 for piece in in_hand), (
+        'without joints it may be a hand'
+    )
+    assert sum(time[piece][-1] - time[piece][0] for piece in in_hand) < 16.5
 
 
 def test_settling_can_be_longer():
@@ -254,7 +318,10 @@ def test_settling_can_be_longer():
     windows, _ = gather(*record(profile), settling=2.0)
     found = of_kind(windows, 'static')
     for low, high in profile.find('rest')[1:]:
-        assert covered(found, low, low + 1.85) == 0 and covered(found, low + 2.1, high) > high - low - 2.3
+        assert (
+            covered(found, low, low + 1.85) == 0
+            and covered(found, low + 2.1, high) > high - low - 2.3
+        )
 
 
 def test_turn_on_is_kept_out():
@@ -270,7 +337,11 @@ def test_long_windows_are_cut_in_equal_pieces():
 def test_cutting_leaves_no_piece_too_short():
     imu, joints = record(rest(10.5))
     windows, counts = gather(imu, joints, window_maximum=1.5)
-    assert counts == {'static': len(imu)} and all(len(window) >= 200 for window in windows) and len(windows) >= 5
+    assert (
+        counts == {'static': len(imu)}
+        and all(len(window) >= 200 for window in windows)
+        and len(windows) >= 5
+    )
 
 
 @pytest.mark.parametrize('chunk, overlap', [(2.0, 0.2), (7.3, 1.0), (600.0, 60.0)])
@@ -280,7 +351,11 @@ def test_grid_of_the_chunks_hardly_matters(chunk, overlap):
     usual, _ = gather(imu, joints)
     windows, _ = gather(imu, joints, chunk=chunk, overlap=overlap)
     for window, other in zip(windows, usual, strict=True):
-        assert window.kind == other.kind and abs(window.time[0] - other.time[0]) < 0.1 and abs(window.time[-1] - other.time[-1]) < 0.1
+        assert (
+            window.kind == other.kind
+            and abs(window.time[0] - other.time[0]) < 0.1
+            and abs(window.time[-1] - other.time[-1]) < 0.1
+        )
     check_motion(windows, profile, 1e-4, 5e-3, 0.3)
 
 
@@ -309,7 +384,9 @@ def test_lost_messages_do_not_cut_windows():
     imu, joints = record(tour(), seed=2)
     rng = np.random.default_rng(5)
     whole, _ = gather(imu, joints)
-    windows, _ = gather(imu.select(rng.random(len(imu)) > 0.05), joints.select(rng.random(len(joints)) > 0.05))
+    windows, _ = gather(
+        imu.select(rng.random(len(imu)) > 0.05), joints.select(rng.random(len(joints)) > 0.05)
+    )
     assert [window.kind for window in windows] == [window.kind for window in whole]
 
 
@@ -325,7 +402,10 @@ def test_nan_burst_is_counted():
 def test_dithering_encoder_is_at_rest():
     imu, joints = record(rest(20, (30, 0, 0)), imu_hz=100)
     rng = np.random.default_rng(0)
-    joints.position[:] = np.round((joints.position + rng.normal(0, 2e-4, joints.position.shape)) / COARSE + 0.5) * COARSE
+    joints.position[:] = (
+        np.round((joints.position + rng.normal(0, 2e-4, joints.position.shape)) / COARSE + 0.5)
+        * COARSE
+    )
     assert np.count_nonzero(np.diff(joints.position[:, 0])) > 50
     windows, counts = gather(imu, joints)
     assert counts == {'static': len(imu)}
@@ -363,7 +443,9 @@ def test_short_stop_between_moves_is_dynamic():
 def test_whole_turns_in_the_readings_do_not_matter():
     profile = rest(10, (180, 0, 0))
     imu, joints = record(profile, joint_noise=1e-4)
-    wrapped = JointSamples(joints.stamp_ns, (joints.position + np.pi) % (2 * np.pi) - np.pi, joints.velocity, NAMES)
+    wrapped = JointSamples(
+        joints.stamp_ns, (joints.position + np.pi) % (2 * np.pi) - np.pi, joints.velocity, NAMES
+    )
     assert np.ptp(wrapped.position[:, 0]) > 6
     windows, counts = gather(imu, wrapped, chunk=3.0)
     assert counts == {'static': len(imu)}
@@ -373,7 +455,9 @@ def test_whole_turns_in_the_readings_do_not_matter():
 def test_wrapped_spin_is_the_same_motion():
     profile = tour()
     imu, joints = record(profile, joint_noise=0.0)
-    wrapped = JointSamples(joints.stamp_ns, (joints.position + np.pi) % (2 * np.pi) - np.pi, joints.velocity, NAMES)
+    wrapped = JointSamples(
+        joints.stamp_ns, (joints.position + np.pi) % (2 * np.pi) - np.pi, joints.velocity, NAMES
+    )
     for window, other in zip(gather(imu, joints)[0], gather(imu, wrapped)[0], strict=True):
         assert window.kind == other.kind
         np.testing.assert_allclose(other.motion.rate, window.motion.rate, atol=1e-6)
@@ -381,15 +465,24 @@ def test_wrapped_spin_is_the_same_motion():
 
 def test_temperature_is_interpolated_and_held():
     imu, joints = record(rest(10))
-    temperature = TemperatureSamples(START + np.array([2, 3, 5], np.int64) * 10 ** 9, np.array([20.0, 21.0, 25.0]))
+    temperature = TemperatureSamples(
+        START + np.array([2, 3, 5], np.int64) * 10**9, np.array([20.0, 21.0, 25.0])
+    )
     (window,), _ = gather(imu, joints, temperature)
-    np.testing.assert_allclose(window.temperature_c, np.interp(window.time, [2, 3, 5], [20, 21, 25]), atol=1e-9)
+    np.testing.assert_allclose(
+        window.temperature_c, np.interp(window.time, [2, 3, 5], [20, 21, 25]), atol=1e-9
+    )
     assert gather(imu, joints)[0][0].temperature_c is None
 
 
 def test_joints_are_ordered_by_the_table():
     imu, joints = record(tour())
-    shuffled = JointSamples(joints.stamp_ns, joints.position[:, [2, 0, 1]], joints.velocity[:, [2, 0, 1]], ('inner', 'outer', 'middle'))
+    shuffled = JointSamples(
+        joints.stamp_ns,
+        joints.position[:, [2, 0, 1]],
+        joints.velocity[:, [2, 0, 1]],
+        ('inner', 'outer', 'middle'),
+    )
     for window, other in zip(gather(imu, joints)[0], gather(imu, shuffled)[0], strict=True):
         same(window, other)
 
@@ -403,7 +496,9 @@ def test_unknown_joint_names_are_refused():
 
 def test_no_table_takes_the_joints_as_they_are():
     imu, joints = record(tour())
-    for window, other in zip(gather(imu, joints)[0], gather(imu, joints, table=None)[0], strict=True):
+    for window, other in zip(
+        gather(imu, joints)[0], gather(imu, joints, table=None)[0], strict=True
+    ):
         same(window, other)
 
 
@@ -417,7 +512,9 @@ def test_clock_set_back_starts_again():
     time = np.concatenate([window.time for window in windows])
     assert np.all(np.diff(time) > 0) and len(time) >= len(imu) - 4
     assert not any(np.any(np.diff(window.stamp_ns) < 0) for window in windows)
-    assert {'static', 'spin', 'dynamic'} <= {window.kind for window in windows if window.time[0] > 20}
+    assert {'static', 'spin', 'dynamic'} <= {
+        window.kind for window in windows if window.time[0] > 20
+    }
 
 
 def test_one_clock_set_back_alone_goes_on():
@@ -427,7 +524,11 @@ def test_one_clock_set_back_alone_goes_on():
     imu = with_reset(imu, 2500)
     gatherer, windows = MotionGatherer(TABLE), []
     for start in range(0, len(imu), 100):
-        windows += gatherer.push(SampleBlock(imu.select(slice(start, start + 100)), joints.select(slice(start, start + 100))))
+        windows += gatherer.push(
+            SampleBlock(
+                imu.select(slice(start, start + 100)), joints.select(slice(start, start + 100))
+            )
+        )
     windows += gatherer.finish()
     assert covered(windows, 55, 190) > 120
 
@@ -438,17 +539,29 @@ def stream(n_seconds, imu_hz=20, joint_hz=20, with_imu=lambda k: True, with_join
     held, windows = 0, []
     rng = np.random.default_rng(0)
     for k in range(n_seconds):
-        at = START + (k * 10 ** 9 + np.arange(imu_hz) * (10 ** 9 // imu_hz)).astype(np.int64)
-        imu = ImuSamples(at, [0, 0, 9.81] + 0.01 * rng.standard_normal((imu_hz, 3)), 1e-3 * rng.standard_normal((imu_hz, 3)))
-        joints = JointSamples(at[:joint_hz], np.zeros((joint_hz, 3)), np.zeros((joint_hz, 3)), NAMES)
-        windows += gatherer.push(SampleBlock(imu if with_imu(k) else None, joints if with_joints(k) else None))
+        at = START + (k * 10**9 + np.arange(imu_hz) * (10**9 // imu_hz)).astype(np.int64)
+        imu = ImuSamples(
+            at,
+            [0, 0, 9.81] + 0.01 * rng.standard_normal((imu_hz, 3)),
+            1e-3 * rng.standard_normal((imu_hz, 3)),
+        )
+        joints = JointSamples(
+            at[:joint_hz], np.zeros((joint_hz, 3)), np.zeros((joint_hz, 3)), NAMES
+        )
+        windows += gatherer.push(
+            SampleBlock(imu if with_imu(k) else None, joints if with_joints(k) else None)
+        )
         held = max(held, gatherer.n_buffered)
     return held, gatherer, windows + gatherer.finish()
 
 
-SILENCE = {'no joints': {'with_joints': lambda k: False}, 'no imu': {'with_imu': lambda k: False},
-           'joints stop': {'with_joints': lambda k: k < 100}, 'imu stops': {'with_imu': lambda k: k < 100},
-           'both there': {}}
+SILENCE = {
+    'no joints': {'with_joints': lambda k: False},
+    'no imu': {'with_imu': lambda k: False},
+    'joints stop': {'with_joints': lambda k: k < 100},
+    'imu stops': {'with_imu': lambda k: k < 100},
+    'both there': {},
+}
 
 
 @pytest.mark.parametrize('case', SILENCE)
@@ -457,7 +570,9 @@ def test_memory_is_bounded_when_a_stream_is_silent(case):
     longest = JOINT_WAIT + 2 * 20 + 4 * 2 + 5  # waiting, two chunks or windows, margins, batch
     assert held < 2 * 20 * longest
     used = sum(len(window) for window in windows)
-    held_back = SPIKE_REACH if case == 'imu stops' else 0   # by the filter of spikes, and late when the joints have gone on for so long
+    held_back = (
+        SPIKE_REACH if case == 'imu stops' else 0
+    )  # by the filter of spikes, and late when the joints have gone on for so long
     assert used == {'no joints': 0, 'no imu': 0, 'both there': 12000}.get(case, 2000 - held_back)
     expected = {'no joints': 12000, 'joints stop': 10000}.get(case, 0)
     assert gatherer.counts.get('no joint state', 0) == expected
@@ -466,7 +581,11 @@ def test_memory_is_bounded_when_a_stream_is_silent(case):
 def test_joints_that_come_back_are_used_again():
     _, gatherer, windows = stream(400, with_joints=lambda k: not 100 <= k < 250)
     assert gatherer.counts['no joint state'] == pytest.approx(150 * 20, abs=5)
-    assert covered(windows, 0, 100) > 97 and covered(windows, 251, 400) > 145 and covered(windows, 101, 249) == 0
+    assert (
+        covered(windows, 0, 100) > 97
+        and covered(windows, 251, 400) > 145
+        and covered(windows, 101, 249) == 0
+    )
 
 
 def test_joints_stuck_while_the_imu_turns_give_no_static_window():
@@ -484,7 +603,9 @@ def test_stream_statistics_are_at_hand():
     gatherer = MotionGatherer(TABLE)
     gatherer.push(SampleBlock(imu, joints))
     statistics = gatherer.cleaner.statistics()
-    assert statistics['imu'].rate == pytest.approx(200) and statistics['joints'].rate == pytest.approx(100)
+    assert statistics['imu'].rate == pytest.approx(200) and statistics[
+        'joints'
+    ].rate == pytest.approx(100)
     assert statistics['temperature'].count == 0
 
 
@@ -494,7 +615,11 @@ def test_the_quieter_the_accelerometer_the_shorter_its_moving_windows():
     cuts = {}
     for density, jitter in ((1e-5, 0.0), (1e-4, 0.0), (1.2e-3, 0.0), (1e-5, 5e-5)):
         limit = WanderLimit()
-        samples = SimpleSamples(time + rng.normal(0.0, jitter, 2000), rng.normal(0.0, 10.0 * density, (2000, 3)), np.ones((2000, 3)))
+        samples = SimpleSamples(
+            time + rng.normal(0.0, jitter, 2000),
+            rng.normal(0.0, 10.0 * density, (2000, 3)),
+            np.ones((2000, 3)),
+        )
         assert limit.pieces(samples) == 1
         limit.rested(samples)
         cuts[density, jitter] = limit.pieces(samples)
@@ -516,16 +641,36 @@ def test_long_motion_of_a_quiet_imu_is_cut_short_and_rests_are_not():
     builder.rest(8.0)
     builder.oscillate([[40.0], [30.0], [20.0]], [[0.3], [0.4], [0.5]], 12.0)
     builder.rest(8.0)
-    found = [gather(*record(Profile('', tuple(builder.segments)), force_noise=noise))[0] for noise in (1e-4, 5e-3)]
-    longest = [max(window.time[-1] - window.time[0] for window in of_kind(windows, kind)) for windows in found for kind in ('dynamic', 'static')]
-    assert longest[0] <= MIN_MOVING_SECONDS + 0.01 and longest[2] > 10.0 and min(longest[1], longest[3]) > 7.0
+    found = [
+        gather(*record(Profile('', tuple(builder.segments)), force_noise=noise))[0]
+        for noise in (1e-4, 5e-3)
+    ]
+    longest = [
+        max(window.time[-1] - window.time[0] for window in of_kind(windows, kind))
+        for windows in found
+        for kind in ('dynamic', 'static')
+    ]
+    assert (
+        longest[0] <= MIN_MOVING_SECONDS + 0.01
+        and longest[2] > 10.0
+        and min(longest[1], longest[3]) > 7.0
+    )
 
 
 def test_columns_of_a_chunk_need_the_memory_of_one_chunk():
     """Windows in groups of at most WINDOW_GROUP_SAMPLES samples, a longer one alone: the columns of a group are in memory at once."""
     sizes = [WINDOW_GROUP_SAMPLES - 1, WINDOW_GROUP_SAMPLES - 1, 1, 1, 3 * WINDOW_GROUP_SAMPLES, 5]
-    groups = [[len(window.motion) for window in group] for group in chunks([SimpleNamespace(motion=range(size)) for size in sizes])]
-    assert groups == [[WINDOW_GROUP_SAMPLES - 1], [WINDOW_GROUP_SAMPLES - 1, 1], [1], [3 * WINDOW_GROUP_SAMPLES], [5]]
+    groups = [
+        [len(window.motion) for window in group]
+        for group in chunks([SimpleNamespace(motion=range(size)) for size in sizes])
+    ]
+    assert groups == [
+        [WINDOW_GROUP_SAMPLES - 1],
+        [WINDOW_GROUP_SAMPLES - 1, 1],
+        [1],
+        [3 * WINDOW_GROUP_SAMPLES],
+        [5],
+    ]
     assert list(chunks([])) == []
 
 

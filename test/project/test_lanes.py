@@ -19,11 +19,14 @@ FAILS = 'def test_always():\n    raise ValueError\n'
 PASSES = 'def test_sound():\n    pass\n'
 
 
-@pytest.mark.parametrize('start', (
-    lambda: subprocess.run([sys.executable, '-c', ''], check=True),
-    lambda: multiprocessing.get_context('spawn').Process(target=print).start(),
-    lambda: os.system('true'),
-))
+@pytest.mark.parametrize(
+    'start',
+    (
+        lambda: subprocess.run([sys.executable, '-c', ''], check=True),
+        lambda: multiprocessing.get_context('spawn').Process(target=print).start(),
+        lambda: os.system('true'),
+    ),
+)
 def test_a_core_test_that_starts_a_process_fails(start):
     with pytest.raises(pytest.fail.Exception, match='test_a_core_test_that_starts_a_process_fails'):
         start()
@@ -42,14 +45,38 @@ def test_a_live_test_may_start_a_process():
 
 
 @pytest.mark.live
-@pytest.mark.parametrize(('text', 'code', 'unstable'), (
-    (PASSES, 0, False), (LIVE + FAILS_ONCE + PASSES, 0, True), (LIVE + FAILS, 1, False), (FAILS_ONCE, 1, False), (FAILS_ONCE.replace('def', LIVE.replace('pytestmark =', '@') + 'def') + FAILS, 1, False),
-    ('raise ValueError\n', 1, False),
-), ids=('passes', 'live test fails once', 'live test fails twice', 'core test fails once', 'core test fails too', 'file cannot be imported'))
+@pytest.mark.parametrize(
+    ('text', 'code', 'unstable'),
+    (
+        (PASSES, 0, False),
+        (LIVE + FAILS_ONCE + PASSES, 0, True),
+        (LIVE + FAILS, 1, False),
+        (FAILS_ONCE, 1, False),
+        (FAILS_ONCE.replace('def', LIVE.replace('pytestmark =', '@') + 'def') + FAILS, 1, False),
+        ('raise ValueError\n', 1, False),
+    ),
+    ids=(
+        'passes',
+        'live test fails once',
+        'live test fails twice',
+        'core test fails once',
+        'core test fails too',
+        'file cannot be imported',
+    ),
+)
 def test_only_live_tests_are_repeated(tmp_path, text, code, unstable):
     (tmp_path / 'pytest.ini').write_text('[pytest]\nmarkers =\n    live: x\n    long: x\n')
     (tmp_path / 'test_it.py').write_text(text)
-    done = subprocess.run([sys.executable, TEST / 'run_lanes.py', 'core', 'live', '--', '-n', str(int(unstable))], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert (bool(done.returncode), 'unstable: test_it.py::test_once' in done.stdout) == (bool(code), unstable), done.stdout
+    done = subprocess.run(
+        [sys.executable, TEST / 'run_lanes.py', 'core', 'live', '--', '-n', str(int(unstable))],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert (bool(done.returncode), 'unstable: test_it.py::test_once' in done.stdout) == (
+        bool(code),
+        unstable,
+    ), done.stdout
     assert not unstable or 'the first failure' in done.stdout.partition('unstable: ')[2]
     assert 'passed' in done.stdout.splitlines()[-1] or code

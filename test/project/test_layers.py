@@ -14,13 +14,23 @@ ROOT = Path(__file__).resolve().parents[2]
 FRONT_DOOR = ROOT / 'imu_calibration/__init__.py'
 """Imports the names for notebooks when they are asked for; test_front_door sees to it that it imports nothing by itself."""
 EDGE = {'cli', 'nodes', 'use_cases', '__main__'}
-ROS = {'rclpy', 'ros2cli', 'ros2doctor', 'rosbags', 'ament_index_python', 'launch', 'launch_ros', 'rosgraph_msgs', 'std_srvs'}
+ROS = {
+    'rclpy',
+    'ros2cli',
+    'ros2doctor',
+    'rosbags',
+    'ament_index_python',
+    'launch',
+    'launch_ros',
+    'rosgraph_msgs',
+    'std_srvs',
+}
 LATE = {'yaml', 'matplotlib', 'jinja2', 'tqdm', 'urdf_parser_py', 'xacro'}
 LATE_OF_SCIPY = ('scipy.optimize', 'scipy.signal', 'scipy.stats')
 NOT_IN_CALIBRATE = ('allan', 'planning')
 """They would take half of the time in which a command or a node starts."""
 
-BLOCKED_IMPORTS = '''
+BLOCKED_IMPORTS = """
 import importlib, sys
 
 class OnlyNumpyAndScipy:
@@ -35,7 +45,7 @@ for name in sys.argv[1:]:
         importlib.import_module(name)
     except ImportError as error:
         print(f'{name}: {error}')
-'''
+"""
 
 
 def module_name(path):
@@ -51,7 +61,11 @@ def modules(package):
 
 def core_modules():
     """Modules of imu_calibration below the command line, the nodes and the installed files."""
-    return [path for path in modules('imu_calibration') if path.relative_to(ROOT).with_suffix('').parts[1] not in EDGE]
+    return [
+        path
+        for path in modules('imu_calibration')
+        if path.relative_to(ROOT).with_suffix('').parts[1] not in EDGE
+    ]
 
 
 @lru_cache(maxsize=None)
@@ -71,7 +85,7 @@ def imports(path, top_level_only=False):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = package[:len(package) - node.level + 1] if node.level else []
+            base = package[: len(package) - node.level + 1] if node.level else []
             name = '.'.join([*base, *([node.module] if node.module else [])])
             found |= {name, *(f'{name}.{alias.name}' for alias in node.names)}
     return found
@@ -96,18 +110,28 @@ def ros_packages(names):
 
 def inside(names, *packages):
     """Those of `names` that lie in one of `packages`."""
-    return {name for name in names if any(name == package or name.startswith(f'{package}.') for package in packages)}
+    return {
+        name
+        for name in names
+        if any(name == package or name.startswith(f'{package}.') for package in packages)
+    }
 
 
 @pytest.mark.live
 def test_the_core_imports_with_numpy_and_scipy_alone_and_without_a_screen():
-    environment = {k: v for k, v in os.environ.items() if k not in ('DISPLAY', 'WAYLAND_DISPLAY', 'PYTHONPATH')}
+    environment = {
+        k: v for k, v in os.environ.items() if k not in ('DISPLAY', 'WAYLAND_DISPLAY', 'PYTHONPATH')
+    }
     command = [sys.executable, '-c', BLOCKED_IMPORTS, *map(module_name, core_modules())]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120
+    )
     assert (done.returncode, done.stdout) == (0, ''), done.stdout + done.stderr
 
 
-@pytest.mark.parametrize('path', [path for path in core_modules() if path != FRONT_DOOR], ids=module_name)
+@pytest.mark.parametrize(
+    'path', [path for path in core_modules() if path != FRONT_DOOR], ids=module_name
+)
 def test_the_core_knows_nothing_of_ros_or_of_the_layers_above(path):
     assert not ros_packages(imports(path))
     assert not inside(imports(path), 'msg_adapters', *(f'imu_calibration.{name}' for name in EDGE))
@@ -117,7 +141,10 @@ def test_the_core_knows_nothing_of_ros_or_of_the_layers_above(path):
 def test_heavy_libraries_are_imported_where_they_are_used(path):
     names = imports(path, top_level_only=True)
     assert not heads(names) & LATE and not inside(names, *LATE_OF_SCIPY)
-    assert not inside(imports(path), 'scipy.signal', 'scipy.stats') or module_name(path).split('.')[1] in NOT_IN_CALIBRATE
+    assert (
+        not inside(imports(path), 'scipy.signal', 'scipy.stats')
+        or module_name(path).split('.')[1] in NOT_IN_CALIBRATE
+    )
 
 
 @pytest.mark.parametrize('path', modules('msg_adapters'), ids=module_name)
@@ -126,31 +153,53 @@ def test_adapters_know_no_node_and_no_command_line(path):
     assert not inside(imports(path), 'imu_calibration.cli', 'imu_calibration.nodes')
 
 
-ORDER = (('core',), ('kinematics',), ('effects',), ('preprocessing',), ('estimation', 'simulation', 'compensation'),
-         ('selection', 'allan'), ('document', 'references'), ('calibration', 'between_imus'), ('planning',), ('report',), ('use_cases',),
-         ('cli', 'nodes'))
+ORDER = (
+    ('core',),
+    ('kinematics',),
+    ('effects',),
+    ('preprocessing',),
+    ('estimation', 'simulation', 'compensation'),
+    ('selection', 'allan'),
+    ('document', 'references'),
+    ('calibration', 'between_imus'),
+    ('planning',),
+    ('report',),
+    ('use_cases',),
+    ('cli', 'nodes'),
+)
 """Packages from the ground up: each may import what stands in an earlier row."""
 ENTRIES = (FRONT_DOOR, FRONT_DOOR.with_name('__main__.py'))
 """Modules of no package; both import late or the command line only."""
 
 
-@pytest.mark.parametrize('path', [path for path in modules('imu_calibration') if path not in ENTRIES], ids=module_name)
+@pytest.mark.parametrize(
+    'path', [path for path in modules('imu_calibration') if path not in ENTRIES], ids=module_name
+)
 def test_each_package_imports_only_what_stands_below_it(path):
     height = {name: row for row, names in enumerate(ORDER) for name in names}
     own = path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0]
-    others = {name.split('.')[1] for name in inside(imports(path), 'imu_calibration') if '.' in name} & set(height) - {own}
+    others = {
+        name.split('.')[1] for name in inside(imports(path), 'imu_calibration') if '.' in name
+    } & set(height) - {own}
     assert all(height[name] < height[own] for name in others), (own, others)
 
 
 def test_every_package_has_its_place_in_the_order():
-    found = {path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0] for path in modules('imu_calibration')} - {'__init__', '__main__'}
+    found = {
+        path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0]
+        for path in modules('imu_calibration')
+    } - {'__init__', '__main__'}
     assert found == {name for names in ORDER for name in names}
 
 
 def test_the_page_of_contents_goes_from_the_ground_up():
     height = {name: row for row, names in enumerate(ORDER) for name in names}
     text = ast.get_docstring(ast.parse(FRONT_DOOR.read_text()))
-    listed = [name for line in text.partition('Contents')[2].splitlines() for name in re.findall(r'^`(\w+)`', line)]
+    listed = [
+        name
+        for line in text.partition('Contents')[2].splitlines()
+        for name in re.findall(r'^`(\w+)`', line)
+    ]
     assert len(listed) > 15 and listed == sorted(listed, key=height.get)
 
 
@@ -182,16 +231,27 @@ def weigher():
 
 def test_no_modules_import_each_other(tmp_path):
     weigh = weigher()
-    assert weigh.cycles(weigh.imports(ROOT, [*modules('imu_calibration'), *modules('msg_adapters')])) == []
+    assert (
+        weigh.cycles(weigh.imports(ROOT, [*modules('imu_calibration'), *modules('msg_adapters')]))
+        == []
+    )
     for name, other in (('first', 'second'), ('second', 'first'), ('third', 'first')):
         (tmp_path / f'{name}.py').write_text(f'def function():\n    from {other} import function\n')
-    assert [sorted(found) for found in weigh.cycles(weigh.imports(tmp_path, list(tmp_path.glob('*.py'))))] == [['first', 'second']]
+    assert [
+        sorted(found)
+        for found in weigh.cycles(weigh.imports(tmp_path, list(tmp_path.glob('*.py'))))
+    ] == [['first', 'second']]
 
 
 def test_the_start_of_a_program_is_the_last_statement_of_its_module():
     """A function below it is missing while the program runs."""
-    starts = {path: [isinstance(node, ast.If) and '__main__' in ast.unparse(node.test) for node in ast.parse(path.read_text()).body]
-              for path in modules('imu_calibration')}
+    starts = {
+        path: [
+            isinstance(node, ast.If) and '__main__' in ast.unparse(node.test)
+            for node in ast.parse(path.read_text()).body
+        ]
+        for path in modules('imu_calibration')
+    }
     guarded = {path: of_nodes for path, of_nodes in starts.items() if any(of_nodes)}
     assert len(guarded) >= 5
     assert [path.name for path, of_nodes in guarded.items() if not of_nodes[-1]] == []
@@ -199,12 +259,24 @@ def test_the_start_of_a_program_is_the_last_statement_of_its_module():
 
 def test_modules_of_all_layers_were_found():
     names = set(map(module_name, [*modules('imu_calibration'), *modules('msg_adapters')]))
-    assert {'imu_calibration.core.samples', 'imu_calibration.cli', 'imu_calibration.nodes', 'msg_adapters'} <= names
+    assert {
+        'imu_calibration.core.samples',
+        'imu_calibration.cli',
+        'imu_calibration.nodes',
+        'msg_adapters',
+    } <= names
 
 
-@pytest.mark.parametrize('path', modules('imu_calibration') + modules('msg_adapters'), ids=module_name)
+@pytest.mark.parametrize(
+    'path', modules('imu_calibration') + modules('msg_adapters'), ids=module_name
+)
 def test_a_module_binds_each_constant_once(path):
     """Two constants of one name, as after a join of two files, leave the first one's users with the second one's value."""
-    bound = [target.id for node in parsed(path).body if isinstance(node, (ast.Assign, ast.AnnAssign))
-             for target in (node.targets if isinstance(node, ast.Assign) else [node.target]) if isinstance(target, ast.Name)]
+    bound = [
+        target.id
+        for node in parsed(path).body
+        if isinstance(node, (ast.Assign, ast.AnnAssign))
+        for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
+        if isinstance(target, ast.Name)
+    ]
     assert sorted(set(bound)) == sorted(bound)

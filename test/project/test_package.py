@@ -22,42 +22,90 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.use_cases import resources
 
 ROOT = Path(__file__).resolve().parents[2]
-EXECUTABLES = {'imu_calibration', 'calibration_node', 'compensator_node', 'simulator_node', 'bag_player_node', 'planner_node'}
+EXECUTABLES = {
+    'imu_calibration',
+    'calibration_node',
+    'compensator_node',
+    'simulator_node',
+    'bag_player_node',
+    'planner_node',
+}
 FOREIGN = {'ekf_node', 'ekf_filter_node'}
 """Of robot_localization, started only where that is asked for."""
 ROSDEP_KEYS = {
-    'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'yaml': 'python3-yaml', 'jinja2': 'python3-jinja2',
-    'matplotlib': 'python3-matplotlib', 'tqdm': 'python3-tqdm', 'rosbags': 'python3-rosbags-pip', 'urdf_parser_py': 'urdfdom_py',
+    'numpy': 'python3-numpy',
+    'scipy': 'python3-scipy',
+    'yaml': 'python3-yaml',
+    'jinja2': 'python3-jinja2',
+    'matplotlib': 'python3-matplotlib',
+    'tqdm': 'python3-tqdm',
+    'rosbags': 'python3-rosbags-pip',
+    'urdf_parser_py': 'urdfdom_py',
     # installed with those that need them; compression is in the standard library from Python 3.14 on
-    'markupsafe': 'python3-jinja2', 'lz4': 'python3-rosbags-pip', 'backports': 'python3-rosbags-pip', 'compression': 'python3-rosbags-pip',
+    'markupsafe': 'python3-jinja2',
+    'lz4': 'python3-rosbags-pip',
+    'backports': 'python3-rosbags-pip',
+    'compression': 'python3-rosbags-pip',
 }
 NOBLE = {
-    'python3-numpy': 'python3-numpy', 'python3-scipy': 'python3-scipy', 'python3-yaml': 'python3-yaml', 'python3-jinja2': 'python3-jinja2',
-    'python3-matplotlib': 'python3-matplotlib', 'python3-tqdm': 'python3-tqdm', 'python3-rosbags-pip': 'rosbags', 'python3-hypothesis': 'python3-hypothesis',
+    'python3-numpy': 'python3-numpy',
+    'python3-scipy': 'python3-scipy',
+    'python3-yaml': 'python3-yaml',
+    'python3-jinja2': 'python3-jinja2',
+    'python3-matplotlib': 'python3-matplotlib',
+    'python3-tqdm': 'python3-tqdm',
+    'python3-rosbags-pip': 'rosbags',
+    'python3-hypothesis': 'python3-hypothesis',
     'python3-jsonschema': 'python3-jsonschema',
-    'python3-pytest': 'python3-pytest', 'python3-pytest-xdist': 'python3-pytest-xdist', 'urdfdom_py': 'ros-jazzy-urdfdom-py', 'xacro': 'ros-jazzy-xacro',
-    'ament_index_python': 'ros-jazzy-ament-index-python', 'launch': 'ros-jazzy-launch', 'launch_ros': 'ros-jazzy-launch-ros', 'rclpy': 'ros-jazzy-rclpy',
-    'ros2cli': 'ros-jazzy-ros2cli', 'ros2doctor': 'ros-jazzy-ros2doctor', 'ros2launch': 'ros-jazzy-ros2launch', 'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs', 'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
-    'rosgraph_msgs': 'ros-jazzy-rosgraph-msgs', 'sensor_msgs': 'ros-jazzy-sensor-msgs', 'std_msgs': 'ros-jazzy-std-msgs', 'std_srvs': 'ros-jazzy-std-srvs',
-    'geometry_msgs': 'ros-jazzy-geometry-msgs', 'nav_msgs': 'ros-jazzy-nav-msgs', 'tf2_msgs': 'ros-jazzy-tf2-msgs',
-    'action_msgs': 'ros-jazzy-action-msgs', 'builtin_interfaces': 'ros-jazzy-builtin-interfaces', 'control_msgs': 'ros-jazzy-control-msgs', 'trajectory_msgs': 'ros-jazzy-trajectory-msgs', 'visualization_msgs': 'ros-jazzy-visualization-msgs',
+    'python3-pytest': 'python3-pytest',
+    'python3-pytest-xdist': 'python3-pytest-xdist',
+    'urdfdom_py': 'ros-jazzy-urdfdom-py',
+    'xacro': 'ros-jazzy-xacro',
+    'ament_index_python': 'ros-jazzy-ament-index-python',
+    'launch': 'ros-jazzy-launch',
+    'launch_ros': 'ros-jazzy-launch-ros',
+    'rclpy': 'ros-jazzy-rclpy',
+    'ros2cli': 'ros-jazzy-ros2cli',
+    'ros2doctor': 'ros-jazzy-ros2doctor',
+    'ros2launch': 'ros-jazzy-ros2launch',
+    'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs',
+    'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
+    'rosgraph_msgs': 'ros-jazzy-rosgraph-msgs',
+    'sensor_msgs': 'ros-jazzy-sensor-msgs',
+    'std_msgs': 'ros-jazzy-std-msgs',
+    'std_srvs': 'ros-jazzy-std-srvs',
+    'geometry_msgs': 'ros-jazzy-geometry-msgs',
+    'nav_msgs': 'ros-jazzy-nav-msgs',
+    'tf2_msgs': 'ros-jazzy-tf2-msgs',
+    'action_msgs': 'ros-jazzy-action-msgs',
+    'builtin_interfaces': 'ros-jazzy-builtin-interfaces',
+    'control_msgs': 'ros-jazzy-control-msgs',
+    'trajectory_msgs': 'ros-jazzy-trajectory-msgs',
+    'visualization_msgs': 'ros-jazzy-visualization-msgs',
 }
 """Key -> the package of Ubuntu 24.04, ROS Jazzy or PyPI that rosdep installs for it."""
 EXTRAS = {'dask', 'foxglove'}
 """Installed by those who ask for the extra of that name; the code goes without."""
-READ_SETUP = '''
+READ_SETUP = """
 import json, setuptools
 from distutils.core import run_setup
 found = run_setup('setup.py', stop_after='init')
 print(json.dumps({'name': found.get_name(), 'version': found.get_version(), 'packages': found.packages, 'requires': found.install_requires,
                   'scripts': found.entry_points['console_scripts'], 'data': found.data_files, 'extras': found.extras_require, 'license': found.get_license()}))
-'''
+"""
 
 
 @pytest.fixture(scope='module')
 def installed():
     """What setup.py declares."""
-    done = subprocess.run([sys.executable, '-c', READ_SETUP], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, '-c', READ_SETUP],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -111,15 +159,32 @@ def test_manifest_set_up_and_module_agree(manifest, installed):
 
 def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
     """By the table, and by rosdep itself where it is installed and has its lists."""
-    keys = {dependency.name for dependency in (*manifest.exec_depends, *manifest.test_depends, *manifest.build_depends)}
+    keys = {
+        dependency.name
+        for dependency in (*manifest.exec_depends, *manifest.test_depends, *manifest.build_depends)
+    }
     assert keys <= set(NOBLE), keys - set(NOBLE)
     rosdep = shutil.which('rosdep')
-    known = rosdep and subprocess.run([rosdep, 'resolve', 'python3-numpy', '--os=ubuntu:noble'], capture_output=True, text=True, timeout=120)
+    known = rosdep and subprocess.run(
+        [rosdep, 'resolve', 'python3-numpy', '--os=ubuntu:noble'],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     if not known or known.returncode:
         return
     for key in sorted(keys):
-        done = subprocess.run([rosdep, 'resolve', key, '--rosdistro=jazzy', '--os=ubuntu:noble'], capture_output=True, text=True, timeout=120)
-        assert done.returncode == 0 and NOBLE[key] in done.stdout.split(), (key, done.stdout, done.stderr)
+        done = subprocess.run(
+            [rosdep, 'resolve', key, '--rosdistro=jazzy', '--os=ubuntu:noble'],
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == 0 and NOBLE[key] in done.stdout.split(), (
+            key,
+            done.stdout,
+            done.stderr,
+        )
 
 
 OPTIONAL = {'dask', 'distributed', 'foxglove'}
@@ -140,19 +205,39 @@ def test_console_scripts_are_those_of_the_contract_and_exist(installed):
         module, function = target.split(':')
         path = ROOT.joinpath(*module.split('.'))
         path = path / '__init__.py' if path.is_dir() else path.with_suffix('.py')
-        names = {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)}
+        names = {
+            node.name
+            for node in ast.parse(path.read_text()).body
+            if isinstance(node, ast.FunctionDef)
+        }
         assert function in names, target
 
 
 @pytest.mark.live
 def test_every_python_package_and_data_file_is_installed(installed):
-    folders = {path.parent for package in ('imu_calibration', 'msg_adapters') for path in (ROOT / package).rglob('*.py')}
-    assert set(installed['packages']) == {'.'.join(folder.relative_to(ROOT).parts) for folder in folders}
+    folders = {
+        path.parent
+        for package in ('imu_calibration', 'msg_adapters')
+        for path in (ROOT / package).rglob('*.py')
+    }
+    assert set(installed['packages']) == {
+        '.'.join(folder.relative_to(ROOT).parts) for folder in folders
+    }
     listed = {name for _, names in installed['data'] for name in names}
-    present = {str(path.relative_to(ROOT)) for pattern in ('config/*', 'launch/*.launch.py') for path in ROOT.glob(pattern)}
+    present = {
+        str(path.relative_to(ROOT))
+        for pattern in ('config/*', 'launch/*.launch.py')
+        for path in ROOT.glob(pattern)
+    }
     assert present | {'package.xml', 'resource/imu_calibration'} == listed
-    others = {path for path in (ROOT / 'imu_calibration').rglob('*') if path.is_file() and path.suffix not in ('.py', '.pyc')}
-    assert {str(path.parent.relative_to(ROOT)) for path in others} <= {'imu_calibration/report/templates'}
+    others = {
+        path
+        for path in (ROOT / 'imu_calibration').rglob('*')
+        if path.is_file() and path.suffix not in ('.py', '.pyc')
+    }
+    assert {str(path.parent.relative_to(ROOT)) for path in others} <= {
+        'imu_calibration/report/templates'
+    }
 
 
 @pytest.mark.live
@@ -161,7 +246,9 @@ def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
     lines = pinned(name)
     for line in lines:
         requirement, _, reason = line.partition('#')
-        assert re.fullmatch(r'[\w.-]+==[\w.]+(; python_version < "3\.\d+")?', requirement.strip()), line
+        assert re.fullmatch(
+            r'[\w.-]+==[\w.]+(; python_version < "3\.\d+")?', requirement.strip()
+        ), line
         assert len(reason.split()) >= 2, f'why is this needed? {line}'
     names = [distribution(line) for line in lines]
     assert len(names) == len(set(names))
@@ -170,8 +257,13 @@ def test_every_requirement_is_pinned_once_with_a_reason(name, installed):
 
 @pytest.mark.live
 def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
-    oldest, newest = ({distribution(line): re.search(r'==([\w.]+)', line).group(1) for line in pinned(name)} for name in ('oldest.txt', 'pypi.txt'))
-    extras = [requirement for requirements in installed['extras'].values() for requirement in requirements]
+    oldest, newest = (
+        {distribution(line): re.search(r'==([\w.]+)', line).group(1) for line in pinned(name)}
+        for name in ('oldest.txt', 'pypi.txt')
+    )
+    extras = [
+        requirement for requirements in installed['extras'].values() for requirement in requirements
+    ]
     for requirement in [*installed['requires'], *extras]:
         name, least = re.match(r'([\w.-]+)>=([\d.]+)', requirement).groups()
         tested = (oldest if distribution(name) in oldest else newest)[distribution(name)]
@@ -190,25 +282,33 @@ def test_every_file_that_a_make_target_runs_exists():
     assert {script for script in scripts if not (ROOT / script).is_file()} == set()
 
 
-@pytest.mark.parametrize('path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    'path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name
+)
 def test_launch_files_name_executables_and_config_files_that_exist(path):
     text = path.read_text()
     ast.parse(text)
     nodes = set(re.findall(r'\b(\w+_node)\b', text)) - FOREIGN
     assert nodes and nodes <= EXECUTABLES
-    files = set(re.findall(r"CONFIG, '(\w+\.yaml)'", text)) | ({f'{node}.yaml' for node in nodes} if "{name}.yaml" in text else set())
+    files = set(re.findall(r"CONFIG, '(\w+\.yaml)'", text)) | (
+        {f'{node}.yaml' for node in nodes} if '{name}.yaml' in text else set()
+    )
     assert files and all((ROOT / 'config' / name).is_file() for name in files)
 
 
 def test_node_parameter_files_hold_one_documented_set_for_any_node_name():
     for path in (ROOT / 'config').glob('*_node.yaml'):
         assert path.stem in EXECUTABLES
-        (name, group), = yaml.safe_load(path.read_text()).items()
+        ((name, group),) = yaml.safe_load(path.read_text()).items()
         assert name == '/**' and set(group) == {'ros__parameters'}
         lines = path.read_text().splitlines()
         for parameter in group['ros__parameters']:
-            row = next(i for i, line in enumerate(lines) if line.strip().startswith(f'{parameter}:'))
-            assert lines[row - 1].strip().startswith('#') or '#' in lines[row], f'{path.name}: {parameter} has no comment'
+            row = next(
+                i for i, line in enumerate(lines) if line.strip().startswith(f'{parameter}:')
+            )
+            assert lines[row - 1].strip().startswith('#') or '#' in lines[row], (
+                f'{path.name}: {parameter} has no comment'
+            )
 
 
 def test_links_of_the_documents_lead_somewhere():
@@ -227,7 +327,9 @@ def test_an_unknown_config_file_is_refused_with_those_there_are():
         resources.config_file('nothing.yaml')
 
 
-@pytest.mark.parametrize('layout', ['lib/python3.11/site-packages', 'local/lib/python3.12/dist-packages'])
+@pytest.mark.parametrize(
+    'layout', ['lib/python3.11/site-packages', 'local/lib/python3.12/dist-packages']
+)
 def test_an_installation_answers_for_itself(tmp_path, monkeypatch, layout):
     def share(prefix):
         (prefix / 'share' / resources.PACKAGE / 'config').mkdir(parents=True)
@@ -236,36 +338,75 @@ def test_an_installation_answers_for_itself(tmp_path, monkeypatch, layout):
 
     own, other = share(tmp_path / 'own'), share(tmp_path / 'other')
     monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path / 'other'))
-    monkeypatch.setattr(resources, '__file__', str(tmp_path / 'own' / layout / resources.PACKAGE / 'resources.py'))
+    monkeypatch.setattr(
+        resources, '__file__', str(tmp_path / 'own' / layout / resources.PACKAGE / 'resources.py')
+    )
     assert resources.share_folder() == own
-    monkeypatch.setattr(resources, '__file__', str(tmp_path / 'elsewhere' / resources.PACKAGE / 'resources.py'))
+    monkeypatch.setattr(
+        resources, '__file__', str(tmp_path / 'elsewhere' / resources.PACKAGE / 'resources.py')
+    )
     assert resources.share_folder() == other
 
 
 def test_the_tolerances_file_covers_the_catalogue_with_its_defaults():
     listed = yaml.safe_load((ROOT / 'config' / 'tolerances.yaml').read_text())
-    flat = {(sensor, name): value for sensor, group in listed.items() for name, value in group.items()}
-    declared = {(effect.sensor, effect.name): effect.tolerance for effect in CATALOGUE.effects().values()}
+    flat = {
+        (sensor, name): value for sensor, group in listed.items() for name, value in group.items()
+    }
+    declared = {
+        (effect.sensor, effect.name): effect.tolerance for effect in CATALOGUE.effects().values()
+    }
     assert flat == pytest.approx(declared, rel=1e-5)
 
 
 def test_the_map_has_each_verb_and_functions_that_exist():
-    rows = [line.split(' | ') for line in (ROOT / 'CONTRIBUTING.md').read_text().split('## Map')[1].split('## ')[0].splitlines() if line.startswith('| ')]
-    verbs = {verb for row in rows[2:] for verb in row[0].strip('| ').split(', ')} - {'table', 'by hand'}
+    rows = [
+        line.split(' | ')
+        for line in (ROOT / 'CONTRIBUTING.md')
+        .read_text()
+        .split('## Map')[1]
+        .split('## ')[0]
+        .splitlines()
+        if line.startswith('| ')
+    ]
+    verbs = {verb for row in rows[2:] for verb in row[0].strip('| ').split(', ')} - {
+        'table',
+        'by hand',
+    }
     assert verbs == set(VERBS)
     for name in re.findall(r'`([a-z_.0-9]+\.\w+)`', ''.join(row[1] for row in rows[2:])):
         module, _, function = name.rpartition('.')
-        assert callable(getattr(import_module(module if module.startswith('msg_adapters') else f'imu_calibration.{module}'), function)), name
+        assert callable(
+            getattr(
+                import_module(
+                    module if module.startswith('msg_adapters') else f'imu_calibration.{module}'
+                ),
+                function,
+            )
+        ), name
 
 
 @pytest.mark.parametrize('folder', ['examples', 'benchmarks', 'validation', 'tools'])
 def test_scripts_import_names_that_the_package_has(folder):
     """No lane runs every script; a name that was moved or removed would be noticed by a user first."""
+
     def known(module, name):
-        return hasattr(found := import_module(module), name) or hasattr(found, '__path__') and find_spec(f'{module}.{name}') is not None
+        return (
+            hasattr(found := import_module(module), name)
+            or hasattr(found, '__path__')
+            and find_spec(f'{module}.{name}') is not None
+        )
+
     lacking = []
     for path in sorted((ROOT / folder).rglob('*.py')):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or '').split('.')[0] in ('imu_calibration', 'msg_adapters'):
-                lacking += [f'{path.name}: {node.module}.{alias.name}' for alias in node.names if not known(node.module, alias.name)]
+            if isinstance(node, ast.ImportFrom) and (node.module or '').split('.')[0] in (
+                'imu_calibration',
+                'msg_adapters',
+            ):
+                lacking += [
+                    f'{path.name}: {node.module}.{alias.name}'
+                    for alias in node.names
+                    if not known(node.module, alias.name)
+                ]
     assert not lacking

@@ -14,29 +14,52 @@ POSITIONAL = ('settings.py',)
 
 def modules():
     """Path of every module."""
-    return [path for folder in ('imu_calibration', 'msg_adapters') for path in sorted((ROOT / folder).rglob('*.py'))]
+    return [
+        path
+        for folder in ('imu_calibration', 'msg_adapters')
+        for path in sorted((ROOT / folder).rglob('*.py'))
+    ]
 
 
 def public_functions(path):
     """Yield (function, its arguments without self) of the functions, methods and constructors that others may call."""
     for node in ast.parse(path.read_text()).body:
-        inside = node.body if isinstance(node, ast.ClassDef) and not node.name.startswith('_') else [node]
+        inside = (
+            node.body
+            if isinstance(node, ast.ClassDef) and not node.name.startswith('_')
+            else [node]
+        )
         for entry in inside:
-            if isinstance(entry, ast.FunctionDef) and (not entry.name.startswith('_') or entry.name in ('__init__', '__call__') and entry is not node):
-                bound = entry is not node and not any(getattr(mark, 'id', '') == 'staticmethod' for mark in entry.decorator_list)
+            if isinstance(entry, ast.FunctionDef) and (
+                not entry.name.startswith('_')
+                or entry.name in ('__init__', '__call__')
+                and entry is not node
+            ):
+                bound = entry is not node and not any(
+                    getattr(mark, 'id', '') == 'staticmethod' for mark in entry.decorator_list
+                )
                 yield entry, [*entry.args.posonlyargs, *entry.args.args][bound:]
 
 
 @pytest.mark.parametrize('path', modules(), ids=lambda path: path.stem)
 def test_it_says_its_types(path):
-    found = [f'{entry.name} (line {entry.lineno})' for entry, arguments in public_functions(path)
-             if any(argument.annotation is None for argument in arguments + entry.args.kwonlyargs)
-             or entry.returns is None and (entry.name != '__init__' or not arguments + entry.args.kwonlyargs)]
+    found = [
+        f'{entry.name} (line {entry.lineno})'
+        for entry, arguments in public_functions(path)
+        if any(argument.annotation is None for argument in arguments + entry.args.kwonlyargs)
+        or entry.returns is None
+        and (entry.name != '__init__' or not arguments + entry.args.kwonlyargs)
+    ]
     assert not found, f'annotate {", ".join(found)}'
 
 
-@pytest.mark.parametrize('path', [path for path in modules() if path.name not in POSITIONAL], ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    'path', [path for path in modules() if path.name not in POSITIONAL], ids=lambda path: path.stem
+)
 def test_what_comes_after_the_third_argument_is_named(path):
-    found = [f'{entry.name} (line {entry.lineno})' for entry, arguments in public_functions(path)
-             if len([argument for argument in arguments if argument.arg not in XYZ]) > 3]
+    found = [
+        f'{entry.name} (line {entry.lineno})'
+        for entry, arguments in public_functions(path)
+        if len([argument for argument in arguments if argument.arg not in XYZ]) > 3
+    ]
     assert not found, f'put a * behind the third argument of {", ".join(found)}'

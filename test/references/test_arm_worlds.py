@@ -29,13 +29,27 @@ def world():
 @pytest.mark.long
 def test_an_imu_is_calibrated_on_an_arm_with_wrong_joints(world):
     errors, calibration = deviations(world)
-    assert np.abs(list(errors.values())).max() < 4.5 and np.mean(np.square(list(errors.values()))) < 2.0
+    assert (
+        np.abs(list(errors.values())).max() < 4.5
+        and np.mean(np.square(list(errors.values()))) < 2.0
+    )
     status = dict(zip(calibration.param_names, calibration.status, strict=True))
     # Three parallel axes: their zeros are one angle, which the last of them carries.
-    assert [status[f'reference.encoder_zero.{name}'] for name in ('lift', 'elbow', 'wrist_1')] == [HELD, HELD, WEAK]
+    assert [status[f'reference.encoder_zero.{name}'] for name in ('lift', 'elbow', 'wrist_1')] == [
+        HELD,
+        HELD,
+        WEAK,
+    ]
     assert calibration.gauge['zeros_as_described'] == ['pan', 'wrist_3']
-    mixed = [direction['parameters'] for direction in calibration.undetermined if 'reference.encoder_zero.lift' in direction['parameters']]
-    assert any({'reference.encoder_zero.lift', 'reference.encoder_zero.elbow'} <= set(parameters) for parameters in mixed)
+    mixed = [
+        direction['parameters']
+        for direction in calibration.undetermined
+        if 'reference.encoder_zero.lift' in direction['parameters']
+    ]
+    assert any(
+        {'reference.encoder_zero.lift', 'reference.encoder_zero.elbow'} <= set(parameters)
+        for parameters in mixed
+    )
 
 
 @pytest.mark.long
@@ -45,7 +59,15 @@ def test_joints_taken_at_their_word_spoil_the_calibration(world):
     errors = []
     for options in (CalibrationOptions(), CalibrationOptions(reference_model='table_tilt')):
         calibration = calibrate([lambda: iter([world.block])], world.table, options).calibration
-        found = dict(zip(calibration.param_names, zip(calibration.values, calibration.sd, strict=True), strict=True))
-        errors.append(np.array([(found[name][0] - value, found[name][1]) for name, value in true.items()]))
+        found = dict(
+            zip(
+                calibration.param_names,
+                zip(calibration.values, calibration.sd, strict=True),
+                strict=True,
+            )
+        )
+        errors.append(
+            np.array([(found[name][0] - value, found[name][1]) for name, value in true.items()])
+        )
     assert np.std(errors[1][:, 0]) > 8 * np.std(errors[0][:, 0])
     assert np.mean(np.square(errors[1][:, 0] / errors[1][:, 1])) < 4

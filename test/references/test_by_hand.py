@@ -20,11 +20,25 @@ from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.equations import GravityRows, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence
 from imu_calibration.references.gravity.hand_calibration import GAUGE, calibrate_by_hand
-from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions, KnownTurn, hand_options
+from imu_calibration.references.gravity.hand_parameters import (
+    HandModel,
+    HandOptions,
+    KnownTurn,
+    hand_options,
+)
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.choices import calibration_options
 
-from worlds.hand_sessions import FACES, GRAVITY, NOMINAL, PARAM_NAMES, random_truth, simulate, turn_samples, unpack
+from worlds.hand_sessions import (
+    FACES,
+    GRAVITY,
+    NOMINAL,
+    PARAM_NAMES,
+    random_truth,
+    simulate,
+    turn_samples,
+    unpack,
+)
 
 
 def differences(found, truth):
@@ -36,11 +50,16 @@ def differences(found, truth):
 
 # identities and Jacobians
 
+
 def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
     rng = np.random.default_rng(1)
     time = np.cumsum(rng.uniform(0.008, 0.012, 300))
     rate, force = rng.normal(0, 2, (300, 3)), rng.normal(0, 9, (300, 3))
-    bias, matrix, response = rng.normal(0, 0.1, 3), np.eye(3) + rng.normal(0, 0.05, (3, 3)), rng.normal(0, 1e-3, (3, 3))
+    bias, matrix, response = (
+        rng.normal(0, 0.1, 3),
+        np.eye(3) + rng.normal(0, 0.05, (3, 3)),
+        rng.normal(0, 1e-3, (3, 3)),
+    )
 
     def further(response):
         return force @ response.T, np.einsum('ip,nq->nipq', np.eye(3), force).reshape(300, 3, 9)
@@ -49,32 +68,59 @@ def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
     true = np.linalg.solve(matrix, (rate - bias - force @ response.T).T).T
     step = np.diff(time)[:, None]
     slope = np.gradient(true, time, axis=0)
-    vectors = 0.5 * step * (true[1:] + true[:-1]) + step**2 / 12 * (np.cross(true[:-1], true[1:]) - np.diff(slope, axis=0))
+    vectors = 0.5 * step * (true[1:] + true[:-1]) + step**2 / 12 * (
+        np.cross(true[:-1], true[1:]) - np.diff(slope, axis=0)
+    )
     attitude = Rotation.identity()
     for vector in vectors:
         attitude = attitude * Rotation.from_rotvec(vector)
     np.testing.assert_allclose(turn.mat_ji, attitude.as_matrix().T, atol=1e-12)
 
     def psi(bias, matrix, response):
-        return -Rotation.from_matrix(integrate_turn(time, rate, bias=bias, matrix=matrix, further=further(response)).mat_ji @ turn.mat_ji.T).as_rotvec()
+        return -Rotation.from_matrix(
+            integrate_turn(time, rate, bias=bias, matrix=matrix, further=further(response)).mat_ji
+            @ turn.mat_ji.T
+        ).as_rotvec()
 
     def slope(make, size=1e-6):
-        return np.stack([(psi(*make(size * e)) - psi(*make(-size * e))) / (2 * size) for e in np.eye(9)], axis=1)
+        return np.stack(
+            [(psi(*make(size * e)) - psi(*make(-size * e))) / (2 * size) for e in np.eye(9)], axis=1
+        )
 
-    np.testing.assert_allclose(slope(lambda e: (bias + e[:3], matrix, response))[:, :3], turn.by_bias, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        slope(lambda e: (bias + e[:3], matrix, response))[:, :3], turn.by_bias, rtol=1e-6, atol=1e-8
+    )
     by_matrix, by_response = turn.by_matrix.reshape(3, 9), turn.by_further
-    np.testing.assert_allclose(slope(lambda e: (bias, matrix + e.reshape(3, 3), response)), by_matrix, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(slope(lambda e: (bias, matrix, response + e.reshape(3, 3))), by_response, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        slope(lambda e: (bias, matrix + e.reshape(3, 3), response)), by_matrix, rtol=1e-6, atol=1e-7
+    )
+    np.testing.assert_allclose(
+        slope(lambda e: (bias, matrix, response + e.reshape(3, 3))),
+        by_response,
+        rtol=1e-6,
+        atol=1e-6,
+    )
 
 
 def test_turn_is_of_third_order_in_the_step():
     """Halving the step lowers the error by about eight; straight lines between the rates would give four and start at 8e-4."""
     errors = []
     for period in (0.04, 0.02):
-        attitude, rate = turn_samples(Rotation.identity(), [1.5, -0.5, 0.8], [0.3, 0.5, -0.2], period, 1.6)
+        attitude, rate = turn_samples(
+            Rotation.identity(), [1.5, -0.5, 0.8], [0.3, 0.5, -0.2], period, 1.6
+        )
         rest = np.zeros((1, 3))
-        turn = integrate_turn(period * np.arange(len(rate) + 2), np.concatenate([rest, rate, rest]), bias=np.zeros(3), matrix=np.eye(3))
-        errors.append(Rotation.from_matrix(turn.mat_ji @ Rotation.from_rotvec([1.5, -0.5, 0.8]).as_matrix()).magnitude())
+        turn = integrate_turn(
+            period * np.arange(len(rate) + 2),
+            np.concatenate([rest, rate, rest]),
+            bias=np.zeros(3),
+            matrix=np.eye(3),
+        )
+        errors.append(
+            Rotation.from_matrix(
+                turn.mat_ji @ Rotation.from_rotvec([1.5, -0.5, 0.8]).as_matrix()
+            ).magnitude()
+        )
     assert errors[0] < 3e-4 and errors[1] < errors[0] / 7
 
 
@@ -92,8 +138,15 @@ def test_system_is_the_derivative_of_its_residuals():
     up = rng.normal(size=(3, 3))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     state = State(laid_out(random_truth(rng, 1e-3)), up, rng.normal(0, 0.01, (3, 3)))
-    poses = Poses(rng.normal(0, 9, (3, 3)), rng.normal(0, 0.1, (3, 3)), np.full((3, 3), 0.01), np.full((3, 3), 0.001), np.arange(3),
-                  np.arange(3) + 1, np.arange(3.0))
+    poses = Poses(
+        rng.normal(0, 9, (3, 3)),
+        rng.normal(0, 0.1, (3, 3)),
+        np.full((3, 3), 0.01),
+        np.full((3, 3), 0.001),
+        np.arange(3),
+        np.arange(3) + 1,
+        np.arange(3.0),
+    )
     time = 0.01 * np.arange(100)
     data = [time, rng.normal(0, 1, (100, 3)), np.tile(rng.normal(0, 9, 3), (100, 1))]
     known = TurnData(*data, rotation=np.array([0.1, 0.2, 0.9]), rotation_cov=np.diag([1, 2, 3.0]))
@@ -105,17 +158,28 @@ def test_system_is_the_derivative_of_its_residuals():
     slopes = []
     for step in size * np.eye(design.shape[1]):
         # rows at the true force: the response to the accelerometer's own parameters through the g-sensitivity is left out on purpose
-        ahead, behind = (GravityRows(FULL, poses, turns).linearise(reference.moved(state, s * step)).residual for s in (1, -1))
+        ahead, behind = (
+            GravityRows(FULL, poses, turns).linearise(reference.moved(state, s * step)).residual
+            for s in (1, -1)
+        )
         slopes.append(-(ahead - behind) / (2 * size))
     slopes = np.array(slopes).T
     accelerometer, fixed = np.arange(15, 27), 15 + np.flatnonzero(FULL.fixed)
     rest = np.setdiff1d(np.arange(design.shape[1]), accelerometer)
     static = system.component == 0
-    np.testing.assert_allclose(np.delete(design[static], fixed, axis=1), np.delete(slopes[static], fixed, axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        np.delete(design[static], fixed, axis=1),
+        np.delete(slopes[static], fixed, axis=1),
+        atol=1e-6,
+    )
     assert not design[:, fixed].any()
     # tangent planes turn with the direction after a turn: to first order only where the turn already fits, so not compared there
     directions = np.arange(15).reshape(3, 5)[:, :2]
-    np.testing.assert_allclose(design[:, np.setdiff1d(rest, directions)], slopes[:, np.setdiff1d(rest, directions)], atol=2e-6)
+    np.testing.assert_allclose(
+        design[:, np.setdiff1d(rest, directions)],
+        slopes[:, np.setdiff1d(rest, directions)],
+        atol=2e-6,
+    )
 
 
 def test_norm_rows_are_minus_the_derivative_of_the_norm():
@@ -124,7 +188,9 @@ def test_norm_rows_are_minus_the_derivative_of_the_norm():
     columns = FULL.norm_rows(values, force)[1]
     for k in FULL.base_index('accelerometer'):
         step = 1e-6 * np.eye(FULL.size)[k]
-        slope = (FULL.norm_rows(values + step, force)[0] - FULL.norm_rows(values - step, force)[0]) / 2e-6
+        slope = (
+            FULL.norm_rows(values + step, force)[0] - FULL.norm_rows(values - step, force)[0]
+        ) / 2e-6
         np.testing.assert_allclose(columns[:, k], -slope, rtol=1e-6, atol=1e-7)
 
 
@@ -133,8 +199,14 @@ def test_scatter_is_found_beside_the_noise():
     noise, group = rng.uniform(0.5, 1.5, 4000), np.repeat([0, 1, -1, 0], 1000)
     design = rng.normal(size=(4000, 5))
     error = rng.normal(size=4000) * np.sqrt(noise + np.array([2.0, 0.0, 0.0])[group])
-    found = estimate_group_variances(design, design @ np.ones(5) + error, noise, group=group, start=np.array([1.0, 1.0]),
-                                     fallback=np.array([9.0, 9.0]))
+    found = estimate_group_variances(
+        design,
+        design @ np.ones(5) + error,
+        noise,
+        group=group,
+        start=np.array([1.0, 1.0]),
+        fallback=np.array([9.0, 9.0]),
+    )
     assert abs(found.variance[0] - 2.0) < 4 * 3.0 * np.sqrt(2 / 2000)
     assert found.variance[1] < 0.2
     assert 1900 < found.dof[0] < 2100
@@ -142,8 +214,11 @@ def test_scatter_is_found_beside_the_noise():
 
 # recovery of the truth
 
+
 def test_noise_free_recording_gives_the_truth():
-    imu, ranges, truth = simulate(5, force_sd=1e-9, rate_sd=1e-9, still=0.5, period=0.005, duration=1.0)
+    imu, ranges, truth = simulate(
+        5, force_sd=1e-9, rate_sd=1e-9, still=0.5, period=0.005, duration=1.0
+    )
     error, _ = differences(calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), truth)
     assert np.max(np.abs(error[:9])) < 1e-7  # poses alone: only the 1e-9 noise
     assert np.max(np.abs(error[9:])) < 1e-6  # the integration's error at 5 ms
@@ -160,11 +235,15 @@ def test_reported_sd_are_honest(seeds, sensitivity):
     """
     normalised, inside = [], []
     for seed in range(seeds):
-        imu, ranges, truth = simulate(seed, n_poses=14, pose_sd=0.003, drift_sd=3e-4, sensitivity=sensitivity)
+        imu, ranges, truth = simulate(
+            seed, n_poses=14, pose_sd=0.003, drift_sd=3e-4, sensitivity=sensitivity
+        )
         error, covariance = differences(calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), truth)
         normalised.append(error @ np.linalg.solve(covariance, error) / len(error))
         inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(covariance)))
-    print(f'mean normalised squared error {np.mean(normalised):.3f}, 95 % intervals hold {100 * np.mean(inside):.1f} %')
+    print(
+        f'mean normalised squared error {np.mean(normalised):.3f}, 95 % intervals hold {100 * np.mean(inside):.1f} %'
+    )
     assert 0.8 < np.mean(normalised) < 1.3
     assert 0.91 < np.mean(inside) < 0.985
 
@@ -192,7 +271,9 @@ def test_nine_poses_are_widened_by_student_s_t():
 
 def test_the_error_of_a_scatter_is_that_of_student_s_t():
     """Ratio of the 97.5 % quantiles with 3, 10 and 30 degrees of freedom: 3.182, 2.228 and 2.042 over 1.960 (tables)."""
-    np.testing.assert_allclose(np.sqrt(student_factor(np.array([3.0, 10.0, 30.0]))), [1.6236, 1.1368, 1.0420], rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(student_factor(np.array([3.0, 10.0, 30.0]))), [1.6236, 1.1368, 1.0420], rtol=1e-3
+    )
 
 
 def test_misfit_of_inseparable_groups_counts_for_each():
@@ -200,10 +281,23 @@ def test_misfit_of_inseparable_groups_counts_for_each():
     rng = np.random.default_rng(3)
     design, group = np.tile(np.eye(8), (2, 1)), np.repeat([0, 1], 8)
     residual = np.concatenate([rng.normal(0, 3.0, 8), np.zeros(8)])
-    found = estimate_group_variances(design, residual, np.full(16, 1e-4), group=group, start=np.ones(2) * 1e-4, fallback=np.ones(2) * 1e-4)
+    found = estimate_group_variances(
+        design,
+        residual,
+        np.full(16, 1e-4),
+        group=group,
+        start=np.ones(2) * 1e-4,
+        fallback=np.ones(2) * 1e-4,
+    )
     assert np.all(found.upper >= found.variance)
-    few = estimate_group_variances(design[:11], residual[:11], np.full(11, 1e-4), group=group[:11], start=np.ones(2) * 1e-4,
-                                   fallback=np.ones(2) * 1e-4)
+    few = estimate_group_variances(
+        design[:11],
+        residual[:11],
+        np.full(11, 1e-4),
+        group=group[:11],
+        start=np.ones(2) * 1e-4,
+        fallback=np.ones(2) * 1e-4,
+    )
     assert few.dof.max() < 2 and np.all(few.upper > 1.0)
 
 
@@ -211,31 +305,45 @@ def test_misfit_of_inseparable_groups_counts_for_each():
 def test_coarse_readings_have_the_noise_of_rounding(step):
     """Readings that are constant in every pose: their means are known to step / sqrt(12); before, to 1e-8 of the reading."""
     imu, ranges, truth = simulate([16, 6], n_poses=14, force_sd=0.002)
-    found = calibrate_by_hand(replace(imu, force_s=step * np.round(imu.force_s / step)), HandOptions(GRAVITY), ranges)
+    found = calibrate_by_hand(
+        replace(imu, force_s=step * np.round(imu.force_s / step)), HandOptions(GRAVITY), ranges
+    )
     np.testing.assert_allclose(found.poses.force_sem.max(), step / np.sqrt(12), rtol=0.01)
     np.testing.assert_allclose(found.statistics['force_noise_sd'], step / np.sqrt(12), rtol=0.01)
     error, covariance = differences(found, truth)
     assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(covariance)))
     fine = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
-    np.testing.assert_allclose(fine.statistics['force_noise_sd'], 0.002, rtol=0.1)   # steps far below the noise change nothing
+    np.testing.assert_allclose(
+        fine.statistics['force_noise_sd'], 0.002, rtol=0.1
+    )  # steps far below the noise change nothing
 
 
 def test_counts_give_the_same_as_si():
     imu, ranges, _ = simulate(6)
     nominal = NominalScaling(32768, 415, (32768, 32000, 33000), 4770)
-    counts = ImuSamples(imu.stamp_ns, imu.force_s * 415 + 32768, imu.rate_s * 4770 + np.array([32768, 32000, 33000]))
+    counts = ImuSamples(
+        imu.stamp_ns, imu.force_s * 415 + 32768, imu.rate_s * 4770 + np.array([32768, 32000, 33000])
+    )
     found = calibrate_by_hand(nominal.apply(counts), HandOptions(GRAVITY), ranges)
-    np.testing.assert_allclose(found.values, calibrate_by_hand(imu, HandOptions(GRAVITY), ranges).values, atol=1e-8)
+    np.testing.assert_allclose(
+        found.values, calibrate_by_hand(imu, HandOptions(GRAVITY), ranges).values, atol=1e-8
+    )
 
 
 def test_wrong_gravity_is_a_common_scale_and_its_sd_goes_there():
     imu, ranges, _ = simulate(7)
-    right, wrong = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), calibrate_by_hand(imu, HandOptions(1.01 * GRAVITY), ranges)
+    right, wrong = (
+        calibrate_by_hand(imu, HandOptions(GRAVITY), ranges),
+        calibrate_by_hand(imu, HandOptions(1.01 * GRAVITY), ranges),
+    )
     np.testing.assert_allclose(wrong.accelerometer[1] * 1.01, right.accelerometer[1], atol=1e-6)
     np.testing.assert_allclose(wrong.gyroscope[1], right.gyroscope[1], atol=1e-5)
     unsure = calibrate_by_hand(imu, HandOptions(GRAVITY, 0.02), ranges)
-    np.testing.assert_allclose(unsure.sd_of('accelerometer.matrix.xx')**2 - right.sd_of('accelerometer.matrix.xx')**2,
-                               (0.02 / GRAVITY * right.value('accelerometer.matrix.xx'))**2, rtol=1e-6)
+    np.testing.assert_allclose(
+        unsure.sd_of('accelerometer.matrix.xx') ** 2 - right.sd_of('accelerometer.matrix.xx') ** 2,
+        (0.02 / GRAVITY * right.value('accelerometer.matrix.xx')) ** 2,
+        rtol=1e-6,
+    )
     assert unsure.sd_of('accelerometer.bias.x') == right.sd_of('accelerometer.bias.x')
 
 
@@ -243,18 +351,34 @@ def test_gravity_follows_from_latitude_and_height():
     """Normal gravity of WGS 84 at 48.8 deg and 100 m (9.808959, pyins 1.0) with a relative sd of 1e-4, by hand as on a table."""
     imu, ranges, _ = simulate(7)
     options = hand_options(calibration_options({'latitude': 48.8, 'height': 100.0}))
-    assert options.gravity == pytest.approx(normal_gravity(48.8, 100.0), abs=1e-9) and options.gravity_sd == pytest.approx(1e-4 * options.gravity)
-    unsure, sure = (calibrate_by_hand(imu, HandOptions(options.gravity, sd), ranges) for sd in (options.gravity_sd, 0.0))
+    assert options.gravity == pytest.approx(
+        normal_gravity(48.8, 100.0), abs=1e-9
+    ) and options.gravity_sd == pytest.approx(1e-4 * options.gravity)
+    unsure, sure = (
+        calibrate_by_hand(imu, HandOptions(options.gravity, sd), ranges)
+        for sd in (options.gravity_sd, 0.0)
+    )
     name = 'accelerometer.matrix.xx'
-    assert unsure.sd_of(name)**2 - sure.sd_of(name)**2 == pytest.approx((1e-4 * sure.value(name))**2, rel=1e-4)
+    assert unsure.sd_of(name) ** 2 - sure.sd_of(name) ** 2 == pytest.approx(
+        (1e-4 * sure.value(name)) ** 2, rel=1e-4
+    )
     live = LiveByHandSettings(latitude=48.8, height=100.0).at_place(CalibrationOptions())
     assert (live.gravity, live.gravity_sd) == (options.gravity, options.gravity_sd)
-    assert LiveByHandSettings(gravity=9.81, latitude=48.8).at_place(CalibrationOptions()).gravity == 9.81
+    assert (
+        LiveByHandSettings(gravity=9.81, latitude=48.8).at_place(CalibrationOptions()).gravity
+        == 9.81
+    )
     assert LiveByHandSettings().at_place(CalibrationOptions()).gravity is None
 
 
-@pytest.mark.parametrize('given, code, values', [({'latitude': 91.0}, 'place_impossible', (91,)), ({'height': 100.0}, 'latitude_missing', (100,)),
-                                                 ({'latitude': 48.0, 'gravity': 9.81}, 'gravity_twice', (48, 9.81))])
+@pytest.mark.parametrize(
+    'given, code, values',
+    [
+        ({'latitude': 91.0}, 'place_impossible', (91,)),
+        ({'height': 100.0}, 'latitude_missing', (100,)),
+        ({'latitude': 48.0, 'gravity': 9.81}, 'gravity_twice', (48, 9.81)),
+    ],
+)
 def test_impossible_places_are_refused(given, code, values):
     with refused(InputError, code, *values):
         calibration_options(given)
@@ -265,17 +389,25 @@ def test_axes_follow_the_gauge():
     found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
     assert GAUGE['axes'] == 'accelerometer_lower_triangular'
     for name in ('xy', 'xz', 'yz'):
-        assert found.value(f'accelerometer.matrix.{name}') == 0.0 and found.sd_of(f'accelerometer.matrix.{name}') == 0.0
+        assert (
+            found.value(f'accelerometer.matrix.{name}') == 0.0
+            and found.sd_of(f'accelerometer.matrix.{name}') == 0.0
+        )
 
 
 # what cannot be seen
+
 
 def face_attitudes(ups):
     """Attitudes in which `ups` (sensor frame) point up."""
     attitudes = []
     for up in np.array(ups, float):
         side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-        attitudes.append(Rotation.from_matrix([side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up]))
+        attitudes.append(
+            Rotation.from_matrix(
+                [side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up]
+            )
+        )
     return attitudes
 
 
@@ -305,7 +437,7 @@ def test_turns_about_one_axis_leave_the_others_weak_or_held():
     assert status['gyroscope.matrix.xx'] == 'determined'
     assert status['accelerometer.matrix.xx'] != 'determined'
     axis = missing_motion(found)[-1]['needs'].split(' deg about its ')[1].split(' axis')[0]
-    assert 'y' in axis or 'z' in axis   # a turn about x would show nothing new
+    assert 'y' in axis or 'z' in axis  # a turn about x would show nothing new
 
 
 def test_too_few_attitudes_are_refused_with_their_number():
@@ -330,6 +462,7 @@ def test_clipped_and_torn_turns_are_left_out():
 
 # further effects
 
+
 def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
     imu, ranges, truth = simulate(13, sensitivity=5e-4, drift_sd=1e-4, n_poses=15)
     found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
@@ -339,14 +472,26 @@ def test_g_sensitivity_enters_when_it_is_there_and_not_otherwise():
     without = calibrate_by_hand(imu, HandOptions(GRAVITY, gyroscope=('bias', 'matrix')), ranges)
     assert without.statistics['drift_scatter_sd'] > 5 * found.statistics['drift_scatter_sd']
     quiet = [simulate(seed, drift_sd=1e-4, n_poses=14)[:2] for seed in range(20, 25)]
-    assert not any('gyroscope.gyro_g_sensitivity.xx' in calibrate_by_hand(imu, HandOptions(GRAVITY), r).param_names for imu, r in quiet)
+    assert not any(
+        'gyroscope.gyro_g_sensitivity.xx'
+        in calibrate_by_hand(imu, HandOptions(GRAVITY), r).param_names
+        for imu, r in quiet
+    )
 
 
 def test_g_sensitivity_test_keeps_its_level():
     rng = np.random.default_rng(14)
     values = []
     for _ in range(500):
-        poses = Poses(rng.normal(0, 6, (15, 3)), rng.normal(0, 1e-4, (15, 3)), None, None, None, None, np.arange(15.0))
+        poses = Poses(
+            rng.normal(0, 6, (15, 3)),
+            rng.normal(0, 1e-4, (15, 3)),
+            None,
+            None,
+            None,
+            None,
+            np.arange(15.0),
+        )
         values.append(g_sensitivity_evidence(poses)['g_sensitivity_p_value'])
     assert abs(np.mean(np.array(values) < 0.05) - 0.05) < 0.04  # four sd of 500 trials
 
@@ -357,23 +502,32 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
     imu, ranges, truth = simulate(15, attitudes=tilts, wobble=0.0)
     _, rate = turn_samples(Rotation.identity(), [0, 0, 2 * np.pi], [0, 0, 0], 0.02, 4.0)
     bias_f, matrix_f, bias_w, matrix_w = unpack(truth)
-    extra = ImuSamples(imu.stamp_ns[-1] + 20_000_000 * np.arange(1, len(rate) + 1),
-                       np.tile(matrix_f @ [0, 0, GRAVITY] + bias_f, (len(rate), 1)), rate @ matrix_w.T + bias_w)
+    extra = ImuSamples(
+        imu.stamp_ns[-1] + 20_000_000 * np.arange(1, len(rate) + 1),
+        np.tile(matrix_f @ [0, 0, GRAVITY] + bias_f, (len(rate), 1)),
+        rate @ matrix_w.T + bias_w,
+    )
     both = ImuSamples.concatenate([imu, extra])
     turn = KnownTurn(len(imu), len(both), (0, 0, 1), 2 * np.pi)
-    before, after = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges), calibrate_by_hand(both, HandOptions(GRAVITY), ranges,
-                                                                                            known_turns=[turn])
+    before, after = (
+        calibrate_by_hand(imu, HandOptions(GRAVITY), ranges),
+        calibrate_by_hand(both, HandOptions(GRAVITY), ranges, known_turns=[turn]),
+    )
     name = 'gyroscope.matrix.zz'
     assert before.sd_of(name) > 5 * after.sd_of(name)
     assert abs(after.value(name) - truth[PARAM_NAMES.index(name)]) < 4 * after.sd_of(name)
-    assert after.sd_of(name) == pytest.approx(0.017 / (2 * np.pi), rel=0.2)  # a hand's degree in a full turn
+    assert after.sd_of(name) == pytest.approx(
+        0.017 / (2 * np.pi), rel=0.2
+    )  # a hand's degree in a full turn
 
 
 # real recordings
 
+
 def load(recordings, name, topic=None):
     from imu_calibration.calibration.hand_workflow import read_by_hand
     from msg_adapters.bag import open_recording
+
     return read_by_hand(open_recording(recordings / name, topic, want_joints=False).blocks()).imu
 
 
@@ -382,7 +536,7 @@ def heldout_norm_rms(imu, ranges, gravity, **options):
     kept = [r for k, r in enumerate(ranges) if k % 3]
     found = calibrate_by_hand(imu, HandOptions(gravity), kept, **options)
     left_out = np.array([imu.force_s[r].mean(0) for r in ranges[::3]])
-    return float(np.sqrt(np.mean(found.hand_model.norm_rows(found.values, left_out)[0]**2)))
+    return float(np.sqrt(np.mean(found.hand_model.norm_rows(found.values, left_out)[0] ** 2)))
 
 
 @pytest.mark.real_data
@@ -404,17 +558,23 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
     offset_w = np.degrees(bias_w - (np.array([32768, 32466, 32485]) - 32768) / 4770)
     held_out = heldout_norm_rms(imu, ranges, 9.81744)
     s = found.statistics
-    print(f'{len(ranges)} poses: offsets {np.round(offset_f, 1)} counts, scales {np.round(100 * scale_f, 2)} %, '
-          f'gyroscope {np.round(100 * scale_w, 2)} % and {np.round(offset_w, 2)} deg/s from the factory')
-    print(f'norm residual {1e3 * s["norm_residual_rms"]:.2f} mm/s^2, held out {1e3 * held_out:.2f}; '
-          f'chi2 per dof with white noise {s["norm_chi2_per_dof"]:.1f}, pose scatter {1e3 * s["pose_scatter_sd"]:.2f} mm/s^2, '
-          f'g-sensitivity p {s["g_sensitivity_p_value"]:.0e}, held-out ratio {s["g_sensitivity_heldout_ratio"]:.2f}, '
-          f'turn scatter {1e3 * s["turn_scatter_sd"]:.2f} mrad')
+    print(
+        f'{len(ranges)} poses: offsets {np.round(offset_f, 1)} counts, scales {np.round(100 * scale_f, 2)} %, '
+        f'gyroscope {np.round(100 * scale_w, 2)} % and {np.round(offset_w, 2)} deg/s from the factory'
+    )
+    print(
+        f'norm residual {1e3 * s["norm_residual_rms"]:.2f} mm/s^2, held out {1e3 * held_out:.2f}; '
+        f'chi2 per dof with white noise {s["norm_chi2_per_dof"]:.1f}, pose scatter {1e3 * s["pose_scatter_sd"]:.2f} mm/s^2, '
+        f'g-sensitivity p {s["g_sensitivity_p_value"]:.0e}, held-out ratio {s["g_sensitivity_heldout_ratio"]:.2f}, '
+        f'turn scatter {1e3 * s["turn_scatter_sd"]:.2f} mrad'
+    )
     assert 36 <= len(ranges) <= 40
     assert np.max(np.abs(offset_f)) < 10 and np.max(np.abs(scale_f)) < 0.003
     assert np.max(np.abs(scale_w)) < 0.005 and np.max(np.abs(offset_w)) < 0.5
     assert set(found.statuses) == {'determined', 'fixed'}
-    assert s['norm_chi2_per_dof'] > 5  # the scatter of the poses is real and unexplained: white noise alone would be far too sure
+    assert (
+        s['norm_chi2_per_dof'] > 5
+    )  # the scatter of the poses is real and unexplained: white noise alone would be far too sure
     assert held_out < 0.002
     # the gyroscopes' answer to gravity: chosen on the poses alone, it takes most of the scatter out of the turns, which took no part
     without = calibrate_by_hand(imu, HandOptions(9.81744, gyroscope=('bias', 'matrix')), ranges)
@@ -432,11 +592,15 @@ def test_mpu9150_by_hand(recordings, name):
     bias, matrix = found.accelerometer
     held_out = heldout_norm_rms(imu, ranges, found.gravity)
     norms = [np.linalg.norm(imu.force_s[r], axis=1) for r in ranges[::3]]
-    noise = float(np.sqrt(np.mean([norm.var() / norm.size for norm in norms])))  # of their means: rests of one to five seconds
-    print(f'{name}: {len(ranges)} poses, bias {np.round(bias, 4)} +- {np.round(found.sd[:3], 4)} m/s^2, '
-          f'norm residual {1e3 * found.statistics["norm_residual_rms"]:.2f} mm/s^2, '
-          f'before {1e3 * found.statistics["norm_residual_rms_before"]:.0f}, '
-          f'held out {1e3 * held_out:.2f} where noise alone leaves {1e3 * noise:.2f}')
+    noise = float(
+        np.sqrt(np.mean([norm.var() / norm.size for norm in norms]))
+    )  # of their means: rests of one to five seconds
+    print(
+        f'{name}: {len(ranges)} poses, bias {np.round(bias, 4)} +- {np.round(found.sd[:3], 4)} m/s^2, '
+        f'norm residual {1e3 * found.statistics["norm_residual_rms"]:.2f} mm/s^2, '
+        f'before {1e3 * found.statistics["norm_residual_rms_before"]:.0f}, '
+        f'held out {1e3 * held_out:.2f} where noise alone leaves {1e3 * noise:.2f}'
+    )
     if name == 'mpu9150_0':
         assert np.max(np.abs(bias - [0.1027, 0.0967, 0.3444])) < 0.010
     assert held_out < 2.5 * noise
@@ -453,7 +617,14 @@ def test_ferraris_sections_agree_with_the_closed_form(recordings):
     short by 1 deg its scale by 0.3 %. Cross-axis terms are not compared: six faces do not show them, and ours says so.
     """
     imu = load(recordings, 'ferraris')
-    sections = {'x_p': (540, 1271), 'x_a': (1620, 2361), 'y_p': (2814, 3298), 'y_a': (3740, 4152), 'z_p': (4522, 4975), 'z_a': (5376, 5983)}
+    sections = {
+        'x_p': (540, 1271),
+        'x_a': (1620, 2361),
+        'y_p': (2814, 3298),
+        'y_a': (3740, 4152),
+        'z_p': (4522, 4975),
+        'z_a': (5376, 5983),
+    }
     full_turns = {'x': (6770, 7093), 'y': (8081, 8405), 'z': (9205, 9512)}
     mean = {key: imu.force_s[slice(*part)].mean(0) for key, part in sections.items()}
     rest = np.mean([imu.rate_s[slice(*part)].mean(0) for part in sections.values()], axis=0)
@@ -462,12 +633,16 @@ def test_ferraris_sections_agree_with_the_closed_form(recordings):
         up, down = mean[f'{axis}_p'][k], mean[f'{axis}_a'][k]
         integral = np.sum(imu.rate_s[slice(*full_turns[axis]), k] - rest[k]) / 102.4
         scale = abs(integral) / (2 * np.pi)
-        print(f'{axis}: bias {found.value(f"accelerometer.bias.{axis}"):.4f} closed form {(up + down) / 2:.4f}, '
-              f'scale {found.value(f"accelerometer.matrix.{axis}{axis}"):.5f} closed form {(up - down) / 2 / found.gravity:.5f}, '
-              f'gyroscope {found.value(f"gyroscope.matrix.{axis}{axis}"):.4f} '
-              f'+- {found.sd_of(f"gyroscope.matrix.{axis}{axis}"):.4f}, turn {scale:.4f}')
+        print(
+            f'{axis}: bias {found.value(f"accelerometer.bias.{axis}"):.4f} closed form {(up + down) / 2:.4f}, '
+            f'scale {found.value(f"accelerometer.matrix.{axis}{axis}"):.5f} closed form {(up - down) / 2 / found.gravity:.5f}, '
+            f'gyroscope {found.value(f"gyroscope.matrix.{axis}{axis}"):.4f} '
+            f'+- {found.sd_of(f"gyroscope.matrix.{axis}{axis}"):.4f}, turn {scale:.4f}'
+        )
         assert abs(found.value(f'accelerometer.bias.{axis}') - (up + down) / 2) < 0.01
-        assert abs(np.linalg.norm(found.accelerometer[1][k]) - (up - down) / 2 / found.gravity) < 1e-3
+        assert (
+            abs(np.linalg.norm(found.accelerometer[1][k]) - (up - down) / 2 / found.gravity) < 1e-3
+        )
         assert abs(found.value(f'gyroscope.matrix.{axis}{axis}') - scale) < 0.015
     assert found.statuses[found.param_names.index('accelerometer.matrix.zx')] != 'determined'
 
@@ -483,8 +658,15 @@ def test_two_recordings_of_one_board_give_the_same_matrices(recordings):
             imu = load(recordings, name, f'/imu_{topic}/data_raw')
             pair.append(calibrate_by_hand(imu, stills=find_still(imu)))
         names = [n for n in pair[0].param_names if '.matrix.' in n and pair[0].sd_of(n) > 0]
-        scores.append([(pair[1].value(n) - pair[0].value(n)) / np.hypot(pair[0].sd_of(n), pair[1].sd_of(n)) for n in names])
+        scores.append(
+            [
+                (pair[1].value(n) - pair[0].value(n)) / np.hypot(pair[0].sd_of(n), pair[1].sd_of(n))
+                for n in names
+            ]
+        )
     scores = np.array(scores)
-    print(f'mean square of difference over sd: accelerometer {np.mean(scores[:, :6]**2):.2f}, gyroscope {np.mean(scores[:, 6:]**2):.2f}; '
-          f'largest {np.max(np.abs(scores)):.1f}')
-    assert np.mean(scores[:, :6]**2) < 2.5 and np.mean(scores[:, 6:]**2) < 2.5
+    print(
+        f'mean square of difference over sd: accelerometer {np.mean(scores[:, :6] ** 2):.2f}, gyroscope {np.mean(scores[:, 6:] ** 2):.2f}; '
+        f'largest {np.max(np.abs(scores)):.1f}'
+    )
+    assert np.mean(scores[:, :6] ** 2) < 2.5 and np.mean(scores[:, 6:] ** 2) < 2.5

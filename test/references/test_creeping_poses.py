@@ -17,7 +17,7 @@ def gyroscope_error(seed, creep):
     """Return the rms error of the gyroscope's matrix, and the HandCalibration."""
     imu, ranges, truth = hold_and_turn(seed, n_poses=16, creep=creep)
     found = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
-    return np.sqrt(np.mean((found.gyroscope[1].ravel() - truth[12:21])**2)), found
+    return np.sqrt(np.mean((found.gyroscope[1].ravel() - truth[12:21]) ** 2)), found
 
 
 @pytest.mark.parametrize('seed', [61, 62])

@@ -19,13 +19,31 @@ from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, UPPER_TERMS, HandOptions, hand_options
-from imu_calibration.references.gravity.poses import at_range_end, average_poses, rising, sample_times
+from imu_calibration.references.gravity.hand_parameters import (
+    CROSS_TERMS,
+    UPPER_TERMS,
+    HandOptions,
+    hand_options,
+)
+from imu_calibration.references.gravity.poses import (
+    at_range_end,
+    average_poses,
+    rising,
+    sample_times,
+)
 from imu_calibration.references.options import CalibrationOptions
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth, unpack
 from worlds.hand_trials import clean, jitter
-from worlds.physics_hand import clipped, drifting, hold_and_turn, warmed_up, with_slow_turn, with_stamp_jitter, with_wrong_full_scale
+from worlds.physics_hand import (
+    clipped,
+    drifting,
+    hold_and_turn,
+    warmed_up,
+    with_slow_turn,
+    with_stamp_jitter,
+    with_wrong_full_scale,
+)
 from worlds.physics_table import stand_up
 
 ANGULAR = np.random.default_rng(0).normal(0, 1, (300, 3))
@@ -46,7 +64,7 @@ def rate_error(found, truth, factor=1.0):
     _, _, bias, matrix = unpack(truth)
     measured = factor * (ANGULAR @ matrix.T + bias)
     bias, matrix, _ = found.gyroscope
-    return np.sqrt(np.mean((np.linalg.solve(matrix, (measured - bias).T).T - ANGULAR)**2))
+    return np.sqrt(np.mean((np.linalg.solve(matrix, (measured - bias).T).T - ANGULAR) ** 2))
 
 
 def looked_at(imu):
@@ -54,6 +72,7 @@ def looked_at(imu):
 
 
 # a gyroscope at the wrong full-scale setting
+
 
 @pytest.mark.parametrize('factor', [2.0, 0.5, 8.0, 3.0])
 def test_the_solver_reaches_a_wrong_full_scale(session, factor):
@@ -72,17 +91,24 @@ def test_a_right_full_scale_stays_one(session):
 
 @pytest.mark.parametrize('factor', [2.0, 0.5, 4.0])
 def test_preflight_names_the_full_scale_factor(session, factor):
-    found, = (f for f in looked_at(with_wrong_full_scale(session[0], factor)) if f.check == 'full_scale')
+    (found,) = (
+        f for f in looked_at(with_wrong_full_scale(session[0], factor)) if f.check == 'full_scale'
+    )
     assert found.severity == 'warning' and f' {factor:g} ' in found.text
-    assert not [f for f in looked_at(session[0]) if f.check == 'full_scale' and f.severity != 'good']
+    assert not [
+        f for f in looked_at(session[0]) if f.check == 'full_scale' and f.severity != 'good'
+    ]
 
 
 # clipped turns
 
+
 @pytest.mark.parametrize('rate_hz', [100.0, 10.0])
 def test_turns_with_clipped_samples_are_left_out(rate_hz):
     """At 10 Hz one or two samples of a turn stands at the end of the range."""
-    imu, _, truth = hold_and_turn(4, n_poses=18, rate_hz=rate_hz, rate_sd=0.001, duration=1.6 if rate_hz > 20 else 1.0)
+    imu, _, truth = hold_and_turn(
+        4, n_poses=18, rate_hz=rate_hz, rate_sd=0.001, duration=1.6 if rate_hz > 20 else 1.0
+    )
     limit = (0.8 if rate_hz > 20 else 0.9) * np.abs(imu.rate_s).max()
     spoiled = clipped(imu, limit)
     at = np.abs(spoiled.rate_s).max(axis=1) == limit
@@ -102,25 +128,37 @@ def test_an_unclipped_gyroscope_has_no_end_of_range(session):
 def test_ranges_of_two_s_complement_end_one_step_apart():
     step, rng = 1e-3, np.random.default_rng(5)
     rate = np.clip(np.round(rng.normal(0, 1.0, (2000, 3)) / step), -2500, 2499) * step
-    assert at_range_end(rate).sum() == np.count_nonzero((rate >= 2.499 - 1e-9).any(axis=1) | (rate <= -2.5 + 1e-9).any(axis=1)) > 2
+    assert (
+        at_range_end(rate).sum()
+        == np.count_nonzero((rate >= 2.499 - 1e-9).any(axis=1) | (rate <= -2.5 + 1e-9).any(axis=1))
+        > 2
+    )
 
 
 # slow turns
 
+
 def test_a_slow_turn_about_the_vertical_is_no_pose():
     """At 1.7 deg/s gravity stays where it is and the gyroscope is as quiet as at rest: only its mean tells."""
     imu, _, turn = with_slow_turn(6)
-    covered = sum(max(min(piece.stop, turn.stop) - max(piece.start, turn.start), 0) for piece in find_still(imu))
+    covered = sum(
+        max(min(piece.stop, turn.stop) - max(piece.start, turn.start), 0)
+        for piece in find_still(imu)
+    )
     assert covered == 0 and len(find_still(imu)) >= 14
 
 
 def test_poses_of_a_gyroscope_that_warms_up_stay_poses():
     imu, ranges, _ = hold_and_turn(7)
     for time_constant in (10.0, 60.0):
-        assert len(find_still(warmed_up(imu, 1, rate=0.03, time_constant=time_constant)[0])) >= len(ranges) - 1
+        assert (
+            len(find_still(warmed_up(imu, 1, rate=0.03, time_constant=time_constant)[0]))
+            >= len(ranges) - 1
+        )
 
 
 # biases that move
+
 
 def test_a_warm_up_is_not_sold_as_g_sensitivity():
     imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
@@ -135,9 +173,15 @@ def test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_
     imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
     poses = average_poses(imu, [(r.start, r.stop) for r in ranges])
     share = np.linspace(0, 1, len(poses.force))
-    tipped = GRAVITY * np.column_stack([np.sin(1.5 * share), 0.1 * np.sin(9 * share), np.cos(1.5 * share)])
-    drift = 1e-2 * np.column_stack([share**2, share, -share]) + np.random.default_rng(4).normal(0, 1e-4, (len(share), 3))
-    assert not shown(g_sensitivity_evidence(replace(poses, force=tipped, rate=drift, time=100 * share)))
+    tipped = GRAVITY * np.column_stack(
+        [np.sin(1.5 * share), 0.1 * np.sin(9 * share), np.cos(1.5 * share)]
+    )
+    drift = 1e-2 * np.column_stack([share**2, share, -share]) + np.random.default_rng(4).normal(
+        0, 1e-4, (len(share), 3)
+    )
+    assert not shown(
+        g_sensitivity_evidence(replace(poses, force=tipped, rate=drift, time=100 * share))
+    )
 
 
 def test_the_earth_is_not_sold_as_g_sensitivity():
@@ -145,16 +189,29 @@ def test_the_earth_is_not_sold_as_g_sensitivity():
     imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
     poses = average_poses(imu, [(r.start, r.stop) for r in ranges])
     noise = np.random.default_rng(5).normal(0, 1e-5, poses.rate.shape)
-    for size, axis, wanted in ((0.9, slice(None), False), (-0.7, slice(None), False), (3.0, slice(None), True), (0.9, 2, True)):
+    for size, axis, wanted in (
+        (0.9, slice(None), False),
+        (-0.7, slice(None), False),
+        (3.0, slice(None), True),
+        (0.9, 2, True),
+    ):
         response = np.zeros((3, 3))
         response[axis, axis] = np.eye(3)[axis, axis] * size * EARTH_RATE / GRAVITY
-        assert shown(g_sensitivity_evidence(replace(poses, rate=poses.force @ response.T + noise))) == wanted
+        assert (
+            shown(g_sensitivity_evidence(replace(poses, rate=poses.force @ response.T + noise)))
+            == wanted
+        )
 
 
 def test_the_latitude_that_nobody_said_is_in_the_sd_of_a_g_sensitivity(session):
     imu, ranges, _ = session
-    hand = calibrate_by_hand(imu, HandOptions(GRAVITY, gyroscope=('bias', 'matrix', 'gyro_g_sensitivity')), ranges)
-    diagonal = [hand.param_names.index(f'gyroscope.gyro_g_sensitivity.{name}') for name in ('xx', 'yy', 'zz')]
+    hand = calibrate_by_hand(
+        imu, HandOptions(GRAVITY, gyroscope=('bias', 'matrix', 'gyro_g_sensitivity')), ranges
+    )
+    diagonal = [
+        hand.param_names.index(f'gyroscope.gyro_g_sensitivity.{name}')
+        for name in ('xx', 'yy', 'zz')
+    ]
     assert min(hand.sd[diagonal]) >= EARTH_RATE / np.sqrt(3) / GRAVITY
 
 
@@ -168,20 +225,32 @@ def test_g_sensitivity_is_seen_beside_a_warm_up():
 def test_biases_that_drift_carry_it_in_their_sd_and_a_note_with_its_size():
     imu, ranges, truth = hold_and_turn(10, n_poses=24, rate_hz=50.0, still=3.0)
     moved = drifting(imu, force=0.0981, rate=0.004)
-    still, found = (calibrate_by_hand(samples, HandOptions(GRAVITY), ranges) for samples in (imu, moved))
+    still, found = (
+        calibrate_by_hand(samples, HandOptions(GRAVITY), ranges) for samples in (imu, moved)
+    )
     assert still.statistics['bias_moved'] == {}
-    assert found.statistics['bias_moved'] == {'accelerometer': pytest.approx(0.0981, rel=0.15), 'gyroscope': pytest.approx(0.004, rel=0.15)}
-    first, = (note.text for note in notes(found.statistics['bias_moved'], 600.0) if note.text.startswith('accelerometer'))
+    assert found.statistics['bias_moved'] == {
+        'accelerometer': pytest.approx(0.0981, rel=0.15),
+        'gyroscope': pytest.approx(0.004, rel=0.15),
+    }
+    (first,) = (
+        note.text
+        for note in notes(found.statistics['bias_moved'], 600.0)
+        if note.text.startswith('accelerometer')
+    )
     assert re.search(r'\b(9|1\d)(\.\d+)? mg\b', first) and ' 10 ' in first
     for name, change in (('accelerometer.bias.x', 0.0981), ('gyroscope.bias.x', 0.004)):
         middle = truth[PARAM_NAMES.index(name)] + change / 2
         assert abs(found.value(name) - middle) < 0.1 * change and found.sd_of(name) > 0.4 * change
     assert found.sd_of('accelerometer.bias.y') < 0.1 * found.sd_of('accelerometer.bias.x')
-    error = np.abs(np.array([found.value(name) - truth[PARAM_NAMES.index(name)] for name in PARAM_NAMES[3:9]]))
+    error = np.abs(
+        np.array([found.value(name) - truth[PARAM_NAMES.index(name)] for name in PARAM_NAMES[3:9]])
+    )
     assert np.all(error < 4.5 * np.array([found.sd_of(name) for name in PARAM_NAMES[3:9]]))
 
 
 # what does not belong to the others
+
 
 def test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out():
     """Somebody leans on the IMU in one pose, turns it slowly in another, and a glitch of a tenth of a second is in one turn."""
@@ -189,10 +258,17 @@ def test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out():
     force, rate = imu.force_s.copy(), imu.rate_s.copy()
     force[ranges[5], 0] += 0.3
     rate[ranges[8], 2] += 0.02
-    rate[ranges[3].stop + 20:ranges[3].stop + 25, 1] += 2.0
-    clean, found = (calibrate_by_hand(samples, HandOptions(GRAVITY), ranges) for samples in (imu, replace(imu, force_s=force, rate_s=rate)))
+    rate[ranges[3].stop + 20 : ranges[3].stop + 25, 1] += 2.0
+    clean, found = (
+        calibrate_by_hand(samples, HandOptions(GRAVITY), ranges)
+        for samples in (imu, replace(imu, force_s=force, rate_s=rate))
+    )
     assert clean.statistics['left_out'] == {}
-    assert found.statistics['left_out'] == {'outlying pose': 1, 'outlying drift': 1, 'outlying turn': 1}
+    assert found.statistics['left_out'] == {
+        'outlying pose': 1,
+        'outlying drift': 1,
+        'outlying turn': 1,
+    }
     assert rate_error(found, truth) < 3 * rate_error(clean, truth)
     assert np.max(np.abs(found.values - clean.values)[:3]) < 0.01
 
@@ -201,33 +277,53 @@ def test_what_was_left_out_does_not_come_back_in_the_proof():
     """The steps from the solution without some poses take the equations as they were solved."""
     imu, ranges, _ = hold_and_turn(0, rate_hz=50.0, still=2.0, n_poses=16)
     rate = imu.rate_s.copy()
-    rate[ranges[3].stop + 20:ranges[3].stop + 25, 1] += 4.0
-    clean, found = (evident_result(HandRecording(samples, None, {}), CalibrationOptions(gravity=GRAVITY), stills=ranges)[0]
-                    for samples in (imu, replace(imu, rate_s=rate)))
+    rate[ranges[3].stop + 20 : ranges[3].stop + 25, 1] += 4.0
+    clean, found = (
+        evident_result(
+            HandRecording(samples, None, {}), CalibrationOptions(gravity=GRAVITY), stills=ranges
+        )[0]
+        for samples in (imu, replace(imu, rate_s=rate))
+    )
     assert found.hand.statistics['left_out'] == {'contradicted by gravity': 1}
-    assert found.calibration.proof['gyroscope']['after'] < 2 * clean.calibration.proof['gyroscope']['after']
+    assert (
+        found.calibration.proof['gyroscope']['after']
+        < 2 * clean.calibration.proof['gyroscope']['after']
+    )
 
 
 def six_faces(seed=1):
-    return hold_and_turn(seed, n_poses=6, attitudes=[Rotation.from_matrix(stand_up(up)) for up in FACES], still=4.0)
+    return hold_and_turn(
+        seed, n_poses=6, attitudes=[Rotation.from_matrix(stand_up(up)) for up in FACES], still=4.0
+    )
 
 
 def test_six_faces_give_what_they_determine():
     imu, ranges, truth = six_faces()
     found = calibrated(imu)
     status = dict(zip(found.param_names, found.statuses))
-    for name in (*(f'accelerometer.bias.{axis}' for axis in 'xyz'), *(f'accelerometer.matrix.{axis}{axis}' for axis in 'xyz')):
-        assert status[name] == 'determined' and abs(found.value(name) - truth[PARAM_NAMES.index(name)]) < 5 * found.sd_of(name)
+    for name in (
+        *(f'accelerometer.bias.{axis}' for axis in 'xyz'),
+        *(f'accelerometer.matrix.{axis}{axis}' for axis in 'xyz'),
+    ):
+        assert status[name] == 'determined' and abs(
+            found.value(name) - truth[PARAM_NAMES.index(name)]
+        ) < 5 * found.sd_of(name)
 
 
 def test_a_weak_cross_term_is_zero_unless_zero_is_significantly_worse():
     """The likelihood ratio of a value is its squared ratio to the sd of the fit: the profile near six faces is a parabola."""
     hand = calibrated(six_faces()[0])
-    hand = replace(hand, terms={term: np.diag(np.diag(part)) for term, part in hand.terms.items()})   # no other replacement moves it
-    name = next(name for name in CROSS_TERMS if hand.statuses[hand.param_names.index(name)] == 'weak')
+    hand = replace(
+        hand, terms={term: np.diag(np.diag(part)) for term, part in hand.terms.items()}
+    )  # no other replacement moves it
+    name = next(
+        name for name in CROSS_TERMS if hand.statuses[hand.param_names.index(name)] == 'weak'
+    )
     for ratio, moves in ((1.8, True), (2.2, False)):
         at = np.arange(len(hand.values)) == hand.param_names.index(name)
-        other = replace(hand, values=np.where(at, ratio * np.sqrt(np.diag(of_fit(hand.terms))), hand.values))
+        other = replace(
+            hand, values=np.where(at, ratio * np.sqrt(np.diag(of_fit(hand.terms))), hand.values)
+        )
         assert (name in with_weak_replaced(other, other.tolerances).replaced) == moves
     assert reasons_held([True], [name], [name], tested=CROSS_TERMS) == {name: 'likelihood ratio'}
 
@@ -236,15 +332,22 @@ def test_faces_without_the_turns_between_them_give_bias_and_scale():
     """A recorder that was stopped for each turn and went on with the next stamp: gravity jumps, the rates know nothing of it."""
     imu, ranges, _ = six_faces()
     cut = ImuSamples.concatenate([imu.select(piece) for piece in ranges])
-    cut = replace(cut, stamp_ns=imu.stamp_ns[:len(cut)])
+    cut = replace(cut, stamp_ns=imu.stamp_ns[: len(cut)])
     found = calibrated(cut)
-    assert found.statistics['left_out'] == {'contradicted by gravity': 5} and found.statistics['poses'] == 6
+    assert (
+        found.statistics['left_out'] == {'contradicted by gravity': 5}
+        and found.statistics['poses'] == 6
+    )
     status = dict(zip(found.param_names, found.statuses))
-    assert {status[f'accelerometer.{name}'] for name in ('bias.x', 'bias.y', 'bias.z', 'matrix.xx', 'matrix.yy', 'matrix.zz')} <= {'determined', 'weak'}
+    assert {
+        status[f'accelerometer.{name}']
+        for name in ('bias.x', 'bias.y', 'bias.z', 'matrix.xx', 'matrix.yy', 'matrix.zz')
+    } <= {'determined', 'weak'}
     assert status['gyroscope.bias.x'] == 'determined' and status['gyroscope.matrix.xx'] == 'held'
 
 
 # late stamps
+
 
 def test_late_stamps_of_even_samples_do_not_reach_the_turns(session):
     imu, _, truth = session
@@ -253,16 +356,27 @@ def test_late_stamps_of_even_samples_do_not_reach_the_turns(session):
 
 
 def test_repeated_stamps_are_spread_over_the_step_that_follows():
-    np.testing.assert_allclose(rising(np.array([0.0, 0.01, 0.01, 0.02])), [0.0, 0.01, 0.015, 0.02], atol=1e-6)
+    np.testing.assert_allclose(
+        rising(np.array([0.0, 0.01, 0.01, 0.02])), [0.0, 0.01, 0.015, 0.02], atol=1e-6
+    )
 
 
 def test_times_are_those_of_the_clock_that_jittering_stamps_follow():
-    steady, jittering = clean(4, rests=10)[0], read_by_hand([SampleBlock(jitter(4, rests=10)[0])]).imu
+    steady, jittering = (
+        clean(4, rests=10)[0],
+        read_by_hand([SampleBlock(jitter(4, rests=10)[0])]).imu,
+    )
     off = sample_times(jittering) - 1e-9 * (steady.stamp_ns - steady.stamp_ns[0])
-    assert np.std(np.diff(off[::150])) < 1e-4   # over a turn: of 3 ms, and 0.3 ms in the times that the cleaning draws over 64 samples
+    assert (
+        np.std(np.diff(off[::150])) < 1e-4
+    )  # over a turn: of 3 ms, and 0.3 ms in the times that the cleaning draws over 64 samples
     lost = np.ones(len(steady), bool)
     lost[[700, 1500, 1501, 2200]] = False
-    np.testing.assert_allclose(np.diff(sample_times(steady.select(lost))), np.diff(steady.select(lost).stamp_ns) * 1e-9, atol=1e-6)
+    np.testing.assert_allclose(
+        np.diff(sample_times(steady.select(lost))),
+        np.diff(steady.select(lost).stamp_ns) * 1e-9,
+        atol=1e-6,
+    )
 
 
 def test_times_of_a_sensor_that_is_polled_at_uneven_moments_are_its_stamps():
@@ -284,20 +398,44 @@ def test_a_gravity_of_no_place_on_the_earth_is_refused(gravity):
 
 def test_the_error_budget_lists_an_unknown_gravity_under_gravity_and_the_given_standard_one_as_known():
     imu, ranges, _ = hold_and_turn(3, n_poses=14)
-    unknown, given = (evident_result(HandRecording(imu, None, {}), CalibrationOptions(gravity=gravity, as_asked=True), stills=ranges)[0]
-                      for gravity in (None, STANDARD_GRAVITY))
+    unknown, given = (
+        evident_result(
+            HandRecording(imu, None, {}),
+            CalibrationOptions(gravity=gravity, as_asked=True),
+            stills=ranges,
+        )[0]
+        for gravity in (None, STANDARD_GRAVITY)
+    )
     scale = unknown.calibration.param_names.index('accelerometer.matrix.xx')
     budgets = [result.error_budget() for result in (unknown, given)]
-    assert budgets[0].causes['gravity'][scale] == pytest.approx(STANDARD_GRAVITY_SD / STANDARD_GRAVITY, rel=0.05)
-    assert budgets[0].causes['noise'][scale] == pytest.approx(budgets[1].causes['noise'][scale], rel=0.05)
+    assert budgets[0].causes['gravity'][scale] == pytest.approx(
+        STANDARD_GRAVITY_SD / STANDARD_GRAVITY, rel=0.05
+    )
+    assert budgets[0].causes['noise'][scale] == pytest.approx(
+        budgets[1].causes['noise'][scale], rel=0.05
+    )
     assert budgets[1].causes['gravity'][scale] < 0.1 * budgets[0].causes['gravity'][scale]
-    assert unknown.calibration.common_scale['status'] == 'weak' and given.calibration.common_scale == {}
-    assert unknown.calibration.status == given.calibration.status and unknown.calibration.status[scale] == 'determined'
-    assert [name for name, status in unknown.calibration.status_by_name.items() if status == 'fixed'] == list(UPPER_TERMS)
+    assert (
+        unknown.calibration.common_scale['status'] == 'weak'
+        and given.calibration.common_scale == {}
+    )
+    assert (
+        unknown.calibration.status == given.calibration.status
+        and unknown.calibration.status[scale] == 'determined'
+    )
+    assert [
+        name for name, status in unknown.calibration.status_by_name.items() if status == 'fixed'
+    ] == list(UPPER_TERMS)
 
 
 def test_an_unknown_gravity_does_not_change_the_recommended_poses():
     imu, ranges, _ = hold_and_turn(3, n_poses=6)
-    unknown, given = (calibrate_by_hand(imu, HandOptions(STANDARD_GRAVITY, sd), ranges) for sd in (STANDARD_GRAVITY_SD, 0.0))
+    unknown, given = (
+        calibrate_by_hand(imu, HandOptions(STANDARD_GRAVITY, sd), ranges)
+        for sd in (STANDARD_GRAVITY_SD, 0.0)
+    )
     assert missing_motion(unknown) == missing_motion(given) != ()
-    assert with_weak_replaced(unknown, unknown.tolerances).replaced == with_weak_replaced(given, given.tolerances).replaced
+    assert (
+        with_weak_replaced(unknown, unknown.tolerances).replaced
+        == with_weak_replaced(given, given.tolerances).replaced
+    )

@@ -30,7 +30,9 @@ def blocks(imu, seed=0, mean=20):
 def make_live(saved=None, **by_hand):
     """Return a LiveByHand that looks for rest as often as it can."""
     settings = LiveByHandSettings(**{'gravity': GRAVITY, **by_hand})
-    return LiveByHand(CalibrationOptions(), LiveSettings(), settings, saved=saved, clock=lambda: 0.0)
+    return LiveByHand(
+        CalibrationOptions(), LiveSettings(), settings, saved=saved, clock=lambda: 0.0
+    )
 
 
 def run(live, imu, seed=0):
@@ -40,7 +42,9 @@ def run(live, imu, seed=0):
 
 def offline(imu, gravity=GRAVITY):
     """What the offline tool says."""
-    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], CalibrationOptions(gravity=gravity))
+    return calibrate_without_table(
+        [lambda: iter([SampleBlock(imu)])], CalibrationOptions(gravity=gravity)
+    )
 
 
 def all_kept(live):
@@ -87,7 +91,7 @@ def test_the_live_answer_is_that_of_the_recording(session, expected):
     for section in ('windows', 'samples_used', 'dropped'):
         assert result.calibration.statistics[section] == expected.calibration.statistics[section]
     assert result.calibration.conditions == expected.calibration.conditions
-    assert len(poses) == 11   # the last rest goes on
+    assert len(poses) == 11  # the last rest goes on
     assert live.status().values['poses'] == 12 and live.status().values['turns'] == 11
 
 
@@ -116,7 +120,11 @@ def test_before_any_motion_it_asks_for_attitudes():
     with refused(NotObservableError, 'no_samples', 4):
         live.solve()
     status = live.status()
-    assert status.word == 'waiting' and re.search(r'[+-][xyz] up', status.message) and set(unseen(live.found)) == set(FACE_DIRECTIONS)
+    assert (
+        status.word == 'waiting'
+        and re.search(r'[+-][xyz] up', status.message)
+        and set(unseen(live.found)) == set(FACE_DIRECTIONS)
+    )
     assert all(group.status == 'waiting' and group.needs for group in live.groups())
 
 
@@ -129,13 +137,18 @@ def test_the_direction_that_is_missing_is_named():
         live.push(block)
         asked[live.found.attitudes] = live.status(), unseen(live.found)
         assert f'next: {live.coverage().next.text}' in live.status().message
-    assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(FACE_DIRECTIONS)
+    assert {name for name, count in ((n, k) for k in asked for n in asked[k][1])} == set(
+        FACE_DIRECTIONS
+    )
     assert asked[1][1][0] == '-z' and set(asked[1][1]) == set(FACE_DIRECTIONS) - {'+z'}
     assert set(asked[2][1]) == set(FACE_DIRECTIONS) - {'+z', '+x'}
     assert asked[6][1] == []
     status = asked[2][0]
     assert status.values['directions of gravity not seen'].split() == asked[2][1]
-    assert f'faces not seen yet: {", ".join(asked[2][1])}' in status.message and '2 poses in 2 attitudes, 1 turn' in status.message
+    assert (
+        f'faces not seen yet: {", ".join(asked[2][1])}' in status.message
+        and '2 poses in 2 attitudes, 1 turn' in status.message
+    )
 
 
 def test_after_a_solution_the_motion_that_helps_most_is_named(session):
@@ -145,10 +158,14 @@ def test_after_a_solution_the_motion_that_helps_most_is_named(session):
     live.solve(pending=True)
     status, groups = live.status(), {(g.sensor, g.effect): g for g in live.groups()}
     shown = live.coverage().next
-    assert status.values['next'] == shown.text and shown.up is not None   # the terminal, the status and the picture say one step
+    assert (
+        status.values['next'] == shown.text and shown.up is not None
+    )  # the terminal, the status and the picture say one step
     assert shown.text in {item['needs'] for item in missing_motion(live.result.hand)}
     assert status.word == 'weak' and re.search(r'[+-][xyz] up', status.message.split('next: ')[1])
-    assert groups['accelerometer', 'matrix'].status != 'determined' and re.search(r'[+-][xyz] up', groups['accelerometer', 'matrix'].needs)
+    assert groups['accelerometer', 'matrix'].status != 'determined' and re.search(
+        r'[+-][xyz] up', groups['accelerometer', 'matrix'].needs
+    )
 
 
 def test_without_a_gravity_the_scales_ask_for_it(session):
@@ -165,7 +182,7 @@ def test_residuals_of_poses_are_what_the_model_leaves(session, expected):
     assert live.residuals(poses) is None
     live.solve(pending=True)
     residuals = live.residuals(poses)
-    norms = expected.hand.norm_residuals()[:len(poses)]
+    norms = expected.hand.norm_residuals()[: len(poses)]
     along = np.linalg.norm(residuals.force_s, axis=1)
     np.testing.assert_allclose(along, np.abs(norms), rtol=0.1, atol=1e-6)
     assert set(residuals.stamp_ns) <= set(session.stamp_ns)
@@ -175,7 +192,9 @@ def test_residuals_of_poses_are_what_the_model_leaves(session, expected):
 def paused(first, second, seconds=100.0):
     """Two recordings one after the other."""
     shift = int(first.stamp_ns[-1] - second.stamp_ns[0] + seconds * 1e9)
-    return ImuSamples.concatenate([first, ImuSamples(second.stamp_ns + shift, second.force_s, second.rate_s, second.frame_id)])
+    return ImuSamples.concatenate(
+        [first, ImuSamples(second.stamp_ns + shift, second.force_s, second.rate_s, second.frame_id)]
+    )
 
 
 def test_a_session_resumed_from_its_samples_is_one_recording_with_a_pause(session):
@@ -216,7 +235,11 @@ def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
     n, largest = 16_000, 0
     mean = session.force_s[-50:].mean(0), session.rate_s[-50:].mean(0)
     noise = rng.normal(0, [[[0.02]], [[0.002]]], (2, n, 3))
-    still = ImuSamples(session.stamp_ns[-1] + 20_000_000 * np.arange(1, n + 1), mean[0] + noise[0], mean[1] + noise[1])
+    still = ImuSamples(
+        session.stamp_ns[-1] + 20_000_000 * np.arange(1, n + 1),
+        mean[0] + noise[0],
+        mean[1] + noise[1],
+    )
     for block in blocks(still, mean=100):
         live.push(block)
         largest = max(largest, len(live._store))
@@ -224,7 +247,10 @@ def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
     result = live.solve(pending=True)
     assert live.found.attitudes == 12 and live.found.turns == 11
     assert_same(result, offline(all_kept(live)), 1e-4)
-    assert np.all(np.abs(result.calibration.values - expected.calibration.values) < 4 * expected.calibration.sd + 1e-12)
+    assert np.all(
+        np.abs(result.calibration.values - expected.calibration.values)
+        < 4 * expected.calibration.sd + 1e-12
+    )
 
 
 def test_without_a_long_rest_the_oldest_go(session):
@@ -234,8 +260,13 @@ def test_without_a_long_rest_the_oldest_go(session):
     assert_same(live.solve(pending=True), offline(all_kept(live)), 1e-4)
 
 
-@pytest.mark.parametrize(('model', 'code'), [('bias+matrix+accel_thermal_bias', 'offline_only'),
-                                             ('bias+matrix+accel_size_effect', 'table_needed')])
+@pytest.mark.parametrize(
+    ('model', 'code'),
+    [
+        ('bias+matrix+accel_thermal_bias', 'offline_only'),
+        ('bias+matrix+accel_size_effect', 'table_needed'),
+    ],
+)
 def test_an_effect_that_cannot_be_seen_live_is_refused_at_the_start(model, code):
     with refused(InputError, code, model.rpartition('+')[2]):
         LiveByHand(CalibrationOptions(accelerometer_model=model), LiveSettings())
@@ -243,8 +274,12 @@ def test_an_effect_that_cannot_be_seen_live_is_refused_at_the_start(model, code)
 
 def test_further_effects_are_estimated_as_offline(session):
     options = CalibrationOptions(accelerometer_model='bias+matrix+accel_quadratic')
-    live = LiveByHand(options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0)
+    live = LiveByHand(
+        options, LiveSettings(), LiveByHandSettings(gravity=GRAVITY), clock=lambda: 0.0
+    )
     run(live, session)
-    expected = calibrate_without_table([lambda: iter([SampleBlock(session)])], replace(options, gravity=GRAVITY))
+    expected = calibrate_without_table(
+        [lambda: iter([SampleBlock(session)])], replace(options, gravity=GRAVITY)
+    )
     assert any('accel_quadratic' in name for name in expected.calibration.param_names)
     assert_same(live.solve(pending=True), expected)

@@ -21,14 +21,21 @@ def test_a_gyroscope_whose_scale_walks_is_not_known_to_the_noise(seed):
     """Its scale walks by two per cent through the recording; what one session says of the next errs by about that, and not by the noise of turns."""
     imu, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0)
     walk = np.linspace(0, 0.02, len(imu))[:, None]
-    walking, steady = (calibrate_by_hand(replace(imu, rate_s=rate), HandOptions(GRAVITY), ranges) for rate in (imu.rate_s * (1 + walk), imu.rate_s))
+    walking, steady = (
+        calibrate_by_hand(replace(imu, rate_s=rate), HandOptions(GRAVITY), ranges)
+        for rate in (imu.rate_s * (1 + walk), imu.rate_s)
+    )
     own = steady.hand_model.gyro_matrix
     assert not steady.terms[DRIFT][own, own].any() and not steady.terms[MODEL_ERROR][own, own].any()
     assert np.sqrt(np.diag(walking.terms[DRIFT])[walking.hand_model.gyro_matrix].max()) > 2e-3
-    assert max(walking.sd_of(name) for name in MATRIX) > 10 * max(steady.sd_of(name) for name in MATRIX)
+    assert max(walking.sd_of(name) for name in MATRIX) > 10 * max(
+        steady.sd_of(name) for name in MATRIX
+    )
 
 
 @pytest.mark.long
 def test_clean_sessions_become_no_wider():
-    grown = np.concatenate([errors('clean', seed, n_poses=16)[group][2] for seed in range(4) for group in GROUPS])
+    grown = np.concatenate(
+        [errors('clean', seed, n_poses=16)[group][2] for seed in range(4) for group in GROUPS]
+    )
     assert np.quantile(grown, 0.95) < 1.3 and np.median(grown) == pytest.approx(1.0)

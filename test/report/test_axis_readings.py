@@ -21,7 +21,9 @@ def test_axis_readings_reproduce_the_layout_of_tables_2_and_4():
         i = 'xyz'.index(line.sensor)
         assert line.before_g - line.theoretical_g == pytest.approx(bias[i] / G, abs=1e-12)
         assert line.improvement == pytest.approx(10)
-        assert line.theoretical_g == pytest.approx({'+': 1, '-': -1}[line.position[0]] if line.position[1] == line.sensor else 0, abs=1e-12)
+        assert line.theoretical_g == pytest.approx(
+            {'+': 1, '-': -1}[line.position[0]] if line.position[1] == line.sensor else 0, abs=1e-12
+        )
 
 
 def test_axis_readings_of_a_recording_without_such_positions_are_empty():

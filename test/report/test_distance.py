@@ -15,7 +15,14 @@ NOISE = {sensor: NoiseModel(np.full(3, 0.01**2), np.ones(3)) for sensor in SENSO
 def window(kind, n, start):
     time = start + 0.01 * np.arange(n)
     still = np.zeros((n, 1))
-    return Window(kind, np.arange(n), time, np.zeros((n, 3)), np.zeros((n, 3)), JointMotion(time, still, still, still, still))
+    return Window(
+        kind,
+        np.arange(n),
+        time,
+        np.zeros((n, 3)),
+        np.zeros((n, 3)),
+        JointMotion(time, still, still, still, still),
+    )
 
 
 @pytest.fixture(scope='module')
@@ -52,7 +59,9 @@ def test_an_offset_is_in_the_window_means(distance):
 def test_the_bands_and_the_means_have_all_of_the_power(distance):
     """Parseval: mean square of the residual of all samples."""
     total = distance.power[0].sum(axis=0) + distance.means[0]
-    assert np.sqrt(total.mean()) == pytest.approx(distance.gains['samples'].heldout_rms_before, rel=1e-9)
+    assert np.sqrt(total.mean()) == pytest.approx(
+        distance.gains['samples'].heldout_rms_before, rel=1e-9
+    )
 
 
 def test_the_density_of_white_noise_is_flat(distance):

@@ -20,8 +20,16 @@ from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.kinematics import strapdown
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.report.calibration_sections import autocorrelation, calibration_report, reading_tables
-from imu_calibration.report.navigation_section import expected_growth, motion_growth, noise_densities
+from imu_calibration.report.calibration_sections import (
+    autocorrelation,
+    calibration_report,
+    reading_tables,
+)
+from imu_calibration.report.navigation_section import (
+    expected_growth,
+    motion_growth,
+    noise_densities,
+)
 from imu_calibration.report.page import fixed, text
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -29,20 +37,46 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
-                                       {'name': 'inner', 'axis': [1, 0, 0]}],
-                            'up': [0, 0, 1], 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 0.0})
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'outer', 'axis': [0, 0, 1]},
+            {'name': 'middle', 'axis': [0, 1, 0]},
+            {'name': 'inner', 'axis': [1, 0, 0]},
+        ],
+        'up': [0, 0, 1],
+        'latitude': 48.8,
+        'height': 150.0,
+        'azimuth_deg': 0.0,
+    }
+)
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 PROVENANCE = {'bags': [{'name': 'session <1>', 'sha256': '0123456789abcdef'}]}
-SECTIONS = ('parameters', 'apply', 'derived', 'residuals', 'observability', 'navigation', 'readings', 'budget', 'origin')
+SECTIONS = (
+    'parameters',
+    'apply',
+    'derived',
+    'residuals',
+    'observability',
+    'navigation',
+    'readings',
+    'budget',
+    'origin',
+)
 VOID = {'meta', 'link', 'br', 'img', 'hr', 'input'}
 
 
 def session(profile, seed=6):
     """Simulate one recording."""
     values = random_values(MODEL, 'industrial', seed)
-    imu, joints, _ = simulate(MODEL, values, TABLE, profile=make_profile(profile, seed, TABLE),
-                              options=SimulationOptions(noise=GRADES['industrial'].noise), seed=seed)
+    imu, joints, _ = simulate(
+        MODEL,
+        values,
+        TABLE,
+        profile=make_profile(profile, seed, TABLE),
+        options=SimulationOptions(noise=GRADES['industrial'].noise),
+        seed=seed,
+    )
     return SampleBlock(imu, joints)
 
 
@@ -67,14 +101,22 @@ def by_hand(quick):
 @pytest.fixture(scope='module')
 def demanding(quick):
     """The recording judged by tolerances on the arms that it does not meet."""
-    return calibrate([lambda: iter([quick])], TABLE, CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
-                     provenance=PROVENANCE)
+    return calibrate(
+        [lambda: iter([quick])],
+        TABLE,
+        CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
+        provenance=PROVENANCE,
+    )
 
 
 @pytest.fixture(scope='module')
 def pages(on_table, by_hand, demanding):
     """The three reports."""
-    return {'on_table': calibration_report(on_table), 'by_hand': calibration_report(by_hand), 'demanding': calibration_report(demanding)}
+    return {
+        'on_table': calibration_report(on_table),
+        'by_hand': calibration_report(by_hand),
+        'demanding': calibration_report(demanding),
+    }
 
 
 class Balance(HTMLParser):
@@ -86,13 +128,17 @@ class Balance(HTMLParser):
 
     def handle_starttag(self, tag, attributes):
         """Open a tag."""
-        self.addresses += [value for name, value in attributes if name in ('src', 'href', 'xlink:href') and value]
+        self.addresses += [
+            value for name, value in attributes if name in ('src', 'href', 'xlink:href') and value
+        ]
         if tag not in VOID:
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attributes):
         """Note the addresses of a tag that closes itself."""
-        self.addresses += [value for name, value in attributes if name in ('src', 'href', 'xlink:href') and value]
+        self.addresses += [
+            value for name, value in attributes if name in ('src', 'href', 'xlink:href') and value
+        ]
 
     def handle_endtag(self, tag):
         """Close a tag."""
@@ -110,8 +156,12 @@ def test_the_page_is_whole_and_needs_nothing_else(pages, name):
     assert not re.search(r'<script|@import|url\((?!#)', page)
     assert [s for s in SECTIONS if f'<section id="{s}">' not in page] == []
     assert 'session &lt;1&gt;' in page and 'session <1>' not in page
-    assert not re.search(r'\bnan\b|\binf\b|None|Undefined',
-                         re.sub(r'<svg.*?</svg>|<style>.*?</style>', '', page, flags=re.S).replace('None: in every', ''))
+    assert not re.search(
+        r'\bnan\b|\binf\b|None|Undefined',
+        re.sub(r'<svg.*?</svg>|<style>.*?</style>', '', page, flags=re.S).replace(
+            'None: in every', ''
+        ),
+    )
 
 
 def test_the_same_calibration_gives_the_same_bytes(on_table, pages):
@@ -119,7 +169,10 @@ def test_the_same_calibration_gives_the_same_bytes(on_table, pages):
 
 
 def test_identifiers_of_different_figures_do_not_meet(pages):
-    found = [set(re.findall(r' id="([^"]+)"', svg)) for svg in re.findall(r'<svg.*?</svg>', pages['on_table'], flags=re.S)]
+    found = [
+        set(re.findall(r' id="([^"]+)"', svg))
+        for svg in re.findall(r'<svg.*?</svg>', pages['on_table'], flags=re.S)
+    ]
     assert len(found) > 8
     assert sum(map(len, found)) == len(set().union(*found))
 
@@ -130,13 +183,21 @@ def test_every_parameter_is_there_with_the_digits_that_it_deserves(on_table, pag
         assert f'title="{name}"' in pages['on_table']
         if '.matrix.' in name:
             shown, spread = with_sd(value, sd)
-            assert f'>{shown.replace("-", "−")}</td><td class="n quiet">{spread}<' in pages['on_table']
+            assert (
+                f'>{shown.replace("-", "−")}</td><td class="n quiet">{spread}<' in pages['on_table']
+            )
 
 
-@pytest.mark.parametrize(('name', 'word', 'next_step'), (
-    ('on_table', 'helps', 'compensate'), ('by_hand', 'helps', 'gravity'), ('demanding', 'helps', 'accelerometer.accel_size_effect')))
+@pytest.mark.parametrize(
+    ('name', 'word', 'next_step'),
+    (
+        ('on_table', 'helps', 'compensate'),
+        ('by_hand', 'helps', 'gravity'),
+        ('demanding', 'helps', 'accelerometer.accel_size_effect'),
+    ),
+)
 def test_the_decision_comes_first_with_its_next_step(pages, name, word, next_step):
-    head = pages[name][:pages[name].index('<nav>')]
+    head = pages[name][: pages[name].index('<nav>')]
     assert f'<section class="verdict {word}">' in head
     assert next_step.lower() in head.lower()
 
@@ -145,7 +206,7 @@ def test_windows_after_calibration_scatter_as_noise_alone_would(on_table, by_han
     for result in (on_table, by_hand):
         errors = result.window_errors()
         for sensor in ('accelerometer', 'gyroscope'):
-            ratio = np.sqrt(np.mean((errors.after[sensor] / errors.floor[sensor])**2))
+            ratio = np.sqrt(np.mean((errors.after[sensor] / errors.floor[sensor]) ** 2))
             assert 0.3 < ratio < 1.3  # by hand two of three components of each pose are fitted
             assert np.linalg.norm(errors.before[sensor]) > 8 * np.linalg.norm(errors.after[sensor])
 
@@ -154,24 +215,44 @@ def test_errors_after_calibration_are_of_held_out_windows(on_table, by_hand):
     """Errors with the parameters of all windows are smaller."""
     for result in (on_table, by_hand):
         errors, known = result.window_errors(), result.calibration
-        for sensor in ('accelerometer', 'gyroscope')[:2 if result is on_table else 1]:
+        for sensor in ('accelerometer', 'gyroscope')[: 2 if result is on_table else 1]:
             inverse = np.linalg.inv(known.of(sensor, Role.LINEAR))
-            fitted = (_fitted(result, sensor) @ inverse.T) if result is on_table else \
-                result.hand.compensate(result.hand.poses.force, result.hand.poses.rate, result.hand.poses.time)[0] - errors.true[sensor]
+            fitted = (
+                (_fitted(result, sensor) @ inverse.T)
+                if result is on_table
+                else result.hand.compensate(
+                    result.hand.poses.force, result.hand.poses.rate, result.hand.poses.time
+                )[0]
+                - errors.true[sensor]
+            )
             assert 1.0 < np.linalg.norm(errors.after[sensor]) / np.linalg.norm(fitted) < 4.0
 
 
 def _fitted(result, sensor):
     """Return the residuals of window means with the parameters of all windows."""
-    means = np.array([row.sensors[sensor].mean for row in restrict(result.gathered.accumulator, result.gathered_model, result.model).rows])
-    return means[:, -3:] - means[:, :-3] @ coefficients(result.model, sensor, result.solution.values)
+    means = np.array(
+        [
+            row.sensors[sensor].mean
+            for row in restrict(
+                result.gathered.accumulator, result.gathered_model, result.model
+            ).rows
+        ]
+    )
+    return means[:, -3:] - means[:, :-3] @ coefficients(
+        result.model, sensor, result.solution.values
+    )
 
 
 def test_readings_at_one_g_are_zhangs_tables(on_table):
     at_rest, moving = reading_tables(on_table, on_table.window_errors())
     assert [reading.position for reading in at_rest[::3]] == ['+x', '+y', '+z', '-x', '-y', '-z']
-    before, after = (np.array([abs(getattr(reading, name) - reading.theoretical_g) for reading in at_rest]).reshape(-1, 3) * 1e3  # mg
-                     for name in ('before_g', 'after_g'))
+    before, after = (
+        np.array(
+            [abs(getattr(reading, name) - reading.theoretical_g) for reading in at_rest]
+        ).reshape(-1, 3)
+        * 1e3  # mg
+        for name in ('before_g', 'after_g')
+    )
     assert after.max() < 0.6  # noise of a mean over 2 s is below 0.1
     assert before.max(axis=1).min() > 1.0
     assert all(reading.rate_deg_s > 0 for reading in moving)
@@ -184,13 +265,22 @@ def test_expected_drift_at_rest_is_that_of_simulated_runs(on_table):
     rng, period, seconds = np.random.default_rng(3), 0.05, 50.0
     time = np.arange(0.0, seconds + period / 2, period)
     densities = noise_densities(on_table)
-    assert densities == pytest.approx([GRADES['industrial'].noise.accel_density, GRADES['industrial'].noise.gyro_density], rel=0.1)
+    assert densities == pytest.approx(
+        [GRADES['industrial'].noise.accel_density, GRADES['industrial'].noise.gyro_density], rel=0.1
+    )
     ends = []
     for _ in range(150):
         force, rate = (rng.normal(0, d / np.sqrt(period), (len(time), 3)) for d in densities)
-        ends.append([np.linalg.norm(part[-1]) for part in strapdown.strapdown(time, force + [0, 0, 9.81], rate, gravity=9.81)])
+        ends.append(
+            [
+                np.linalg.norm(part[-1])
+                for part in strapdown.strapdown(time, force + [0, 0, 9.81], rate, gravity=9.81)
+            ]
+        )
     rms = np.sqrt(np.mean(np.square(ends), axis=0))
-    assert rms == pytest.approx([parts['noise'].velocity[0, -1], parts['noise'].position[0, -1]], rel=0.2)  # 150 runs: 4 % each
+    assert rms == pytest.approx(
+        [parts['noise'].velocity[0, -1], parts['noise'].position[0, -1]], rel=0.2
+    )  # 150 runs: 4 % each
 
 
 def test_drift_in_motion_falls_by_the_calibration(on_table):
@@ -205,13 +295,18 @@ def test_white_residuals_show_no_autocorrelation_and_a_wrong_model_does(on_table
         assert np.mean(np.abs(values[1:]) < bound) > 0.85
     wrong = on_table.solution.values.copy()
     wrong[on_table.solution.model.slices['gyroscope', 'matrix']] += 0.01
-    _, values, bound = autocorrelation(replace(on_table, solution=replace(on_table.solution, values=wrong)))['gyroscope']
+    _, values, bound = autocorrelation(
+        replace(on_table, solution=replace(on_table.solution, values=wrong))
+    )['gyroscope']
     assert np.max(np.abs(values[1:])) > 10 * bound
 
 
 def test_a_recording_with_an_unmodelled_effect_recommends_a_diagnosis(quick):
     """A lag of 20 ms in the gyroscope leaves far more than noise in motion."""
-    late = replace(quick.imu, rate_s=np.concatenate([np.repeat(quick.imu.rate_s[:1], 2, axis=0), quick.imu.rate_s[:-2]]))
+    late = replace(
+        quick.imu,
+        rate_s=np.concatenate([np.repeat(quick.imu.rate_s[:1], 2, axis=0), quick.imu.rate_s[:-2]]),
+    )
     result = calibrate([lambda: iter([SampleBlock(late, quick.joints)])], TABLE)
     page = calibration_report(result)
     assert 'imu_calibration diagnose' in page
@@ -232,7 +327,7 @@ def chromium():
     pytest.skip('no chromium here; install it to have the report opened in a browser')
 
 
-WATCH = '''<script>window.addEventListener('load', () => {
+WATCH = """<script>window.addEventListener('load', () => {
 const shown = [], own = node => [...node.childNodes].filter(child => child.nodeType === 3 && child.textContent.trim());
 for (const node of document.querySelectorAll('body *:not(script):not(svg *)')) for (const child of own(node)) {
   const range = document.createRange(); range.selectNodeContents(child);
@@ -244,18 +339,32 @@ for (const [k, a] of shown.entries()) for (const b of shown.slice(k + 1))
 const cut = [...document.querySelectorAll('.wide, .scroll, pre, .pair > div')].filter(e => e.scrollWidth > e.clientWidth + 1).length;
 const wide = document.documentElement.scrollWidth - window.innerWidth, figures = [...document.querySelectorAll('svg')];
 const flat = figures.filter(s => s.getBoundingClientRect().height < 50).length;
-document.title = `wide ${wide} flat ${flat} overlaps ${overlaps} cut ${cut} figures ${figures.length}`; });</script></body>'''
+document.title = `wide ${wide} flat ${flat} overlaps ${overlaps} cut ${cut} figures ${figures.length}`; });</script></body>"""
 
 
 def opened(page, width, tmp_path):
     """Return {what was measured: number} of a page opened in a browser."""
     file = tmp_path / 'report.html'
     file.write_text(page.replace('</body>', WATCH))
-    flags = ['--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run', '--disable-background-networking',
-             '--disable-component-update', '--disable-sync', '--disable-dev-shm-usage', '--enable-logging=stderr',
-             f'--user-data-dir={tmp_path / "profile"}',
-             f'--window-size={width},1000', '--virtual-time-budget=3000', '--dump-dom']
-    done = subprocess.run([chromium(), *flags, file.as_uri()], capture_output=True, text=True, timeout=120)
+    flags = [
+        '--headless',
+        '--no-sandbox',
+        '--disable-gpu',
+        '--disable-quic',
+        '--no-first-run',
+        '--disable-background-networking',
+        '--disable-component-update',
+        '--disable-sync',
+        '--disable-dev-shm-usage',
+        '--enable-logging=stderr',
+        f'--user-data-dir={tmp_path / "profile"}',
+        f'--window-size={width},1000',
+        '--virtual-time-budget=3000',
+        '--dump-dom',
+    ]
+    done = subprocess.run(
+        [chromium(), *flags, file.as_uri()], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     assert [line for line in done.stderr.splitlines() if 'CONSOLE' in line] == []
     found = re.search(r'<title>(wide .*)</title>', done.stdout)
@@ -265,7 +374,9 @@ def opened(page, width, tmp_path):
 
 
 @pytest.mark.live
-@pytest.mark.parametrize(('name', 'width'), (('on_table', 1300), ('on_table', 800), ('on_table', 500), ('by_hand', 500)))
+@pytest.mark.parametrize(
+    ('name', 'width'), (('on_table', 1300), ('on_table', 800), ('on_table', 500), ('by_hand', 500))
+)
 def test_a_browser_shows_it_without_errors_overflow_or_overlap(pages, tmp_path, name, width):
     found = opened(pages[name], width, tmp_path)
     assert found['wide'] <= 0 and found['figures'] >= 6

@@ -19,16 +19,31 @@ from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.report.diagnosis_page import cause_of, diagnosis_report, draw_finding, explained_share, variables
+from imu_calibration.report.diagnosis_page import (
+    cause_of,
+    diagnosis_report,
+    draw_finding,
+    explained_share,
+    variables,
+)
 from imu_calibration.report.page import chance
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
 
-TABLE = Table.from_mapping({'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, {'name': 'middle', 'axis': [0, 1, 0]},
-                                       {'name': 'inner', 'axis': [1, 0, 0]}],
-                            'up': [0, 0, 1], 'latitude': 48.8, 'azimuth_deg': 0.0})
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'outer', 'axis': [0, 0, 1]},
+            {'name': 'middle', 'axis': [0, 1, 0]},
+            {'name': 'inner', 'axis': [1, 0, 0]},
+        ],
+        'up': [0, 0, 1],
+        'latitude': 48.8,
+        'azimuth_deg': 0.0,
+    }
+)
 MODEL = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'))
 
 
@@ -36,11 +51,24 @@ MODEL = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'))
 def result():
     """The diagnosis of a short session."""
     values = random_values(MODEL, 'industrial', 9)
-    values[MODEL.slices['gyroscope', 'gyro_g_sensitivity']] = 8e-5 * np.array([1, -0.5, 0.3, 0.2, 1, -0.4, 0.5, 0.1, -1])
-    imu, joints, _ = simulate(MODEL, values, TABLE, profile=make_profile('quick', 9, TABLE),
-                              options=SimulationOptions(noise=GRADES['industrial'].noise), seed=9)
+    values[MODEL.slices['gyroscope', 'gyro_g_sensitivity']] = 8e-5 * np.array(
+        [1, -0.5, 0.3, 0.2, 1, -0.4, 0.5, 0.1, -1]
+    )
+    imu, joints, _ = simulate(
+        MODEL,
+        values,
+        TABLE,
+        profile=make_profile('quick', 9, TABLE),
+        options=SimulationOptions(noise=GRADES['industrial'].noise),
+        seed=9,
+    )
     block = SampleBlock(imu, joints)
-    return diagnose_recording(lambda: iter([block]), TABLE, CalibrationOptions(), provenance={'bags': [{'name': 'session', 'sha256': '0'}]})
+    return diagnose_recording(
+        lambda: iter([block]),
+        TABLE,
+        CalibrationOptions(),
+        provenance={'bags': [{'name': 'session', 'sha256': '0'}]},
+    )
 
 
 def test_the_finding_is_told_drawn_and_measured(result):
@@ -48,15 +76,28 @@ def test_the_finding_is_told_drawn_and_measured(result):
     assert result.lines[0].startswith('1. gyro_g_sensitivity')
     page = diagnosis_report(result)
     assert diagnosis_report(result) == page
-    head = page[:page.index('<nav>')]
+    head = page[: page.index('<nav>')]
     assert 'cause found' in head or 'causes found' in head
     assert 'respond to specific force' in head
     assert page.count('<svg') == len(result.diagnosis.findings)
-    plain = page.replace(resources.files('imu_calibration.report').joinpath('templates/uPlot.iife.min.js').read_text().strip(), '')
+    plain = page.replace(
+        resources.files('imu_calibration.report')
+        .joinpath('templates/uPlot.iife.min.js')
+        .read_text()
+        .strip(),
+        '',
+    )
     assert len(page) - len(plain) > 50_000 and page.count('<script>') == page.count('<script') == 1
     assert not re.search(r'https?://(?!www\.w3\.org)|\bsrc=|fetch\(|import\(', plain)
     assert len(page.encode()) < 4e6
-    for section in ('findings', 'unexplained', 'simulation', 'candidates', 'untested', 'parameters'):
+    for section in (
+        'findings',
+        'unexplained',
+        'simulation',
+        'candidates',
+        'untested',
+        'parameters',
+    ):
         assert f'<section id="{section}">' in page
     for row in result.diagnosis.candidates:
         assert row.effect.replace('_', ' ') in page
@@ -65,7 +106,9 @@ def test_the_finding_is_told_drawn_and_measured(result):
 def test_it_is_drawn_against_its_cause(result):
     finding = result.diagnosis.findings[0]
     assert finding.gain.sensor == 'gyroscope'
-    assert cause_of(result.diagnosis, finding.gain.sensor, finding.against)[1].startswith('specific force')
+    assert cause_of(result.diagnosis, finding.gain.sensor, finding.against)[1].startswith(
+        'specific force'
+    )
 
 
 def test_a_figure_is_svg_pdf_axes_and_arrays(result, tmp_path):
@@ -75,25 +118,43 @@ def test_a_figure_is_svg_pdf_axes_and_arrays(result, tmp_path):
         assert (tmp_path / name).read_bytes().startswith(head)
     with refused(InputError, 'figure_suffix', 'p.jpg'):
         drawing.save(tmp_path / 'p.jpg')
-    assert drawing.bytes_as("pdf") == drawing.bytes_as("pdf")
+    assert drawing.bytes_as('pdf') == drawing.bytes_as('pdf')
     left, right = drawing.data
     axis, _, values = cause_of(result.diagnosis, 'gyroscope', ('force',))
     np.testing.assert_array_equal(left['lines'][0][1], values)
-    np.testing.assert_allclose(right['lines'][0][2], np.rad2deg(result.diagnosis.traces.after['gyroscope'][:, axis]), rtol=1e-12)
-    assert left['x'].startswith('specific force') and [axes.get_xlabel() for axes in drawing.axes] == [left['x'], right['x']]
+    np.testing.assert_allclose(
+        right['lines'][0][2],
+        np.rad2deg(result.diagnosis.traces.after['gyroscope'][:, axis]),
+        rtol=1e-12,
+    )
+    assert left['x'].startswith('specific force') and [
+        axes.get_xlabel() for axes in drawing.axes
+    ] == [left['x'], right['x']]
 
 
 def test_a_joint_goes_by_its_name(result):
     labels = variables(result.diagnosis.traces, result.diagnosis.baseline.model.joint_names)
-    assert [label for label in labels if label.startswith('angle')] == ['angle of outer, deg', 'angle of middle, deg', 'angle of inner, deg']
-    by_hand = replace(result.diagnosis.traces, position=np.empty((len(result.diagnosis.traces.time), 0)))
-    assert not [label for label in variables(by_hand, ('outer', 'middle', 'inner')) if label.startswith('angle')]
+    assert [label for label in labels if label.startswith('angle')] == [
+        'angle of outer, deg',
+        'angle of middle, deg',
+        'angle of inner, deg',
+    ]
+    by_hand = replace(
+        result.diagnosis.traces, position=np.empty((len(result.diagnosis.traces.time), 0))
+    )
+    assert not [
+        label
+        for label in variables(by_hand, ('outer', 'middle', 'inner'))
+        if label.startswith('angle')
+    ]
 
 
 def test_the_document_and_the_calibration_agree(result):
     parameters = result.document['findings'][0]['parameters']
     for name, entry in parameters.items():
-        assert result.calibration.values[result.calibration.param_names.index(name)] == pytest.approx(entry['value'], rel=1e-9)
+        assert result.calibration.values[
+            result.calibration.param_names.index(name)
+        ] == pytest.approx(entry['value'], rel=1e-9)
     assert exit_code(result.calibration) in (0, 3)
 
 
@@ -113,28 +174,69 @@ def test_chances_that_underflow_are_not_printed_as_nothing():
 @pytest.fixture(scope='module')
 def of_formula(result):
     """The same result with an unexplained residual of gyroscope y that follows a formula, and no finding."""
-    effect = term('gyro_proposed_1', sensor='gyroscope', column='w_z ** 3', unit='rad/s/(rad/s)^3', tolerance=1e-5, text='A formula.')
-    proposal = Proposal('gyroscope', (effect,), (np.array([0.0, 2e-4, 0.0]),), (np.full(3, 3e-6),), frozenset({'rate'}), ('y',), 0.96,
-                        (0.91, 0.99), 0.8, 1e-30, ('w_z',), ('gyro_quadratic', 0.4), 'turn about two axes')
+    effect = term(
+        'gyro_proposed_1',
+        sensor='gyroscope',
+        column='w_z ** 3',
+        unit='rad/s/(rad/s)^3',
+        tolerance=1e-5,
+        text='A formula.',
+    )
+    proposal = Proposal(
+        'gyroscope',
+        (effect,),
+        (np.array([0.0, 2e-4, 0.0]),),
+        (np.full(3, 3e-6),),
+        frozenset({'rate'}),
+        ('y',),
+        0.96,
+        (0.91, 0.99),
+        0.8,
+        1e-30,
+        ('w_z',),
+        ('gyro_quadratic', 0.4),
+        'turn about two axes',
+    )
     diagnosis = result.diagnosis
-    rest = replace(diagnosis.unexplained['gyroscope'], significant=True, rms=5e-4, axes=('y',), proposal=proposal)
-    return replace(result, diagnosis=replace(diagnosis, findings=(), unexplained={**diagnosis.unexplained, 'gyroscope': rest}))
+    rest = replace(
+        diagnosis.unexplained['gyroscope'],
+        significant=True,
+        rms=5e-4,
+        axes=('y',),
+        proposal=proposal,
+    )
+    return replace(
+        result,
+        diagnosis=replace(
+            diagnosis, findings=(), unexplained={**diagnosis.unexplained, 'gyroscope': rest}
+        ),
+    )
 
 
 def test_the_headline_of_a_formula_states_its_share(of_formula):
     page = diagnosis_report(of_formula)
     headline = page.partition('<p class="word">')[2].partition('</p>')[0]
     assert '96 %' in headline and 'gyroscope' in headline
-    assert 'section id="formulas"' in page and page.lower().count('turn about two axes') == 1   # advice once
+    assert (
+        'section id="formulas"' in page and page.lower().count('turn about two axes') == 1
+    )  # advice once
     assert not any('nothing found' in line for line in of_formula.lines)
 
 
 def test_the_gain_of_a_formula_is_in_the_unit_of_the_sensor(of_formula):
     """``after = before sqrt(1 - share)``, and the interval of the reduction from that of the share."""
     gain = of_formula.document['unexplained']['gyroscope']['proposals'][0]['gain']
-    assert gain['heldout_rms_before'] == 5e-4 and gain['heldout_rms_after'] == pytest.approx(5e-4 * 0.2, rel=1e-12)
-    assert gain['ci95'] == pytest.approx([0.7, 0.9], rel=1e-12) and gain['windows'] == of_formula.diagnosis.locked
-    assert any(all(size in line for size in ('0.0286 deg/s', '0.00286 deg/s', '0.00859 deg/s')) for line in of_formula.lines)
+    assert gain['heldout_rms_before'] == 5e-4 and gain['heldout_rms_after'] == pytest.approx(
+        5e-4 * 0.2, rel=1e-12
+    )
+    assert (
+        gain['ci95'] == pytest.approx([0.7, 0.9], rel=1e-12)
+        and gain['windows'] == of_formula.diagnosis.locked
+    )
+    assert any(
+        all(size in line for size in ('0.0286 deg/s', '0.00286 deg/s', '0.00859 deg/s'))
+        for line in of_formula.lines
+    )
 
 
 def test_the_distance_agrees_with_the_held_out_gain(result):
@@ -151,26 +253,56 @@ def test_the_segments_are_measured_and_simulated(result):
     """Over a segment the simulation of the extended model differs from the measurement by noise, that of the baseline by more."""
     for segment in result.diagnosis.traces.segments['gyroscope']:
         assert 5.0 < np.ptp(segment.time) < 11.0 and len(segment.time) <= 800
-        before, after = (np.mean(segment.signals['measured'] - segment.signals[f'simulated {when}']) for when in ('before', 'after'))
+        before, after = (
+            np.mean(segment.signals['measured'] - segment.signals[f'simulated {when}'])
+            for when in ('before', 'after')
+        )
         assert abs(after) < 0.6 * abs(before)
 
 
 def test_the_charts_have_the_data_of_each_sensor_and_axis(result):
     """Five rows of three axes for each sensor, the same numbers as the traces, and the cause as the first variable."""
-    charts = [json.loads(unescape(each)) for each in re.findall(r'data-chart="([^"]*)"', diagnosis_report(result))]
-    assert [chart['title'] for chart in charts[:3]] == ['accelerometer x', 'accelerometer y', 'accelerometer z'] and len(charts) == 30
+    charts = [
+        json.loads(unescape(each))
+        for each in re.findall(r'data-chart="([^"]*)"', diagnosis_report(result))
+    ]
+    assert [chart['title'] for chart in charts[:3]] == [
+        'accelerometer x',
+        'accelerometer y',
+        'accelerometer z',
+    ] and len(charts) == 30
     overlay, difference = charts[15:18], charts[18:21]
-    for segment, signals, errors in zip(result.diagnosis.traces.segments['gyroscope'], overlay, difference):
-        assert signals['names'] == ['measured', 'simulated before', 'simulated after'] and errors['names'] == ['before', 'after']
-        np.testing.assert_allclose(signals['data'][1], np.rad2deg(segment.signals['measured']), rtol=1e-4, atol=1e-12)
-        np.testing.assert_allclose(errors['data'][2], np.rad2deg(segment.signals['measured'] - segment.signals['simulated after']),
-                                   rtol=1e-4, atol=1e-12)
+    for segment, signals, errors in zip(
+        result.diagnosis.traces.segments['gyroscope'], overlay, difference
+    ):
+        assert signals['names'] == ['measured', 'simulated before', 'simulated after'] and errors[
+            'names'
+        ] == ['before', 'after']
+        np.testing.assert_allclose(
+            signals['data'][1], np.rad2deg(segment.signals['measured']), rtol=1e-4, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            errors['data'][2],
+            np.rad2deg(segment.signals['measured'] - segment.signals['simulated after']),
+            rtol=1e-4,
+            atol=1e-12,
+        )
     assert charts[21]['kind'] == 'points' and charts[21]['x'].startswith('specific force')
-    assert charts[24]['kind'] == 'log' and sum(charts[27]['data'][1]) > 0.95 * len(result.diagnosis.traces.time)
+    assert charts[24]['kind'] == 'log' and sum(charts[27]['data'][1]) > 0.95 * len(
+        result.diagnosis.traces.time
+    )
 
 
-def test_the_extended_calibration_has_its_decisions_and_the_motions_for_undetermined_parameters(result):
-    reasons = [reason for reason in result.calibration.judgement.reasons if reason.word in (DECISION, PARAMETERS)]
+def test_the_extended_calibration_has_its_decisions_and_the_motions_for_undetermined_parameters(
+    result,
+):
+    reasons = [
+        reason
+        for reason in result.calibration.judgement.reasons
+        if reason.word in (DECISION, PARAMETERS)
+    ]
     assert {reason.word for reason in reasons} == {DECISION, PARAMETERS}
     section = unescape(diagnosis_report(result)).partition('<section id="parameters">')[2]
-    assert all(text[1:] in section for reason in reasons for text in (reason.what, reason.advice()) if text)
+    assert all(
+        text[1:] in section for reason in reasons for text in (reason.what, reason.advice()) if text
+    )

@@ -14,10 +14,13 @@ class Harness:
     """A node in this process, in a DDS domain of its own on this host."""
 
     def __init__(self, domain_id):
-        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = local_environment(domain_id)['ROS_AUTOMATIC_DISCOVERY_RANGE']
+        os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = local_environment(domain_id)[
+            'ROS_AUTOMATIC_DISCOVERY_RANGE'
+        ]
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
         from rclpy.executors import SingleThreadedExecutor
+
         self.context = rclpy.Context()
         rclpy.init(context=self.context, domain_id=domain_id)
         self.node = rclpy.create_node('harness', context=self.context)
@@ -38,7 +41,9 @@ class Harness:
 
     def listen(self, message_type, topic, qos):
         """Keep serialized messages of a topic in ``received[topic]``."""
-        self.node.create_subscription(message_type, topic, self.received[topic].append, qos, raw=True)
+        self.node.create_subscription(
+            message_type, topic, self.received[topic].append, qos, raw=True
+        )
 
     def spin(self, seconds):
         """Take messages for so long."""
@@ -50,7 +55,9 @@ class Harness:
         """Take messages until `condition()` holds."""
         end = time.monotonic() + seconds
         while not condition():
-            assert time.monotonic() < end, f'{what} did not come within {seconds} s; diagnostics: {self.lines()}'
+            assert time.monotonic() < end, (
+                f'{what} did not come within {seconds} s; diagnostics: {self.lines()}'
+            )
             self._executor.spin_once(timeout_sec=0.05)
 
     def lines(self):
@@ -59,7 +66,11 @@ class Harness:
 
     def values(self, node):
         """Return the latest details of a node's diagnostics."""
-        return {pair.key: pair.value for pair in self.statuses[node].values} if node in self.statuses else {}
+        return (
+            {pair.key: pair.value for pair in self.statuses[node].values}
+            if node in self.statuses
+            else {}
+        )
 
     def connected(self, topic, subscribers=1):
         """Return whether our publisher of `topic` has found its subscribers."""

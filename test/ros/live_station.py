@@ -46,6 +46,7 @@ class Station:
         import rclpy
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
+
         os.environ |= STAY_LOCAL
         domain_id, self._lock = free_domain()
         self.processes = NodeProcesses(domain_id)
@@ -75,29 +76,43 @@ class Station:
 
     def calibration_node(self, folder, **parameters):
         """Start calibration_node with a place to save in `folder`."""
-        options = {key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters}
-        fixed = {'table_file': TABLE, 'save_file': Path(folder) / 'calibration.yaml', 'solve_share': 0.2}
+        options = {
+            key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters
+        }
+        fixed = {
+            'table_file': TABLE,
+            'save_file': Path(folder) / 'calibration.yaml',
+            'solve_share': 0.2,
+        }
         return self.start('calibration_node', fixed | parameters, **options)
 
     def play(self, bag, rate, subscribers=1, **parameters):
         """Start bag_player_node."""
-        options = {key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters}
+        options = {
+            key: parameters.pop(key) for key in ('namespace', 'remappings') if key in parameters
+        }
         fixed = {'bag': bag, 'rate': float(rate), 'wait_for_subscribers': subscribers}
         return self.start('bag_player_node', fixed | parameters, **options)
 
     def publisher(self, message_type, topic, reliable=True, depth=1000):
         """Return a publisher of the station's node."""
         from rclpy.qos import QoSProfile, ReliabilityPolicy
+
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        return self.node.create_publisher(message_type, topic, QoSProfile(depth=depth, reliability=reliability))
+        return self.node.create_publisher(
+            message_type, topic, QoSProfile(depth=depth, reliability=reliability)
+        )
 
     def watch_imu(self, topic):
         """Gather the Imu messages of a topic; returns the LiveGatherer."""
         from sensor_msgs.msg import Imu
 
         from imu_calibration.nodes.inputs import BatchInput
+
         gatherer = LiveGatherer()
-        self.subscriptions.append(BatchInput(self.node, Imu, topic, add=gatherer.add_imu, depth=20_000))
+        self.subscriptions.append(
+            BatchInput(self.node, Imu, topic, add=gatherer.add_imu, depth=20_000)
+        )
         return gatherer
 
     def watch_documents(self, topic='imu/calibration'):
@@ -105,8 +120,11 @@ class Station:
         from std_msgs.msg import String
 
         from imu_calibration.nodes.inputs import latched_qos
+
         documents = []
-        note = self.node.create_subscription(String, topic, lambda message: documents.append(message.data), latched_qos())
+        note = self.node.create_subscription(
+            String, topic, lambda message: documents.append(message.data), latched_qos()
+        )
         self.subscriptions.append(note)
         return documents
 
@@ -120,21 +138,32 @@ class Station:
                 if known is None or (known.level, known.message) != (status.level, status.message):
                     self.history.append((status.name, status.level[0], status.message))
                 self.status[status.name] = status
-        self.subscriptions.append(self.node.create_subscription(DiagnosticArray, '/diagnostics', note, 100))
+
+        self.subscriptions.append(
+            self.node.create_subscription(DiagnosticArray, '/diagnostics', note, 100)
+        )
 
     def figure(self, key, name='calibration_node: calibration'):
         """Return a figure of a diagnostic status as int; 0 while it is not there."""
         status = self.status.get(name)
-        return next((int(float(value.value)) for value in status.values if value.key == key), 0) if status else 0
+        return (
+            next((int(float(value.value)) for value in status.values if value.key == key), 0)
+            if status
+            else 0
+        )
 
     def until(self, condition, what, patience=PATIENCE):
         """Spin until a condition holds; fail with `what` when it does not in time or a node has died."""
         deadline = time.monotonic() + patience
         while not condition():
             for process in self.processes.running:
-                assert process.poll() in (None, 0), f'a node ended with {process.returncode} while waiting for {what}: {process.args[2]}'
+                assert process.poll() in (None, 0), (
+                    f'a node ended with {process.returncode} while waiting for {what}: {process.args[2]}'
+                )
             known = {name: status.message for name, status in self.status.items()}
-            assert time.monotonic() < deadline, f'waited in vain for {what}; last diagnostics: {known}'
+            assert time.monotonic() < deadline, (
+                f'waited in vain for {what}; last diagnostics: {known}'
+            )
             self.executor.spin_once(timeout_sec=0.05)
 
     def spin_for(self, seconds):
@@ -150,6 +179,7 @@ class Station:
         An answer may be lost before both sides are connected; the call is repeated every `again` seconds.
         """
         from std_srvs.srv import Trigger
+
         kind = kind or Trigger
         client = self.node.create_client(kind, service)
         try:
@@ -160,6 +190,7 @@ class Station:
                 if time.monotonic() - began >= len(asked) * again:
                     asked.append(client.call_async(kind.Request(**fields)))
                 return any(future.done() for future in asked)
+
             self.until(answered, f'the answer of {service}')
             return next(future for future in asked if future.done()).result()
         finally:
@@ -169,29 +200,41 @@ class Station:
 class Publisher:
     """Publishes samples of one IMU and its joints from the station, faster than they were taken."""
 
-    def __init__(self, station, imu_topic='imu/data_raw', joint_topic='joint_states', reliable=True):
+    def __init__(
+        self, station, imu_topic='imu/data_raw', joint_topic='joint_states', reliable=True
+    ):
         from sensor_msgs.msg import Imu, JointState
+
         self.station = station
-        self.imu, self.joints = (station.publisher(kind, topic, reliable, 20_000)
-                                 for kind, topic in ((Imu, imu_topic), (JointState, joint_topic)))
+        self.imu, self.joints = (
+            station.publisher(kind, topic, reliable, 20_000)
+            for kind, topic in ((Imu, imu_topic), (JointState, joint_topic))
+        )
 
     def wait(self, subscribers=1):
         """Wait until both topics have subscribers."""
-        self.station.until(lambda: min(p.get_subscription_count() for p in (self.imu, self.joints)) >= subscribers, 'subscribers')
+        self.station.until(
+            lambda: min(p.get_subscription_count() for p in (self.imu, self.joints)) >= subscribers,
+            'subscribers',
+        )
         self.station.spin_for(0.3)
 
     def send(self, imu, joints, per_second=4000):
         """Publish ImuSamples and JointSamples merged by their place in the recording, about so many per second."""
         from msg_adapters.layout import Packed
         from msg_adapters.write import encode_imu, encode_joints
+
         queue = []
-        for publisher, samples, encode in ((self.imu, imu, encode_imu), (self.joints, joints, encode_joints)):
+        for publisher, samples, encode in (
+            (self.imu, imu, encode_imu),
+            (self.joints, joints, encode_joints),
+        ):
             messages = Packed.of_rows(encode(samples)).views() if len(samples) else []
             queue += [(k / len(messages), publisher, message) for k, message in enumerate(messages)]
         queue.sort(key=lambda entry: entry[0])
         step = max(per_second // 50, 1)
         for start in range(0, len(queue), step):
-            for _, publisher, message in queue[start:start + step]:
+            for _, publisher, message in queue[start : start + step]:
                 publisher.publish(bytes(message))
             self.station.spin_for(0.02)
 

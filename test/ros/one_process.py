@@ -61,7 +61,12 @@ class OneProcess:
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
         with self._monkeypatch.context() as patch:
             patch.setattr(make, 'get_logger', lambda node: Ear(self.said))
-            node = make(context=self.context, parameter_overrides=overrides, use_global_arguments=False, **options)
+            node = make(
+                context=self.context,
+                parameter_overrides=overrides,
+                use_global_arguments=False,
+                **options,
+            )
         node.get_logger = lambda: Ear(self.said)
         self.executor.add_node(node)
         self.nodes.append(node)
@@ -71,7 +76,9 @@ class OneProcess:
         """Spin until a condition holds."""
         end = time.monotonic() + PATIENCE
         while not condition():
-            assert time.monotonic() < end, f'waited in vain for {what}; said: {self.said}; status: {self.lines()}'
+            assert time.monotonic() < end, (
+                f'waited in vain for {what}; said: {self.said}; status: {self.lines()}'
+            )
             self.executor.spin_once(timeout_sec=0.02)
 
     def lines(self):
@@ -80,16 +87,28 @@ class OneProcess:
 
     def figure(self, name, key):
         """Return a value of a status, '' when it is not there."""
-        return next((pair.value for pair in self.status[name].values if pair.key == key), '') if name in self.status else ''
+        return (
+            next((pair.value for pair in self.status[name].values if pair.key == key), '')
+            if name in self.status
+            else ''
+        )
 
     def heard(self, *values, level=None):
         """Return how many lines hold all of these names, numbers and keys; sentences may change."""
-        return sum(all(str(value) in line for value in values) for kind, line in self.said if level in (None, kind))
+        return sum(
+            all(str(value) in line for value in values)
+            for kind, line in self.said
+            if level in (None, kind)
+        )
 
     def shows(self, name, *values, level=None):
         """Return whether the latest status has this level and holds all of these names, numbers and keys."""
         shown, line = self.lines().get(name, (None, ''))
-        return shown is not None and level in (None, shown) and all(str(value) in line for value in values)
+        return (
+            shown is not None
+            and level in (None, shown)
+            and all(str(value) in line for value in values)
+        )
 
     def call(self, name, kind=Trigger, until=None, **fields):
         """Call a service with these fields of its request and return its answer; `until` waits in place of the method."""

@@ -40,16 +40,24 @@ class PlannerBench(OneProcess):
     def __init__(self, monkeypatch, folder, limits=LIMITED, **parameters):
         super().__init__(monkeypatch)
         self.table_file = folder / 'table.yaml'
-        joints = [{'name': name, 'axis': axis} | dict(limits) for name, axis in zip(NAMES, ([0, 0, 1], [1, 0, 0]), strict=True)]
+        joints = [
+            {'name': name, 'axis': axis} | dict(limits)
+            for name, axis in zip(NAMES, ([0, 0, 1], [1, 0, 0]), strict=True)
+        ]
         self.table_file.write_text(json.dumps({'joints': joints, 'gravity': 9.81}))
         self.stamp, self.position, self.rate, self.trajectories = 100.0, np.zeros(2), [], []
         self.publisher = self.node.create_publisher(JointState, 'joint_states', output_qos())
-        self.node.create_subscription(JointTrajectory, 'joint_trajectory', self.trajectories.append, 10)
+        self.node.create_subscription(
+            JointTrajectory, 'joint_trajectory', self.trajectories.append, 10
+        )
         for what in ('solve', 'diagnose'):
             self.node.create_service(Trigger, f'/calibration_node/{what}', self._no)
         self.node.create_publisher(String, 'imu/calibration', 10)
         self.planner = self.start(PlannerNode, {'table_file': str(self.table_file), **parameters})
-        self.until(lambda: self.publisher.get_subscription_count() == 1 and self.planner._command.is_heard, 'the connection')
+        self.until(
+            lambda: self.publisher.get_subscription_count() == 1 and self.planner._command.is_heard,
+            'the connection',
+        )
 
     def _no(self, _, response):
         response.success, response.message = False, 'too little motion'
@@ -58,16 +66,25 @@ class PlannerBench(OneProcess):
     def look(self, elapsed=PERIOD, **fields):
         """Publish a joint state so much later, and let everything be heard."""
         self.stamp += elapsed
-        message = JointState(name=NAMES, position=[float(value) for value in self.position], velocity=list(self.rate), **fields)
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(self.stamp * 1e9), 1_000_000_000)
+        message = JointState(
+            name=NAMES,
+            position=[float(value) for value in self.position],
+            velocity=list(self.rate),
+            **fields,
+        )
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(
+            round(self.stamp * 1e9), 1_000_000_000
+        )
         self.publisher.publish(message)
         self.executor.spin_once(timeout_sec=0.005)
 
     def looks(self, condition, what, elapsed=PERIOD):
         """Publish joint states until a condition holds."""
+
         def step():
             self.look(elapsed)
             return condition()
+
         self.until(step, what)
 
     def ask(self, what, elapsed=PERIOD):
@@ -84,5 +101,7 @@ class PlannerBench(OneProcess):
 
     def set(self, node='planner_node', **values):
         """Set parameters of a node from outside; return the results."""
-        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        parameters = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
         return self.call(f'/{node}/set_parameters', SetParameters, parameters=parameters).results

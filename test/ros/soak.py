@@ -61,14 +61,27 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
     memory = {name: [] for name in LARGEST_MB}
     with Station() as station:
         station.watch_diagnostics()
-        running = {'calibration_node': station.calibration_node(folder, autosave_period=10.0),
-                   'compensator_node': station.start('compensator_node')}
+        running = {
+            'calibration_node': station.calibration_node(folder, autosave_period=10.0),
+            'compensator_node': station.start('compensator_node'),
+        }
         station.until(lambda: len(station.status) > 2, 'the nodes')
-        station.start('simulator_node', {'profile': 'quick', 'repeat': True, 'seed': 1, 'time_factor': factor, 'imu_rate': imu_rate,
-                                         'joint_rate': joint_rate, 'wait_for_subscribers': 2})
+        station.start(
+            'simulator_node',
+            {
+                'profile': 'quick',
+                'repeat': True,
+                'seed': 1,
+                'time_factor': factor,
+                'imu_rate': imu_rate,
+                'joint_rate': joint_rate,
+                'wait_for_subscribers': 2,
+            },
+        )
 
         def count():
             return station.figure('imu messages', 'calibration_node: streams')
+
         station.until(count, 'the first messages')
         start, told = time.monotonic(), 0.0
         while time.monotonic() - start < seconds / factor:
@@ -79,9 +92,17 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
                 memory[name].append((now, private_mb(process.pid)))
             if tell and now - told > 60.0:
                 told = now
-                tell(f'{now * factor / 3600:.2f} h: ' + ', '.join(f'{name} {samples[-1][1]:.1f} MB' for name, samples in memory.items()))
+                tell(
+                    f'{now * factor / 3600:.2f} h: '
+                    + ', '.join(
+                        f'{name} {samples[-1][1]:.1f} MB' for name, samples in memory.items()
+                    )
+                )
         n_imu = count()
-    return {name: (*thirds(samples), max(mb for _, mb in samples), n_imu) for name, samples in memory.items()}
+    return {
+        name: (*thirds(samples), max(mb for _, mb in samples), n_imu)
+        for name, samples in memory.items()
+    }
 
 
 def main():
@@ -91,11 +112,26 @@ def main():
     parser.add_argument('--factor', type=float, default=20.0, help='seconds of data per second')
     options = parser.parse_args()
     from tempfile import TemporaryDirectory
+
     with TemporaryDirectory() as folder:
-        found = soak(options.hours * 3600.0, options.factor, Path(folder), tell=lambda line: print(line, flush=True))
+        found = soak(
+            options.hours * 3600.0,
+            options.factor,
+            Path(folder),
+            tell=lambda line: print(line, flush=True),
+        )
     for name, (middle, last, largest, n_imu) in found.items():
-        print(f'{name}: {middle:.1f} MB in the middle third, {last:.1f} MB in the last, {largest:.1f} MB at most ({n_imu} Imu messages)')
-    return 0 if all(last - middle <= GROWTH_MB and largest <= LARGEST_MB[name] for name, (middle, last, largest, _) in found.items()) else 1
+        print(
+            f'{name}: {middle:.1f} MB in the middle third, {last:.1f} MB in the last, {largest:.1f} MB at most ({n_imu} Imu messages)'
+        )
+    return (
+        0
+        if all(
+            last - middle <= GROWTH_MB and largest <= LARGEST_MB[name]
+            for name, (middle, last, largest, _) in found.items()
+        )
+        else 1
+    )
 
 
 if __name__ == '__main__':

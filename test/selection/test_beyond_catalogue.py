@@ -27,8 +27,22 @@ from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.physics_beyond import Beyond
 
-FEW = ('accel_quadratic', 'accel_cubic', 'accel_bias_drift', 'accel_thermal_bias', 'gyro_g_sensitivity', 'gyro_quadratic', 'gyro_bandwidth', 'gyro_bias_drift',
-       'gyro_thermal_bias', 'accel_thermal_bias_2', 'gyro_thermal_bias_2', 'gyro_thermal_scale', 'time_offset', 'load_compliance')
+FEW = (
+    'accel_quadratic',
+    'accel_cubic',
+    'accel_bias_drift',
+    'accel_thermal_bias',
+    'gyro_g_sensitivity',
+    'gyro_quadratic',
+    'gyro_bandwidth',
+    'gyro_bias_drift',
+    'gyro_thermal_bias',
+    'accel_thermal_bias_2',
+    'gyro_thermal_bias_2',
+    'gyro_thermal_scale',
+    'time_offset',
+    'load_compliance',
+)
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
@@ -36,14 +50,18 @@ pytestmark = pytest.mark.usefixtures('few_candidates')
 def recorded(kind=None, seed=5):
     """Return (recording, cause) of a session."""
     cause = Beyond(kind, seed) if kind else None
-    return record(seed, None, through_bag=False, profile='quick', **({'cause': cause} if cause else {})), cause
+    return record(
+        seed, None, through_bag=False, profile='quick', **({'cause': cause} if cause else {})
+    ), cause
 
 
 @lru_cache(maxsize=None)
 def looked(kind=None, seed=5):
     """Return (examination, sensor -> blocks, cause) of a session."""
     recording, cause = recorded(kind, seed)
-    found = ResidualAnalysis.of(investigate(recording.windows, recording.table, recording.model), recording.table)
+    found = ResidualAnalysis.of(
+        investigate(recording.windows, recording.table, recording.model), recording.table
+    )
     return found, found.blocks, cause
 
 
@@ -58,38 +76,74 @@ def proposed(found, blocks, fits):
 
 def test_the_grammar_is_arithmetic_with_units_and_speaks_of_what_it_says():
     formulas = grammar(3, True, 300.0)
-    assert sum(len(formula.columns) for formula in formulas) > 1000 and len(set(formulas)) == len(formulas)
+    assert sum(len(formula.columns) for formula in formulas) > 1000 and len(set(formulas)) == len(
+        formulas
+    )
     by_text = {formula.columns[0]: formula for formula in formulas}
-    assert by_text['f_x * w_y'].unit('rad/s') == 'rad/s/(m/s^2)/(rad/s)' and by_text['w_x ** 3'].unit('rad/s') == 'rad/s/(rad/s)^3'
+    assert (
+        by_text['f_x * w_y'].unit('rad/s') == 'rad/s/(m/s^2)/(rad/s)'
+        and by_text['w_x ** 3'].unit('rad/s') == 'rad/s/(rad/s)^3'
+    )
     assert by_text['(temperature_c - temperature_ref_c) * f_z'].unit('m/s^2') == 'm/s^2/K/(m/s^2)'
     assert by_text['(temperature_c - temperature_ref_c) * f_z'].family == {'temperature', 'force'}
-    assert by_text['sign(f_x)'].unit('m/s^2') == by_text['cos(3 * angle_2)'].unit('m/s^2') == 'm/s^2'
-    assert {f.columns[0] for f in formulas if f.smooth} >= {'(temperature_c - temperature_ref_c) ** 2'} and not by_text['w_x'].smooth
+    assert (
+        by_text['sign(f_x)'].unit('m/s^2') == by_text['cos(3 * angle_2)'].unit('m/s^2') == 'm/s^2'
+    )
+    assert {f.columns[0] for f in formulas if f.smooth} >= {
+        '(temperature_c - temperature_ref_c) ** 2'
+    } and not by_text['w_x'].smooth
     for formula in formulas:
         for column in formula.columns:
-            assert ColumnGroup('c', (column,) if isinstance(column, str) else column).names, 'reads and speaks of something'
+            assert ColumnGroup('c', (column,) if isinstance(column, str) else column).names, (
+                'reads and speaks of something'
+            )
 
 
 def test_the_sense_of_a_rate_is_not_that_of_the_rate_of_the_earth():
     """At rest the sign of a rate is that of 7.3e-5 rad/s, or of noise: a column of it would shake every bias there."""
     texts = [text for formula in grammar(3, True, 300.0) for text in np.ravel(formula.columns)]
-    assert any('tanh(w_x' in text for text in texts) and any('tanh(joint_rate_1' in text for text in texts) and 'sign(f_x)' in texts
+    assert (
+        any('tanh(w_x' in text for text in texts)
+        and any('tanh(joint_rate_1' in text for text in texts)
+        and 'sign(f_x)' in texts
+    )
     assert not any('sign(w' in text or 'sign(joint' in text for text in texts)
 
 
 @pytest.mark.parametrize('span, warms', [(None, False), (0.3, False), (4.0, True)])
 def test_a_temperature_that_stays_is_no_cause(span, warms):
     _, blocks, _ = looked()
-    changed = {sensor: replace(of, ref=replace(of.ref, temperature_c=None if span is None else np.linspace(25.0, 25.0 + span, len(of.ref.rate_s))))
-               for sensor, of in blocks.items()}
+    changed = {
+        sensor: replace(
+            of,
+            ref=replace(
+                of.ref,
+                temperature_c=None
+                if span is None
+                else np.linspace(25.0, 25.0 + span, len(of.ref.rate_s)),
+            ),
+        )
+        for sensor, of in blocks.items()
+    }
     for of in changed.values():
         assert of.warms is warms
-        assert any('temperature' in str(formula.columns) for formula in proposals._grammar(of)) is warms
-        assert any('temperature' in variable.name for variable in variables_of(of, ('outer', 'middle', 'inner'))) is warms
+        assert (
+            any('temperature' in str(formula.columns) for formula in proposals._grammar(of))
+            is warms
+        )
+        assert (
+            any(
+                'temperature' in variable.name
+                for variable in variables_of(of, ('outer', 'middle', 'inner'))
+            )
+            is warms
+        )
 
 
 @pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('kind, formula', [(None, None), pytest.param('gyro_cubic', 'w_z ** 3', marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    'kind, formula', [(None, None), pytest.param('gyro_cubic', 'w_z ** 3', marks=pytest.mark.long)]
+)
 def test_a_recording_without_noise_is_judged_too(kind, formula):
     """As of a simulator whose noise is off: no sample is taken for exact, and nothing is divided by nothing."""
     cause = {'cause': Beyond(kind, 5)} if kind else {}
@@ -107,22 +161,40 @@ def test_blocks_of_a_recording_that_hides_nothing_are_noise():
         assert abs(plain.excess) < 5 * np.sqrt(2 * plain.rest.size)
 
 
-@pytest.mark.parametrize('kind, text', [('scale_under_load', 'f_'), ('gyro_cubic', '** 3'), pytest.param('stray_field_accel', 'sin(', marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    'kind, text',
+    [
+        ('scale_under_load', 'f_'),
+        ('gyro_cubic', '** 3'),
+        pytest.param('stray_field_accel', 'sin(', marks=pytest.mark.long),
+    ],
+)
 def test_a_formula_is_found_and_judged_on_windows_that_took_no_part(kind, text):
     found, blocks, cause = looked(kind)
     proposal = found.proposals[cause.kind.sensor]
-    assert text in proposal.columns[0] and proposal.family == cause.kind.family and set(proposal.axes) == cause.axes
+    assert (
+        text in proposal.columns[0]
+        and proposal.family == cause.kind.family
+        and set(proposal.axes) == cause.axes
+    )
     assert proposal.share > 0.95 and proposal.ci95[0] > 0.9 and proposal.reduction > 0.8
     assert proposal.nearest[0] in proposal.sentence
     size = sum(proposal.sizes)
-    assert size == pytest.approx(np.sqrt((cause.signal**2).sum(axis=1).mean()), rel=0.6), 'as large as what was hidden'
+    assert size == pytest.approx(np.sqrt((cause.signal**2).sum(axis=1).mean()), rel=0.6), (
+        'as large as what was hidden'
+    )
 
 
 def test_nothing_is_proposed_where_nothing_is_hidden_even_when_asked():
     found, blocks, _ = looked()
     for sensor in blocks:
         assert proposed(found, blocks[sensor], fits_of(found, blocks[sensor])) is None
-        assert not find_regimes(blocks[sensor], found.problem, found.problem.search.indices([]), joint_names=('outer', 'middle', 'inner'))
+        assert not find_regimes(
+            blocks[sensor],
+            found.problem,
+            found.problem.search.indices([]),
+            joint_names=('outer', 'middle', 'inner'),
+        )
 
 
 def test_a_formula_that_takes_little_off_held_out_windows_is_a_story(monkeypatch):
@@ -136,7 +208,10 @@ def test_halves_that_disagree_make_no_formula(monkeypatch):
     found, blocks, cause = looked('scale_under_load')
     sensor = blocks['gyroscope']
     late = sensor.time > np.median(sensor.time)
-    turned = tuple(np.concatenate([part[:, :-1], np.where(late, -1.0, 1.0)[:, None] * part[:, -1:]], axis=1) for part in sensor.design)
+    turned = tuple(
+        np.concatenate([part[:, :-1], np.where(late, -1.0, 1.0)[:, None] * part[:, -1:]], axis=1)
+        for part in sensor.design
+    )
     upset = replace(sensor, design=turned)
     told = proposed(found, upset, fits_of(found, upset))
     assert told is None or 'f_z * w' not in str(told.columns)
@@ -146,14 +221,25 @@ def test_shares_are_of_the_locked_windows():
     found, blocks, cause = looked('gyro_cubic')
     fits = fits_of(found, blocks['gyroscope'])
     before = fits.fit()
-    true = np.stack([np.interp(blocks['gyroscope'].time, cause.time, cause.signal[:, axis]) for axis in range(3)], axis=1)[:, None]
+    true = np.stack(
+        [
+            np.interp(blocks['gyroscope'].time, cause.time, cause.signal[:, axis])
+            for axis in range(3)
+        ],
+        axis=1,
+    )[:, None]
     after = fits.fit(true)
-    assert len(before.window) == blocks['gyroscope'].locked.sum() and set(before.window) == set(np.flatnonzero(found.problem.locked))
+    assert len(before.window) == blocks['gyroscope'].locked.sum() and set(before.window) == set(
+        np.flatnonzero(found.problem.locked)
+    )
     low, high = share_interval(before, after, np.random.default_rng(0))
     assert low <= share_removed(before, after) <= high
 
 
-@pytest.mark.parametrize(('kind', 'size'), [('cable_in_an_arc', 1.0), pytest.param('sticks_when_warm', 2.0, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ('kind', 'size'),
+    [('cable_in_an_arc', 1.0), pytest.param('sticks_when_warm', 2.0, marks=pytest.mark.long)],
+)
 def test_the_place_is_found(kind, size):
     """A gyroscope step of half this size is within the wander of its bias."""
     row, known = row_of(6, kind, 'white', Beyond(kind, 6, size))
@@ -164,12 +250,19 @@ def test_the_place_is_found(kind, size):
 def test_the_formula_is_printed():
     (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
     lines = '\n'.join(diagnosis_lines(build_diagnosis(recording.table, without_superseded(found))))
-    assert all(part in lines for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposals['gyroscope'].sentence))
+    assert all(
+        part in lines
+        for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposals['gyroscope'].sentence)
+    )
 
 
 def test_a_mount_that_bends_is_named_in_both_sensors():
     arcmin_per_g = 2.97e-5
-    recording = record(3, {'load_compliance': 0.5 * arcmin_per_g * np.random.default_rng(3).normal(size=(3, 3))}, through_bag=False)
+    recording = record(
+        3,
+        {'load_compliance': 0.5 * arcmin_per_g * np.random.default_rng(3).normal(size=(3, 3))},
+        through_bag=False,
+    )
     found = diagnose(recording.windows, recording.table, recording.model)
     assert [finding.effect for finding in found.findings] == ['load_compliance']
     assert not any(rest.significant for rest in found.unexplained.values())
@@ -183,29 +276,82 @@ def test_a_cause_of_the_table_that_spoils_the_other_sensor_is_no_cause(monkeypat
 
 
 @pytest.mark.long
-def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and_is_diagnosed(tmp_path, capsys):
-    session = physics.make_session(5, None, 'white', cause=Beyond('scale_under_load', 5), profile='quick')
+def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and_is_diagnosed(
+    tmp_path, capsys
+):
+    session = physics.make_session(
+        5, None, 'white', cause=Beyond('scale_under_load', 5), profile='quick'
+    )
     physics.write_bag(session, tmp_path / 'bag')
     from imu_calibration.core import documents
+
     (tmp_path / 'table.yaml').write_text(documents.to_text(session.table))
     table = ['--table', str(tmp_path / 'table.yaml')]
-    assert main(['diagnose', str(tmp_path / 'bag'), *table, '--output', str(tmp_path / 'out')]) in (0, 3)
+    assert main(['diagnose', str(tmp_path / 'bag'), *table, '--output', str(tmp_path / 'out')]) in (
+        0,
+        3,
+    )
     assert 'extended.yaml' in capsys.readouterr().out
     extended = tmp_path / 'out' / 'extended.yaml'
-    entry = json.loads((tmp_path / 'out' / 'diagnosis.json').read_text())['unexplained']['gyroscope']['proposals'][0]
+    entry = json.loads((tmp_path / 'out' / 'diagnosis.json').read_text())['unexplained'][
+        'gyroscope'
+    ]['proposals'][0]
     name = entry['terms'][0]['name']
     known = files.read_calibration(extended)
-    np.testing.assert_allclose(known.value('gyroscope', name), entry['terms'][0]['value'], atol=5 * np.max(entry['terms'][0]['sd']))
+    np.testing.assert_allclose(
+        known.value('gyroscope', name),
+        entry['terms'][0]['value'],
+        atol=5 * np.max(entry['terms'][0]['sd']),
+    )
     assert name in (tmp_path / 'out' / 'report.html').read_text()
     model = ['--effects', str(extended), '--gyroscope-model', f'bias+matrix+{name}']
-    assert main(['diagnose', str(tmp_path / 'bag'), *table, *model, '--output', str(tmp_path / 'again')]) in (0, 3)
+    assert main(
+        ['diagnose', str(tmp_path / 'bag'), *table, *model, '--output', str(tmp_path / 'again')]
+    ) in (0, 3)
     again = json.loads((tmp_path / 'again' / 'diagnosis.json').read_text())
     assert not again['unexplained']['gyroscope']['significant'] and not again['findings']
-    assert main(['diagnose', str(tmp_path / 'bag'), *table, '--effects', str(extended), '--output', str(tmp_path / 'named')]) in (0, 3)
-    assert [f['effect'] for f in json.loads((tmp_path / 'named' / 'diagnosis.json').read_text())['findings']] == [name]
-    assert main(['simulate', '--calibration', str(extended), *table, '--profile', 'quick', '--output', str(tmp_path / 'bag2')]) == 0
+    assert main(
+        [
+            'diagnose',
+            str(tmp_path / 'bag'),
+            *table,
+            '--effects',
+            str(extended),
+            '--output',
+            str(tmp_path / 'named'),
+        ]
+    ) in (0, 3)
+    assert [
+        f['effect']
+        for f in json.loads((tmp_path / 'named' / 'diagnosis.json').read_text())['findings']
+    ] == [name]
+    assert (
+        main(
+            [
+                'simulate',
+                '--calibration',
+                str(extended),
+                *table,
+                '--profile',
+                'quick',
+                '--output',
+                str(tmp_path / 'bag2'),
+            ]
+        )
+        == 0
+    )
     assert main(['check', str(tmp_path / 'bag2'), '--calibration', str(extended), *table]) in (0, 3)
-    assert main(['compensate', str(tmp_path / 'bag'), '--calibration', str(extended), '--anyway', '--output', str(tmp_path / 'bag3')]) in (0, 3)
+    assert main(
+        [
+            'compensate',
+            str(tmp_path / 'bag'),
+            '--calibration',
+            str(extended),
+            '--anyway',
+            '--output',
+            str(tmp_path / 'bag3'),
+        ]
+    ) in (0, 3)
 
 
 @pytest.mark.long
@@ -214,7 +360,13 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
     row, _ = row_of(141, 'gyro_scale_settling', 'realistic', Beyond('gyro_scale_settling', 141))
     assert row['found'] == [] and row['family'], row
     row, _ = row_of(81013, 'sticks_when_warm', 'realistic', Beyond('sticks_when_warm', 81013))
-    assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.95, 'a step when it is warm looks like a curve of the temperature'
-    recording = record(5, {'gyro_g_sensitivity': None}, through_bag=False, cause=Beyond('gyro_cubic', 5, 0.3))
+    assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.95, (
+        'a step when it is warm looks like a curve of the temperature'
+    )
+    recording = record(
+        5, {'gyro_g_sensitivity': None}, through_bag=False, cause=Beyond('gyro_cubic', 5, 0.3)
+    )
     found = diagnose(recording.windows, recording.table, recording.model)
-    assert [finding.effect for finding in found.findings] == ['gyro_g_sensitivity'] and found.unexplained['gyroscope'].proposal is not None
+    assert [finding.effect for finding in found.findings] == [
+        'gyro_g_sensitivity'
+    ] and found.unexplained['gyroscope'].proposal is not None

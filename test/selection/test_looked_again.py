@@ -11,24 +11,31 @@ from imu_calibration.selection.investigation import LEFT, LEFT_BEFORE
 @pytest.fixture
 def looked_again(monkeypatch):
     """Return a function: rest of the best choice before and after it is linearised -> (rest of the outcome, number of trials)."""
+
     def look(before, after):
         best, trials = [SimpleNamespace(label='bent', name='bent')], []
         search = SimpleNamespace(run=lambda start: best, resolved=(), cost=len)
         problem = SimpleNamespace(search=search, questions=[])
         problem.asking_any_size = lambda: problem
-        first = SimpleNamespace(rest=100.0, problem=problem, chosen=[SimpleNamespace(label=label, name=label) for label in ('one', 'two')],
-                                explained=SimpleNamespace(rest=lambda chosen: before))
+        first = SimpleNamespace(
+            rest=100.0,
+            problem=problem,
+            chosen=[SimpleNamespace(label=label, name=label) for label in ('one', 'two')],
+            explained=SimpleNamespace(rest=lambda chosen: before),
+        )
         monkeypatch.setattr(investigation, 'best_pairs', lambda search: [])
 
         def settled(linearised_at, problem, chosen):
             trials.append(chosen)
             return SimpleNamespace(rest=after)
+
         monkeypatch.setattr(investigation, '_settled', settled)
         outcome, tried = first, set()
         for any_size in (False, True):
             if outcome is first:
                 outcome = investigation._looked_again(outcome, None, any_size, tried)
         return outcome.rest, len(trials)
+
     return look
 
 

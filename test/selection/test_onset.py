@@ -11,7 +11,14 @@ from imu_calibration.selection.investigation import investigate
 from worlds.hiding import record
 from worlds.moments import Clock, Moment
 
-FEW = ('time_offset', 'clock_rate', 'clock_step', 'encoder_zero', 'table_tilt', 'gyro_g_sensitivity')
+FEW = (
+    'time_offset',
+    'clock_rate',
+    'clock_step',
+    'encoder_zero',
+    'table_tilt',
+    'gyro_g_sensitivity',
+)
 SEED = 6
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
@@ -26,22 +33,47 @@ def moment_of(recording, share):
     return share * max(window.time[-1] for window in recording.windows)
 
 
-@pytest.mark.parametrize('kind, what, axes', [('axes', 'accelerometer', 'xy'), ('mount', 'accelerometer and gyroscope', 'xyz'), ('belt', 'encoder_zero', '')])
+@pytest.mark.parametrize(
+    'kind, what, axes',
+    [
+        ('axes', 'accelerometer', 'xy'),
+        ('mount', 'accelerometer and gyroscope', 'xyz'),
+        ('belt', 'encoder_zero', ''),
+    ],
+)
 def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     recording, found = investigated(Moment(kind))
     onset = found.onset
-    assert onset.what == what and onset.share > 0.95 and set(onset.axes) == set(axes) == set(onset.to_mapping()['axes'])
+    assert (
+        onset.what == what
+        and onset.share > 0.95
+        and set(onset.axes) == set(axes) == set(onset.to_mapping()['axes'])
+    )
     assert abs(onset.time - moment_of(recording, 0.55)) < 1.5 and onset.time_sd < 1.5
     changes = {name: onset.after[name] - value for name, value in onset.before.items()}
-    if kind == 'axes':   # row x senses y; scale factors differ from one by less than a percent
-        assert changes['accelerometer.matrix.xx'] == pytest.approx(-1.0, abs=0.03) and changes['accelerometer.matrix.xy'] == pytest.approx(1.0, abs=0.03)
+    if kind == 'axes':  # row x senses y; scale factors differ from one by less than a percent
+        assert changes['accelerometer.matrix.xx'] == pytest.approx(-1.0, abs=0.03) and changes[
+            'accelerometer.matrix.xy'
+        ] == pytest.approx(1.0, abs=0.03)
     elif kind == 'mount':
-        for sensor in ('accelerometer', 'gyroscope'):   # to first order the change of a matrix is that of the frame
-            turn = 0.5 * np.array([changes[f'{sensor}.matrix.{b}{a}'] - changes[f'{sensor}.matrix.{a}{b}'] for a, b in ('yz', 'zx', 'xy')])
+        for sensor in (
+            'accelerometer',
+            'gyroscope',
+        ):  # to first order the change of a matrix is that of the frame
+            turn = 0.5 * np.array(
+                [
+                    changes[f'{sensor}.matrix.{b}{a}'] - changes[f'{sensor}.matrix.{a}{b}']
+                    for a, b in ('yz', 'zx', 'xy')
+                ]
+            )
             np.testing.assert_allclose(np.abs(turn), [0.01, 0.006, 0.008], atol=5e-4)
     else:
-        assert changes == {'reference.encoder_zero.middle': pytest.approx(-0.03, abs=6e-4)}   # columns at zero: slip^2 / 2
-    assert not found.named and len(found.used) < 0.7 * len(recording.windows)   # the longer part, in which nothing is left to find
+        assert changes == {
+            'reference.encoder_zero.middle': pytest.approx(-0.03, abs=6e-4)
+        }  # columns at zero: slip^2 / 2
+    assert not found.named and len(found.used) < 0.7 * len(
+        recording.windows
+    )  # the longer part, in which nothing is left to find
     diagnosis = build_diagnosis(recording.table, found)
     assert diagnosis.onset is onset and set(onset.to_mapping()['parameters']) == set(changes)
     assert any(f'{onset.time:.1f} +-' in line for line in diagnosis_lines(diagnosis))
@@ -56,8 +88,10 @@ def test_no_change_and_a_gradual_change_are_no_onset(cause):
 def test_a_clock_of_another_rate_is_named():
     _, found = investigated(Clock(rate=200e-6))
     assert [question.name for question in found.named] == ['clock_rate'] and found.onset is None
-    value, = found.problem.values(found.named)[list(found.named[0].parameters)]
-    assert value == pytest.approx(200e-6 / (1 + 200e-6), abs=1e-7)   # stamps run at this rate by themselves
+    (value,) = found.problem.values(found.named)[list(found.named[0].parameters)]
+    assert value == pytest.approx(
+        200e-6 / (1 + 200e-6), abs=1e-7
+    )  # stamps run at this rate by themselves
 
 
 def test_a_step_of_the_clock_is_named_with_its_time():
@@ -66,5 +100,7 @@ def test_a_step_of_the_clock_is_named_with_its_time():
     step, time = found.problem.values(found.named)[list(found.named[0].parameters)]
     assert step == pytest.approx(8e-3, abs=1e-4) and abs(time - moment_of(recording, 0.6)) < 1.5
     model = found.problem.recording.model
-    assert model.prior()[0][model.slices['reference', 'clock_step']][1] == time   # least squares does not move it
+    assert (
+        model.prior()[0][model.slices['reference', 'clock_step']][1] == time
+    )  # least squares does not move it
     assert model.find('reference', Role.DELAY) is not None

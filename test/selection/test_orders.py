@@ -15,7 +15,10 @@ def swings(rest_of, *, count=6, span=0.6):
     rng = np.random.default_rng(8)
     angles = [k + span * np.sin(2 * np.pi * (0.3 + 0.05 * k) * TIME) for k in range(count)]
     windows = [Window(time=TIME, motion=Motion(position=angle[:, None])) for angle in angles]
-    return windows, [rng.normal(size=(len(TIME), 3)) + np.outer(rest_of(k, angle), [0, 0, 1]) for k, angle in enumerate(angles)]
+    return windows, [
+        rng.normal(size=(len(TIME), 3)) + np.outer(rest_of(k, angle), [0, 0, 1])
+        for k, angle in enumerate(angles)
+    ]
 
 
 class Motion(SimpleNamespace):
@@ -34,24 +37,41 @@ class Window(SimpleNamespace):
 
 def seen(rest_of):
     orders = orders_of(*swings(rest_of), 0)
-    return [(int(order), axis) for at, order in enumerate(orders.order) for axis in range(3)
-            if orders.p_value[at, axis] < 1e-7 and orders.power[at, axis] > OUT and orders.share[at, axis] > MIN_ORDER_SHARE]
+    return [
+        (int(order), axis)
+        for at, order in enumerate(orders.order)
+        for axis in range(3)
+        if orders.p_value[at, axis] < 1e-7
+        and orders.power[at, axis] > OUT
+        and orders.share[at, axis] > MIN_ORDER_SHARE
+    ]
 
 
 def test_what_is_fixed_to_the_joint_is_found_in_swings_with_its_amplitude():
     windows, rests = swings(lambda k, angle: 0.5 * np.sin(17 * angle + 0.3))
     orders = orders_of(windows, rests, 0)
     at = int(np.argmin(orders.p_value[:, 2]))
-    assert orders.order[at] == 17 and orders.amplitude[at, 2] == pytest.approx(0.5, rel=0.1) and orders.share[at, 2] > 0.9
+    assert (
+        orders.order[at] == 17
+        and orders.amplitude[at, 2] == pytest.approx(0.5, rel=0.1)
+        and orders.share[at, 2] > 0.9
+    )
 
 
-@pytest.mark.parametrize('rest_of', [
-    lambda k, angle: 0.0,
-    lambda k, angle: 2.0 * np.sin(17 * angle) * (k < 4),            # in some of the swings only: what these motions do
-    lambda k, angle: 0.5 * np.sin(2 * np.pi * 9.3 * TIME + k),      # a hum
-    lambda k, angle: 3.0 * (angle - k),                             # a lag, in phase with the swing
-    lambda k, angle: np.exp(-0.5 * ((angle - 2.0) / 0.02)**2) * 5,  # a dent of the bearing: every order, none stands out
-])
+@pytest.mark.parametrize(
+    'rest_of',
+    [
+        lambda k, angle: 0.0,
+        lambda k, angle: (
+            2.0 * np.sin(17 * angle) * (k < 4)
+        ),  # in some of the swings only: what these motions do
+        lambda k, angle: 0.5 * np.sin(2 * np.pi * 9.3 * TIME + k),  # a hum
+        lambda k, angle: 3.0 * (angle - k),  # a lag, in phase with the swing
+        lambda k, angle: (
+            np.exp(-0.5 * ((angle - 2.0) / 0.02) ** 2) * 5
+        ),  # a dent of the bearing: every order, none stands out
+    ],
+)
 def test_noise_hum_lags_and_dents_are_no_order(rest_of):
     assert not seen(rest_of)
 

@@ -13,7 +13,10 @@ from imu_calibration.selection.rivals import _Blocks, best_pairs
 from imu_calibration.selection.search import PENALTY, Search
 
 NAMES = ('accel_quadratic', 'accel_cubic', 'accel_cross_product', 'accel_scale_asymmetry')
-ASKED = [Question(CATALOGUE.find('accelerometer', name), (k + 1,), 1, name) for k, name in enumerate(NAMES)]
+ASKED = [
+    Question(CATALOGUE.find('accelerometer', name), (k + 1,), 1, name)
+    for k, name in enumerate(NAMES)
+]
 N_ROWS = 600
 
 
@@ -21,10 +24,18 @@ def searched(signal, alike, size=1e-6):
     """Return the Search on rows of which the first column is the baseline's, and the first two effects are alike; each has the size of what is plausible."""
     rng = np.random.default_rng(3)
     columns = rng.normal(size=(N_ROWS, 5))
-    columns[:, 2] = alike * columns[:, 1] + np.sqrt(1 - alike**2) * columns[:, 2] + 0.5 * columns[:, 0]
-    rows = np.column_stack([columns / size, columns @ np.asarray(signal, float) + rng.normal(size=N_ROWS)])
+    columns[:, 2] = (
+        alike * columns[:, 1] + np.sqrt(1 - alike**2) * columns[:, 2] + 0.5 * columns[:, 0]
+    )
+    rows = np.column_stack(
+        [columns / size, columns @ np.asarray(signal, float) + rng.normal(size=N_ROWS)]
+    )
     total, parts = rows.T @ rows, np.array([part.T @ part for part in np.split(rows, 6)])
-    return Search(Evidence(total, total - parts, prior_sd=np.full(5, 1e3), prior_mean=np.zeros(5)), (0,), ASKED)
+    return Search(
+        Evidence(total, total - parts, prior_sd=np.full(5, 1e3), prior_mean=np.zeros(5)),
+        (0,),
+        ASKED,
+    )
 
 
 def names(choice):
@@ -34,7 +45,10 @@ def names(choice):
 def test_two_causes_that_hide_each_other_are_found_together():
     """Each alone removes a tenth of what both do, and no more than noise."""
     search = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95)
-    assert not any(search.score([], question).significant for question in search.questions) and not search.run()
+    assert (
+        not any(search.score([], question).significant for question in search.questions)
+        and not search.run()
+    )
     assert names(best_pairs(search)[0]) == set(NAMES[:2])
     assert names(search.run(best_pairs(search)[0])) == set(NAMES[:2])
 
@@ -57,14 +71,32 @@ def test_a_pair_of_which_one_does_nothing_does_not_survive():
 
 def outcome(search, named, rest):
     problem = SimpleNamespace(search=search)
-    return SimpleNamespace(problem=problem, chosen=named, named=named, rest=rest, explained=SimpleNamespace(rest=lambda chosen: 0.0))
+    return SimpleNamespace(
+        problem=problem,
+        chosen=named,
+        named=named,
+        rest=rest,
+        explained=SimpleNamespace(rest=lambda chosen: 0.0),
+    )
 
 
-@pytest.mark.parametrize(('rest', 'remaining', 'found'), ((0.0, -1.0, set()), (50.0, -1.0, set(NAMES[:2])), (50.0, 10.0, set())),
-                         ids=('nothing to explain', 'a pair explains it', 'a pair leaves a fifth'))
+@pytest.mark.parametrize(
+    ('rest', 'remaining', 'found'),
+    ((0.0, -1.0, set()), (50.0, -1.0, set(NAMES[:2])), (50.0, 10.0, set())),
+    ids=('nothing to explain', 'a pair explains it', 'a pair leaves a fifth'),
+)
 def test_pairs_are_tested_for_a_remaining_excess(monkeypatch, rest, remaining, found):
     search, tested = searched((1.0, 0.6, -0.6, 0.0, 0.0), 0.95), []
-    monkeypatch.setattr(investigation, 'best_pairs', lambda search: tested.append(search) or best_pairs(search))
-    monkeypatch.setattr(investigation, '_settled', lambda linearised_at, problem, chosen: outcome(search, chosen, remaining))
-    assert names(investigation._looked_again(outcome(search, [], rest), None, False, set()).named) == found
-    assert bool(tested) == bool(rest)   # their search takes long
+    monkeypatch.setattr(
+        investigation, 'best_pairs', lambda search: tested.append(search) or best_pairs(search)
+    )
+    monkeypatch.setattr(
+        investigation,
+        '_settled',
+        lambda linearised_at, problem, chosen: outcome(search, chosen, remaining),
+    )
+    assert (
+        names(investigation._looked_again(outcome(search, [], rest), None, False, set()).named)
+        == found
+    )
+    assert bool(tested) == bool(rest)  # their search takes long

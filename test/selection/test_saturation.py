@@ -23,8 +23,17 @@ def windows_of(force, count=10):
     """Return moving windows with some specific force, shape (n, 3)."""
     size = len(force) // count
     zero = np.zeros((size, 1))
-    return [Window('dynamic', np.arange(size) * 10**7, np.arange(size) * 0.01, force[k * size:(k + 1) * size], np.zeros((size, 3)),
-                   JointMotion(np.arange(size) * 0.01, zero, zero, zero, zero)) for k in range(count)]
+    return [
+        Window(
+            'dynamic',
+            np.arange(size) * 10**7,
+            np.arange(size) * 0.01,
+            force[k * size : (k + 1) * size],
+            np.zeros((size, 3)),
+            JointMotion(np.arange(size) * 0.01, zero, zero, zero, zero),
+        )
+        for k in range(count)
+    ]
 
 
 def upright(noise, step=STEP):
@@ -63,8 +72,12 @@ def test_samples_at_a_limit_and_those_predicted_near_it_are_left_out():
     """The first twenty of a hundred are at the limit, the next twenty might be, and no more go."""
     expected, force = np.zeros((100, 3)), np.zeros((100, 3))
     force[:20, 2], expected[20:40, 2], force[20:40, 2] = 10.0, 9.97, 9.9
-    kept = without_clipped(windows_of(force, 1), [(expected, np.zeros((100, 3)))], {'accelerometer': 10.0},
-                           noise_sd={'accelerometer': np.full(3, 0.01), 'gyroscope': np.full(3, 0.01)})
+    kept = without_clipped(
+        windows_of(force, 1),
+        [(expected, np.zeros((100, 3)))],
+        {'accelerometer': 10.0},
+        noise_sd={'accelerometer': np.full(3, 0.01), 'gyroscope': np.full(3, 0.01)},
+    )
     assert [list(window.stamp_ns // 10**7) for window in kept] == [list(range(40, 100))]
 
 
@@ -78,9 +91,15 @@ def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
 
 def test_locked_windows_show_no_limit(monkeypatch):
     windows, seen = windows_of(np.random.default_rng(0).normal(0.0, 1.0, (1200, 3)), 12), []
-    monkeypatch.setattr(saturation, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([], {}, None))[1])
+    monkeypatch.setattr(
+        saturation,
+        '_limits',
+        lambda some, table, model: (seen.extend(map(id, some)), ([], {}, None))[1],
+    )
     _, locked, _ = saturation.without_clipping(windows, None, None)
-    assert locked.sum() == 3 and seen == [id(window) for window, out in zip(windows, locked) if not out]
+    assert locked.sum() == 3 and seen == [
+        id(window) for window, out in zip(windows, locked) if not out
+    ]
 
 
 def test_a_limit_that_one_window_alone_shows_is_seen(monkeypatch):
@@ -88,7 +107,11 @@ def test_a_limit_that_one_window_alone_shows_is_seen(monkeypatch):
     force, seen = np.random.default_rng(0).normal(0.0, 1.0, (1200, 3)), []
     force[1020:1040, 2] = 9.0
     windows, limit = windows_of(force, 12), SimpleNamespace(sensor='accelerometer', level=9.0)
-    monkeypatch.setattr(saturation, '_limits', lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, None))[1])
+    monkeypatch.setattr(
+        saturation,
+        '_limits',
+        lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, None))[1],
+    )
     monkeypatch.setattr(saturation, 'predictions', lambda *given, **named: None)
     monkeypatch.setattr(saturation, 'without_clipped', lambda some, *given, **named: some)
     _, locked, _ = saturation.without_clipping(windows, None, None)
@@ -103,4 +126,6 @@ def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):
     monkeypatch.setattr(saturation, 'may_be_clipped', lambda windows, sensor: True)
     monkeypatch.setattr(saturation, 'without_clipped', lambda *given, **known: [])
     found = investigation.investigate(windows, table, SensorModel(joint_names=table.joint_names))
-    assert found.used == [window for window in windows if window.kind != 'unused'] and not found.limits
+    assert (
+        found.used == [window for window in windows if window.kind != 'unused'] and not found.limits
+    )

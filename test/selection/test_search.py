@@ -14,11 +14,27 @@ from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, Refe
 from imu_calibration.estimation.noise_search import FLICKER_MARK, BiasProcessSearch, NoiseLikelihood
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection import unexplained as rests
-from imu_calibration.selection.evidence import MOST_FITS, Evidence, WindowEvidence, folds_of, locked_windows
+from imu_calibration.selection.evidence import (
+    MOST_FITS,
+    Evidence,
+    WindowEvidence,
+    folds_of,
+    locked_windows,
+)
 from imu_calibration.selection.explained_share import SHOWS, Explained, ExplainedWindows, pruned
 from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.noise_beside_effects import _needed_smooth, drift_prior, natural_processes, plausible_processes
-from imu_calibration.selection.parameter_space import ParameterSpace, parameter_space, scatter_of_each, white_means
+from imu_calibration.selection.noise_beside_effects import (
+    _needed_smooth,
+    drift_prior,
+    natural_processes,
+    plausible_processes,
+)
+from imu_calibration.selection.parameter_space import (
+    ParameterSpace,
+    parameter_space,
+    scatter_of_each,
+    white_means,
+)
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import MIN_GAIN_NATS, Search
 
@@ -30,15 +46,24 @@ def asked(sensor, name, *parameters):
     return Question(CATALOGUE.find(sensor, name), parameters, len(parameters), name)
 
 
-QUADRATIC, CUBIC, PRODUCT = (asked('accelerometer', name, k) for k, name in enumerate(('accel_quadratic', 'accel_cubic', 'accel_cross_product')))
-TILT, OFFSET, DRIFT = asked('reference', 'table_tilt', 0, 1), asked('reference', 'time_offset', 3), asked('accelerometer', 'accel_bias_drift', 4, 5, 6)
+QUADRATIC, CUBIC, PRODUCT = (
+    asked('accelerometer', name, k)
+    for k, name in enumerate(('accel_quadratic', 'accel_cubic', 'accel_cross_product'))
+)
+TILT, OFFSET, DRIFT = (
+    asked('reference', 'table_tilt', 0, 1),
+    asked('reference', 'time_offset', 3),
+    asked('accelerometer', 'accel_bias_drift', 4, 5, 6),
+)
 
 
 class Known(Evidence):
     """Evidence that is given: losses of choices, an estimate, a p-value."""
 
     def __init__(self, loss=dict, values=None, p=1e-12):
-        super().__init__(np.zeros((10, 10)), np.zeros((0, 10, 10)), prior_sd=np.ones(9), prior_mean=np.zeros(9))
+        super().__init__(
+            np.zeros((10, 10)), np.zeros((0, 10, 10)), prior_sd=np.ones(9), prior_mean=np.zeros(9)
+        )
         self.loss_of, self.values, self.p = loss, values, p
 
     def loss(self, used):
@@ -73,21 +98,42 @@ def test_a_finding_predicts_what_it_was_not_fitted_to():
     assert not scored(-10.0).significant
 
 
-@pytest.mark.parametrize(('question', 'value', 'step', 'possible'), (
-    (asked('gyroscope', 'gyro_bandwidth', 0), [2e-3], 0.0, True),
-    (asked('gyroscope', 'gyro_bandwidth', 0), [-2e-3], 0.0, False),
-    (TILT, [4e-6, 3e-6], 1e-5, False), (TILT, [6e-6, 3e-6], 1e-5, True), (TILT, [4e-6, 3e-6], 0.0, True),
-    (asked('reference', 'encoder_harmonic', 0), [4e-6], 1e-5, False),
-    (asked('reference', 'load_compliance', 0), [4e-7] * 9, 1e-5, False),
-    (QUADRATIC, [100 * QUADRATIC.effect.largest], 0.0, False), (QUADRATIC, [9 * QUADRATIC.effect.largest], 0.0, True), (asked('reference', 'earth_rate', 0), [1e-4], 0.0, False)))
-def test_no_lag_is_negative_no_angle_within_an_encoder_step_no_size_beyond_what_is_known(question, value, step, possible):
-    assert Search(Known(values=value), (), [question], encoder_step=step).allowed([question], question) == possible
+@pytest.mark.parametrize(
+    ('question', 'value', 'step', 'possible'),
+    (
+        (asked('gyroscope', 'gyro_bandwidth', 0), [2e-3], 0.0, True),
+        (asked('gyroscope', 'gyro_bandwidth', 0), [-2e-3], 0.0, False),
+        (TILT, [4e-6, 3e-6], 1e-5, False),
+        (TILT, [6e-6, 3e-6], 1e-5, True),
+        (TILT, [4e-6, 3e-6], 0.0, True),
+        (asked('reference', 'encoder_harmonic', 0), [4e-6], 1e-5, False),
+        (asked('reference', 'load_compliance', 0), [4e-7] * 9, 1e-5, False),
+        (QUADRATIC, [100 * QUADRATIC.effect.largest], 0.0, False),
+        (QUADRATIC, [9 * QUADRATIC.effect.largest], 0.0, True),
+        (asked('reference', 'earth_rate', 0), [1e-4], 0.0, False),
+    ),
+)
+def test_no_lag_is_negative_no_angle_within_an_encoder_step_no_size_beyond_what_is_known(
+    question, value, step, possible
+):
+    assert (
+        Search(Known(values=value), (), [question], encoder_step=step).allowed([question], question)
+        == possible
+    )
 
 
 def test_an_earlier_choice_gives_way_to_what_explains_better_together():
     """The first effect is the best alone; with the second beside it a third does more, and the first is needed no longer."""
-    losses = {frozenset(): 400.0, frozenset({0}): 100.0, frozenset({1}): 200.0, frozenset({2}): 190.0, frozenset({0, 1}): 80.0,
-              frozenset({0, 2}): 90.0, frozenset({1, 2}): 4.0, frozenset({0, 1, 2}): 3.0}
+    losses = {
+        frozenset(): 400.0,
+        frozenset({0}): 100.0,
+        frozenset({1}): 200.0,
+        frozenset({2}): 190.0,
+        frozenset({0, 1}): 80.0,
+        frozenset({0, 2}): 90.0,
+        frozenset({1, 2}): 4.0,
+        frozenset({0, 1, 2}): 3.0,
+    }
     found = Search(Known(losses.get), (), [QUADRATIC, CUBIC, PRODUCT]).run()
     assert {question.label for question in found} == {CUBIC.label, PRODUCT.label}
 
@@ -103,10 +149,17 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
     """Columns of noise fit the windows that they see, and predict others worse than one column does: on average of forty draws."""
     gained = []
     for seed in range(40):
-        parts = np.array([rows.T @ rows for rows in np.random.default_rng(seed).normal(size=(6, 6, 5))])
+        parts = np.array(
+            [rows.T @ rows for rows in np.random.default_rng(seed).normal(size=(6, 6, 5))]
+        )
         total = parts.sum(axis=0)
         evidence = Evidence(total, total - parts, prior_sd=np.full(4, 1e3), prior_mean=np.zeros(4))
-        gained.append((evidence.loss([0]) - evidence.loss(range(4)), evidence.heldout([0]) - evidence.heldout(range(4))))
+        gained.append(
+            (
+                evidence.loss([0]) - evidence.loss(range(4)),
+                evidence.heldout([0]) - evidence.heldout(range(4)),
+            )
+        )
     fitted, held_out = np.mean(gained, axis=0)
     assert fitted > 2.0 and held_out < -2.0
 
@@ -114,21 +167,39 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
 def test_memory_of_a_search_does_not_grow_with_the_choices_it_tried():
     """A search tries thousands; only their losses are kept, and the last fits and predictions, which come out the same again."""
     parts = np.array([rows.T @ rows for rows in np.random.default_rng(1).normal(size=(6, 20, 11))])
-    evidence = Evidence(parts.sum(axis=0), parts.sum(axis=0) - parts, prior_sd=np.full(10, 1e3), prior_mean=np.zeros(10))
+    evidence = Evidence(
+        parts.sum(axis=0),
+        parts.sum(axis=0) - parts,
+        prior_sd=np.full(10, 1e3),
+        prior_mean=np.zeros(10),
+    )
     tried = list(combinations(range(10), 4))
     first = evidence.left_by_others(tried[0])
     for choice in tried:
         evidence.heldout(choice)
-    kept = [each for each in vars(evidence).values() if isinstance(each, dict) and any(isinstance(v, np.ndarray) for v in each.values())]
+    kept = [
+        each
+        for each in vars(evidence).values()
+        if isinstance(each, dict) and any(isinstance(v, np.ndarray) for v in each.values())
+    ]
     assert len(tried) > MOST_FITS and max(map(len, kept)) == MOST_FITS
     np.testing.assert_array_equal(evidence.left_by_others(tried[0]), first)
 
 
 def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
-    recording = SimpleNamespace(kind=np.array(['static'] * 4), count=np.full(4, 100.0), duration=np.ones(4), keys=(), time=np.arange(4.0), sessions=[np.arange(4)])
+    recording = SimpleNamespace(
+        kind=np.array(['static'] * 4),
+        count=np.full(4, 100.0),
+        duration=np.ones(4),
+        keys=(),
+        time=np.arange(4.0),
+        sessions=[np.arange(4)],
+    )
     space = SimpleNamespace(recording=recording, mean={'gyroscope': [np.ones((4, 2))] * 3})
     for offset, weight in ((0.0, 10.0), (3.0, 1 / np.sqrt(9.01))):
-        white = white_means(space, {'gyroscope': NoiseModel(np.ones(3), np.ones(3), offset)}, 'gyroscope')
+        white = white_means(
+            space, {'gyroscope': NoiseModel(np.ones(3), np.ones(3), offset)}, 'gyroscope'
+        )
         np.testing.assert_allclose(white, weight, rtol=1e-9)
 
 
@@ -145,10 +216,22 @@ class Squares:
     @staticmethod
     def of(space, values, _sensor):
         count, within, means, *rests = space
-        within, means = (np.where(values[:, 0] > 0, left, 1.0) * size * np.ones(count) for left, size in ((within, 97.0), (means, 0.15)))
+        within, means = (
+            np.where(values[:, 0] > 0, left, 1.0) * size * np.ones(count)
+            for left, size in ((within, 97.0), (means, 0.15))
+        )
         still = np.where(values[:, 0] > 0, rests[0] if rests else 0.15, 0.15) * np.ones(count)
-        return dict(zip(gain.MEASURES, ((within + 100.0 / 3.0 * means, np.full(count, 100.0)), (means, np.full(count, 3.0)),
-                                        (within, np.full(count, 97.0)), (still, np.full(count, 3.0)))))
+        return dict(
+            zip(
+                gain.MEASURES,
+                (
+                    (within + 100.0 / 3.0 * means, np.full(count, 100.0)),
+                    (means, np.full(count, 3.0)),
+                    (within, np.full(count, 97.0)),
+                    (still, np.full(count, 3.0)),
+                ),
+            )
+        )
 
 
 def test_the_gain_is_that_of_locked_windows_by_the_measure_of_the_others(monkeypatch):
@@ -157,30 +240,46 @@ def test_the_gain_is_that_of_locked_windows_by_the_measure_of_the_others(monkeyp
     found = gain.heldout_gain(Squares(means=0.5), [], [QUADRATIC], sensors=['accelerometer'])
     assert (found.measure, found.windows) == ('samples about the mean of their window', 10)
     assert found.heldout_rms_after**2 == pytest.approx(0.9)
-    assert gain.gain_in_turn(Squares(means=0.5), [], [QUADRATIC], sensors=['accelerometer']).heldout_rms_after**2 == pytest.approx(0.4)
+    assert gain.gain_in_turn(
+        Squares(means=0.5), [], [QUADRATIC], sensors=['accelerometer']
+    ).heldout_rms_after ** 2 == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize(('risen', 'measure'), ((0.25, 'window means'), (3.0, 'samples about the mean of their window')))
+@pytest.mark.parametrize(
+    ('risen', 'measure'), ((0.25, 'window means'), (3.0, 'samples about the mean of their window'))
+)
 def test_a_large_fall_of_a_few_means_may_be_chance(monkeypatch, risen, measure):
     """The means fall in two of three windows, and rise in the third; where they rise so far that a fall of all is not sure the samples are told, by a little."""
     monkeypatch.setattr(gain, '_squares', Squares.of)
     means = np.where(np.arange(30) % 3, 0.001, risen)
-    assert gain.gain_in_turn(Squares(0.99, means), [], [QUADRATIC], sensors=['accelerometer']).measure == measure
+    assert (
+        gain.gain_in_turn(Squares(0.99, means), [], [QUADRATIC], sensors=['accelerometer']).measure
+        == measure
+    )
 
 
 def test_rests_are_told_of_where_no_other_measure_falls_for_sure(monkeypatch):
     """Moving windows of a quiet sensor show the encoder."""
     monkeypatch.setattr(gain, '_squares', Squares.of)
     unsure = np.where(np.arange(30) % 3, 0.001, 3.0)
-    for within, measure in ((1.0, gain.REST_MEASURE), (0.99, 'samples about the mean of their window')):
+    for within, measure in (
+        (1.0, gain.REST_MEASURE),
+        (0.99, 'samples about the mean of their window'),
+    ):
         some = Squares(within, unsure)
         some.all_samples = (*some.all_samples, 0.02 if within == 1.0 else 0.001)
-        assert gain.gain_in_turn(some, [], [QUADRATIC], sensors=['accelerometer']).measure == measure
+        assert (
+            gain.gain_in_turn(some, [], [QUADRATIC], sensors=['accelerometer']).measure == measure
+        )
 
 
 def test_a_recording_without_rests_says_nothing_of_them(monkeypatch):
     """All measures rise; that of no windows at all does not, and must not stand for a fall."""
-    monkeypatch.setattr(gain, '_squares', lambda *args: Squares.of(*args) | {gain.REST_MEASURE: (np.zeros(0), np.zeros(0))})
+    monkeypatch.setattr(
+        gain,
+        '_squares',
+        lambda *args: Squares.of(*args) | {gain.REST_MEASURE: (np.zeros(0), np.zeros(0))},
+    )
     found = gain.gain_in_turn(Squares(1.2, 1.2), [], [QUADRATIC], sensors=['accelerometer'])
     assert found.measure != gain.REST_MEASURE and found.ci95[0] < 0
 
@@ -196,7 +295,10 @@ def test_an_interval_of_95_percent_holds_95_percent():
     assert 0.93 < np.mean((reductions > low) & (reductions < high)) < 0.97
 
 
-@pytest.mark.parametrize(('question', 'share', 'kept'), ((QUADRATIC, 0.6, False), (QUADRATIC, 0.75, True), (DRIFT, 0.85, False), (DRIFT, 0.95, True)))
+@pytest.mark.parametrize(
+    ('question', 'share', 'kept'),
+    ((QUADRATIC, 0.6, False), (QUADRATIC, 0.75, True), (DRIFT, 0.85, False), (DRIFT, 0.95, True)),
+)
 def test_what_leaves_most_unexplained_is_not_named(question, share, kept):
     assert pruned([question], lambda chosen, each: share) == ([question] if kept else [])
 
@@ -204,9 +306,15 @@ def test_what_leaves_most_unexplained_is_not_named(question, share, kept):
 def test_a_cause_of_the_table_shows_in_both_sensors():
     """It takes all there is off the accelerometer, and leaves twice as much on the gyroscope as it takes."""
     explained = Explained.__new__(Explained)
-    explained.numbers, explained.least_part = dict.fromkeys(SENSORS, np.array([100.0, 1000.0])), SHOWS
-    explained.excess = lambda chosen: {'accelerometer': alike(0.0, 0.0), 'gyroscope': alike(2000.0, 0.0)} if chosen else {
-        'accelerometer': alike(1000.0, 0.0), 'gyroscope': alike(3000.0, 0.0)}
+    explained.numbers, explained.least_part = (
+        dict.fromkeys(SENSORS, np.array([100.0, 1000.0])),
+        SHOWS,
+    )
+    explained.excess = lambda chosen: (
+        {'accelerometer': alike(0.0, 0.0), 'gyroscope': alike(2000.0, 0.0)}
+        if chosen
+        else {'accelerometer': alike(1000.0, 0.0), 'gyroscope': alike(3000.0, 0.0)}
+    )
     assert explained.share([OFFSET], OFFSET) == pytest.approx(1 / 3)
 
 
@@ -214,16 +322,27 @@ def test_a_cause_of_the_table_shows_in_both_sensors():
 def test_what_is_unexplained_where_an_effect_does_not_show_does_not_hide_it(within, share):
     """It explains the means; within windows, where it shows or does not, as much stays as it removes in all."""
     explained = Explained.__new__(Explained)
-    explained.numbers, explained.least_part = dict.fromkeys(SENSORS, np.array([100.0, 1000.0])), SHOWS
-    explained.excess = lambda chosen: {'accelerometer': alike(0.0, 1000.0 + within) if chosen else alike(1000.0, 1000.0 + 2 * within)}
+    explained.numbers, explained.least_part = (
+        dict.fromkeys(SENSORS, np.array([100.0, 1000.0])),
+        SHOWS,
+    )
+    explained.excess = lambda chosen: {
+        'accelerometer': alike(0.0, 1000.0 + within)
+        if chosen
+        else alike(1000.0, 1000.0 + 2 * within)
+    }
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
 
 
 @pytest.mark.parametrize(('least_part', 'share'), ((SHOWS, 1.0), (-np.inf, 0.5)))
 def test_an_effect_is_compared_with_the_excess_of_the_parts_in_which_it_counts(least_part, share):
     """It removes the excess of turns; as much remains in poses, which by hand count too, because parts are few."""
-    explained = Explained(SimpleNamespace(indices=len), lambda used: {'accelerometer': np.array([[1100.0], [100.0 if used else 1100.0]])},
-                          {'accelerometer': np.array([100.0, 100.0])}, least_part=least_part)
+    explained = Explained(
+        SimpleNamespace(indices=len),
+        lambda used: {'accelerometer': np.array([[1100.0], [100.0 if used else 1100.0]])},
+        {'accelerometer': np.array([100.0, 100.0])},
+        least_part=least_part,
+    )
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
     assert explained.rest([QUADRATIC]) == pytest.approx(1000.0)
 
@@ -240,9 +359,17 @@ def test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others():
     alone = np.array([[-20.0, 100.0, -20.0], [0.0, 0.0, 0.0]])
     explained.excess = lambda excess: {'accelerometer': excess}
     assert explained.sigma('accelerometer', alone)[0] > 5.0 and explained.rest(alone) == 100.0
-    assert explained.rest(alike(60.0, 0.0)) == explained.rest(np.array([[0.0, 80.0, 0.0], [0.0, 0.0, 0.0]])) == 0.0
-    explained.excess = lambda chosen: {'accelerometer': alone if chosen else alone + np.array([[0.0, 300.0, 0.0], [0.0, 0.0, 0.0]])}
-    assert explained.share([DRIFT], DRIFT) == pytest.approx(0.75), 'too little for an effect that is smooth in time'
+    assert (
+        explained.rest(alike(60.0, 0.0))
+        == explained.rest(np.array([[0.0, 80.0, 0.0], [0.0, 0.0, 0.0]]))
+        == 0.0
+    )
+    explained.excess = lambda chosen: {
+        'accelerometer': alone if chosen else alone + np.array([[0.0, 300.0, 0.0], [0.0, 0.0, 0.0]])
+    }
+    assert explained.share([DRIFT], DRIFT) == pytest.approx(0.75), (
+        'too little for an effect that is smooth in time'
+    )
 
 
 def test_every_bias_moves_by_half_the_white_noise_of_a_second():
@@ -253,12 +380,20 @@ def test_every_bias_moves_by_half_the_white_noise_of_a_second():
 def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
     """Natural is 0.01; the found one in its own time, up to three times as much, offsets of windows never."""
     for found, most in ((0.005, 0.01), (0.02, 0.02), (0.5, 0.03)):
-        noise = NoiseModel(np.full(3, 0.04), np.ones(3), 0.2, (BiasProcess(max(found, 0.01), 15.0),))
+        noise = NoiseModel(
+            np.full(3, 0.04), np.ones(3), 0.2, (BiasProcess(max(found, 0.01), 15.0),)
+        )
         (process,) = plausible_processes(noise, 0.01, sensor='gyroscope', duration=1e9)
         assert process.sd == pytest.approx(most) and process.time == 15.0
         assert noise.at_rest_only(process).offset_sd == 0.0
-    for middle, most in ((0.008, 0.03), (0.02, 0.06), (0.2, 0.12)):   # where most axes do so up to three times the middle one, and twelve times
-        (process,) = plausible_processes(replace(noise, middle_wander=middle), 0.01, sensor='gyroscope', duration=1e9)
+    for middle, most in (
+        (0.008, 0.03),
+        (0.02, 0.06),
+        (0.2, 0.12),
+    ):  # where most axes do so up to three times the middle one, and twelve times
+        (process,) = plausible_processes(
+            replace(noise, middle_wander=middle), 0.01, sensor='gyroscope', duration=1e9
+        )
         assert process.sd == pytest.approx(most)
     measured = replace(noise, known=(BiasProcess(1e-4, 40.0),))
     assert plausible_processes(measured, 0.01, sensor='gyroscope', duration=1e9) == measured.known
@@ -278,9 +413,13 @@ def test_within_windows_nothing_is_told_of_what_is_smooth_in_time():
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_thermal_bias'))
     values = model.start()
     values[model.slices['accelerometer', 'accel_thermal_bias']] = 2.0
-    recording = SimpleNamespace(model=model, values=values, bank={'accelerometer': (), 'gyroscope': ()})
+    recording = SimpleNamespace(
+        model=model, values=values, bank={'accelerometer': (), 'gyroscope': ()}
+    )
     space = parameter_space(recording, SensorModel(accelerometer=('bias', 'matrix')))
-    used, mean, within = (some['accelerometer'][0] for some in (space.index, space.join, space.join_within))
+    used, mean, within = (
+        some['accelerometer'][0] for some in (space.index, space.join, space.join_within)
+    )
     thermal = np.array(['thermal' in space.names[k] for k in used])
     assert np.any(mean[:, :-1][:, thermal]) and not np.any(within[:, :-1][:, thermal])
     np.testing.assert_array_equal(within[:, :-1][:, ~thermal], mean[:, :-1][:, ~thermal])
@@ -300,23 +439,31 @@ def test_a_wander_is_as_large_as_on_the_middle_axis(loud):
     search = BiasProcessSearch(likelihood, 1.0)
     shape = search.best([0])[0]
     assert shape[1] > 4.0
-    assert search.of_middle_axis(shape, [0]) == pytest.approx(10.0 if sum(loud) > 1 else 0.0, abs=3.0)
+    assert search.of_middle_axis(shape, [0]) == pytest.approx(
+        10.0 if sum(loud) > 1 else 0.0, abs=3.0
+    )
 
 
 def test_a_session_sees_a_part_of_a_slow_wander():
     """About the mean of a session of 100 s, a tenth of the correlation time: the variance of sums of the covariance, in steps of 0.1 s."""
     time = np.arange(0.05, 100.0, 0.1)
     covariance = 4.0 * np.exp(-np.abs(time[:, None] - time) / 1000.0)
-    assert BiasProcess(2.0, 1000.0).within(100.0) == pytest.approx(np.sqrt(4.0 - covariance.mean()), rel=1e-3)
+    assert BiasProcess(2.0, 1000.0).within(100.0) == pytest.approx(
+        np.sqrt(4.0 - covariance.mean()), rel=1e-3
+    )
     assert BiasProcess(2.0, 15.0).within(1e9) == pytest.approx(2.0)
     noise = NoiseModel(np.full(3, 0.04), np.ones(3), bias_processes=(BiasProcess(0.08, 1000.0),))
-    assert plausible_processes(noise, 0.01, sensor='gyroscope', duration=100.0) == noise.bias_processes
+    assert (
+        plausible_processes(noise, 0.01, sensor='gyroscope', duration=100.0) == noise.bias_processes
+    )
 
 
 @pytest.mark.parametrize(('won', 'found'), ((5.0, False), (30.0, True)))
 def test_offsets_of_windows_have_their_price(won, found):
     """Flicker scatters means beyond a wander of 15 s by a little; what moves with the pose does by more."""
-    likelihood = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - won * (shape[0] > 0))
+    likelihood = SimpleNamespace(
+        typical=1.0, many=True, loss=lambda shape, used: 100.0 - won * (shape[0] > 0)
+    )
     assert (BiasProcessSearch(likelihood, 1.0).best([])[0][0] > 0) == found
 
 
@@ -331,9 +478,17 @@ def test_what_replaces_an_effect_is_significant_itself():
 @pytest.mark.parametrize('behind, alike', [(30.0, ['gyro_thermal_bias']), (90.0, [])])
 def test_curves_in_time_that_are_nearly_collinear_are_named_together(behind, alike):
     """Of 60,000 nats, 30 do not separate two curves that the wander of a bias may bend; they separate causes that depend on motion."""
-    warm, drift, product = (asked('gyroscope', name, *at) for name, at in (('gyro_thermal_bias', (0, 1, 2)), ('gyro_bias_drift', (3, 4, 5, 6)),
-                                                                           ('gyro_rate_product', (7, 8, 9))))
-    evidence = Known(lambda used: 0.0 if 3 in used else 2 * (behind + 1.0) if used & {0, 7} else 120000.0)
+    warm, drift, product = (
+        asked('gyroscope', name, *at)
+        for name, at in (
+            ('gyro_thermal_bias', (0, 1, 2)),
+            ('gyro_bias_drift', (3, 4, 5, 6)),
+            ('gyro_rate_product', (7, 8, 9)),
+        )
+    )
+    evidence = Known(
+        lambda used: 0.0 if 3 in used else 2 * (behind + 1.0) if used & {0, 7} else 120000.0
+    )
     search = Search(evidence, (), [warm, drift, product])
     assert [mate.name for mate, _ in search.confounded([drift], drift)] == alike
 
@@ -341,8 +496,16 @@ def test_curves_in_time_that_are_nearly_collinear_are_named_together(behind, ali
 def test_what_was_resolved_is_not_replaced():
     """The drift outweighs the lag, which could not come back beside it."""
     lag, drift = asked('gyroscope', 'gyro_delay', 0), replace(DRIFT, parameters=(1,))
-    losses = {frozenset(): 2000.0, frozenset([0]): 1600.0, frozenset([1]): 400.0, frozenset([0, 1]): 0.0}
-    assert Search(Known(losses.get), (), [lag, drift], resolved={lag.name}).run([lag]) == [lag, drift]
+    losses = {
+        frozenset(): 2000.0,
+        frozenset([0]): 1600.0,
+        frozenset([1]): 400.0,
+        frozenset([0, 1]): 0.0,
+    }
+    assert Search(Known(losses.get), (), [lag, drift], resolved={lag.name}).run([lag]) == [
+        lag,
+        drift,
+    ]
 
 
 @pytest.mark.parametrize(('p_value', 'kept'), ((1e-12, [QUADRATIC]), (0.01, [])))
@@ -354,25 +517,56 @@ def test_what_a_search_starts_from_is_significant_by_itself_too(p_value, kept):
 
 def test_windows_agree_on_what_they_tell_of_an_effect():
     """The second of two parameters shows nowhere, as one arm of three that add up to nothing."""
-    evidence, alone = (evidence_of(0.3 + 0.1 * np.random.default_rng(4).normal(0.0, 1.0, 40), 1.0) for _ in range(2))
+    evidence, alone = (
+        evidence_of(0.3 + 0.1 * np.random.default_rng(4).normal(0.0, 1.0, 40), 1.0)
+        for _ in range(2)
+    )
     space = evidence.space
-    space.size, space.places, space.reduced = 2, lambda sensor, axis: np.array([0, 2]), lambda used, values: np.array([-values[0], 0.0, 1.0])
-    evidence.fit = lambda used: (np.append(alone.fit([0])[0], 0.0), np.diag([alone.fit([0])[1][0, 0], 1e12]))
-    assert evidence.p_value_by_scatter([0, 1], [0, 1]) == pytest.approx(alone.p_value_by_scatter([0], [0]))
+    space.size, space.places, space.reduced = (
+        2,
+        lambda sensor, axis: np.array([0, 2]),
+        lambda used, values: np.array([-values[0], 0.0, 1.0]),
+    )
+    evidence.fit = lambda used: (
+        np.append(alone.fit([0])[0], 0.0),
+        np.diag([alone.fit([0])[1][0, 0], 1e12]),
+    )
+    assert evidence.p_value_by_scatter([0, 1], [0, 1]) == pytest.approx(
+        alone.p_value_by_scatter([0], [0])
+    )
 
 
 def evidence_of(rows, noise_within, scatter=None):
     """Return evidence of moving windows of 100 samples, whose parameter shows within alone: products of one column with itself, the residual and both."""
     count = len(rows)
-    recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 100.0), duration=np.ones(count), keys=(), time=np.arange(float(count)),
-                                sessions=[np.arange(count)], moving=np.ones(count, bool))
-    products = np.array([[[100.0, 100.0 * a], [100.0 * a, 100.0 * (a**2 + noise_within)]] for a in rows])
+    recording = SimpleNamespace(
+        kind=np.array(['spin'] * count),
+        count=np.full(count, 100.0),
+        duration=np.ones(count),
+        keys=(),
+        time=np.arange(float(count)),
+        sessions=[np.arange(count)],
+        moving=np.ones(count, bool),
+    )
+    products = np.array(
+        [[[100.0, 100.0 * a], [100.0 * a, 100.0 * (a**2 + noise_within)]] for a in rows]
+    )
     still = np.zeros((count, 2))
-    space = SimpleNamespace(recording=recording, size=1, prior_sd=np.full(1, 1e6), prior_mean=np.zeros(1), places=lambda sensor, axis: np.array([0, 1]),
-                            mean={sensor: [still + [0.0, 0.5]] * 3 for sensor in ('accelerometer', 'gyroscope')}, within_sum=lambda sensor, axis, at: products[at].sum(axis=0),
-                            slopes_within=lambda sensor, axis, weights: products @ weights, reduced=lambda used, values: np.append(-values, 1.0))
+    space = SimpleNamespace(
+        recording=recording,
+        size=1,
+        prior_sd=np.full(1, 1e6),
+        prior_mean=np.zeros(1),
+        places=lambda sensor, axis: np.array([0, 1]),
+        mean={sensor: [still + [0.0, 0.5]] * 3 for sensor in ('accelerometer', 'gyroscope')},
+        within_sum=lambda sensor, axis, at: products[at].sum(axis=0),
+        slopes_within=lambda sensor, axis, weights: products @ weights,
+        reduced=lambda used, values: np.append(-values, 1.0),
+    )
     noise = NoiseModel(np.full(3, noise_within), np.ones(3))
-    return WindowEvidence(space, {'accelerometer': noise, 'gyroscope': noise}, np.arange(count) % 6, scatter=scatter)
+    return WindowEvidence(
+        space, {'accelerometer': noise, 'gyroscope': noise}, np.arange(count) % 6, scatter=scatter
+    )
 
 
 @pytest.mark.parametrize(('scatter', 'sure'), ((0.1, True), (1.0, False)))
@@ -384,13 +578,24 @@ def test_windows_agree_on_a_finding(scatter, sure):
     assert value / np.sqrt(covariance[0, 0]) > 30.0
     assert (evidence.p_value_by_scatter([0], [0]) < 1e-6) == sure
     problem = LinearisedProblem.__new__(LinearisedProblem)
-    problem.evidence, problem.questions, problem.search = evidence, [QUADRATIC] * 30, SimpleNamespace(indices=lambda chosen: (0,))
+    problem.evidence, problem.questions, problem.search = (
+        evidence,
+        [QUADRATIC] * 30,
+        SimpleNamespace(indices=lambda chosen: (0,)),
+    )
     assert problem.windows_agree([QUADRATIC], QUADRATIC) == sure
 
 
 def test_a_window_that_scatters_more_within_has_a_less_certain_mean():
     evidence = evidence_of(np.zeros(12), 1.0)
-    found = scatter_of_each(evidence.space, {sensor: NoiseModel(np.full(3, 0.25), np.ones(3)) for sensor in ('accelerometer', 'gyroscope')}, np.zeros(1))
+    found = scatter_of_each(
+        evidence.space,
+        {
+            sensor: NoiseModel(np.full(3, 0.25), np.ones(3))
+            for sensor in ('accelerometer', 'gyroscope')
+        },
+        np.zeros(1),
+    )
     np.testing.assert_allclose(found['gyroscope'], 4.0, rtol=0.02)
     means = evidence_of(np.zeros(12), 1.0, found).heldout_parts([0])['gyroscope'][0]
     assert means == pytest.approx(evidence.heldout_parts([0])['gyroscope'][0] / 4.0, rel=0.02)
@@ -399,10 +604,22 @@ def test_a_window_that_scatters_more_within_has_a_less_certain_mean():
 def test_what_only_one_window_tells_is_not_held_against_it():
     """The level of a bias that hardly forgets is known from the first window alone: held out, it is missed by what the others do not know."""
     rows = np.column_stack([[1.0, *[0.01] * 11], [50.0, *np.random.default_rng(0).normal(size=11)]])
-    evidence, parts = WindowEvidence.__new__(WindowEvidence), np.array([rows[k::6].T @ rows[k::6] for k in range(6)])
-    Evidence.__init__(evidence, parts.sum(axis=0), parts.sum(axis=0) - parts, prior_sd=np.full(1, 1e3), prior_mean=np.zeros(1))
+    evidence, parts = (
+        WindowEvidence.__new__(WindowEvidence),
+        np.array([rows[k::6].T @ rows[k::6] for k in range(6)]),
+    )
+    Evidence.__init__(
+        evidence,
+        parts.sum(axis=0),
+        parts.sum(axis=0) - parts,
+        prior_sd=np.full(1, 1e3),
+        prior_mean=np.zeros(1),
+    )
     evidence.space = SimpleNamespace(size=1, places=lambda sensor, axis: np.array([0, 1]))
-    evidence._of_axis, evidence._within_whole = {'gyroscope': [np.stack([parts, 0 * parts])]}, {'gyroscope': [0 * parts[None]]}
+    evidence._of_axis, evidence._within_whole = (
+        {'gyroscope': [np.stack([parts, 0 * parts])]},
+        {'gyroscope': [0 * parts[None]]},
+    )
     assert evidence.heldout([0]) > 500.0
     assert evidence.unpredicted([0])['gyroscope'][0, 0] < 30.0
 
@@ -410,31 +627,62 @@ def test_what_only_one_window_tells_is_not_held_against_it():
 def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it():
     """Means say 3; within windows of 100 samples of unit noise the slope of the residual is 3 times that of the column too, or -7 times by a wander."""
     for slope, left in ((3.0, 0.0), (-7.0, 100.0)):
-        count, each = 12, np.array([[100.0, 100.0 * slope], [100.0 * slope, 100.0 * (slope**2 + 1.0)]])
-        recording = SimpleNamespace(kind=np.array(['spin'] * count), count=np.full(count, 101.0), duration=np.ones(count), keys=(), time=np.arange(float(count)), moving=np.ones(count, bool),
-                                    sessions=[np.arange(count)], mean=lambda sensor: np.tile([1.0, 3.0], (12, 1)), product_sum=lambda sensor, part, rows: rows.sum() * each,
-                                    factors_of=lambda sensor, part, rows: [(np.flatnonzero(rows), np.tile(np.linalg.cholesky(each).T, (rows.sum(), 1, 1)))])
-        index, join, within = ({sensor: [some] * 3 for sensor in SENSORS} for some in (np.array([0]), np.eye(2), np.diag([0.0, 1.0])))
-        space = ParameterSpace(recording, ('drift',), np.full(1, 1e3), np.zeros(1), index, join, within)
-        evidence = WindowEvidence(space, dict.fromkeys(SENSORS, NoiseModel(np.ones(3), np.ones(3))), np.arange(count) % 6)
+        count, each = (
+            12,
+            np.array([[100.0, 100.0 * slope], [100.0 * slope, 100.0 * (slope**2 + 1.0)]]),
+        )
+        recording = SimpleNamespace(
+            kind=np.array(['spin'] * count),
+            count=np.full(count, 101.0),
+            duration=np.ones(count),
+            keys=(),
+            time=np.arange(float(count)),
+            moving=np.ones(count, bool),
+            sessions=[np.arange(count)],
+            mean=lambda sensor: np.tile([1.0, 3.0], (12, 1)),
+            product_sum=lambda sensor, part, rows: rows.sum() * each,
+            factors_of=lambda sensor, part, rows: [
+                (np.flatnonzero(rows), np.tile(np.linalg.cholesky(each).T, (rows.sum(), 1, 1)))
+            ],
+        )
+        index, join, within = (
+            {sensor: [some] * 3 for sensor in SENSORS}
+            for some in (np.array([0]), np.eye(2), np.diag([0.0, 1.0]))
+        )
+        space = ParameterSpace(
+            recording, ('drift',), np.full(1, 1e3), np.zeros(1), index, join, within
+        )
+        evidence = WindowEvidence(
+            space, dict.fromkeys(SENSORS, NoiseModel(np.ones(3), np.ones(3))), np.arange(count) % 6
+        )
         assert evidence.fit([0])[0] == pytest.approx(3.0, rel=1e-6)
-        assert evidence.unpredicted([0])['gyroscope'][1].sum() == pytest.approx(3 * count * 100.0 * (1.0 + left), rel=1e-6)
+        assert evidence.unpredicted([0])['gyroscope'][1].sum() == pytest.approx(
+            3 * count * 100.0 * (1.0 + left), rel=1e-6
+        )
 
 
 def test_flicker_is_as_much_of_each_time():
     likelihood = NoiseLikelihood.__new__(NoiseLikelihood)
     likelihood.known = ()
     made = likelihood.processes(3.0, FLICKER_MARK)
-    assert len(made) > 3 and len({process.sd for process in made}) == 1 and sum(process.sd**2 for process in made) == pytest.approx(9.0)
+    assert (
+        len(made) > 3
+        and len({process.sd for process in made}) == 1
+        and sum(process.sd**2 for process in made) == pytest.approx(9.0)
+    )
     assert likelihood.processes(3.0, 40.0) == (BiasProcess(3.0, 40.0),)
-    likeliest = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - 5.0 * (shape[2] == FLICKER_MARK))
+    likeliest = SimpleNamespace(
+        typical=1.0, many=True, loss=lambda shape, used: 100.0 - 5.0 * (shape[2] == FLICKER_MARK)
+    )
     assert BiasProcessSearch(likeliest, 1.0).best([])[0] == (0.0, 1.0, FLICKER_MARK)
 
 
 def test_a_usual_wander_has_no_price():
     """Accelerometers may wander by so much whatever their white noise."""
     search = BiasProcessSearch(SimpleNamespace(typical=2.0), 1.0, 20.0)
-    assert search.price(0.0, 10.0) == 0.0 and search.price(0.0, 20.0) == pytest.approx((np.log(2.0) / 0.8)**2)
+    assert search.price(0.0, 10.0) == 0.0 and search.price(0.0, 20.0) == pytest.approx(
+        (np.log(2.0) / 0.8) ** 2
+    )
 
 
 def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sensor():
@@ -443,7 +691,9 @@ def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sens
     turned = rng.uniform(0.0, 1.0, (20000, 2))
     read = np.round(turned / 1e-3) * 1e-3
     scatter = np.var(np.diff(read - turned, axis=1) / 5.0) + 1e-8 / 500
-    noise = NoiseModel(np.full(3, 1e-8), np.ones(3), reference=ReferenceNoise.of_steps(1e-3, 'gyroscope'))
+    noise = NoiseModel(
+        np.full(3, 1e-8), np.ones(3), reference=ReferenceNoise.of_steps(1e-3, 'gyroscope')
+    )
     moving, still = noise.mean_variance(['spin', 'static'], np.full(2, 500.0), np.full(2, 5.0))
     np.testing.assert_allclose(moving, scatter, rtol=0.05)
     np.testing.assert_allclose(still, 1e-8 / 500)
@@ -451,7 +701,11 @@ def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sens
 
 def test_a_wander_far_beyond_the_natural_one_has_its_price():
     """Two units of likelihood less for eight times the natural size are a drift beside a natural wander, not a wander."""
-    likelihood = SimpleNamespace(typical=1.0, many=True, loss=lambda shape, used: 100.0 - 2.0 * (shape[1] == 8.0 and shape[2] == 100.0))
+    likelihood = SimpleNamespace(
+        typical=1.0,
+        many=True,
+        loss=lambda shape, used: 100.0 - 2.0 * (shape[1] == 8.0 and shape[2] == 100.0),
+    )
     assert BiasProcessSearch(likelihood, 1.0).best([]) == ((0.0, 1.0, 100.0), 100.0)
     assert BiasProcessSearch(likelihood, 4.0).best([])[0] == (0.0, 8.0, 100.0)
 
@@ -468,17 +722,34 @@ def test_halves_agree_within_chance(apart, agree):
     """An effect of two standard deviations of the whole, halves that differ by so many of theirs."""
     problem = LinearisedProblem.__new__(LinearisedProblem)
     problem.space = SimpleNamespace(prior_sd=np.full(1, 1e6), prior_mean=np.zeros(1))
-    problem._halves = [np.array([[1.0, value], [value, value**2]]) for value in (apart / np.sqrt(2), -apart / np.sqrt(2))]
+    problem._halves = [
+        np.array([[1.0, value], [value, value**2]])
+        for value in (apart / np.sqrt(2), -apart / np.sqrt(2))
+    ]
     problem.search = SimpleNamespace(indices=lambda chosen: (0,))
     problem.evidence = SimpleNamespace(fit=lambda used: (np.array([2.0]), np.eye(1) / 2))
     assert problem.agrees_in_halves([QUADRATIC], QUADRATIC) == agree
 
 
-def with_problem(monkeypatch, paid=None, agree=lambda question: True, windows_agree=lambda named, question: True, drop_insignificant=list):
+def with_problem(
+    monkeypatch,
+    paid=None,
+    agree=lambda question: True,
+    windows_agree=lambda named, question: True,
+    drop_insignificant=list,
+):
     """Return an attempt of which the residual in the sensor's unit and the halves say this."""
-    monkeypatch.setattr(investigation, '_sure_reduction', lambda problem, kept, each: (paid or {}).get(each, 0.5))
+    monkeypatch.setattr(
+        investigation, '_sure_reduction', lambda problem, kept, each: (paid or {}).get(each, 0.5)
+    )
     monkeypatch.setattr(investigation, '_needed_reduction', lambda *given: 0.0)
-    return SimpleNamespace(search=SimpleNamespace(allowed=lambda named, question: True, drop_insignificant=drop_insignificant), windows_agree=windows_agree, agrees_in_halves=lambda named, question: agree(question))
+    return SimpleNamespace(
+        search=SimpleNamespace(
+            allowed=lambda named, question: True, drop_insignificant=drop_insignificant
+        ),
+        windows_agree=windows_agree,
+        agrees_in_halves=lambda named, question: agree(question),
+    )
 
 
 def test_a_finding_lowers_the_residual_in_the_sensors_own_unit(monkeypatch):
@@ -498,32 +769,76 @@ def test_what_the_halves_disagree_on_is_denied(monkeypatch):
 
 def test_what_is_nothing_without_what_was_taken_out_is_not_named(monkeypatch):
     """A clock that is early and a lag that makes up for it: each is significant beside the other alone."""
-    losses = {frozenset(): 100.0, frozenset([0]): 99.0, frozenset([1]): 99.0, frozenset([0, 1]): 0.0}
+    losses = {
+        frozenset(): 100.0,
+        frozenset([0]): 99.0,
+        frozenset([1]): 99.0,
+        frozenset([0, 1]): 0.0,
+    }
     drop_insignificant = Search(Known(losses.get), (), [QUADRATIC, CUBIC]).drop_insignificant
-    for agree, named in ((lambda question: True, [QUADRATIC, CUBIC]), (lambda question: question is not CUBIC, [])):
-        assert investigation._agreed(with_problem(monkeypatch, agree=agree, drop_insignificant=drop_insignificant), None, [QUADRATIC, CUBIC])[0] == named
+    for agree, named in (
+        (lambda question: True, [QUADRATIC, CUBIC]),
+        (lambda question: question is not CUBIC, []),
+    ):
+        assert (
+            investigation._agreed(
+                with_problem(monkeypatch, agree=agree, drop_insignificant=drop_insignificant),
+                None,
+                [QUADRATIC, CUBIC],
+            )[0]
+            == named
+        )
 
 
-@pytest.mark.parametrize(('value', 'fall', 'asked_about'), ((-1e-4, 100.0, True), (1e-4, 100.0, False), (-1e-4, 2.0, False)))
-def test_a_lag_that_would_be_negative_is_no_finding_and_asks_for_an_explanation(value, fall, asked_about):
+@pytest.mark.parametrize(
+    ('value', 'fall', 'asked_about'),
+    ((-1e-4, 100.0, True), (1e-4, 100.0, False), (-1e-4, 2.0, False)),
+)
+def test_a_lag_that_would_be_negative_is_no_finding_and_asks_for_an_explanation(
+    value, fall, asked_about
+):
     lag = asked('accelerometer', 'accel_delay', 0)
     search = Search(Known(lambda used: -fall * (0 in used), values=[value]), (), [lag])
-    assert search.early([]) == ([lag] if asked_about else []) and search.run() == ([lag] if value > 0 else [])
+    assert search.early([]) == ([lag] if asked_about else []) and search.run() == (
+        [lag] if value > 0 else []
+    )
 
 
 def rest_of(sigma, residual):
     """Return the Unexplained of a residual whose windows exceed noise by so many standard deviations."""
     count = len(residual)
-    recording = SimpleNamespace(kind=np.array(['static'] * count), moving=np.zeros(count, bool), count=np.full(count, 100.0), duration=np.ones(count), keys=(),
-                                time=np.arange(float(count)),
-                                describe={'time': np.arange(float(count)), 'temperature': np.full(count, np.nan), 'rate': np.zeros(count),
-                                          'specific force': np.full(count, 9.8)})
-    space = SimpleNamespace(mean={'accelerometer': [column[:, None] for column in residual.T]}, recording=recording, places=lambda sensor, axis: np.array([0]))
+    recording = SimpleNamespace(
+        kind=np.array(['static'] * count),
+        moving=np.zeros(count, bool),
+        count=np.full(count, 100.0),
+        duration=np.ones(count),
+        keys=(),
+        time=np.arange(float(count)),
+        describe={
+            'time': np.arange(float(count)),
+            'temperature': np.full(count, np.nan),
+            'rate': np.zeros(count),
+            'specific force': np.full(count, 9.8),
+        },
+    )
+    space = SimpleNamespace(
+        mean={'accelerometer': [column[:, None] for column in residual.T]},
+        recording=recording,
+        places=lambda sensor, axis: np.array([0]),
+    )
     explained = ExplainedWindows.__new__(ExplainedWindows)
-    explained.floor = SimpleNamespace(noise={'accelerometer': NoiseModel(np.full(3, 100.0), np.ones(3))})
+    explained.floor = SimpleNamespace(
+        noise={'accelerometer': NoiseModel(np.full(3, 100.0), np.ones(3))}
+    )
     explained.n_means, explained.n_within = 3.0 * count, 0.0
     explained.numbers = {'accelerometer': np.array([3.0 * count, 0.0])}
-    return rests._rest(SimpleNamespace(space=space, recording=recording), explained, 'accelerometer', alike(sigma * np.sqrt(6.0 * count), 0.0), np.ones(1))
+    return rests._rest(
+        SimpleNamespace(space=space, recording=recording),
+        explained,
+        'accelerometer',
+        alike(sigma * np.sqrt(6.0 * count), 0.0),
+        np.ones(1),
+    )
 
 
 def test_a_rest_of_some_standard_deviations_is_unexplained():
@@ -537,4 +852,7 @@ def test_noise_goes_with_nothing():
     rng = np.random.default_rng(6)
     curves = [(f'curve {k}', rng.normal(size=(60, 2)), np.ones(60, bool)) for k in range(20)]
     assert rests.correlate(iter(curves), rng.normal(size=(60, 3))) == (None, 0.0)
-    assert rests.correlate(iter(curves), rng.normal(size=(60, 3)) + 1.5 * curves[3][1][:, :1])[0] == 'curve 3'
+    assert (
+        rests.correlate(iter(curves), rng.normal(size=(60, 3)) + 1.5 * curves[3][1][:, :1])[0]
+        == 'curve 3'
+    )

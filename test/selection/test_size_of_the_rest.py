@@ -12,19 +12,46 @@ def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monk
     monkeypatch.setattr(unexplained, 'correlate', lambda explanations, residual: ('time', 0.5))
     monkeypatch.setattr(unexplained, '_explanations', lambda recording: {})
     n = 40
-    noise = SimpleNamespace(variance_beside_bias=lambda kind, count, duration, keys: np.full((n, 3), 4e-6), bias_variance=1e-2)
-    problem = SimpleNamespace(space=SimpleNamespace(mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]),
-                              recording=SimpleNamespace(kind=None, count=None, duration=None, keys=(), time=np.arange(n)))
-    explained = SimpleNamespace(floor=SimpleNamespace(noise={'gyroscope': noise}), n_means=3 * n, n_within=1, sigma=lambda sensor, excess: (20.0, 0.0))
-    rest = unexplained._rest(problem, explained, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1))
+    noise = SimpleNamespace(
+        variance_beside_bias=lambda kind, count, duration, keys: np.full((n, 3), 4e-6),
+        bias_variance=1e-2,
+    )
+    problem = SimpleNamespace(
+        space=SimpleNamespace(
+            mean={'gyroscope': [np.full((n, 1), 0.01)] * 3}, places=lambda sensor, axis: [0]
+        ),
+        recording=SimpleNamespace(kind=None, count=None, duration=None, keys=(), time=np.arange(n)),
+    )
+    explained = SimpleNamespace(
+        floor=SimpleNamespace(noise={'gyroscope': noise}),
+        n_means=3 * n,
+        n_within=1,
+        sigma=lambda sensor, excess: (20.0, 0.0),
+    )
+    rest = unexplained._rest(
+        problem, explained, 'gyroscope', np.outer([9.0 * 3 * n, 0.0], np.full(3, 1 / 3)), np.ones(1)
+    )
     assert rest.significant
     np.testing.assert_allclose(rest.rms, 3 * 2e-3)
 
 
 def test_a_joint_goes_by_its_name():
     n = 60
-    describe = {'time': np.arange(n, dtype=float), 'temperature': np.full(n, np.nan), 'rate': np.zeros(n), 'specific force': np.full(n, 9.8),
-                'angle0': np.linspace(0, 9, n), 'span0': np.zeros(n), 'angle1': np.linspace(1, 5, n)[::-1], 'span1': np.zeros(n)}
-    recording = SimpleNamespace(describe=describe, kind=np.zeros(n), moving=np.zeros(n, bool), model=SimpleNamespace(joint_names=('pan', 'tilt')))
+    describe = {
+        'time': np.arange(n, dtype=float),
+        'temperature': np.full(n, np.nan),
+        'rate': np.zeros(n),
+        'specific force': np.full(n, 9.8),
+        'angle0': np.linspace(0, 9, n),
+        'span0': np.zeros(n),
+        'angle1': np.linspace(1, 5, n)[::-1],
+        'span1': np.zeros(n),
+    }
+    recording = SimpleNamespace(
+        describe=describe,
+        kind=np.zeros(n),
+        moving=np.zeros(n, bool),
+        model=SimpleNamespace(joint_names=('pan', 'tilt')),
+    )
     rest = np.random.default_rng(3).normal(size=(n, 3)) + 4 * np.cos(describe['angle1'])[:, None]
     assert unexplained.correlate(unexplained._explanations(recording), rest)[0] == 'angle of tilt'

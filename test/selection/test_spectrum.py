@@ -27,20 +27,35 @@ STEP = 0.01
 def stretches(amplitudes, frequency=23.7, noise=1.0):
     """Return stretches of noise in which axis y carries a tone of each amplitude, in a phase of its own."""
     rng, time = np.random.default_rng(3), STEP * np.arange(400)
-    return [(noise * rng.normal(size=(400, 3)) + np.outer(size * np.sin(2 * np.pi * frequency * time + k), [0, 1, 0]), STEP, 45.0)
-            for k, size in enumerate(amplitudes)]
+    return [
+        (
+            noise * rng.normal(size=(400, 3))
+            + np.outer(size * np.sin(2 * np.pi * frequency * time + k), [0, 1, 0]),
+            STEP,
+            45.0,
+        )
+        for k, size in enumerate(amplitudes)
+    ]
 
 
 def test_a_tone_is_found_where_it_is_with_its_amplitude():
-    tone, = of_stretches('gyroscope', stretches([0.8] * 30), None)
-    assert tone.axis == 'y' and tone.frequency == pytest.approx(23.7, abs=0.11) and tone.amplitude == pytest.approx(0.8, rel=0.1)
+    (tone,) = of_stretches('gyroscope', stretches([0.8] * 30), None)
+    assert (
+        tone.axis == 'y'
+        and tone.frequency == pytest.approx(23.7, abs=0.11)
+        and tone.amplitude == pytest.approx(0.8, rel=0.1)
+    )
     assert tone.p_value < 1e-20 and tone.share > 0.9
 
 
 @pytest.mark.parametrize('amplitudes', [[0.0] * 40, [30.0] * 5 + [0.0] * 35, [0.8] * 4])
 def test_noise_what_some_motions_do_and_too_few_stretches_are_no_tone(amplitudes):
     """A large line in an eighth of the stretches is that of their motion; four stretches are few."""
-    assert not [tone for tone in of_stretches('gyroscope', stretches(amplitudes), None) if tone.share <= 0.5 or tone.p_value * 3 < 1e-4]
+    assert not [
+        tone
+        for tone in of_stretches('gyroscope', stretches(amplitudes), None)
+        if tone.share <= 0.5 or tone.p_value * 3 < 1e-4
+    ]
 
 
 def test_noise_that_is_not_white_is_no_tone():
@@ -51,7 +66,10 @@ def test_noise_that_is_not_white_is_no_tone():
 
 def test_a_fixed_frequency_is_removed_before_orders_are_searched():
     time, rng = STEP * np.arange(700), np.random.default_rng(2)
-    other, line = np.sin(2 * np.pi * 11.0 * time) + 0.1 * rng.normal(size=len(time)), np.sin(2 * np.pi * 31.04 * time + 1.0)
+    other, line = (
+        np.sin(2 * np.pi * 11.0 * time) + 0.1 * rng.normal(size=len(time)),
+        np.sin(2 * np.pi * 31.04 * time + 1.0),
+    )
     left = _without(31.0, time, other + 3.0 * line)
     assert np.std(left - other) < 0.05 and abs(left @ line) / len(time) < 1e-3
 
@@ -61,17 +79,41 @@ def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
     found = investigate(recording.windows, recording.table, recording.model)
     tones = find_tones(found, recording.table)
     (hum,), (teeth,) = tones['accelerometer'], tones['gyroscope']
-    assert (hum.joint, hum.axis) == (None, 'z') and hum.frequency == pytest.approx(Machine.hum_hz, abs=0.1)
-    assert hum.amplitude == pytest.approx(9.8e-3, rel=0.1) and '23.7 Hz' in hum.text and 'accelerometer z' in hum.text
-    assert (teeth.joint, teeth.axis) == ('outer', 'x') and teeth.frequency == pytest.approx(Machine.teeth, abs=0.2)
-    assert 'outer' in teeth.text and 'gyroscope x' in teeth.text and teeth.to_mapping()['joint'] == 'outer'
+    assert (hum.joint, hum.axis) == (None, 'z') and hum.frequency == pytest.approx(
+        Machine.hum_hz, abs=0.1
+    )
+    assert (
+        hum.amplitude == pytest.approx(9.8e-3, rel=0.1)
+        and '23.7 Hz' in hum.text
+        and 'accelerometer z' in hum.text
+    )
+    assert (teeth.joint, teeth.axis) == ('outer', 'x') and teeth.frequency == pytest.approx(
+        Machine.teeth, abs=0.2
+    )
+    assert (
+        'outer' in teeth.text
+        and 'gyroscope x' in teeth.text
+        and teeth.to_mapping()['joint'] == 'outer'
+    )
 
-    mesh = term('mesh', sensor='gyroscope', column=f'sin({Machine.teeth} * angle_1)', unit='rad/s', tolerance=1e-5, text='Teeth of the gear.')
+    mesh = term(
+        'mesh',
+        sensor='gyroscope',
+        column=f'sin({Machine.teeth} * angle_1)',
+        unit='rad/s',
+        tolerance=1e-5,
+        text='Teeth of the gear.',
+    )
     formula = SimpleNamespace(effects=[mesh], values=[np.array([0.2 * DEG, 0.0, 0.0])])
-    assert [tone.sensor for tones in find_tones(found, recording.table, [formula]).values() for tone in tones] == ['accelerometer']
+    assert [
+        tone.sensor
+        for tones in find_tones(found, recording.table, [formula]).values()
+        for tone in tones
+    ] == ['accelerometer']
 
     class Rest:
         tones = (teeth, hum)
+
     drawn = draw_tones('gyroscope', Rest)
     assert 'of the gyroscope' in drawn and 'mathdefault' not in drawn
     Rest.tones = ()
@@ -84,7 +126,12 @@ class Loud(Cause):
     def delivered(self, time, outputs, rate_s):
         """Return both."""
         tone = self.size * 20 * MG * np.sin(2 * np.pi * 31.0 * time)
-        noise = 0.5 * self.size * np.random.default_rng(1).normal(size=len(time)) * np.linalg.norm(rate_s, axis=1)
+        noise = (
+            0.5
+            * self.size
+            * np.random.default_rng(1).normal(size=len(time))
+            * np.linalg.norm(rate_s, axis=1)
+        )
         return [outputs[0] + np.outer(tone, [0, 0, 1]), outputs[1] + np.outer(noise, [0, 1, 0])]
 
 
@@ -93,11 +140,20 @@ class Loud(Cause):
 def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size):
     """Both are random to least squares, whose noise they increase: the diagnosis of either was "nothing found"."""
     recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size))
-    found = build_diagnosis(recording.table, investigate(recording.windows, recording.table, recording.model)).unexplained
-    assert [found[sensor].significant for sensor in ('accelerometer', 'gyroscope')] == [size > 0] * 2
+    found = build_diagnosis(
+        recording.table, investigate(recording.windows, recording.table, recording.model)
+    ).unexplained
+    assert [found[sensor].significant for sensor in ('accelerometer', 'gyroscope')] == [
+        size > 0
+    ] * 2
     if size:
-        assert [(rest.axes, rest.correlates_with) for rest in found.values()] == [(('z',), None), (('y',), IN_MOTION)]
-        assert found['accelerometer'].rms == pytest.approx(20 * MG / np.sqrt(6), rel=0.1)   # a mean over three axes, as of other residuals
+        assert [(rest.axes, rest.correlates_with) for rest in found.values()] == [
+            (('z',), None),
+            (('y',), IN_MOTION),
+        ]
+        assert found['accelerometer'].rms == pytest.approx(
+            20 * MG / np.sqrt(6), rel=0.1
+        )  # a mean over three axes, as of other residuals
 
 
 @pytest.mark.long
@@ -105,9 +161,23 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
 def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
     """Tones and the scatter of one axis were tested by `diagnose` only."""
     session = make_session(5, None, 'realistic', cause=Loud(1.0))
-    reported = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration.statistics['unexplained']
-    found = imu.diagnose(session.block, Table.from_mapping(session.table)).result.diagnosis.unexplained
-    assert reported == {sensor: {'rms': pytest.approx(rest.rms), 'axes': list(rest.axes)} for sensor, rest in found.items() if rest.significant}
-    assert {sensor: rest['axes'] for sensor, rest in reported.items()} == {'accelerometer': ['z'], 'gyroscope': ['y']}
+    reported = imu.calibrate(
+        session.block, Table.from_mapping(session.table)
+    ).calibration.statistics['unexplained']
+    found = imu.diagnose(
+        session.block, Table.from_mapping(session.table)
+    ).result.diagnosis.unexplained
+    assert reported == {
+        sensor: {'rms': pytest.approx(rest.rms), 'axes': list(rest.axes)}
+        for sensor, rest in found.items()
+        if rest.significant
+    }
+    assert {sensor: rest['axes'] for sensor, rest in reported.items()} == {
+        'accelerometer': ['z'],
+        'gyroscope': ['y'],
+    }
     empty = make_session(5, None, 'realistic')
-    assert 'unexplained' not in imu.calibrate(empty.block, Table.from_mapping(empty.table)).calibration.statistics
+    assert (
+        'unexplained'
+        not in imu.calibrate(empty.block, Table.from_mapping(empty.table)).calibration.statistics
+    )

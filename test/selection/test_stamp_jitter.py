@@ -24,9 +24,12 @@ def blocks(jitter, seed=0):
     """Return (variances, mean square slopes, degrees of freedom) of blocks, a third of them at rest; `jitter` of each sensor, s."""
     rng = np.random.default_rng(seed)
     speed = np.where(np.arange(BLOCKS) % 3 == 0, 0.0, rng.uniform(0.5, 4.0, BLOCKS))[:, None]
-    slope = [(size * speed * rng.uniform(0.5, 1.0, (BLOCKS, 3)))**2 for size in (4.0, 1.0)]
+    slope = [(size * speed * rng.uniform(0.5, 1.0, (BLOCKS, 3))) ** 2 for size in (4.0, 1.0)]
     scatter = rng.chisquare(FREEDOM, (2, BLOCKS, 3)) / FREEDOM
-    rough = [(noise + sd**2 * steep) * part for noise, sd, steep, part in zip(NOISE, jitter, slope, scatter)]
+    rough = [
+        (noise + sd**2 * steep) * part
+        for noise, sd, steep, part in zip(NOISE, jitter, slope, scatter)
+    ]
     return rough, slope, np.full(BLOCKS, float(FREEDOM))
 
 
@@ -36,7 +39,9 @@ def test_the_size_of_the_errors_is_estimated_and_their_scatter_removed(sd):
     found = stamp_jitter(rough, slope, freedom)
     assert found.significant and found.sd == pytest.approx(sd, rel=0.05) and len(found.lines) == 1
     for own, steep, noise in zip(rough, slope, NOISE):
-        assert np.median((own / jitter_ratio(own, steep, found.sd))[steep[:, 0] > 0]) == pytest.approx(noise, rel=0.15)
+        assert np.median(
+            (own / jitter_ratio(own, steep, found.sd))[steep[:, 0] > 0]
+        ) == pytest.approx(noise, rel=0.15)
 
 
 @pytest.mark.parametrize('jitter', [(1e-4, 0.0), (0.0, 1e-4), (0.0, 5e-6)])
@@ -66,8 +71,14 @@ def test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model()
     session = make_session(6, None, 'realistic', grade='navigation')
     result = imu.calibrate(session.block, Table.from_mapping(session.table))
     entry = result.calibration.statistics['stamp_jitter']
-    assert entry['sd_s'] == pytest.approx(50e-6, rel=0.1) and entry['variance_ratio']['gyroscope']['spin'] > 100
+    assert (
+        entry['sd_s'] == pytest.approx(50e-6, rel=0.1)
+        and entry['variance_ratio']['gyroscope']['spin'] > 100
+    )
     assert max(misfit_ratios(result.calibration, 'gyroscope').values()) < NOTED_MISFIT
     assert not misfits(result.calibration)
-    without = replace(result.calibration, statistics={k: v for k, v in result.calibration.statistics.items() if k != 'stamp_jitter'})
+    without = replace(
+        result.calibration,
+        statistics={k: v for k, v in result.calibration.statistics.items() if k != 'stamp_jitter'},
+    )
     assert {reason.word for reason in misfits(without)} >= {WARNING}

@@ -17,7 +17,9 @@ from imu_calibration.simulation.sensor_noise import (
 
 def test_white_noise_integrates_to_a_random_walk_of_its_density():
     model = SimulatedNoise(accel_density=2e-3, gyro_density=1e-4)
-    force, rate = ImuNoise(model, sample_rate=200.0, rng=np.random.default_rng(1)).add(np.zeros((40000, 3)), np.zeros((40000, 3)))
+    force, rate = ImuNoise(model, sample_rate=200.0, rng=np.random.default_rng(1)).add(
+        np.zeros((40000, 3)), np.zeros((40000, 3))
+    )
     for noise, density in ((force, 2e-3), (rate, 1e-4)):
         # 1200 integrals over 0.5 s: 2 % sampling error of their sd.
         walk = noise.reshape(-1, 100, 3).sum(axis=1) / 200.0
@@ -40,20 +42,30 @@ def test_bias_wander_continues_from_block_to_block():
     second = gauss_markov(3.0, 5.0, 0.1, shape=(10, 4000), rng=rng, before=first[-1])
     # 4000 independent paths: 1.6 % sampling error.
     assert np.mean(second[0] * first[-1]) / 9.0 == pytest.approx(np.exp(-0.1 / 5.0), abs=0.06)
-    assert np.std(second[0] - first[-1]) == pytest.approx(3.0 * np.sqrt(2 * -np.expm1(-0.1 / 5.0)), rel=0.06)
+    assert np.std(second[0] - first[-1]) == pytest.approx(
+        3.0 * np.sqrt(2 * -np.expm1(-0.1 / 5.0)), rel=0.06
+    )
 
 
 def test_no_noise_changes_nothing():
     force = np.random.default_rng(3).normal(size=(10, 3))
-    for got in ImuNoise(SimulatedNoise(), sample_rate=100.0, rng=np.random.default_rng(4)).add(force, force):
+    for got in ImuNoise(SimulatedNoise(), sample_rate=100.0, rng=np.random.default_rng(4)).add(
+        force, force
+    ):
         np.testing.assert_array_equal(got, force)
-    np.testing.assert_array_equal(read_encoders(force, SimulatedNoise(), np.random.default_rng(4)), force)
+    np.testing.assert_array_equal(
+        read_encoders(force, SimulatedNoise(), np.random.default_rng(4)), force
+    )
 
 
 def test_resolution():
     values = quantise(np.linspace(-1, 1, 1000), 0.25)
     np.testing.assert_array_equal(np.unique(values), np.arange(-1, 1.1, 0.25))
-    angles = read_encoders(np.linspace(0, 1, 500)[:, None], realistic(encoder_resolution=0.01), np.random.default_rng(5))
+    angles = read_encoders(
+        np.linspace(0, 1, 500)[:, None],
+        realistic(encoder_resolution=0.01),
+        np.random.default_rng(5),
+    )
     np.testing.assert_allclose(angles / 0.01, np.round(angles / 0.01), atol=1e-9)
 
 
@@ -66,6 +78,8 @@ def test_stamp_jitter():
 
 
 def test_grades_are_ordered_and_sourced():
-    densities = [GRADES[name].noise.accel_density for name in ('consumer', 'industrial', 'navigation')]
+    densities = [
+        GRADES[name].noise.accel_density for name in ('consumer', 'industrial', 'navigation')
+    ]
     assert densities == sorted(densities, reverse=True)
     assert all(grade.source and grade.noise.accel_instability > 0 for grade in GRADES.values())

@@ -16,7 +16,10 @@ NAMES = sorted(profile_names())
 
 def reference(profile, time, **changes):
     axes = dict(zip(profile.joint_names, ([0, 0, 1], [0, 1, 0], [1, 0, 0])))
-    mapping = profile.table or {'joints': [{'name': name, 'axis': axis} for name, axis in axes.items()], 'latitude': 45.0}
+    mapping = profile.table or {
+        'joints': [{'name': name, 'axis': axis} for name, axis in axes.items()],
+        'latitude': 45.0,
+    }
     return reference_motion(Table.from_mapping(mapping | changes), profile.at(time))
 
 
@@ -78,7 +81,9 @@ def test_calibration_session_is_rich():
     sphere = np.random.default_rng(3).normal(size=(500, 3))
     sphere /= np.linalg.norm(sphere, axis=1)[:, None]
     assert np.degrees(np.arccos(np.max(sphere @ different.T, axis=1))).max() < 36
-    rates = np.degrees(reference(profile, profile.find('spin').mean(axis=1), latitude=None, gravity=9.8).rate_s)
+    rates = np.degrees(
+        reference(profile, profile.find('spin').mean(axis=1), latitude=None, gravity=9.8).rate_s
+    )
     for axis in range(3):
         along = rates[np.linalg.norm(np.delete(rates, axis, 1), axis=1) < 1, axis]
         assert set(np.round(along)) >= {-200, -120, -60, 60, 120, 200}
@@ -93,14 +98,22 @@ def test_seed_draws_the_session():
 
 def test_duration_is_reached():
     for seed in range(3):
-        assert make_profile('random', seed=seed, duration=300.0).duration == pytest.approx(300.0, abs=1e-6)
+        assert make_profile('random', seed=seed, duration=300.0).duration == pytest.approx(
+            300.0, abs=1e-6
+        )
     with refused(InputError, 'too_short', 30):
         make_profile('calibration', duration=30.0)
 
 
 def test_other_tables():
-    two = {'joints': [{'name': 'tilt', 'axis': [0, 1, 0]}, {'name': 'plate', 'axis': [0, 0, 1]}], 'latitude': 45.0}
-    assert make_profile('calibration', table=Table.from_mapping(two)).joint_names == ('tilt', 'plate')
+    two = {
+        'joints': [{'name': 'tilt', 'axis': [0, 1, 0]}, {'name': 'plate', 'axis': [0, 0, 1]}],
+        'latitude': 45.0,
+    }
+    assert make_profile('calibration', table=Table.from_mapping(two)).joint_names == (
+        'tilt',
+        'plate',
+    )
     assert make_profile('two_axis').at(0.0).position.shape == (1, 2)
     one = {'joints': two['joints'][:1], 'latitude': 45.0}
     assert make_profile('quick', table=one).at(0.0).position.shape == (1, 1)
@@ -110,7 +123,9 @@ def test_other_tables():
         make_profile('no_such_profile')
 
 
-@pytest.mark.parametrize('name', sorted(name for name in REGISTRY if name.startswith('avrutov_') and name[8] in 'XYZ'))
+@pytest.mark.parametrize(
+    'name', sorted(name for name in REGISTRY if name.startswith('avrutov_') and name[8] in 'XYZ')
+)
 def test_equal_angles_determine_the_linear_model(name):
     """All 36 cases of gimbal order and gravity have rank 4, and rank 7 with products (the 41 positions of samples 1 and 2)."""
     profile = make_profile(name)
@@ -128,7 +143,9 @@ def test_conditions_of_equal_angles_are_those_of_the_analysis():
     for name, expected in (('avrutov_ZYX', 3.767), ('avrutov_XYX_up_x', 3.596)):
         profile = make_profile(name)
         ref = reference(profile, profile.find('rest').mean(axis=1)[-41:])
-        assert np.linalg.cond(np.column_stack([np.ones(41), ref.force_s / ref.gravity])) == pytest.approx(expected, abs=1e-3)
+        assert np.linalg.cond(
+            np.column_stack([np.ones(41), ref.force_s / ref.gravity])
+        ) == pytest.approx(expected, abs=1e-3)
 
 
 def test_the_literal_simultaneous_turn_is_degenerate():
@@ -143,7 +160,7 @@ def test_gyroscope_series_give_the_rates_of_the_paper(sample, condition):
     spins = profile.find('spin').mean(axis=1)
     rates = np.degrees(reference(profile, spins, latitude=None, gravity=9.8).rate_s)
     wanted = avrutov_rates_deg(sample)
-    np.testing.assert_allclose(rates, wanted[-len(rates):], atol=1e-9)
+    np.testing.assert_allclose(rates, wanted[-len(rates) :], atol=1e-9)
     x, y, z = wanted.T
     columns = [np.ones(11), x, y, z] + ([x * y, y * z, x * z] if sample == 4 else [])
     assert np.linalg.cond(np.column_stack(columns)) == pytest.approx(condition, rel=1e-4)
@@ -152,7 +169,9 @@ def test_gyroscope_series_give_the_rates_of_the_paper(sample, condition):
 def test_commanded_gimbal_rates_are_not_body_rates():
     profile = make_profile('avrutov_gimbals_3')
     start, end = profile.find('spin')[-1]
-    rates = np.degrees(reference(profile, np.linspace(start, end, 3000), latitude=None, gravity=9.8).rate_s)
+    rates = np.degrees(
+        reference(profile, np.linspace(start, end, 3000), latitude=None, gravity=9.8).rate_s
+    )
     assert np.abs(rates.mean(axis=0) - avrutov_rates_deg(3)[-1]).max() > 4.0
 
 
@@ -160,13 +179,23 @@ def test_skewed_fixture_shares_every_spin_among_the_sensor_axes():
     profile = make_profile('zhang_z60')
     rates = reference(profile, profile.find('spin').mean(axis=1), latitude=None, gravity=9.8).rate_s
     cosines = np.abs(rates) / np.linalg.norm(rates, axis=1)[:, None]
-    np.testing.assert_allclose(np.sort(cosines, axis=1), np.tile([1 / 3, 2 / 3, 2 / 3], (9, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        np.sort(cosines, axis=1), np.tile([1 / 3, 2 / 3, 2 / 3], (9, 1)), atol=1e-9
+    )
 
 
 def test_example_tables_are_valid():
     yaml = pytest.importorskip('yaml')
     from pathlib import Path
+
     for name, joints in (('table_simulated', 3), ('table_two_axis', 2)):
-        table = Table.from_mapping({**yaml.safe_load((Path(__file__).parents[2] / 'config' / f'{name}.yaml').read_text()), 'gravity': 9.8})
+        table = Table.from_mapping(
+            {
+                **yaml.safe_load(
+                    (Path(__file__).parents[2] / 'config' / f'{name}.yaml').read_text()
+                ),
+                'gravity': 9.8,
+            }
+        )
         assert len(table.joints) == joints
         assert make_profile('calibration', table=table).joint_names == table.joint_names.read

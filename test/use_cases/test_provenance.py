@@ -32,14 +32,28 @@ def place(tmp_path_factory):
 
 
 def calibrate(folder, *more, verb='calibrate'):
-    return [verb, str(SESSION), '--table', str(folder / 'table.yaml'), '--output', str(folder / 'out'), '--quiet', *more]
+    return [
+        verb,
+        str(SESSION),
+        '--table',
+        str(folder / 'table.yaml'),
+        '--output',
+        str(folder / 'out'),
+        '--quiet',
+        *more,
+    ]
 
 
 def test_a_result_names_verb_options_files_serial_number_and_operator(place):
     found = yaml.safe_load((place / 'out/calibration.yaml').read_text())['provenance']
     assert (found['verb'], found['serial'], found['operator']) == ('calibrate', 'A-17', 'Ada')
-    assert found['options'] == {'table': {'name': 'table.yaml', 'sha256': files.hash_of(TABLE)},
-                                'tolerances': {'name': 'tolerances.yaml', 'sha256': files.hash_of(config_file('tolerances.yaml'))}}
+    assert found['options'] == {
+        'table': {'name': 'table.yaml', 'sha256': files.hash_of(TABLE)},
+        'tolerances': {
+            'name': 'tolerances.yaml',
+            'sha256': files.hash_of(config_file('tolerances.yaml')),
+        },
+    }
     assert re.fullmatch('[0-9a-f]{64}', found['bags'][0]['sha256'])
     page = (place / 'out/report.html').read_text()
     assert 'A-17' in page and 'Ada' in page
@@ -51,8 +65,11 @@ def test_a_result_of_other_inputs_is_not_replaced(place, capsys):
     same = provenance_with('calibrate', [SESSION], {}, stand=place / 'table.yaml')
     require_same_inputs(place / 'out', same)
     require_same_inputs(place / 'elsewhere', {})
-    for changes, part in (({'verb': 'diagnose'}, 'verb'), ({'bags': [{'name': 'b', 'sha256': '0'}]}, 'recordings'),
-                          ({'options': {'table': {'name': 'table.yaml', 'sha256': '0'}}}, 'reference')):
+    for changes, part in (
+        ({'verb': 'diagnose'}, 'verb'),
+        ({'bags': [{'name': 'b', 'sha256': '0'}]}, 'recordings'),
+        ({'options': {'table': {'name': 'table.yaml', 'sha256': '0'}}}, 'reference'),
+    ):
         with refused(InputError, 'other_result', part):
             require_same_inputs(place / 'out', same | changes)
     assert (place / 'out/calibration.yaml').read_bytes() == before
@@ -67,12 +84,32 @@ def test_a_file_that_is_no_result_is_not_replaced(text, tmp_path):
 
 def test_options_in_memory_and_robots_are_named(tmp_path):
     (tmp_path / 'arm.urdf').write_text('<robot/>')
-    options = provenance_with('calibrate', (), {'gravity': 9.81, 'tolerances': {'gyroscope': {'bias': 1.0}}, 'setting': {'settling': 1.0},
-                                                'serial': None, 'model_as_asked': True},
-                              stand=Arm(tmp_path / 'arm.urdf', 'imu_link', up=(0, 0, 1)))['options']
-    assert options['gravity'] == 9.81 and options['setting'] == ['settling=1.0'] and options['up'] == [0, 0, 1]
-    assert options['urdf'] == {'name': 'arm.urdf', 'sha256': files.hash_of(tmp_path / 'arm.urdf')} and options['model_as_asked'] is True
-    assert options['tolerances']['name'] == 'in memory' and len(options['tolerances']['sha256']) == 64 and 'serial' not in options
+    options = provenance_with(
+        'calibrate',
+        (),
+        {
+            'gravity': 9.81,
+            'tolerances': {'gyroscope': {'bias': 1.0}},
+            'setting': {'settling': 1.0},
+            'serial': None,
+            'model_as_asked': True,
+        },
+        stand=Arm(tmp_path / 'arm.urdf', 'imu_link', up=(0, 0, 1)),
+    )['options']
+    assert (
+        options['gravity'] == 9.81
+        and options['setting'] == ['settling=1.0']
+        and options['up'] == [0, 0, 1]
+    )
+    assert (
+        options['urdf'] == {'name': 'arm.urdf', 'sha256': files.hash_of(tmp_path / 'arm.urdf')}
+        and options['model_as_asked'] is True
+    )
+    assert (
+        options['tolerances']['name'] == 'in memory'
+        and len(options['tolerances']['sha256']) == 64
+        and 'serial' not in options
+    )
 
 
 def test_a_file_is_read_again_for_its_hash_only_after_a_change(tmp_path):
@@ -86,5 +123,7 @@ def test_a_file_is_read_again_for_its_hash_only_after_a_change(tmp_path):
 
 
 def test_hashes_of_earlier_versions_are_recognised():
-    assert made_from({'bags': [{'sha256': '0123456789abcdef' + 48 * '7'}]}) == made_from({'bags': [{'sha256': '0123456789abcdef'}]})
+    assert made_from({'bags': [{'sha256': '0123456789abcdef' + 48 * '7'}]}) == made_from(
+        {'bags': [{'sha256': '0123456789abcdef'}]}
+    )
     assert made_from({'bags': 3 * [None]}) == made_from({}) == set()

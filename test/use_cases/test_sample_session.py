@@ -21,7 +21,10 @@ def load(path):
 def output(tmp_path_factory):
     """Folder of a calibration of the sample recording."""
     folder = tmp_path_factory.mktemp('sample')
-    assert main(['calibrate', str(BAG), '--table', str(BAG / 'table.yaml'), '--output', str(folder)]) == 0
+    assert (
+        main(['calibrate', str(BAG), '--table', str(BAG / 'table.yaml'), '--output', str(folder)])
+        == 0
+    )
     return folder
 
 
@@ -36,17 +39,27 @@ def test_truth_is_found_within_the_reported_standard_deviations(output):
     names = [name for name in truth.param_names if name in found.param_names]
     a, b = ([c.param_names.index(name) for name in names] for c in (found, truth))
     ratio = np.abs(found.values[a] - truth.values[b]) / found.sd[a]
-    print(f'sample session: largest error {ratio.max():.2f} sd, rms {np.sqrt((ratio**2).mean()):.2f} sd over {len(names)} parameters')
+    print(
+        f'sample session: largest error {ratio.max():.2f} sd, rms {np.sqrt((ratio**2).mean()):.2f} sd over {len(names)} parameters'
+    )
     assert ratio.max() < 4.5
     assert set(found.requested.values()) == {'determined'}
-    for sensor, effect, bound in (('accelerometer', 'bias', 2e-3), ('accelerometer', 'matrix', 2e-4), ('accelerometer', 'accel_size_effect', 3e-4),
-                                  ('gyroscope', 'bias', 1e-4), ('gyroscope', 'matrix', 1e-4)):
+    for sensor, effect, bound in (
+        ('accelerometer', 'bias', 2e-3),
+        ('accelerometer', 'matrix', 2e-4),
+        ('accelerometer', 'accel_size_effect', 3e-4),
+        ('gyroscope', 'bias', 1e-4),
+        ('gyroscope', 'matrix', 1e-4),
+    ):
         assert np.max(np.abs(found.value(sensor, effect) - truth.value(sensor, effect))) < bound
 
 
 def test_same_input_gives_the_same_bytes(output, tmp_path):
     """Calibration and report are the same file again."""
-    assert main(['calibrate', str(BAG), '--table', str(BAG / 'table.yaml'), '--output', str(tmp_path)]) == 0
+    assert (
+        main(['calibrate', str(BAG), '--table', str(BAG / 'table.yaml'), '--output', str(tmp_path)])
+        == 0
+    )
     for name in ('calibration.yaml', 'report.html'):
         assert (tmp_path / name).read_bytes() == (output / name).read_bytes()
 
@@ -63,10 +76,27 @@ def test_compensated_bag(output, tmp_path):
     from imu_calibration.kinematics.table import Table
     from imu_calibration.preprocessing.window_finder import session_truth
     from msg_adapters.bag import open_recording
+
     corrected = tmp_path / 'corrected'
-    assert main(['compensate', str(BAG), '--calibration', str(output / 'calibration.yaml'), '--output', str(corrected)]) == 0
+    assert (
+        main(
+            [
+                'compensate',
+                str(BAG),
+                '--calibration',
+                str(output / 'calibration.yaml'),
+                '--output',
+                str(corrected),
+            ]
+        )
+        == 0
+    )
     with open_recording(corrected, imu_topic='/imu/data_corrected') as recording:
-        assert {topic.name for topic in recording.topics} == {'/imu/data_raw', '/imu/data_corrected', '/joint_states'}
+        assert {topic.name for topic in recording.topics} == {
+            '/imu/data_raw',
+            '/imu/data_corrected',
+            '/joint_states',
+        }
         table = Table.from_mapping(documents.from_text((BAG / 'table.yaml').read_text()))
         imu, reference = session_truth(recording.blocks(table.joint_names), table)
     still = np.linalg.norm(reference.rate_s, axis=1) < 1e-3
@@ -75,5 +105,7 @@ def test_compensated_bag(output, tmp_path):
     with open_recording(BAG) as recording:
         raw = session_truth(recording.blocks(table.joint_names), table)
     before, after = before_and_after(*raw, load(output / 'calibration.yaml'))
-    print(f'sample session: {before.force} -> {after.force} m/s^2, {before.rate} -> {after.rate} rad/s')
+    print(
+        f'sample session: {before.force} -> {after.force} m/s^2, {before.rate} -> {after.rate} rad/s'
+    )
     assert after.force < 0.1 * before.force and after.rate < 0.1 * before.rate

@@ -29,6 +29,7 @@ def a_sensor(seed, n_poses, noise=0.0):
 
 # the means of comparison
 
+
 def test_the_plain_norm_fit_gives_the_sensor_back():
     bias, matrix, force = a_sensor(1, 15)
     found = fit_norm(force, G)
@@ -40,7 +41,12 @@ def test_the_plain_norm_fit_gives_the_sensor_back():
 def test_a_turn_left_out_is_used_by_no_peer():
     rests = [slice(0, 10), slice(20, 30), slice(40, 50), slice(60, 70)]
     up = np.eye(4, 3)
-    for without, kept in ((None, [0, 1, 2]), (slice(25, 45), [0, 2]), (slice(5, 25), [1, 2]), (slice(15, 55), [])):
+    for without, kept in (
+        (None, [0, 1, 2]),
+        (slice(25, 45), [0, 2]),
+        (slice(5, 25), [1, 2]),
+        (slice(15, 55), []),
+    ):
         turns, first, last = _other_turns(['a', 'b', 'c'], up, rests, without)
         assert turns == ['abc'[k] for k in kept]
         np.testing.assert_array_equal(first, up[kept].reshape(-1, 3))
@@ -49,6 +55,7 @@ def test_a_turn_left_out_is_used_by_no_peer():
 
 def test_a_pose_left_out_leaves_nothing_behind():
     from imu_calibration.core.samples import ImuSamples
+
     values = np.arange(60.0).reshape(20, 3)
     imu = ImuSamples(10**9 + 10**7 * np.arange(20), values, values)
     rest, ranges = held_out.without(imu, [slice(2, 5), slice(8, 12), slice(15, 20)], [1])
@@ -62,8 +69,12 @@ def test_intervals_of_differences_hold_what_they_say(monkeypatch):
     monkeypatch.setattr(held_out, 'DRAWS', 1000)
     rng = np.random.default_rng(2)
     pairs = [rng.normal(0, 1, (2, 30)) for _ in range(150)]
-    inside = [low < 0 < high for low, high in (held_out.bootstrap_difference(a, b, rng) for a, b in pairs)]
-    assert 0.86 < np.mean(inside) <= 1.0   # 95 % less what a bootstrap of 30 lacks, four sd of 150 trials
+    inside = [
+        low < 0 < high for low, high in (held_out.bootstrap_difference(a, b, rng) for a, b in pairs)
+    ]
+    assert (
+        0.86 < np.mean(inside) <= 1.0
+    )  # 95 % less what a bootstrap of 30 lacks, four sd of 150 trials
     assert held_out.bootstrap_difference(pairs[0][0], 4 * pairs[0][1], rng)[0] > 0
 
 
@@ -72,7 +83,10 @@ def test_a_section_shows_what_does_not_hold(tmp_path):
     section.claim('first', '1', '1.0', True)
     section.claim('second', '2', '3.0 | 4', False)
     text = run.document([section])
-    assert '1 of 2 claims hold. Those that do not:' in text and text.count('| second | 2 | 3.0 \\| 4 | **no** |') == 2
+    assert (
+        '1 of 2 claims hold. Those that do not:' in text
+        and text.count('| second | 2 | 3.0 \\| 4 | **no** |') == 2
+    )
 
 
 def test_the_evidence_quotes_the_document():
@@ -82,18 +96,23 @@ def test_the_evidence_quotes_the_document():
     rows = [line.split('|') for line in part.splitlines() if line.startswith('| ')][2:]
     assert len(rows) >= 5
     for row in rows:
-        assert row[3].strip() in written, f'{row[3].strip()!r} of docs/claims.md is not in docs/validation.md'
+        assert row[3].strip() in written, (
+            f'{row[3].strip()!r} of docs/claims.md is not in docs/validation.md'
+        )
     date = written.partition('one run on ')[2][:10]
     assert date in part
 
 
 # recordings with known facts
 
+
 @pytest.mark.real_data
 def test_xsens_in_counts(recordings):
     _, differences = xsens.figures(recordings)
     (offset, scale), (_, scale_w) = differences['accelerometer'], differences['gyroscope']
-    print(f'xsens_counts: offsets {np.round(offset, 1)} counts, scales {np.round(100 * scale, 2)} % off wanted 10 counts, 0.3 %')
+    print(
+        f'xsens_counts: offsets {np.round(offset, 1)} counts, scales {np.round(100 * scale, 2)} % off wanted 10 counts, 0.3 %'
+    )
     assert np.max(np.abs(offset)) < 10
     assert np.max(np.abs(scale)) < 0.003 and np.max(np.abs(scale_w)) < 0.003
 
@@ -101,7 +120,9 @@ def test_xsens_in_counts(recordings):
 @pytest.mark.real_data
 def test_mpu9150_biases(recordings):
     _, difference = mpu9150.figures(recordings)
-    print(f'mpu9150_0: biases {np.round(1e3 * difference, 1)} mm/s^2 from those published wanted 10')
+    print(
+        f'mpu9150_0: biases {np.round(1e3 * difference, 1)} mm/s^2 from those published wanted 10'
+    )
     assert np.max(np.abs(difference)) < 0.010
 
 
@@ -113,7 +134,9 @@ def test_ferraris_agrees_with_imucal(recordings):
     angle = np.radians(known['turn_deg'])
     found, order = ferraris.calibrate_sections(imu, known['sections'], angle)
     sign = np.sign(ferraris.known_turns(imu, known['sections'], angle)[0].angle)
-    info = ferraris.ferraris(imu, known['sections'], ferraris.RATE_HZ, ferraris.GRAVITY, sign * angle)
+    info = ferraris.ferraris(
+        imu, known['sections'], ferraris.RATE_HZ, ferraris.GRAVITY, sign * angle
+    )
     apart = np.array([(b - a) / sd for _, _, a, b, sd in ferraris.comparable(found, info)])
     print(f'ferraris against imucal: largest difference {np.max(np.abs(apart)):.1f} sd wanted 3')
     assert len(apart) == 18 and np.max(np.abs(apart)) < 3
@@ -130,10 +153,14 @@ def test_ours_predicts_poses_left_out_no_worse_than_the_norm_fit(recordings):
     """Over the 18 poses of mpu9150_3; the fit with fewer poses and the other recordings are left to `make validate`."""
     imu = load(recordings, 'mpu9150_3')
     ranges = held_out.find_still(imu)
-    values, interval, errors = held_out.leave_one_out(imu, ranges, 9.80665, np.random.default_rng(3))
-    print(f'mpu9150_3: poses left out {1e3 * values["ours"]:.2f} mm/s^2, norm fit {1e3 * values["norm fit"]:.2f}, uncalibrated '
-          f'{1e3 * values["uncalibrated"]:.0f} wanted ours not beyond the norm fit')
-    assert interval[1] > 0   # not shown to be worse
+    values, interval, errors = held_out.leave_one_out(
+        imu, ranges, 9.80665, np.random.default_rng(3)
+    )
+    print(
+        f'mpu9150_3: poses left out {1e3 * values["ours"]:.2f} mm/s^2, norm fit {1e3 * values["norm fit"]:.2f}, uncalibrated '
+        f'{1e3 * values["uncalibrated"]:.0f} wanted ours not beyond the norm fit'
+    )
+    assert interval[1] > 0  # not shown to be worse
     assert values['ours'] < 0.1 * values['uncalibrated']
 
 
@@ -144,13 +171,22 @@ def test_norm_errors_are_zero_for_the_true_sensor():
 
 # another simulator, and live
 
+
 @pytest.mark.slow
 def test_the_truth_of_python_ins_is_recovered():
     pytest.importorskip('pyins', reason='python-ins is not installed; `make validate` installs it')
-    rows = [row for row in simulated_table.compare(simulated_table.calibrate_through_a_bag(*simulated_table.record())) if row[-1] != 'held']
+    rows = [
+        row
+        for row in simulated_table.compare(
+            simulated_table.calibrate_through_a_bag(*simulated_table.record())
+        )
+        if row[-1] != 'held'
+    ]
     ratio = np.array([(value - true) / sd for _, value, true, sd, _ in rows])
     spread, largest = np.sqrt(np.mean(ratio**2)), np.abs(ratio).max()
-    print(f'python-ins: {len(rows)} parameters, rms error {spread:.2f} sd, largest {largest:.1f} sd wanted 1, 4')
+    print(
+        f'python-ins: {len(rows)} parameters, rms error {spread:.2f} sd, largest {largest:.1f} sd wanted 1, 4'
+    )
     assert len(rows) >= 24 and largest < 4 and 0.5 < spread < 1.5
 
 
@@ -160,9 +196,13 @@ def test_the_truth_of_python_ins_is_recovered():
 def test_one_imu_predicts_another_live(recordings):
     pytest.importorskip('rclpy')
     case = arm_live.prepare(recordings, 'array_2', 'array_5', seconds=40.0)
-    found, count = arm_live.residuals(case, arm_live.play(case, speed=5.0, domain_id=arm_live.DOMAIN + 1))
+    found, count = arm_live.residuals(
+        case, arm_live.play(case, speed=5.0, domain_id=arm_live.DOMAIN + 1)
+    )
     before, after = arm_live.rms(found['turned']), arm_live.rms(found['moved'])
-    print(f'live: one IMU from another, {len(found["moved"])} samples, {before:.2f} m/s^2, with the arm {after:.2f} wanted 0.65 of it')
+    print(
+        f'live: one IMU from another, {len(found["moved"])} samples, {before:.2f} m/s^2, with the arm {after:.2f} wanted 0.65 of it'
+    )
     assert set(count.values()) == {len(case.imu_a)}
     assert len(found['moved']) > 300
     assert after < 0.65 * before

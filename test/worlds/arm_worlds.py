@@ -17,7 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.kinematics.chain import reference_motion, tilt, with_axis_angles, with_axis_places
+from imu_calibration.kinematics.chain import (
+    reference_motion,
+    tilt,
+    with_axis_angles,
+    with_axis_places,
+)
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
@@ -53,7 +58,16 @@ def pinocchio():
     return pinocchio
 
 
-def make_arm_world(seed, joint_error=3e-4, place_error=0.0, text=SIX_AXES, link='imu_link', rate=100.0, grade='industrial', seconds=np.inf):
+def make_arm_world(
+    seed,
+    joint_error=3e-4,
+    place_error=0.0,
+    text=SIX_AXES,
+    link='imu_link',
+    rate=100.0,
+    grade='industrial',
+    seconds=np.inf,
+):
     """
     Return an `ArmWorld`: every joint's frame stands turned by `joint_error` (rad, about each axis) and shifted by `place_error` (m).
 
@@ -65,17 +79,25 @@ def make_arm_world(seed, joint_error=3e-4, place_error=0.0, text=SIX_AXES, link=
     profile = make_profile('within_limits_short', seed, table)
     time = np.arange(0.0, min(profile.duration, seconds), 1.0 / rate)
     accelerometer, gyroscope = draw_imu(GRADES[grade], {}, True, generator(seed, 'unit'))
-    poses = [_poses(model, profile.at(time + k * STEP).position, table.joint_names, link) for k in (-2, -1, 0, 1, 2)]
+    poses = [
+        _poses(model, profile.at(time + k * STEP).position, table.joint_names, link)
+        for k in (-2, -1, 0, 1, 2)
+    ]
     forces = [_force(poses, arm) for arm in accelerometer.arms]
     still = np.full(len(time), 25.0)
-    outputs = (accelerometer.respond(forces, time, still, forces[0]), gyroscope.respond([_rate(poses)] * 3, time, still, forces[0]))
+    outputs = (
+        accelerometer.respond(forces, time, still, forces[0]),
+        gyroscope.respond([_rate(poses)] * 3, time, still, forces[0]),
+    )
     noisy = ImuNoise(noise, sample_rate=rate, rng=generator(seed, 'noise')).add(*outputs)
     imu = ImuSamples(START_NS + to_ns(time), *noisy, link)
     # As joint states come: in another order, with joints that are nobody's business.
     joint_time = time[:-1] + 0.5 / rate
     motion = profile.at(joint_time)
     position = read_encoders(motion.position, noise, generator(seed, 'encoders'))
-    joints = JointSamples(START_NS + to_ns(joint_time), position, motion.rate, tuple(table.joint_names))
+    joints = JointSamples(
+        START_NS + to_ns(joint_time), position, motion.rate, tuple(table.joint_names)
+    )
     return ArmWorld(SampleBlock(imu, joints), table, accelerometer, gyroscope, model)
 
 
@@ -84,7 +106,9 @@ def _bent(text, rng, joint_error, place_error):
     model = pin.buildModelFromXML(text.split('?>', 1)[1])
     for k in range(1, model.njoints):
         turn = Rotation.from_rotvec(rng.normal(0.0, joint_error, 3)).as_matrix()
-        model.jointPlacements[k] = model.jointPlacements[k] * pin.SE3(turn, rng.normal(0.0, 1.0, 3) * place_error)
+        model.jointPlacements[k] = model.jointPlacements[k] * pin.SE3(
+            turn, rng.normal(0.0, 1.0, 3) * place_error
+        )
     return model
 
 
@@ -96,7 +120,9 @@ def _poses(model, position, names, link):
     parts = [model.joints[model.getJointId(name)] for name in names]
     for row, at in enumerate(position):
         for part, angle in zip(parts, at, strict=True):
-            q[part.idx_q:part.idx_q + part.nq] = angle if part.nq == 1 else (np.cos(angle), np.sin(angle))
+            q[part.idx_q : part.idx_q + part.nq] = (
+                angle if part.nq == 1 else (np.cos(angle), np.sin(angle))
+            )
         pin.framesForwardKinematics(model, data, q)
         turns[row], places[row] = data.oMf[frame].rotation, data.oMf[frame].translation
     return turns, places
@@ -105,7 +131,9 @@ def _poses(model, position, names, link):
 def _force(poses, arm):
     """Return the specific force at a point of the link, in the link's frame: second differences of where it is."""
     points = [place + turn @ arm for turn, place in poses]
-    acceleration = (-points[0] + 16 * points[1] - 30 * points[2] + 16 * points[3] - points[4]) / (12 * STEP**2)
+    acceleration = (-points[0] + 16 * points[1] - 30 * points[2] + 16 * points[3] - points[4]) / (
+        12 * STEP**2
+    )
     return np.einsum('nji,nj->ni', poses[2][0], acceleration + [0.0, 0.0, STANDARD_GRAVITY])
 
 
@@ -131,16 +159,28 @@ def in_our_axes(world, n=60, seed=1):
 
     def bent(x):
         shifted = position.copy()
-        shifted[:, [names.index(name) for name in names.zeros]] += x[3 + n_angles:3 + n_angles + n_zeros]
-        return tilt(with_axis_angles(table, x[3:3 + n_angles]), x[:2]), shifted
+        shifted[:, [names.index(name) for name in names.zeros]] += x[
+            3 + n_angles : 3 + n_angles + n_zeros
+        ]
+        return tilt(with_axis_angles(table, x[3 : 3 + n_angles]), x[:2]), shifted
 
     def attitude_rest(x):
         bent_table, shifted = bent(x)
         ours = reference_motion(bent_table, _still(shifted)).mat_sn
-        world_turn, mount = Rotation.from_euler('z', x[2]).as_matrix(), Rotation.from_rotvec(x[-3:]).as_matrix()
+        world_turn, mount = (
+            Rotation.from_euler('z', x[2]).as_matrix(),
+            Rotation.from_rotvec(x[-3:]).as_matrix(),
+        )
         return (mount @ ours @ world_turn - turns.transpose(0, 2, 1)).ravel()
 
-    fit = least_squares(attitude_rest, np.zeros(3 + n_angles + n_zeros + 3), x_scale=1e-3, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    fit = least_squares(
+        attitude_rest,
+        np.zeros(3 + n_angles + n_zeros + 3),
+        x_scale=1e-3,
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-14,
+    )
     mount = Rotation.from_rotvec(fit.x[-3:]).as_matrix()
 
     def place_rest(x):
@@ -150,7 +190,9 @@ def in_our_axes(world, n=60, seed=1):
         return (turned - places + x[-6:-3] + turns @ mount @ x[-3:]).ravel()
 
     # Far from its start nothing: everything is linear but for the azimuth.
-    move = least_squares(place_rest, np.zeros(n_places + 6), x_scale=1e-3, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    move = least_squares(
+        place_rest, np.zeros(n_places + 6), x_scale=1e-3, xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
     return mount, move.x[-3:], (np.abs(fit.fun).max(), np.abs(move.fun).max())
 
 
@@ -165,7 +207,11 @@ def _places_of(table, position):
     at = dict(zip(table.joint_names, position.T, strict=True))
     for joint in table.joints:
         places = places + turn.apply(joint.xyz)
-        turn = turn * Rotation.from_euler('xyz', joint.rpy_deg, degrees=True) * Rotation.from_rotvec(at[joint.source][:, None] * np.array(joint.axis))
+        turn = (
+            turn
+            * Rotation.from_euler('xyz', joint.rpy_deg, degrees=True)
+            * Rotation.from_rotvec(at[joint.source][:, None] * np.array(joint.axis))
+        )
     return places + turn.apply(table.mount_xyz)
 
 
@@ -176,18 +222,35 @@ def truth(world):
     for sensor, triad in (('accelerometer', world.accelerometer), ('gyroscope', world.gyroscope)):
         values |= {f'{sensor}.bias.{a}': v for a, v in zip('xyz', triad.bias, strict=True)}
         matrix = triad.matrix @ mount
-        values |= {f'{sensor}.matrix.{a}{b}': matrix[i, j] for i, a in enumerate('xyz') for j, b in enumerate('xyz')}
+        values |= {
+            f'{sensor}.matrix.{a}{b}': matrix[i, j]
+            for i, a in enumerate('xyz')
+            for j, b in enumerate('xyz')
+        }
     arms = world.accelerometer.arms @ mount + shift
-    values |= {f'accelerometer.accel_size_effect.{a}{b}': arms[i, j] for i, a in enumerate('xyz') for j, b in enumerate('xyz')}
+    values |= {
+        f'accelerometer.accel_size_effect.{a}{b}': arms[i, j]
+        for i, a in enumerate('xyz')
+        for j, b in enumerate('xyz')
+    }
     return values
 
 
 def deviations(world):
     """Return {parameter: error in standard deviations} of a calibration of the world, and the calibration."""
     from imu_calibration.calibration.table_calibration import calibrate
+
     calibration = calibrate([lambda: iter([world.block])], world.table).calibration
-    found = dict(zip(calibration.param_names, zip(calibration.values, calibration.sd, strict=True), strict=True))
-    return {name: (found[name][0] - value) / found[name][1] for name, value in truth(world).items()}, calibration
+    found = dict(
+        zip(
+            calibration.param_names,
+            zip(calibration.values, calibration.sd, strict=True),
+            strict=True,
+        )
+    )
+    return {
+        name: (found[name][0] - value) / found[name][1] for name, value in truth(world).items()
+    }, calibration
 
 
 def main():
@@ -202,11 +265,16 @@ def main():
         errors, _ = deviations(make_arm_world(seed, place_error=options.place_error))
         every.append(list(errors.values()))
         worst = max(errors, key=lambda name: abs(errors[name]))
-        print(f'world {seed}: mean square {np.mean(np.square(every[-1])):.2f}, worst {errors[worst]:+.2f} sd, {worst}', flush=True)
+        print(
+            f'world {seed}: mean square {np.mean(np.square(every[-1])):.2f}, worst {errors[worst]:+.2f} sd, {worst}',
+            flush=True,
+        )
     every = np.abs(np.array(every))
-    print(f'{len(every)} worlds of {every.shape[1]} parameters: within 3 sd {100 * np.mean(every < 3):.1f} %, each parameter in at least '
-          f'{100 * np.mean(every < 3, axis=0).min():.1f} % of the worlds, all at once in {100 * np.mean(np.all(every < 3, axis=1)):.1f} %; '
-          f'within 1.96 sd {100 * np.mean(every < 1.96):.1f} %; mean square {np.mean(every**2):.2f}')
+    print(
+        f'{len(every)} worlds of {every.shape[1]} parameters: within 3 sd {100 * np.mean(every < 3):.1f} %, each parameter in at least '
+        f'{100 * np.mean(every < 3, axis=0).min():.1f} % of the worlds, all at once in {100 * np.mean(np.all(every < 3, axis=1)):.1f} %; '
+        f'within 1.96 sd {100 * np.mean(every < 1.96):.1f} %; mean square {np.mean(every**2):.2f}'
+    )
 
 
 if __name__ == '__main__':

@@ -17,5 +17,8 @@ def clean_samples(samples, gap=0.1):
     """
     check = StreamCheck()
     pieces = check.push(samples) + check.finish()
-    epochs = [type(samples).concatenate([part for number, part in pieces if number == epoch]) for epoch in sorted({n for n, _ in pieces})]
+    epochs = [
+        type(samples).concatenate([part for number, part in pieces if number == epoch])
+        for epoch in sorted({n for n, _ in pieces})
+    ]
     return [part for part in epochs if len(part)], check.statistics(gap)

@@ -45,8 +45,16 @@ def openvins(text, am, wm):
     kalibr) or upper (rpng) triangle of the inverse column by column; State.h (Dm, Tg) builds the matrices; Propagator.cpp applies them.
     """
     chain = safe_load(text.split('\n', 1)[1])['imu0']
-    get = {name: np.array(chain.get(name, default)) for name, default in
-           (('Tw', np.eye(3)), ('Ta', np.eye(3)), ('R_IMUtoACC', np.eye(3)), ('R_IMUtoGYRO', np.eye(3)), ('Tg', np.zeros((3, 3))))}
+    get = {
+        name: np.array(chain.get(name, default))
+        for name, default in (
+            ('Tw', np.eye(3)),
+            ('Ta', np.eye(3)),
+            ('R_IMUtoACC', np.eye(3)),
+            ('R_IMUtoGYRO', np.eye(3)),
+            ('Tg', np.zeros((3, 3))),
+        )
+    }
     dw, da = np.linalg.inv(get['Tw']), np.linalg.inv(get['Ta'])
     half = np.tril if chain['model'] == 'kalibr' else np.triu
     a = get['R_IMUtoACC'].T @ half(da) @ am
@@ -89,7 +97,15 @@ def px4(text, accel, gyro, temperature_c):
             return np.zeros(3)
         n = f'TC_{letter}0_'
         delta = min(max(temperature_c, p[n + 'TMIN']), p[n + 'TMAX']) - p[n + 'TREF']
-        return np.array([p[f'{n}X0_{i}'] + p[f'{n}X1_{i}'] * delta + p[f'{n}X2_{i}'] * delta**2 + p[f'{n}X3_{i}'] * delta**3 for i in range(3)])
+        return np.array(
+            [
+                p[f'{n}X0_{i}']
+                + p[f'{n}X1_{i}'] * delta
+                + p[f'{n}X2_{i}'] * delta**2
+                + p[f'{n}X3_{i}'] * delta**3
+                for i in range(3)
+            ]
+        )
 
     offset = np.array([p[f'CAL_ACC0_{a}OFF'] for a in 'XYZ'])
     scale = np.array([p[f'CAL_ACC0_{a}SCALE'] for a in 'XYZ'])
@@ -122,7 +138,9 @@ def ardupilot(text, accel, gyro, temperature_c):
         return np.array([p[f'{name}_{a}'] for a in 'XYZ'])
 
     accel = tcal('ACC', accel, p.get('INS_ACC1_CALTEMP', -300.0)) - vector('INS_ACCOFFS')
-    return accel * vector('INS_ACCSCAL'), tcal('GYR', gyro, p.get('INS_GYR1_CALTEMP', -300.0)) - vector('INS_GYROFFS')
+    return accel * vector('INS_ACCSCAL'), tcal(
+        'GYR', gyro, p.get('INS_GYR1_CALTEMP', -300.0)
+    ) - vector('INS_GYROFFS')
 
 
 def autoware(text, accel, gyro):
@@ -133,8 +151,11 @@ def autoware(text, accel, gyro):
     """
     p = safe_load(text)['/**']['ros__parameters']
     told = next(line for line in text.splitlines() if 'gyro_scale_input geometry_msgs' in line)
-    scale = safe_load(told[told.index('"') + 1:told.rindex('"')])['vector']
-    if p['on_off_correction']['correct_for_static_bias'] and not p['on_off_correction']['correct_for_dynamic_bias']:
+    scale = safe_load(told[told.index('"') + 1 : told.rindex('"')])['vector']
+    if (
+        p['on_off_correction']['correct_for_static_bias']
+        and not p['on_off_correction']['correct_for_dynamic_bias']
+    ):
         gyro = gyro - [p[f'angular_velocity_offset_{a}'] for a in 'xyz']
     return accel, gyro / [scale[a] for a in 'xyz']
 
@@ -149,7 +170,11 @@ def imu_calib(text, accel, gyro):
 def imu_tk(text, raw):
     """Return calibrated readings of one sensor; imu_tk, calibration.h (CalibratedTriad_::load, unbiasNormalize)."""
     values = [float(word) for word in text.split()]
-    mis, scale, bias = np.reshape(values[:9], (3, 3)), np.reshape(values[9:18], (3, 3)), np.array(values[18:21])
+    mis, scale, bias = (
+        np.reshape(values[:9], (3, 3)),
+        np.reshape(values[9:18], (3, 3)),
+        np.array(values[18:21]),
+    )
     return mis @ scale @ (raw - bias)
 
 
@@ -164,21 +189,74 @@ def spread_in_a_second(name, text, dt):
     head = text.split('\n', 1)[1] if text.startswith('%YAML') else text
     c = safe_load(head) if name != 'basalt' else json.loads(text)['value0']
     pairs = {'accelerometer': ('acc', 'Acc'), 'gyroscope': ('gyr', 'Gyr')}
-    if name == 'kalibr':       # IccSensors.py: noise density * sqrt(rate) is the sd of a sample; the walk enters a continuous spline
-        found = {s: ((c[f'{s}_noise_density'] * c['update_rate']**0.5 * dt)**2 * steps, c[f'{s}_random_walk']**2) for s in pairs}
-    elif name == 'openvins':   # Propagator.cpp: Qc = sigma^2 / dt, propagated with dt
-        found = {s: (c['imu0'][f'{s}_noise_density']**2 / dt * dt**2 * steps, c['imu0'][f'{s}_random_walk']**2 / dt * dt**2 * steps) for s in pairs}
-    elif name == 'vins':       # integration_base.h, midPointIntegration: V has 0.5 dt for each of two samples, dt for the bias
-        found = {s: (2 * (0.5 * dt * c[f'{a}_n'])**2 * steps, (dt * c[f'{a}_w'])**2 * steps) for s, (a, _) in pairs.items()}
-    elif name == 'lio-sam':    # imuPreintegration.cpp: covariance = I imuGyrNoise^2 (gtsam: continuous), between factor sqrt(dt) * imuGyrBiasN
-        found = {s: (c['lio_sam'][f'imu{b}Noise']**2 * dt * steps, c['lio_sam'][f'imu{b}BiasN']**2 * dt * steps) for s, (_, b) in pairs.items()}
-    elif name == 'fast-lio':   # esekfom.hpp, predict: P += (dt f_w) Q (dt f_w)'
-        found = {s: (dt**2 * c['mapping'][f'{a}_cov'] * steps, dt**2 * c['mapping'][f'b_{a}_cov'] * steps) for s, (a, _) in pairs.items()}
-    elif name == 'orb-slam3':  # Tracking.cc: Calib(Ng sqrt(f), Na sqrt(f), Ngw / sqrt(f), Naw / sqrt(f)); ImuTypes.cc adds the walk per step
+    if (
+        name == 'kalibr'
+    ):  # IccSensors.py: noise density * sqrt(rate) is the sd of a sample; the walk enters a continuous spline
+        found = {
+            s: (
+                (c[f'{s}_noise_density'] * c['update_rate'] ** 0.5 * dt) ** 2 * steps,
+                c[f'{s}_random_walk'] ** 2,
+            )
+            for s in pairs
+        }
+    elif name == 'openvins':  # Propagator.cpp: Qc = sigma^2 / dt, propagated with dt
+        found = {
+            s: (
+                c['imu0'][f'{s}_noise_density'] ** 2 / dt * dt**2 * steps,
+                c['imu0'][f'{s}_random_walk'] ** 2 / dt * dt**2 * steps,
+            )
+            for s in pairs
+        }
+    elif (
+        name == 'vins'
+    ):  # integration_base.h, midPointIntegration: V has 0.5 dt for each of two samples, dt for the bias
+        found = {
+            s: (2 * (0.5 * dt * c[f'{a}_n']) ** 2 * steps, (dt * c[f'{a}_w']) ** 2 * steps)
+            for s, (a, _) in pairs.items()
+        }
+    elif (
+        name == 'lio-sam'
+    ):  # imuPreintegration.cpp: covariance = I imuGyrNoise^2 (gtsam: continuous), between factor sqrt(dt) * imuGyrBiasN
+        found = {
+            s: (
+                c['lio_sam'][f'imu{b}Noise'] ** 2 * dt * steps,
+                c['lio_sam'][f'imu{b}BiasN'] ** 2 * dt * steps,
+            )
+            for s, (_, b) in pairs.items()
+        }
+    elif name == 'fast-lio':  # esekfom.hpp, predict: P += (dt f_w) Q (dt f_w)'
+        found = {
+            s: (
+                dt**2 * c['mapping'][f'{a}_cov'] * steps,
+                dt**2 * c['mapping'][f'b_{a}_cov'] * steps,
+            )
+            for s, (a, _) in pairs.items()
+        }
+    elif (
+        name == 'orb-slam3'
+    ):  # Tracking.cc: Calib(Ng sqrt(f), Na sqrt(f), Ngw / sqrt(f), Naw / sqrt(f)); ImuTypes.cc adds the walk per step
         f = c['IMU.Frequency']
         long = {'accelerometer': 'Acc', 'gyroscope': 'Gyro'}
-        found = {s: ((c[f'IMU.Noise{n}'] * f**0.5 * dt)**2 * steps, (c[f'IMU.{n}Walk'] / f**0.5)**2 * steps) for s, n in long.items()}
-    elif name == 'basalt':     # calibration.hpp: std * sqrt(rate) is the sd of a sample; sqrt_vio_estimator: bias weight 1 / (std sqrt(dt))
+        found = {
+            s: (
+                (c[f'IMU.Noise{n}'] * f**0.5 * dt) ** 2 * steps,
+                (c[f'IMU.{n}Walk'] / f**0.5) ** 2 * steps,
+            )
+            for s, n in long.items()
+        }
+    elif (
+        name == 'basalt'
+    ):  # calibration.hpp: std * sqrt(rate) is the sd of a sample; sqrt_vio_estimator: bias weight 1 / (std sqrt(dt))
         short = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
-        found = {s: ((c[f'{n}_noise_std'][0] * c['imu_update_rate']**0.5 * dt)**2 * steps, c[f'{n}_bias_std'][0]**2 * dt * steps) for s, n in short.items()}
-    return {(sensor, kind): value for sensor, pair in found.items() for kind, value in zip(('white', 'walk'), pair)}
+        found = {
+            s: (
+                (c[f'{n}_noise_std'][0] * c['imu_update_rate'] ** 0.5 * dt) ** 2 * steps,
+                c[f'{n}_bias_std'][0] ** 2 * dt * steps,
+            )
+            for s, n in short.items()
+        }
+    return {
+        (sensor, kind): value
+        for sensor, pair in found.items()
+        for kind, value in zip(('white', 'walk'), pair)
+    }

@@ -13,10 +13,20 @@ from imu_calibration.references.gravity.hand_parameters import HandOptions
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES
 from worlds.physics_hand import hold_and_turn, warmed_up
 
-WORLDS = {'clean': {}, 'warm-up': {}, 'creep': {'creep': 0.0026}, 'poses that do not repeat': {'pose_sd': 0.02, 'drift_sd': 2e-3},
-          'flexing grip': {'settling': 0.009}}
+WORLDS = {
+    'clean': {},
+    'warm-up': {},
+    'creep': {'creep': 0.0026},
+    'poses that do not repeat': {'pose_sd': 0.02, 'drift_sd': 2e-3},
+    'flexing grip': {'settling': 0.009},
+}
 """What `hold_and_turn` is told: 0.15 deg/s of creep, 2 mg and 0.11 deg/s from pose to pose, half a degree of giving way."""
-GROUPS = {'accelerometer.bias': slice(0, 3), 'accelerometer.matrix': slice(3, 9), 'gyroscope.bias': slice(9, 12), 'gyroscope.matrix': slice(12, 21)}
+GROUPS = {
+    'accelerometer.bias': slice(0, 3),
+    'accelerometer.matrix': slice(3, 9),
+    'gyroscope.bias': slice(9, 12),
+    'gyroscope.matrix': slice(12, 21),
+}
 
 
 def session(world, seed, n_poses=24):
@@ -25,7 +35,16 @@ def session(world, seed, n_poses=24):
     moved = {sensor: np.zeros(3) for sensor in SENSORS}
     if world == 'warm-up':
         before, (imu, _) = imu, warmed_up(imu, seed, force=0.05, rate=0.01, time_constant=60.0)
-        moved = dict(zip(SENSORS, ((imu.force_s - before.force_s).mean(axis=0), (imu.rate_s - before.rate_s).mean(axis=0)), strict=True))
+        moved = dict(
+            zip(
+                SENSORS,
+                (
+                    (imu.force_s - before.force_s).mean(axis=0),
+                    (imu.rate_s - before.rate_s).mean(axis=0),
+                ),
+                strict=True,
+            )
+        )
     return gather_by_hand(imu), truth, moved
 
 
@@ -34,7 +53,9 @@ def errors(world, seed, **options):
     data, truth, moved = session(world, seed, **options)
     hand, truth = solve_by_evidence(data, HandOptions(GRAVITY)).hand, truth.copy()
     for sensor, part in zip(SENSORS, (slice(0, 3), slice(9, 12)), strict=True):
-        if not any(effect.sensor == sensor and effect.time_constant for effect in hand.hand_model.extras):   # a bias beside a drift is that of the start, else a mean
+        if not any(
+            effect.sensor == sensor and effect.time_constant for effect in hand.hand_model.extras
+        ):  # a bias beside a drift is that of the start, else a mean
             truth[part] += moved[sensor]
     places = [hand.param_names.index(name) for name in PARAM_NAMES[:21]]
     fit = of_fit(hand.terms) + hand.terms[HELD_PRIORS]
@@ -54,9 +75,12 @@ def main():
         for group in GROUPS:
             off, sd, grown = (np.concatenate([run[group][k] for run in runs]) for k in range(3))
             alone = off / (sd / grown)
-            print(f'{world:26s} {group:22s} noise alone {np.sqrt(np.mean(alone**2)):5.2f} {100 * np.mean(np.abs(alone) < 1.96):4.0f} %   '
-                  f'reported {np.sqrt(np.mean((off / sd)**2)):5.2f} {100 * np.mean(np.abs(off / sd) < 1.96):4.0f} %   '
-                  f'wider by {np.median(grown):.2f} (95 %: {np.quantile(grown, 0.95):.2f})', flush=True)
+            print(
+                f'{world:26s} {group:22s} noise alone {np.sqrt(np.mean(alone**2)):5.2f} {100 * np.mean(np.abs(alone) < 1.96):4.0f} %   '
+                f'reported {np.sqrt(np.mean((off / sd) ** 2)):5.2f} {100 * np.mean(np.abs(off / sd) < 1.96):4.0f} %   '
+                f'wider by {np.median(grown):.2f} (95 %: {np.quantile(grown, 0.95):.2f})',
+                flush=True,
+            )
 
 
 if __name__ == '__main__':

@@ -7,10 +7,20 @@ from imu_calibration.core.samples import ImuSamples
 
 GRAVITY = 9.81
 LOWER, SQUARE = ('xx', 'yx', 'yy', 'zx', 'zy', 'zz'), tuple(a + b for a in 'xyz' for b in 'xyz')
-PARAM_NAMES = (*(f'accelerometer.bias.{k}' for k in 'xyz'), *(f'accelerometer.matrix.{k}' for k in LOWER),
-               *(f'gyroscope.bias.{k}' for k in 'xyz'), *(f'gyroscope.matrix.{k}' for k in SQUARE), *(f'gyroscope.gyro_g_sensitivity.{k}' for k in SQUARE))
+PARAM_NAMES = (
+    *(f'accelerometer.bias.{k}' for k in 'xyz'),
+    *(f'accelerometer.matrix.{k}' for k in LOWER),
+    *(f'gyroscope.bias.{k}' for k in 'xyz'),
+    *(f'gyroscope.matrix.{k}' for k in SQUARE),
+    *(f'gyroscope.gyro_g_sensitivity.{k}' for k in SQUARE),
+)
 """Truths are laid out like this: the accelerometer's matrix without the elements above its diagonal, which are zero."""
-NOMINAL, SENSITIVITY = np.array([float(name.endswith(('matrix.xx', 'matrix.yy', 'matrix.zz'))) for name in PARAM_NAMES]), slice(21, 30)
+NOMINAL, SENSITIVITY = (
+    np.array(
+        [float(name.endswith(('matrix.xx', 'matrix.yy', 'matrix.zz'))) for name in PARAM_NAMES]
+    ),
+    slice(21, 30),
+)
 FACES = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
 
 
@@ -34,15 +44,29 @@ def random_truth(rng, sensitivity=0.0):
 def turn_samples(start, rotvec, wobble, period, duration):
     """Attitudes and exact body rates of a turn that starts and ends at rest; the axis wobbles on the way."""
     s = np.arange(period, duration - 0.5 * period, period) / duration
-    share, speed = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s)**2 / duration
+    share, speed = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / duration
     bump, bump_speed = 4 * share * (1 - share), 4 * speed * (1 - 2 * share)
     inner = Rotation.from_rotvec(np.outer(bump, wobble))
     attitude = start * Rotation.from_rotvec(np.outer(share, rotvec)) * inner
     return attitude, inner.inv().apply(np.outer(speed, rotvec)) + np.outer(bump_speed, wobble)
 
 
-def simulate(seed, n_poses=12, period=0.02, still=2.0, duration=1.6, force_sd=0.02, rate_sd=0.002, pose_sd=0.0, drift_sd=0.0,
-             sensitivity=0.0, attitudes=None, truth=None, wobble=0.4, spoil=None):
+def simulate(
+    seed,
+    n_poses=12,
+    period=0.02,
+    still=2.0,
+    duration=1.6,
+    force_sd=0.02,
+    rate_sd=0.002,
+    pose_sd=0.0,
+    drift_sd=0.0,
+    sensitivity=0.0,
+    attitudes=None,
+    truth=None,
+    wobble=0.4,
+    spoil=None,
+):
     """
     A recording held still in poses with turns between; returns (imu, ranges, true parameters).
 
@@ -70,7 +94,9 @@ def simulate(seed, n_poses=12, period=0.02, still=2.0, duration=1.6, force_sd=0.
         rotvec *= rng.uniform(1.2, 2.6) / np.linalg.norm(rotvec)
         if attitudes is not None:
             rotvec = (attitude.inv() * attitudes[pose + 1]).as_rotvec()
-        on_the_way, body_rate = turn_samples(attitude, rotvec, rng.normal(0, wobble, 3), period, duration)
+        on_the_way, body_rate = turn_samples(
+            attitude, rotvec, rng.normal(0, wobble, 3), period, duration
+        )
         true_force = on_the_way.inv().apply([0, 0, GRAVITY])
         force.append(true_force @ matrix_f.T + bias_f)
         rate.append(body_rate @ matrix_w.T + bias_w + drift + true_force @ response.T)
@@ -82,7 +108,15 @@ def simulate(seed, n_poses=12, period=0.02, still=2.0, duration=1.6, force_sd=0.
     force, rate = np.concatenate(force), np.concatenate(rate)
     stamp_ns = 10**9 + np.round(np.arange(len(force)) * period * 1e9).astype(np.int64)
     if spoil is not None:
-        more = spoil(np.concatenate(true_f), np.concatenate(true_w), period * np.arange(len(force)), np.concatenate(poses))
+        more = spoil(
+            np.concatenate(true_f),
+            np.concatenate(true_w),
+            period * np.arange(len(force)),
+            np.concatenate(poses),
+        )
         force, rate = force + more[0], rate + more[1]
-    noisy = (force + rng.normal(0, force_sd, force.shape), rate + rng.normal(0, rate_sd, rate.shape))
+    noisy = (
+        force + rng.normal(0, force_sd, force.shape),
+        rate + rng.normal(0, rate_sd, rate.shape),
+    )
     return ImuSamples(stamp_ns, *noisy, 'imu_link'), ranges, truth

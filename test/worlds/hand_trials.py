@@ -40,7 +40,15 @@ def jitter(seed, rests=RESTS, sd=3e-3):
     """Stamps that are early or late by a normal error, in order."""
     imu, ranges, truth = _session(seed, rests)
     late = np.random.default_rng([seed, 3]).normal(0.0, sd, len(imu))
-    return replace(imu, stamp_ns=np.sort(imu.stamp_ns + np.round(1e9 * late).astype(np.int64)) + np.arange(len(imu))), ranges, truth
+    return (
+        replace(
+            imu,
+            stamp_ns=np.sort(imu.stamp_ns + np.round(1e9 * late).astype(np.int64))
+            + np.arange(len(imu)),
+        ),
+        ranges,
+        truth,
+    )
 
 
 def ramp(seed, rests=RESTS):
@@ -53,11 +61,24 @@ def ramp(seed, rests=RESTS):
     truth = truth.copy()
     truth[0:3] += warm[-1] * force
     truth[9:12] += warm[-1] * rate
-    return replace(imu, force_s=imu.force_s + np.outer(warm, force), rate_s=imu.rate_s + np.outer(warm, rate)), ranges, truth
+    return (
+        replace(
+            imu,
+            force_s=imu.force_s + np.outer(warm, force),
+            rate_s=imu.rate_s + np.outer(warm, rate),
+        ),
+        ranges,
+        truth,
+    )
 
 
-TRIALS = {'clean': clean, 'vibration while holding': vibration, 'hand tremor of 2 mg': tremor, 'stamps that jitter by 3 ms': jitter,
-          'ramp of 10 K, judged on the warm sensor': ramp}
+TRIALS = {
+    'clean': clean,
+    'vibration while holding': vibration,
+    'hand tremor of 2 mg': tremor,
+    'stamps that jitter by 3 ms': jitter,
+    'ramp of 10 K, judged on the warm sensor': ramp,
+}
 
 
 def _session(seed, rests, disturb=None, force_sd=0.02, rate_sd=0.002):
@@ -67,7 +88,10 @@ def _session(seed, rests, disturb=None, force_sd=0.02, rate_sd=0.002):
     forces, rates, ranges, total = [], [], [], 0
     for rest in range(rests):
         count = round(RATE_HZ * (FIRST if rest == 0 else rng.uniform(*STILL)))
-        force, rate = np.tile(attitude.inv().apply([0, 0, GRAVITY]), (count, 1)), np.zeros((count, 3))
+        force, rate = (
+            np.tile(attitude.inv().apply([0, 0, GRAVITY]), (count, 1)),
+            np.zeros((count, 3)),
+        )
         if disturb is not None:
             force, rate = disturb(rng, period * np.arange(count), force)
         forces.append(force)
@@ -79,25 +103,41 @@ def _session(seed, rests, disturb=None, force_sd=0.02, rate_sd=0.002):
         axis = rng.normal(size=3)
         full = rest % FULL_TURN_EVERY == FULL_TURN_EVERY - 1
         rotvec = axis / np.linalg.norm(axis) * (2 * np.pi if full else rng.uniform(1.0, 2.6))
-        if rest < len(FACES):   # by hand, a degree off
+        if rest < len(FACES):  # by hand, a degree off
             face = Rotation.from_rotvec(rng.normal(0, np.radians(0.6), 3)).apply(FACES[rest])
             rotvec = _to_face(attitude, face, rng)
             full = False
-        turning, rate = turn_samples(attitude, rotvec, np.zeros(3) if full else rng.normal(0, 0.3, 3), period,
-                                     rng.uniform(3.0, 4.0) if full else rng.uniform(1.2, 2.5))
+        turning, rate = turn_samples(
+            attitude,
+            rotvec,
+            np.zeros(3) if full else rng.normal(0, 0.3, 3),
+            period,
+            rng.uniform(3.0, 4.0) if full else rng.uniform(1.2, 2.5),
+        )
         forces.append(turning.inv().apply([0, 0, GRAVITY]))
         rates.append(rate)
         total, attitude = total + len(rate), attitude * Rotation.from_rotvec(rotvec)
-    force, rate = np.concatenate(forces) @ matrix_f.T + bias_f, np.concatenate(rates) @ matrix_w.T + bias_w
+    force, rate = (
+        np.concatenate(forces) @ matrix_f.T + bias_f,
+        np.concatenate(rates) @ matrix_w.T + bias_w,
+    )
     noisy = force + rng.normal(0, force_sd, force.shape), rate + rng.normal(0, rate_sd, rate.shape)
-    return ImuSamples(10**18 + np.round(1e9 * period * np.arange(total)).astype(np.int64), *noisy, 'imu_link'), ranges, truth
+    return (
+        ImuSamples(
+            10**18 + np.round(1e9 * period * np.arange(total)).astype(np.int64), *noisy, 'imu_link'
+        ),
+        ranges,
+        truth,
+    )
 
 
 def _to_face(attitude, face, rng):
     """Return a rotation vector in the sensor's axes after which `face` points up, with a turn about it."""
     up = attitude.inv().apply([0, 0, 1.0])
     axis = np.cross(face, up)
-    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.arctan2(np.linalg.norm(axis), face @ up))
+    turn = Rotation.from_rotvec(
+        axis / np.linalg.norm(axis) * np.arctan2(np.linalg.norm(axis), face @ up)
+    )
     return (turn * Rotation.from_rotvec(rng.uniform(0.3, 1.0) * np.asarray(face))).as_rotvec()
 
 
@@ -114,13 +154,20 @@ def _tremble(rng, time, force):
     swell, period = _swell(time), time[1] - time[0]
     shake, twist, angle = (np.zeros_like(force) for _ in range(3))
     for axis in range(3):
-        for part, size, lowest, highest in ((shake, TREMOR, 7, 11), (twist, TREMOR_RATE, 7, 11), (angle, SWAY, 0.15, 0.5)):
-            waves = sum(np.sin(2 * np.pi * rng.uniform(lowest, highest) * time + rng.uniform(0, 2 * np.pi)) for _ in range(4))
+        for part, size, lowest, highest in (
+            (shake, TREMOR, 7, 11),
+            (twist, TREMOR_RATE, 7, 11),
+            (angle, SWAY, 0.15, 0.5),
+        ):
+            waves = sum(
+                np.sin(2 * np.pi * rng.uniform(lowest, highest) * time + rng.uniform(0, 2 * np.pi))
+                for _ in range(4)
+            )
             part[:, axis] = size * swell * waves / np.sqrt(2)
-    angle += np.cumsum(twist, axis=0) * period   # small angles: the attitude follows the rate
+    angle += np.cumsum(twist, axis=0) * period  # small angles: the attitude follows the rate
     return force + shake + np.cross(force, angle), np.gradient(angle, period, axis=0)
 
 
 def _swell(time):
     """Return how strong the disturbance of a rest is, shape (n,): smooth at both ends."""
-    return np.clip(np.minimum(time, time[-1] - time) / FADE, 0, 1)**2
+    return np.clip(np.minimum(time, time[-1] - time) / FADE, 0, 1) ** 2

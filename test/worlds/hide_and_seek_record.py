@@ -39,7 +39,10 @@ def differences(rows, kept):
         changed = [] if was is None else [name for name in TOLD if row.get(name) != was.get(name)]
         if changed:
             which = ' '.join(str(row[name]) for name in WHICH if name in row)
-            lines.append(f'{which}: ' + '; '.join(f'{name} {was.get(name)} -> {row.get(name)}' for name in changed))
+            lines.append(
+                f'{which}: '
+                + '; '.join(f'{name} {was.get(name)} -> {row.get(name)}' for name in changed)
+            )
     return lines
 
 

@@ -23,15 +23,31 @@ REALISTIC = ('realistic', *WANDERS)
 """Kinds of realistic noise, dealt to effects and sessions in turn."""
 DEG = np.pi / 180
 TRAPS = {
-    'joints_at_50_Hz': {'imu_rate': 400.0, 'joint_rate': 50.0}, 'encoder_0.01_deg': {'encoder_resolution': 0.01 * DEG},
-    'two_seconds_lost': {'dropped': 'both'}, 'knock_on_table': {'knock': True}, 'wrong_covariance': {'wrong_covariance': True},
+    'joints_at_50_Hz': {'imu_rate': 400.0, 'joint_rate': 50.0},
+    'encoder_0.01_deg': {'encoder_resolution': 0.01 * DEG},
+    'two_seconds_lost': {'dropped': 'both'},
+    'knock_on_table': {'knock': True},
+    'wrong_covariance': {'wrong_covariance': True},
     'wander': {'noise': 'realistic'},
-    'mounted_at_45_deg': {'mount_rpy_deg': (45.0, 0.0, 0.0)}, 'two_axis_table': {'table': 'two_axis'},
+    'mounted_at_45_deg': {'mount_rpy_deg': (45.0, 0.0, 0.0)},
+    'two_axis_table': {'table': 'two_axis'},
     'only_at_rest': {'profile': 'static_only'},
 }
 """What must not produce a finding."""
-SEPARATED = ('accel_quadratic', 'accel_scale_asymmetry', 'accel_cubic', 'accel_size_effect', 'lever_arm', 'gyro_quadratic',
-             'gyro_scale_asymmetry', 'accel_bandwidth', 'gyro_bandwidth', 'time_offset', 'accel_thermal_bias', 'accel_bias_drift')
+SEPARATED = (
+    'accel_quadratic',
+    'accel_scale_asymmetry',
+    'accel_cubic',
+    'accel_size_effect',
+    'lever_arm',
+    'gyro_quadratic',
+    'gyro_scale_asymmetry',
+    'accel_bandwidth',
+    'gyro_bandwidth',
+    'time_offset',
+    'accel_thermal_bias',
+    'accel_bias_drift',
+)
 """Effects with near relatives, sought again in sessions made to separate them."""
 POWER = ('accel_quadratic', 'gyro_g_sensitivity', 'time_offset', 'gyro_thermal_bias', 'table_tilt')
 POWER_SIZES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
@@ -48,15 +64,28 @@ FINE = ('tactical', 'navigation')
 def seek(recording, hidden, **labels):
     """Diagnose a recording and return one row of the record."""
     start = time.process_time()
-    return _row(diagnose(recording.windows, recording.table, recording.model), recording.truth, hidden, time.process_time() - start, labels)
+    return _row(
+        diagnose(recording.windows, recording.table, recording.model),
+        recording.truth,
+        hidden,
+        time.process_time() - start,
+        labels,
+    )
 
 
 def _row(diagnosis, truth, hidden, seconds, labels):
     findings, rests = diagnosis.findings, diagnosis.unexplained.values()
-    row = {**labels, 'hidden': sorted(hidden or ()), 'seconds': seconds,
-           'found': [f.effect for f in findings], 'implausible': [f.implausible for f in findings], 'classes': [list(f.indistinguishable_from) for f in findings],
-           'unexplained': any(rest.significant for rest in rests), 'formulas': [column for rest in rests if rest.proposal for column in rest.proposal.columns],
-           'errors_in_sd': {}}
+    row = {
+        **labels,
+        'hidden': sorted(hidden or ()),
+        'seconds': seconds,
+        'found': [f.effect for f in findings],
+        'implausible': [f.implausible for f in findings],
+        'classes': [list(f.indistinguishable_from) for f in findings],
+        'unexplained': any(rest.significant for rest in rests),
+        'formulas': [column for rest in rests if rest.proposal for column in rest.proposal.columns],
+        'errors_in_sd': {},
+    }
     for finding in findings:
         if finding.effect in truth and finding.effect in (hidden or ()):
             true = np.ravel(truth[finding.effect])
@@ -64,7 +93,10 @@ def _row(diagnosis, truth, hidden, seconds, labels):
                 value = next(iter(finding.parameters.values()))[0]
                 row['level_error'] = float(abs(value / true[0] - 1))
                 continue
-            row['errors_in_sd'][finding.effect] = [float((value - t) / sd) for (value, sd, _), t in zip(finding.parameters.values(), true)]
+            row['errors_in_sd'][finding.effect] = [
+                float((value - t) / sd)
+                for (value, sd, _), t in zip(finding.parameters.values(), true)
+            ]
     return row
 
 
@@ -93,7 +125,9 @@ def oracle(recording, effect):
     search = found.problem.search
     best = min(asked, key=lambda q: search.evidence.loss(search.indices([q])))
     sensors = sensors_of(best.effect)
-    pair = [heldout_gain(found.problem, [], choice, sensors=sensors) for choice in (found.named, [best])]
+    pair = [
+        heldout_gain(found.problem, [], choice, sensors=sensors) for choice in (found.named, [best])
+    ]
     alike = (pair[0].measure, pair[0].sensor) == (pair[1].measure, pair[1].sensor)
     return pair[0].heldout_rms_after / pair[1].heldout_rms_after if alike else None
 
@@ -106,20 +140,42 @@ def effects_of_seed(seed, noise, effects, profile='random', table='three_axis', 
         hidden = {effect: sizes_for(seed, noise, [effect], options).hidden(effect, seed, 5.0)}
         recording = record(seed, hidden, noise, **options | options_of(effect))
         found = seek(recording, hidden, part=part, seed=seed, noise=noise)
-        return found | ({'oracle_ratio': oracle(recording, effect)} if part == 'effects' and seed % 10 == 0 else {})
-    return [*(nothing_of(sizes_for(seed, noise, [], options), seed, noise) if part == 'effects' else []), *_each(effects, row, f'{part} {seed} {noise}')]
+        return found | (
+            {'oracle_ratio': oracle(recording, effect)}
+            if part == 'effects' and seed % 10 == 0
+            else {}
+        )
+
+    return [
+        *(
+            nothing_of(sizes_for(seed, noise, [], options), seed, noise)
+            if part == 'effects'
+            else []
+        ),
+        *_each(effects, row, f'{part} {seed} {noise}'),
+    ]
 
 
 def nothing_of(sizes, seed, noise):
     """Return the row of the session that gave the sizes."""
     empty, start = sizes.recording, time.process_time()
     diagnosis = build_diagnosis(empty.table, sizes.found)
-    return [_row(diagnosis, empty.truth, None, sizes.seconds + time.process_time() - start, {'part': 'none', 'seed': seed, 'noise': noise})]
+    return [
+        _row(
+            diagnosis,
+            empty.truth,
+            None,
+            sizes.seconds + time.process_time() - start,
+            {'part': 'none', 'seed': seed, 'noise': noise},
+        )
+    ]
 
 
 def separating_of_seed(seed, noise, effects):
     """Hide each effect in a session made to separate relatives: many angles, three speeds both ways, on an arm."""
-    return effects_of_seed(seed, noise, effects, profile='separating', table='centrifuge', part='separating')
+    return effects_of_seed(
+        seed, noise, effects, profile='separating', table='centrifuge', part='separating'
+    )
 
 
 def none_of_seed(seed, noise):
@@ -129,15 +185,30 @@ def none_of_seed(seed, noise):
 
 def outside_of_seed(seed, noise, names):
     """Hide causes that no catalogue holds."""
-    return _each(names, lambda name: seek(record(seed, {name: None}, noise), {name: None}, part='outside', seed=seed, noise=noise), f'outside {seed}')
+    return _each(
+        names,
+        lambda name: seek(
+            record(seed, {name: None}, noise), {name: None}, part='outside', seed=seed, noise=noise
+        ),
+        f'outside {seed}',
+    )
 
 
 def pairs_of_seed(seed, noise, pairs):
     """Hide two effects at once, each pair in one session."""
+
     def row(pair):
         sizes = sizes_for(seed, noise, pair, {})
         hidden = {name: sizes.hidden(name, seed, 5.0) for name in pair}
-        return seek(record(seed, hidden, noise, through_bag=False, **options_of(*pair)), hidden, part='pairs', seed=seed, noise=noise, beside=sizes.beside(hidden))
+        return seek(
+            record(seed, hidden, noise, through_bag=False, **options_of(*pair)),
+            hidden,
+            part='pairs',
+            seed=seed,
+            noise=noise,
+            beside=sizes.beside(hidden),
+        )
+
     return _each(pairs, row, f'pairs {seed}')
 
 
@@ -148,19 +219,41 @@ def all_pairs(effects):
 
 def traps_of_seed(seed, names):
     """Set traps that must not produce a finding."""
+
     def row(name):
         options = {'noise': 'white', **TRAPS[name]}
-        return seek(record(seed, None, **options), None, part='traps', trap=name, seed=seed, noise=options['noise'])
+        return seek(
+            record(seed, None, **options),
+            None,
+            part='traps',
+            trap=name,
+            seed=seed,
+            noise=options['noise'],
+        )
+
     return _each(names, row, f'traps {seed}')
 
 
 def sizes_of_seed(seed, noise, effects, factors, part='sizes'):
     """Hide effects at several times the smallest detectable size; those of part 'power' are around it."""
+
     def row(case):
         effect, factor = case
         hidden = {effect: sizes_for(seed, noise, [effect], {}).hidden(effect, seed, factor)}
-        return seek(record(seed, hidden, noise, through_bag=False, **options_of(effect)), hidden, part=part, factor=factor, seed=seed, noise=noise)
-    return _each([(effect, factor) for effect in sorted(set(effects) - NOT_SIZED) for factor in factors], row, f'{part} {seed}')
+        return seek(
+            record(seed, hidden, noise, through_bag=False, **options_of(effect)),
+            hidden,
+            part=part,
+            factor=factor,
+            seed=seed,
+            noise=noise,
+        )
+
+    return _each(
+        [(effect, factor) for effect in sorted(set(effects) - NOT_SIZED) for factor in factors],
+        row,
+        f'{part} {seed}',
+    )
 
 
 def tasks_of(options):
@@ -177,39 +270,97 @@ def tasks_of(options):
     def shuffled(things):
         return [things[k] for k in rng.permutation(len(things))]
 
-    singles = [single for k in rounds for grade in options.grades
-               for single in _singles([name for name in names if name not in NOT_SIZED or grade in FINE], k, grade, options.noise)]
-    pairs = shuffled(all_pairs(names))[:options.pairs]
+    singles = [
+        single
+        for k in rounds
+        for grade in options.grades
+        for single in _singles(
+            [name for name in names if name not in NOT_SIZED or grade in FINE],
+            k,
+            grade,
+            options.noise,
+        )
+    ]
+    pairs = shuffled(all_pairs(names))[: options.pairs]
     some = {
-        'effects': [(effects_of_seed, (first + k, *single)) for k, single in enumerate(shuffled(singles))],
-        'none': [(none_of_seed, (first + 1000 + k, noise)) for k, noise in enumerate(
-            shuffled([f'{noise}@{grade}' for _ in rounds for grade in options.grades for noise in options.noise or ('white', *REALISTIC)]))],
-        'pairs': [(pairs_of_seed, (first + 2000 + k, 'realistic', hand)) for k, hand in enumerate(_dealt(pairs, PAIR_SESSIONS))],
-        'sizes': [(sizes_of_seed, (first + 3000 + k, 'realistic', hand, SIZES))
-                  for k, hand in enumerate(hand for _ in rounds for hand in _dealt(shuffled(names), 8))],
-        'beyond': [(beyond_of_seed, (first + 4000 + k, 'realistic', hand))
-                   for k, hand in enumerate(hand for _ in range(BEYOND_ROUNDS * options.seeds) for hand in _dealt(shuffled(tuple(KINDS)), 3))],
-        'outside': [(outside_of_seed, (first + 5000 + k, 'realistic', tuple(OUTSIDE))) for k in rounds],
+        'effects': [
+            (effects_of_seed, (first + k, *single)) for k, single in enumerate(shuffled(singles))
+        ],
+        'none': [
+            (none_of_seed, (first + 1000 + k, noise))
+            for k, noise in enumerate(
+                shuffled(
+                    [
+                        f'{noise}@{grade}'
+                        for _ in rounds
+                        for grade in options.grades
+                        for noise in options.noise or ('white', *REALISTIC)
+                    ]
+                )
+            )
+        ],
+        'pairs': [
+            (pairs_of_seed, (first + 2000 + k, 'realistic', hand))
+            for k, hand in enumerate(_dealt(pairs, PAIR_SESSIONS))
+        ],
+        'sizes': [
+            (sizes_of_seed, (first + 3000 + k, 'realistic', hand, SIZES))
+            for k, hand in enumerate(hand for _ in rounds for hand in _dealt(shuffled(names), 8))
+        ],
+        'beyond': [
+            (beyond_of_seed, (first + 4000 + k, 'realistic', hand))
+            for k, hand in enumerate(
+                hand
+                for _ in range(BEYOND_ROUNDS * options.seeds)
+                for hand in _dealt(shuffled(tuple(KINDS)), 3)
+            )
+        ],
+        'outside': [
+            (outside_of_seed, (first + 5000 + k, 'realistic', tuple(OUTSIDE))) for k in rounds
+        ],
         'traps': [(traps_of_seed, (first + 5000 + k, tuple(TRAPS))) for k in rounds],
-        'separating': [(separating_of_seed, (first + 5000 + k, 'white', SEPARATED)) for k in rounds],
-        'power': [(sizes_of_seed, (first + 6000 + k, 'white', POWER, POWER_SIZES, 'power')) for k in range(3 * options.seeds)],
+        'separating': [
+            (separating_of_seed, (first + 5000 + k, 'white', SEPARATED)) for k in rounds
+        ],
+        'power': [
+            (sizes_of_seed, (first + 6000 + k, 'white', POWER, POWER_SIZES, 'power'))
+            for k in range(3 * options.seeds)
+        ],
     }
-    placed = [((k + 0.5) / len(some[part]), task) for part in PARTS if part in options.parts for k, task in enumerate(some[part])]
+    placed = [
+        ((k + 0.5) / len(some[part]), task)
+        for part in PARTS
+        if part in options.parts
+        for k, task in enumerate(some[part])
+    ]
     return [task for _, task in sorted(placed, key=lambda pair: pair[0])]
 
 
 def beyond_of_seed(seed, noise, kinds):
     """Hide nothing, then a cause of each kind."""
     empty, known = row_of(seed, NOTHING, noise)
-    return [empty, *_each(kinds, lambda kind: hidden_row(seed, kind, noise, known=known), f'beyond {seed}')]
+    return [
+        empty,
+        *_each(kinds, lambda kind: hidden_row(seed, kind, noise, known=known), f'beyond {seed}'),
+    ]
 
 
 def _singles(names, number, grade, asked):
     """Return (noise, effects) of a round at a grade: all in white noise and dealt to the kinds of realistic noise, or all in each that is asked for."""
-    every = [(f'{noise}@{grade}', hand) for noise in asked or ('white',) for hand in _dealt(names, -(-len(names) // BUNDLE))]
+    every = [
+        (f'{noise}@{grade}', hand)
+        for noise in asked or ('white',)
+        for hand in _dealt(names, -(-len(names) // BUNDLE))
+    ]
     turn = number + 3 * GRADES.index(grade)
-    dealt = [tuple(names[(k + turn) % len(REALISTIC)::len(REALISTIC)]) for k in range(len(REALISTIC))]
-    return every + ([] if asked else [(f'{noise}@{grade}', hand) for noise, hand in zip(REALISTIC, dealt) if hand])
+    dealt = [
+        tuple(names[(k + turn) % len(REALISTIC) :: len(REALISTIC)]) for k in range(len(REALISTIC))
+    ]
+    return every + (
+        []
+        if asked
+        else [(f'{noise}@{grade}', hand) for noise, hand in zip(REALISTIC, dealt) if hand]
+    )
 
 
 def _dealt(things, hands):

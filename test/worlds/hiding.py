@@ -43,12 +43,15 @@ class Recording:
 def record(seed, hidden=None, noise='white', through_bag=True, **options):
     """Return the Recording of a session made by physics (`physics.make_session`), written to a bag and read again."""
     kind, _, grade = noise.partition('@')
-    session = physics.make_session(seed, hidden, kind, **({'grade': grade} if grade else {}) | options)
+    session = physics.make_session(
+        seed, hidden, kind, **({'grade': grade} if grade else {}) | options
+    )
     table = Table.from_mapping(session.table)
     gatherer = MotionGatherer(table)
     windows = []
     if through_bag:
         from msg_adapters.bag import open_recording
+
         with tempfile.TemporaryDirectory() as folder:
             physics.write_bag(session, Path(folder) / 'bag')
             with open_recording(Path(folder) / 'bag') as bag:
@@ -63,7 +66,12 @@ def record(seed, hidden=None, noise='white', through_bag=True, **options):
 def options_of(*effects):
     """Return the options of sessions that hide effects."""
     wanted = {'_hysteresis': {'temperature': 'cycle'}, '_rectification': {'machine': True}}
-    return {key: value for ending, options in wanted.items() if any(name.endswith(ending) for name in effects) for key, value in options.items()}
+    return {
+        key: value
+        for ending, options in wanted.items()
+        if any(name.endswith(ending) for name in effects)
+        for key, value in options.items()
+    }
 
 
 @lru_cache(maxsize=8)
@@ -78,13 +86,19 @@ def sizes_for(seed, noise, effects, options):
 
 def pattern(effect, seed, n_joints=3):
     """Return a random value of an effect of magnitude one, and for a warm-up its time constant."""
-    return np.atleast_1d(np.asarray(draw_value(effect, 1.0, n_joints, generator(seed, 'pattern of ' + effect)), float))
+    return np.atleast_1d(
+        np.asarray(
+            draw_value(effect, 1.0, n_joints, generator(seed, 'pattern of ' + effect)), float
+        )
+    )
 
 
 @lru_cache(maxsize=None)
 def threshold_noncentrality(n_parameters, n_questions):
     """Return the noncentrality at which an effect passes the rules of the search half of the time: its threshold, its penalties, its held-out windows."""
-    return brentq(lambda value: passing(value, n_parameters, n_questions).mean() - 0.5, 1.0, 1000.0, xtol=0.1)
+    return brentq(
+        lambda value: passing(value, n_parameters, n_questions).mean() - 0.5, 1.0, 1000.0, xtol=0.1
+    )
 
 
 def passing(noncentrality, n_parameters, n_questions, draws=4000):
@@ -94,13 +108,19 @@ def passing(noncentrality, n_parameters, n_questions, draws=4000):
     The chi-square test over all questions, the gain of held-out log likelihood with its least value and its penalty for each parameter, and the fall of the residual from
     window to window in the unit of the sensor, for sure (95 %). Shares of a rest and halves are no part of it.
     """
-    noise = np.random.default_rng(1).normal(size=(draws, EVIDENCE_FOLDS, n_parameters)) * np.sqrt(EVIDENCE_FOLDS)
+    noise = np.random.default_rng(1).normal(size=(draws, EVIDENCE_FOLDS, n_parameters)) * np.sqrt(
+        EVIDENCE_FOLDS
+    )
     parts = noise + np.sqrt(noncentrality) * np.eye(1, n_parameters)[0]
     whole = parts.mean(axis=1)
     others = (EVIDENCE_FOLDS * whole[:, None] - parts) / (EVIDENCE_FOLDS - 1)
-    gain = 0.5 * ((parts**2).sum(axis=2) - ((parts - others)**2).sum(axis=2)).mean(axis=1)
+    gain = 0.5 * ((parts**2).sum(axis=2) - ((parts - others) ** 2).sum(axis=2)).mean(axis=1)
     fall = (whole**2).sum(axis=1)
-    return ((chi2.sf(fall, n_parameters) * n_questions < FAMILY_WISE) & (gain > max(MIN_GAIN_NATS, PENALTY * n_parameters)) & (gain > 1.96 * np.sqrt(fall)))
+    return (
+        (chi2.sf(fall, n_parameters) * n_questions < FAMILY_WISE)
+        & (gain > max(MIN_GAIN_NATS, PENALTY * n_parameters))
+        & (gain > 1.96 * np.sqrt(fall))
+    )
 
 
 class Sizes:
@@ -111,9 +131,11 @@ class Sizes:
         self.found = investigate(recording.windows, recording.table, recording.model)
         self.seconds, self.problem = time.process_time() - start, self.found.problem
         evidence, used = self.problem.evidence, np.array(self.problem.search.baseline)
-        prior = np.diag(1 / self.problem.space.prior_sd[used]**2)
+        prior = np.diag(1 / self.problem.space.prior_sd[used] ** 2)
         normal = evidence.total[:-1, :-1]
-        self.information = normal - normal[:, used] @ np.linalg.solve(normal[np.ix_(used, used)] + prior, normal[used])
+        self.information = normal - normal[:, used] @ np.linalg.solve(
+            normal[np.ix_(used, used)] + prior, normal[used]
+        )
 
     def hidden(self, effect, seed, factor):
         """Return what to hide: of random shape, `factor` times as large as detectable; None where nature gives the size."""
@@ -124,25 +146,51 @@ class Sizes:
         value = pattern(effect, seed)
         direction, n_parameters = self._direction(effect, value)
         strength = direction @ self.information @ direction
-        seen = np.sqrt(threshold_noncentrality(n_parameters, len(self.problem.questions)) / strength)
-        read = least_angle(self._question(effect, value)[0].effect, self.problem.search.encoder_step) / np.max(np.abs(value))
+        seen = np.sqrt(
+            threshold_noncentrality(n_parameters, len(self.problem.questions)) / strength
+        )
+        read = least_angle(
+            self._question(effect, value)[0].effect, self.problem.search.encoder_step
+        ) / np.max(np.abs(value))
         size = factor * max(seen, read)
         if effect.endswith('_bias_drift'):
             return np.append(size * value[:3], value[3])
         if effect.endswith(POSITIVE):
             return float(abs(size * value[0]))
-        return (size * value).reshape(np.shape(draw_value(effect, 1.0, 3, generator(seed, effect))) or (1,))
+        return (size * value).reshape(
+            np.shape(draw_value(effect, 1.0, 3, generator(seed, effect))) or (1,)
+        )
 
     def beside(self, hidden):
         """Return how many times the smallest detectable size is left of each of two hidden effects where the other one may take any value; no limit for limits."""
-        sized = {name: self._direction(name, np.ravel(value)) for name, value in hidden.items() if not name.endswith('_saturation') and value is not None}
+        sized = {
+            name: self._direction(name, np.ravel(value))
+            for name, value in hidden.items()
+            if not name.endswith('_saturation') and value is not None
+        }
         left = {name: np.inf for name in hidden}
         for name, (direction, n_parameters) in sized.items():
-            others = [k for other in sized if other != name for q in self.problem.questions if q.name == other for k in q.parameters]
-            known = self.information[np.ix_(others, others)] + np.diag(1 / self.problem.space.prior_sd[others]**2)
+            others = [
+                k
+                for other in sized
+                if other != name
+                for q in self.problem.questions
+                if q.name == other
+                for k in q.parameters
+            ]
+            known = self.information[np.ix_(others, others)] + np.diag(
+                1 / self.problem.space.prior_sd[others] ** 2
+            )
             shared = self.information[others] @ direction
-            strength = direction @ self.information @ direction - shared @ np.linalg.solve(known, shared)
-            left[name] = float(np.sqrt(max(strength, 0.0) / threshold_noncentrality(n_parameters, len(self.problem.questions))))
+            strength = direction @ self.information @ direction - shared @ np.linalg.solve(
+                known, shared
+            )
+            left[name] = float(
+                np.sqrt(
+                    max(strength, 0.0)
+                    / threshold_noncentrality(n_parameters, len(self.problem.questions))
+                )
+            )
         return left
 
     def _direction(self, effect, value):

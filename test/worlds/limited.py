@@ -12,8 +12,17 @@ LIMIT_BYTES = 3 << 30
 """Address space; libraries and the stacks of threads reserve more of it than they use."""
 LIMIT_SECONDS = 20
 """Processor time."""
-PRELOAD = ['imu_calibration.cli.main', 'imu_calibration.use_cases.calibrate', 'imu_calibration.use_cases.inspect', 'msg_adapters.bag',
-           'rosbags.typesys', 'scipy.optimize', 'scipy.signal', 'scipy.spatial.transform', 'worlds.limited']
+PRELOAD = [
+    'imu_calibration.cli.main',
+    'imu_calibration.use_cases.calibrate',
+    'imu_calibration.use_cases.inspect',
+    'msg_adapters.bag',
+    'rosbags.typesys',
+    'scipy.optimize',
+    'scipy.signal',
+    'scipy.spatial.transform',
+    'worlds.limited',
+]
 
 
 class Ended(NamedTuple):
@@ -59,12 +68,15 @@ def survived(*arguments) -> Ended:
 
 def _refused_or_warned(arguments, codes):
     from imu_calibration.cli.main import main
+
     ended = limited(main, [str(argument) for argument in arguments])
     said = f'{arguments}: {ended}'
     assert ended.code in codes and 'Traceback' not in ended.err and ended.megabytes < 500, said
     assert ended.code != 1 or (ended.err.count('\n') == 1 and len(ended.err) < 3000), said
     assert all(character.isprintable() or character in '\n\r' for character in ended.err), said
-    print(f'{arguments[0]}: {ended.seconds:.2f} s, {ended.megabytes:.0f} MB, exit code {ended.code}: {ended.err.strip()}')
+    print(
+        f'{arguments[0]}: {ended.seconds:.2f} s, {ended.megabytes:.0f} MB, exit code {ended.code}: {ended.err.strip()}'
+    )
     return ended
 
 
@@ -81,7 +93,15 @@ def _child(pipe, function, arguments):
         except BaseException:
             traceback.print_exc(file=sys.stderr)
     used = resource.getrusage(resource.RUSAGE_SELF)
-    pipe.send(Ended(code, out.getvalue(), err.getvalue(), used.ru_utime + used.ru_stime, _megabytes() - before))
+    pipe.send(
+        Ended(
+            code,
+            out.getvalue(),
+            err.getvalue(),
+            used.ru_utime + used.ru_stime,
+            _megabytes() - before,
+        )
+    )
 
 
 def _megabytes():

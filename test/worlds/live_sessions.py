@@ -20,10 +20,18 @@ OPTIONS = CalibrationOptions(tolerances=TOLERANCES)
 
 def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='quick'):
     """Return (imu, joints, true values, model) of a simulated session, or of its first seconds."""
-    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=TABLE.joint_names)
+    model = SensorModel(
+        accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=TABLE.joint_names
+    )
     values = random_values(model, 'industrial', seed)
-    imu, joints, _ = simulate(model, values, TABLE, profile=make_profile(profile, 1, TABLE),
-                              options=SimulationOptions(rate, joint_rate or rate), seed=seed)
+    imu, joints, _ = simulate(
+        model,
+        values,
+        TABLE,
+        profile=make_profile(profile, 1, TABLE),
+        options=SimulationOptions(rate, joint_rate or rate),
+        seed=seed,
+    )
     if seconds is not None:
         end = imu.stamp_ns[0] + int(seconds * 1e9)
         imu, joints = imu.select(imu.stamp_ns < end), joints.select(joints.stamp_ns < end)
@@ -32,7 +40,9 @@ def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='qui
 
 def offline(*sessions):
     """Return the offline answer for (imu, joints) as they were sent."""
-    return calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, OPTIONS).calibration
+    return calibrate(
+        [lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, OPTIONS
+    ).calibration
 
 
 def assert_same(live, expected, share=1e-6):
@@ -47,5 +57,8 @@ def errors_in_sd(calibration, model, values):
     for effect in model.effects:
         if (effect.sensor, effect.name) in calibration.model.slices:
             part = calibration.model.slices[effect.sensor, effect.name]
-            found.append((calibration.values[part] - values[model.slices[effect.sensor, effect.name]]) / calibration.sd[part])
+            found.append(
+                (calibration.values[part] - values[model.slices[effect.sensor, effect.name]])
+                / calibration.sd[part]
+            )
     return np.concatenate(found)

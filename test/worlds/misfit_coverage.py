@@ -23,7 +23,9 @@ from worlds.misfit_worlds import CAUSES, make_pair
 
 OPTIONS = CalibrationOptions('bias+matrix', 'bias+matrix', 'time_offset')
 """The timing is asked, as a search would: a lag is not what these worlds are about."""
-GROUPS = tuple(f'{sensor}.{name}' for sensor in ('accelerometer', 'gyroscope') for name in ('bias', 'matrix'))
+GROUPS = tuple(
+    f'{sensor}.{name}' for sensor in ('accelerometer', 'gyroscope') for name in ('bias', 'matrix')
+)
 FIRST_SEED = 9001
 
 
@@ -68,7 +70,10 @@ def errors_in_sd(found):
     for group in GROUPS:
         sensor, name = group.split('.')
         part = solution.model.slices[sensor, name]
-        free, error = ~solution.held[part], solution.values[part] - np.ravel(getattr(found.truth[sensor], name))
+        free, error = (
+            ~solution.held[part],
+            solution.values[part] - np.ravel(getattr(found.truth[sensor], name)),
+        )
         for what, sd in (('noise alone', base_sd(solution)), ('reported', solution.sd)):
             errors[what, group] = (error / sd[part])[free]
     return errors
@@ -80,16 +85,29 @@ def main():
     parser.add_argument('--seeds', type=int, default=8)
     parser.add_argument('--first', type=int, default=FIRST_SEED)
     arguments = parser.parse_args()
-    print(f'| world | parameters | rms error in sd, noise alone | as reported | 95 % interval holds | wider, median (95 %) |\n|{" --- |" * 6}')
+    print(
+        f'| world | parameters | rms error in sd, noise alone | as reported | 95 % interval holds | wider, median (95 %) |\n|{" --- |" * 6}'
+    )
     for cause in (None, *CAUSES):
-        results = [calibrated(make_pair(cause, seed).first) for seed in range(arguments.first, arguments.first + arguments.seeds)]
+        results = [
+            calibrated(make_pair(cause, seed).first)
+            for seed in range(arguments.first, arguments.first + arguments.seeds)
+        ]
         errors = [errors_in_sd(found) for found in results]
         for group in GROUPS:
-            alone, reported = (np.concatenate([error[what, group] for error in errors]) for what in ('noise alone', 'reported'))
+            alone, reported = (
+                np.concatenate([error[what, group] for error in errors])
+                for what in ('noise alone', 'reported')
+            )
             part = results[0].solution.model.slices[tuple(group.split('.'))]
-            wider = np.concatenate([(found.solution.sd / base_sd(found.solution))[part] for found in results])
-            print(f'| {cause or "clean"} | {group} | {np.sqrt(np.mean(alone**2)):.1f} | {np.sqrt(np.mean(reported**2)):.1f} | '
-                  f'{100 * np.mean(np.abs(reported) < 1.96):.0f} % | {np.median(wider):.1f} ({np.quantile(wider, 0.95):.1f}) |', flush=True)
+            wider = np.concatenate(
+                [(found.solution.sd / base_sd(found.solution))[part] for found in results]
+            )
+            print(
+                f'| {cause or "clean"} | {group} | {np.sqrt(np.mean(alone**2)):.1f} | {np.sqrt(np.mean(reported**2)):.1f} | '
+                f'{100 * np.mean(np.abs(reported) < 1.96):.0f} % | {np.median(wider):.1f} ({np.quantile(wider, 0.95):.1f}) |',
+                flush=True,
+            )
 
 
 if __name__ == '__main__':

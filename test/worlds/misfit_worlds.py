@@ -19,8 +19,13 @@ from worlds.physics import Session, make_session
 from worlds.physics_cause import Cause
 from worlds.physics_draw import ARCMIN, DEG, generator
 
-SHAFT = {'joints': [{'name': 'shaft', 'axis': [1, 0, 0]}], 'up': [0, 1, 0], 'gravity': 9.80665, 'latitude': None,
-         'mount': {'rpy_deg': [0, 0, 0], 'xyz': None}}
+SHAFT = {
+    'joints': [{'name': 'shaft', 'axis': [1, 0, 0]}],
+    'up': [0, 1, 0],
+    'gravity': 9.80665,
+    'latitude': None,
+    'mount': {'rpy_deg': [0, 0, 0], 'xyz': None},
+}
 """A horizontal motor shaft, as in recordings of hardware."""
 FINE_RATE = 1000.0
 """Rate of the grid on which what a motor does is differentiated, Hz."""
@@ -37,7 +42,11 @@ class Disturbed:
 
     def __post_init__(self):
         time = np.arange(-0.1, self.moves.duration + 0.1, 1.0 / FINE_RATE)
-        object.__setattr__(self, '_curve', make_interp_spline(time, self.displacement(time, self.moves.at(time)), k=5))
+        object.__setattr__(
+            self,
+            '_curve',
+            make_interp_spline(time, self.displacement(time, self.moves.at(time)), k=5),
+        )
 
     @property
     def duration(self):
@@ -51,7 +60,10 @@ class Disturbed:
     def at(self, time):
         """Return the true JointMotion."""
         told, time = self.moves.at(time), np.atleast_1d(time)
-        parts = [getattr(told, name) + self._curve(time, order) for order, name in enumerate(('position', 'rate', 'acceleration', 'jerk'))]
+        parts = [
+            getattr(told, name) + self._curve(time, order)
+            for order, name in enumerate(('position', 'rate', 'acceleration', 'jerk'))
+        ]
         return JointMotion(told.time, *parts)
 
 
@@ -66,10 +78,14 @@ class MotorRipple(Cause):
 
     def moved(self, moves):
         """Add the ripple of every order."""
+
         def ripple(time, motion):
-            waves = [amplitude * np.sin(order * motion.position + phase[:motion.position.shape[1]])
-                     for order, amplitude, phase in zip(self.ORDERS, self.AMPLITUDES, self.phase)]
+            waves = [
+                amplitude * np.sin(order * motion.position + phase[: motion.position.shape[1]])
+                for order, amplitude, phase in zip(self.ORDERS, self.AMPLITUDES, self.phase)
+            ]
             return self.size * np.sum(waves, axis=0)
+
         return Disturbed(moves, ripple)
 
 
@@ -80,9 +96,11 @@ class Cogging(Cause):
 
     def moved(self, moves):
         """Pull the joint towards the nearest detent, the less the faster it turns."""
+
         def pull(time, motion):
-            depth = self.size * self.DEPTH / (1.0 + (motion.rate / self.SMOOTH_FROM)**2)
+            depth = self.size * self.DEPTH / (1.0 + (motion.rate / self.SMOOTH_FROM) ** 2)
             return -depth * np.sin(self.DETENTS * motion.position)
+
         return Disturbed(moves, pull)
 
 
@@ -100,14 +118,21 @@ class Backlash(Cause):
             side = lfilter([1.0 - decay], [1.0, -decay], side, axis=0, zi=side[:1] * decay)[0]
         error = 0.5 * self.size * self.PLAY * side
         slope = np.gradient(error, 1.0 / FINE_RATE, axis=0)
-        return tuple(np.stack([np.interp(time, fine, column) for column in part.T], axis=1) for part in (error, slope))
+        return tuple(
+            np.stack([np.interp(time, fine, column) for column in part.T], axis=1)
+            for part in (error, slope)
+        )
 
 
 def _last_sign(rate):
     """Return the sign of the last motion, 1 before the first, shape (n, n_joints)."""
     moving = np.abs(rate) > 0.05 * DEG
     last = np.maximum.accumulate(np.where(moving, np.arange(len(rate))[:, None], 0), axis=0)
-    return np.where(np.take_along_axis(moving, last, axis=0), np.sign(np.take_along_axis(rate, last, axis=0)), 1.0)
+    return np.where(
+        np.take_along_axis(moving, last, axis=0),
+        np.sign(np.take_along_axis(rate, last, axis=0)),
+        1.0,
+    )
 
 
 class EncoderEccentricity(Cause):
@@ -149,12 +174,19 @@ class FlexibleMount(Cause):
         """
         omega, step = 2.0 * np.pi * self.FREQUENCY, time[1] - time[0]
         drive = self.size * (omega**2 * self.SAG * np.cross(_lever(), force_s) / 9.80665 - alpha_s)
-        matrices = (np.array([[0.0, 1.0], [-omega**2, -2.0 * self.DAMPING * omega]]), np.array([[0.0], [1.0]]), np.eye(2), np.zeros((2, 1)))
+        matrices = (
+            np.array([[0.0, 1.0], [-(omega**2), -2.0 * self.DAMPING * omega]]),
+            np.array([[0.0], [1.0]]),
+            np.eye(2),
+            np.zeros((2, 1)),
+        )
         a, b = cont2discrete(matrices, step)[:2]
         # both states have the same poles: as filters of the second order that start in balance
         poles, adjugate = np.poly(a), np.array([[-a[1, 1], a[0, 1]], [a[1, 0], -a[0, 0]]]) @ b
         base = drive[:1]
-        turn, rate = (lfilter([0.0, b[k, 0], adjugate[k, 0]], poles, drive - base, axis=0) for k in range(2))
+        turn, rate = (
+            lfilter([0.0, b[k, 0], adjugate[k, 0]], poles, drive - base, axis=0) for k in range(2)
+        )
         turn = turn + base / omega**2
         return force_s - np.cross(turn, force_s), rate_s - np.cross(turn, rate_s) + rate
 
@@ -191,7 +223,9 @@ class LagJitter(Cause):
         """Return a gamma-distributed delay with a slow wander, in the order of arrival."""
         every_ten = np.arange(0.0, time[-1] + 20.0, 10.0)
         slow = np.interp(time, every_ten, rng.uniform(0.0, 1.0, len(every_ten)))
-        late = self.size * (self.SMALLEST + rng.gamma(2.0, self.MEAN / 2.0, len(time)) + self.WANDER * slow)
+        late = self.size * (
+            self.SMALLEST + rng.gamma(2.0, self.MEAN / 2.0, len(time)) + self.WANDER * slow
+        )
         return np.maximum.accumulate(time + late) - time
 
 
@@ -206,13 +240,24 @@ class StampBursts(Cause):
         ends = starts + self.size * rng.uniform(0.3, 1.0, len(starts)) * self.HELD_UP
         k = np.searchsorted(starts, time, side='right') - 1
         late = np.where(k >= 0, np.maximum(ends[np.maximum(k, 0)] - time, 0.0), 0.0)
-        order = np.arange(len(time)) * 1e-4   # messages follow one another by a tenth of a millisecond at least
+        order = (
+            np.arange(len(time)) * 1e-4
+        )  # messages follow one another by a tenth of a millisecond at least
         return np.maximum.accumulate(time + late - order) + order - time
 
 
-CAUSES = {'motor_ripple': MotorRipple, 'cogging': Cogging, 'backlash': Backlash, 'encoder_eccentricity': EncoderEccentricity,
-          'gear_eccentricity': GearEccentricity, 'flexible_mount': FlexibleMount, 'rate_dependent_lag': RateDependentLag,
-          'lag_jitter': LagJitter, 'stamp_bursts': StampBursts, 'driver_lag': DriverLag}
+CAUSES = {
+    'motor_ripple': MotorRipple,
+    'cogging': Cogging,
+    'backlash': Backlash,
+    'encoder_eccentricity': EncoderEccentricity,
+    'gear_eccentricity': GearEccentricity,
+    'flexible_mount': FlexibleMount,
+    'rate_dependent_lag': RateDependentLag,
+    'lag_jitter': LagJitter,
+    'stamp_bursts': StampBursts,
+    'driver_lag': DriverLag,
+}
 """Causes by name."""
 
 
@@ -233,7 +278,17 @@ class Pair:
         return self.first.table
 
 
-def make_pair(cause, seed, *, size=1.0, table='three_axis', profile='quick', noise='realistic', grade='industrial', **options):
+def make_pair(
+    cause,
+    seed,
+    *,
+    size=1.0,
+    table='three_axis',
+    profile='quick',
+    noise='realistic',
+    grade='industrial',
+    **options,
+):
     """
     Return the `Pair` of a world.
 
@@ -255,8 +310,18 @@ def make_pair(cause, seed, *, size=1.0, table='three_axis', profile='quick', noi
     for number in range(2):
         acting = None if cause is None else CAUSES[cause](size, generator(seed, 'cause ' + cause))
         motion = sweeps(1.0 + 0.25 * number) if profile == 'sweeps' else profile
-        sessions.append(make_session(2 * seed + number, noise=noise, grade=grade, table=SHAFT if table == 'shaft' else table, profile=motion, unit=seed,
-                                     cause=acting, **options))
+        sessions.append(
+            make_session(
+                2 * seed + number,
+                noise=noise,
+                grade=grade,
+                table=SHAFT if table == 'shaft' else table,
+                profile=motion,
+                unit=seed,
+                cause=acting,
+                **options,
+            )
+        )
     return Pair(cause, *sessions)
 
 

@@ -23,19 +23,32 @@ class Moment(Cause):
 
     def __init__(self, kind, share=0.55, turn=(0.01, -0.006, 0.008), joint=1, slip=0.03):
         super().__init__()
-        self.kind, self.share, self.turn, self.joint, self.slip = kind, share, np.array(turn), joint, slip
+        self.kind, self.share, self.turn, self.joint, self.slip = (
+            kind,
+            share,
+            np.array(turn),
+            joint,
+            slip,
+        )
 
     def delivered(self, time, outputs, rate_s):
         """Exchange the axes of the accelerometer."""
         if self.kind != 'axes':
             return outputs
-        return [np.where((time > self.share * time[-1])[:, None], outputs[0][:, [1, 0, 2]], outputs[0]), outputs[1]]
+        return [
+            np.where((time > self.share * time[-1])[:, None], outputs[0][:, [1, 0, 2]], outputs[0]),
+            outputs[1],
+        ]
 
     def carried(self, time, force_s, rate_s, alpha_s):
         """Turn the sensor on its mount."""
         if self.kind not in ('mount', 'creep'):
             return force_s, rate_s
-        course = time > self.share * time[-1] if self.kind == 'mount' else np.clip((time / time[-1] - 0.3) / 0.4, 0.0, 1.0)
+        course = (
+            time > self.share * time[-1]
+            if self.kind == 'mount'
+            else np.clip((time / time[-1] - 0.3) / 0.4, 0.0, 1.0)
+        )
         turned = Rotation.from_rotvec(np.outer(course, self.turn)).inv()
         return turned.apply(force_s), turned.apply(rate_s)
 

@@ -50,7 +50,7 @@ def _folded_flicker(length, period):
     folded = np.zeros(len(frequency))
     for alias in range(-6, 7):
         seen = np.abs(frequency + alias / period)
-        folded += np.sinc(seen * period)**2 / (2 * np.pi * seen)
+        folded += np.sinc(seen * period) ** 2 / (2 * np.pi * seen)
     folded[0] = 0.0
     return np.sqrt(0.5 * folded)
 
@@ -69,7 +69,11 @@ class AxisTruth:
     @property
     def form(self):
         """The slow part, in the order of the package."""
-        return tuple(name for name in ('bias_instability', 'random_walk', 'gauss_markov') if name in self.figures)
+        return tuple(
+            name
+            for name in ('bias_instability', 'random_walk', 'gauss_markov')
+            if name in self.figures
+        )
 
     def draw(self, n, period, rng):
         """Return a record of n samples."""
@@ -94,21 +98,35 @@ def overlapping_allan_variance(values, factors):
     return sums.variance()
 
 
-FORMS = (('random_walk',), ('bias_instability',), ('gauss_markov',), ('bias_instability', 'random_walk'))
+FORMS = (
+    ('random_walk',),
+    ('bias_instability',),
+    ('gauss_markov',),
+    ('bias_instability', 'random_walk'),
+)
 
 
 def draw_truth(grade, sensor, form, rng):
     """Return the figures of an axis: the grade's densities and instability within a factor of two, in one of `FORMS`."""
     noise = GRADES[grade].noise
-    density, instability = ((noise.accel_density, noise.accel_instability) if sensor == 'accelerometer' else (noise.gyro_density, noise.gyro_instability))
+    density, instability = (
+        (noise.accel_density, noise.accel_instability)
+        if sensor == 'accelerometer'
+        else (noise.gyro_density, noise.gyro_instability)
+    )
     density, instability = (value * 2.0 ** rng.uniform(-1, 1) for value in (density, instability))
     figures = {'white_noise': density}
     if 'bias_instability' in form:
         figures['bias_instability'] = instability
-    if 'random_walk' in form:   # crosses the flicker, or the white noise of as much, after some hundred seconds
+    if (
+        'random_walk' in form
+    ):  # crosses the flicker, or the white noise of as much, after some hundred seconds
         figures['random_walk'] = instability / np.sqrt(100.0 * 2.0 ** rng.uniform(-1, 2))
     if 'gauss_markov' in form:
-        figures |= {'gauss_markov': instability, 'correlation_time': 100.0 * 2.0 ** rng.uniform(-1.5, 1.5)}
+        figures |= {
+            'gauss_markov': instability,
+            'correlation_time': 100.0 * 2.0 ** rng.uniform(-1.5, 1.5),
+        }
     if rng.random() < 0.2:
         figures['quantisation'] = density * np.sqrt(1.0 / RATE) * 2.0 ** rng.uniform(-1, 1)
     return AxisTruth(figures)

@@ -39,14 +39,24 @@ class Person:
         count = round(self.hold_time / PERIOD)
         rate = self.rng.normal(0, self.creep, 3)
         held = self.attitude * Rotation.from_rotvec(np.outer(PERIOD * np.arange(count), rate))
-        shake = self.tremor * np.sin(2 * np.pi * 8 * PERIOD * np.arange(count) + self.rng.uniform(0, 6))
+        shake = self.tremor * np.sin(
+            2 * np.pi * 8 * PERIOD * np.arange(count) + self.rng.uniform(0, 6)
+        )
         self.attitude = held[-1]
-        return self._read(held.inv().apply([0, 0, GRAVITY]) + np.outer(shake, self.rng.normal(0, 1, 3)), np.tile(rate, (count, 1)))
+        return self._read(
+            held.inv().apply([0, 0, GRAVITY]) + np.outer(shake, self.rng.normal(0, 1, 3)),
+            np.tile(rate, (count, 1)),
+        )
 
     def go(self, axis, angle):
         """Return the samples of a turn about an axis of the sensor, and of the pose in which it ends, some degrees off."""
-        aim = (Rotation.from_rotvec(np.asarray(axis) * angle) * Rotation.from_rotvec(self.rng.normal(0, OFF / np.sqrt(3), 3))).as_rotvec()
-        turning, rate = turn_samples(self.attitude, aim, self.rng.normal(0, 0.3, 3), PERIOD, self.move_time)
+        aim = (
+            Rotation.from_rotvec(np.asarray(axis) * angle)
+            * Rotation.from_rotvec(self.rng.normal(0, OFF / np.sqrt(3), 3))
+        ).as_rotvec()
+        turning, rate = turn_samples(
+            self.attitude, aim, self.rng.normal(0, 0.3, 3), PERIOD, self.move_time
+        )
         moved = self._read(turning.inv().apply([0, 0, GRAVITY]), rate)
         self.attitude = self.attitude * Rotation.from_rotvec(aim)
         return ImuSamples.concatenate([moved, self.hold()])
@@ -56,5 +66,9 @@ class Person:
         count = len(force)
         stamps = self.now_ns + np.round(1e9 * PERIOD * np.arange(count)).astype(np.int64)
         self.now_ns, self.seconds = int(stamps[-1] + 1e9 * PERIOD), self.seconds + count * PERIOD
-        return ImuSamples(stamps, force @ matrix_f.T + bias_f + self.rng.normal(0, 0.02, force.shape),
-                          rate @ matrix_w.T + bias_w + self.rng.normal(0, 0.002, rate.shape), 'imu_link')
+        return ImuSamples(
+            stamps,
+            force @ matrix_f.T + bias_f + self.rng.normal(0, 0.02, force.shape),
+            rate @ matrix_w.T + bias_w + self.rng.normal(0, 0.002, rate.shape),
+            'imu_link',
+        )

@@ -29,7 +29,7 @@ class Scene:
     """What a cause may go by."""
 
     def __init__(self, world, temperature_c, force_s, rate_s, alpha_s, other):
-        self.other = other   # an axis that is not the one the cause acts on
+        self.other = other  # an axis that is not the one the cause acts on
         self.time, self.angle, self.world = world.time, world.joints, world
         self.force, self.rate, self.alpha = force_s, rate_s, alpha_s
         self.turn = np.gradient(world.joints, world.time, axis=0)
@@ -44,7 +44,7 @@ def _axis(rng):
 def _arc(angle, rng):
     """Return a smooth bump over an arc of 60 degrees of a joint, about an angle at which the session is often."""
     middle = rng.choice(angle[:: max(1, len(angle) // 200)])
-    return np.exp(-0.5 * (np.angle(np.exp(1j * (angle - middle))) / (10 * DEG))**2)
+    return np.exp(-0.5 * (np.angle(np.exp(1j * (angle - middle))) / (10 * DEG)) ** 2)
 
 
 def _approach(scene, rng):
@@ -56,7 +56,7 @@ def _approach(scene, rng):
 
 
 def _power(which, power):
-    return lambda scene, rng: getattr(scene, which)[:, _axis(rng)]**power
+    return lambda scene, rng: getattr(scene, which)[:, _axis(rng)] ** power
 
 
 def _fast(scene, rng):
@@ -67,16 +67,23 @@ def _fast(scene, rng):
 
 def _cogging(scene, rng):
     joint = int(rng.integers(scene.angle.shape[1]))
-    return scene.turn[:, joint] * np.sin(int(rng.integers(3, 8)) * scene.angle[:, joint] + rng.uniform(0, 6))
+    return scene.turn[:, joint] * np.sin(
+        int(rng.integers(3, 8)) * scene.angle[:, joint] + rng.uniform(0, 6)
+    )
 
 
 def _two_joints(scene, rng):
     orders = rng.integers(2, 6, 2)
-    return np.sin(orders[0] * scene.angle[:, 0] + rng.uniform(0, 6)) * np.sin(orders[1] * scene.angle[:, 1] + rng.uniform(0, 6))
+    return np.sin(orders[0] * scene.angle[:, 0] + rng.uniform(0, 6)) * np.sin(
+        orders[1] * scene.angle[:, 1] + rng.uniform(0, 6)
+    )
 
 
 def _settling(which):
-    return lambda scene, rng: -getattr(scene, which)[:, _axis(rng)] * np.expm1(-scene.time / rng.uniform(0.1, 0.4) / scene.time[-1])
+    return lambda scene, rng: (
+        -getattr(scene, which)[:, _axis(rng)]
+        * np.expm1(-scene.time / rng.uniform(0.1, 0.4) / scene.time[-1])
+    )
 
 
 def _of(*names):
@@ -85,32 +92,73 @@ def _of(*names):
 
 def _magnet(scene, rng):
     """Return the component along one axis of a field that stays with the room."""
-    field = np.append(rng.normal(size=2), 0.0)   # along the vertical it would be a response to gravity
+    field = np.append(
+        rng.normal(size=2), 0.0
+    )  # along the vertical it would be a response to gravity
     return scene.world.to_sensor(np.broadcast_to(field, scene.force.shape))
 
 
 KINDS = {
-    'warm_cross_axis_force': Kind('accelerometer', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, s.other]),
-    'warm_cross_axis_rate': Kind('gyroscope', _of('rate', 'temperature'), lambda s, r: s.warm * s.rate[:, s.other]),
-    'warm_g_sensitivity': Kind('gyroscope', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, _axis(r)]),
+    'warm_cross_axis_force': Kind(
+        'accelerometer', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, s.other]
+    ),
+    'warm_cross_axis_rate': Kind(
+        'gyroscope', _of('rate', 'temperature'), lambda s, r: s.warm * s.rate[:, s.other]
+    ),
+    'warm_g_sensitivity': Kind(
+        'gyroscope', _of('force', 'temperature'), lambda s, r: s.warm * s.force[:, _axis(r)]
+    ),
     'force_cubed_in_gyro': Kind('gyroscope', _of('force'), _power('force', 3)),
     'gyro_cubic': Kind('gyroscope', _of('rate'), _power('rate', 3)),
-    'acceleration_under_load': Kind('gyroscope', _of('angular acceleration', 'force'), lambda s, r: s.alpha[:, _axis(r)] * s.force[:, _axis(r)]),
-    'scale_under_load': Kind('gyroscope', _of('force', 'rate'), lambda s, r: s.force[:, _axis(r)] * s.rate[:, _axis(r)]),
-    'coriolis_in_accelerometer': Kind('accelerometer', _of('force', 'rate'), lambda s, r: s.force[:, _axis(r)] * s.rate[:, _axis(r)]),
+    'acceleration_under_load': Kind(
+        'gyroscope',
+        _of('angular acceleration', 'force'),
+        lambda s, r: s.alpha[:, _axis(r)] * s.force[:, _axis(r)],
+    ),
+    'scale_under_load': Kind(
+        'gyroscope', _of('force', 'rate'), lambda s, r: s.force[:, _axis(r)] * s.rate[:, _axis(r)]
+    ),
+    'coriolis_in_accelerometer': Kind(
+        'accelerometer',
+        _of('force', 'rate'),
+        lambda s, r: s.force[:, _axis(r)] * s.rate[:, _axis(r)],
+    ),
     'gyro_scale_settling': Kind('gyroscope', _of('rate', 'time'), _settling('rate')),
     'accel_scale_settling': Kind('accelerometer', _of('force', 'time'), _settling('force')),
-    'motor_hum': Kind('accelerometer', _of('joint rate'), lambda s, r: np.abs(s.turn[:, int(r.integers(s.turn.shape[1]))])),
-    'bearing_drag': Kind('gyroscope', _of('joint rate'), lambda s, r: np.tanh(s.turn[:, int(r.integers(s.turn.shape[1]))] / (0.2 * DEG))),
+    'motor_hum': Kind(
+        'accelerometer',
+        _of('joint rate'),
+        lambda s, r: np.abs(s.turn[:, int(r.integers(s.turn.shape[1]))]),
+    ),
+    'bearing_drag': Kind(
+        'gyroscope',
+        _of('joint rate'),
+        lambda s, r: np.tanh(s.turn[:, int(r.integers(s.turn.shape[1]))] / (0.2 * DEG)),
+    ),
     'cogging': Kind('gyroscope', _of('joint angle', 'joint rate'), _cogging),
     'stray_field_accel': Kind('accelerometer', _of('joint angle'), _two_joints),
     'stray_field_gyro': Kind('gyroscope', _of('joint angle'), _two_joints),
     'field_of_the_room': Kind('gyroscope', _of('attitude'), _magnet),
-    'cable_in_an_arc': Kind('accelerometer', None, lambda s, r: _arc(s.angle[:, int(r.integers(s.angle.shape[1]))], r), 'angle'),
+    'cable_in_an_arc': Kind(
+        'accelerometer',
+        None,
+        lambda s, r: _arc(s.angle[:, int(r.integers(s.angle.shape[1]))], r),
+        'angle',
+    ),
     'resonance_when_fast': Kind('gyroscope', None, _fast, 'speed'),
-    'knock': Kind('accelerometer', None, lambda s, r: (s.time > r.uniform(0.4, 0.85) * s.time[-1]) * 1.0, 'time'),
+    'knock': Kind(
+        'accelerometer',
+        None,
+        lambda s, r: (s.time > r.uniform(0.4, 0.85) * s.time[-1]) * 1.0,
+        'time',
+    ),
     'backlash': Kind('accelerometer', None, _approach, 'approach'),
-    'sticks_when_warm': Kind('gyroscope', None, lambda s, r: (s.warm > np.quantile(s.warm, r.uniform(0.4, 0.7))) * 1.0, 'temperature'),
+    'sticks_when_warm': Kind(
+        'gyroscope',
+        None,
+        lambda s, r: (s.warm > np.quantile(s.warm, r.uniform(0.4, 0.7))) * 1.0,
+        'temperature',
+    ),
 }
 """Name -> Kind."""
 
@@ -130,7 +178,9 @@ class Beyond(Cause):
         signal = self.kind.signal(scene, np.random.default_rng([self.seed, 78]))
         if signal.ndim == 1:
             signal = signal[:, None] * np.eye(3)[self.axis]
-        self.signal = self.size * SIZE[self.kind.sensor] * signal / np.sqrt((signal**2).sum(axis=1).mean())
+        self.signal = (
+            self.size * SIZE[self.kind.sensor] * signal / np.sqrt((signal**2).sum(axis=1).mean())
+        )
         self.time = world.time
         return (self.signal, 0.0) if self.kind.sensor == 'accelerometer' else (0.0, self.signal)
 

@@ -13,26 +13,62 @@ MG = 1e-3 * G
 DEG = np.pi / 180
 ARCMIN = DEG / 60
 EFFECTS = {
-    'accel_quadratic': (1e-3 / G, (3,)), 'accel_cubic': (2e-3 / G**2, (3,)), 'accel_scale_asymmetry': (1e-3, (3,)),
-    'accel_cross_product': (1e-3 / G, (3, 3)), 'accel_size_effect': (8e-3, (3, 3)), 'lever_arm': (10e-3, (3,)),
-    'accel_thermal_bias': (0.3 * MG, (3,)), 'accel_thermal_scale': (3e-4, (3,)), 'accel_bias_drift': (2 * MG, None),
-    'accel_bias_trend': (2 * MG / 300, (3,)), 'gyro_bias_trend': (0.05 * DEG / 300, (3,)),
-    'accel_saturation': (0.02, None), 'accel_bandwidth': (4e-3, None),
-    'accel_thermal_bias_2': (0.05 * MG, (3,)), 'gyro_thermal_bias_2': (2e-3 * DEG, (3,)), 'gyro_force_squared': (5e-3 * DEG / G**2, (3, 6)),
-    'accel_thermal_hysteresis': (2 * MG, (3,)), 'gyro_thermal_hysteresis': (0.05 * DEG, (3,)), 'accel_delay': (4e-3, None), 'gyro_delay': (4e-3, None), 'accel_filter': (4e-3, None), 'gyro_filter': (4e-3, None),
-    'accel_vibration_rectification': (0.3, (3,)), 'gyro_vibration_rectification': (4e-3, (3, 3)),
-    'accel_cross_axis_lag': (2e-4, (3, 2)), 'gyro_cross_axis_lag': (2e-4, (3, 2)),
-    'axis_sag': (5 * ARCMIN, None), 'axis_wobble': (3 * ARCMIN, None), 'axis_offset': (5e-3, None),
+    'accel_quadratic': (1e-3 / G, (3,)),
+    'accel_cubic': (2e-3 / G**2, (3,)),
+    'accel_scale_asymmetry': (1e-3, (3,)),
+    'accel_cross_product': (1e-3 / G, (3, 3)),
+    'accel_size_effect': (8e-3, (3, 3)),
+    'lever_arm': (10e-3, (3,)),
+    'accel_thermal_bias': (0.3 * MG, (3,)),
+    'accel_thermal_scale': (3e-4, (3,)),
+    'accel_bias_drift': (2 * MG, None),
+    'accel_bias_trend': (2 * MG / 300, (3,)),
+    'gyro_bias_trend': (0.05 * DEG / 300, (3,)),
+    'accel_saturation': (0.02, None),
+    'accel_bandwidth': (4e-3, None),
+    'accel_thermal_bias_2': (0.05 * MG, (3,)),
+    'gyro_thermal_bias_2': (2e-3 * DEG, (3,)),
+    'gyro_force_squared': (5e-3 * DEG / G**2, (3, 6)),
+    'accel_thermal_hysteresis': (2 * MG, (3,)),
+    'gyro_thermal_hysteresis': (0.05 * DEG, (3,)),
+    'accel_delay': (4e-3, None),
+    'gyro_delay': (4e-3, None),
+    'accel_filter': (4e-3, None),
+    'gyro_filter': (4e-3, None),
+    'accel_vibration_rectification': (0.3, (3,)),
+    'gyro_vibration_rectification': (4e-3, (3, 3)),
+    'accel_cross_axis_lag': (2e-4, (3, 2)),
+    'gyro_cross_axis_lag': (2e-4, (3, 2)),
+    'axis_sag': (5 * ARCMIN, None),
+    'axis_wobble': (3 * ARCMIN, None),
+    'axis_offset': (5e-3, None),
     'load_compliance': (1 * ARCMIN / G, (3, 3)),
-    'gyro_g_sensitivity': (0.02 * DEG / G, (3, 3)), 'gyro_rate_product': (1e-3, (3, 3)), 'gyro_quadratic': (1e-3, (3,)),
-    'gyro_scale_asymmetry': (1e-3, (3,)), 'gyro_thermal_bias': (0.01 * DEG, (3,)), 'gyro_thermal_scale': (5e-4, (3,)),
-    'gyro_bias_drift': (0.05 * DEG, None), 'gyro_saturation': (0.02, None), 'gyro_bandwidth': (4e-3, None),
-    'table_tilt': (5 * ARCMIN, (2,)), 'axis_non_orthogonality': (5 * ARCMIN, None), 'encoder_zero': (5 * ARCMIN, None),
-    'encoder_harmonic': (3 * ARCMIN, None), 'time_offset': (2e-3, ()), 'clock_rate': (2e-5, ()), 'earth_rate': (1.0, None),
+    'gyro_g_sensitivity': (0.02 * DEG / G, (3, 3)),
+    'gyro_rate_product': (1e-3, (3, 3)),
+    'gyro_quadratic': (1e-3, (3,)),
+    'gyro_scale_asymmetry': (1e-3, (3,)),
+    'gyro_thermal_bias': (0.01 * DEG, (3,)),
+    'gyro_thermal_scale': (5e-4, (3,)),
+    'gyro_bias_drift': (0.05 * DEG, None),
+    'gyro_saturation': (0.02, None),
+    'gyro_bandwidth': (4e-3, None),
+    'table_tilt': (5 * ARCMIN, (2,)),
+    'axis_non_orthogonality': (5 * ARCMIN, None),
+    'encoder_zero': (5 * ARCMIN, None),
+    'encoder_harmonic': (3 * ARCMIN, None),
+    'time_offset': (2e-3, ()),
+    'clock_rate': (2e-5, ()),
+    'earth_rate': (1.0, None),
 }
 """Effects that can be hidden: name -> (clearly visible size, shape of its value or None)."""
-OUTSIDE = {'angle_bias_accel': 2 * MG, 'angle_bias_gyro': 0.05 * DEG, 'stop_bias': 2 * MG, 'knock_step': 5 * MG,
-           'fixture_slip': 10 * ARCMIN, 'second_warm_up': 3 * MG}
+OUTSIDE = {
+    'angle_bias_accel': 2 * MG,
+    'angle_bias_gyro': 0.05 * DEG,
+    'stop_bias': 2 * MG,
+    'knock_step': 5 * MG,
+    'fixture_slip': 10 * ARCMIN,
+    'second_warm_up': 3 * MG,
+}
 """Causes that no catalogue holds: name -> clearly visible size."""
 
 
@@ -63,8 +99,13 @@ def draw_value(name, size, n_joints, rng):
         phase = rng.uniform(0.0, 2.0 * np.pi, (n_joints, 2))
         amplitude = size * rng.uniform(0.6, 1.4, (n_joints, 2)) * [1.0, 0.4]
         return np.stack([amplitude * np.cos(phase), amplitude * np.sin(phase)], axis=2)
-    shape = {'axis_non_orthogonality': (n_joints - 1,), 'encoder_zero': (n_joints - 2,), 'axis_sag': (n_joints - 1,),
-             'axis_wobble': (n_joints, 2, 2), 'axis_offset': (n_joints - 1, 2)}.get(name, shape)
+    shape = {
+        'axis_non_orthogonality': (n_joints - 1,),
+        'encoder_zero': (n_joints - 2,),
+        'axis_sag': (n_joints - 1,),
+        'axis_wobble': (n_joints, 2, 2),
+        'axis_offset': (n_joints - 1, 2),
+    }.get(name, shape)
     return float(size * _pattern((), rng)) if shape == () else size * _pattern(shape, rng)
 
 
@@ -74,7 +115,10 @@ def _pattern(shape, rng):
 
 def draw_imu(grade, values, arms, rng):
     """Return the accelerometer and the gyroscope of one random unit, with the hidden effects built in."""
-    accel, gyro = (Triad(rng.normal(0.0, bias, 3), _matrix(grade, rng)) for bias in (grade.accel_bias, grade.gyro_bias))
+    accel, gyro = (
+        Triad(rng.normal(0.0, bias, 3), _matrix(grade, rng))
+        for bias in (grade.accel_bias, grade.gyro_bias)
+    )
     drawn_arms = rng.uniform(-1.0, 1.0, (3, 3)) * grade.arm
     if arms:
         accel.arms = drawn_arms
@@ -87,14 +131,29 @@ def draw_imu(grade, values, arms, rng):
         triad.hysteresis = values.get(short + '_thermal_hysteresis', 0.0)
         triad.rectifies = values.get(short + '_vibration_rectification', 0.0)
         triad.thermal_scale = values.get(short + '_thermal_scale', 0.0)
-        triad.low_pass, triad.late = float(values.get(short + '_bandwidth', 0.0)), float(values.get(short + '_delay', 0.0))
-        triad.second_order, triad.crosstalk = float(values.get(short + '_filter', 0.0)), values.get(short + '_cross_axis_lag')
+        triad.low_pass, triad.late = (
+            float(values.get(short + '_bandwidth', 0.0)),
+            float(values.get(short + '_delay', 0.0)),
+        )
+        triad.second_order, triad.crosstalk = (
+            float(values.get(short + '_filter', 0.0)),
+            values.get(short + '_cross_axis_lag'),
+        )
         triad.trend = values.get(short + '_bias_trend', 0.0)
         if short + '_bias_drift' in values:
-            triad.drift, triad.drift_constant = values[short + '_bias_drift'][:3], values[short + '_bias_drift'][3]
+            triad.drift, triad.drift_constant = (
+                values[short + '_bias_drift'][:3],
+                values[short + '_bias_drift'][3],
+            )
     accel.cubic = values.get('accel_cubic', 0.0)
-    accel.products, gyro.products = values.get('accel_cross_product'), values.get('gyro_rate_product')
-    gyro.to_force, gyro.to_force_squared = values.get('gyro_g_sensitivity'), values.get('gyro_force_squared')
+    accel.products, gyro.products = (
+        values.get('accel_cross_product'),
+        values.get('gyro_rate_product'),
+    )
+    gyro.to_force, gyro.to_force_squared = (
+        values.get('gyro_g_sensitivity'),
+        values.get('gyro_force_squared'),
+    )
     return accel, gyro
 
 
@@ -108,10 +167,17 @@ def draw_events(moves, rng):
     """Return the times and directions of things that may happen, drawn always so that the rest of the session does not depend on them."""
     length = moves.duration
     stops = moves.find('rest')[:, 0]
-    return {'knock': rng.uniform(0.25, 0.75) * length, 'slip': rng.uniform(0.3, 0.7) * length, 'gap': rng.uniform(0.2, 0.8) * length,
-            'second_start': rng.uniform(0.2, 0.5) * length, 'second_constant': rng.uniform(0.1, 0.3) * length,
-            'direction': _unit(rng.normal(size=3)), 'turn': _unit(rng.normal(size=3)),
-            'stops': stops, 'stop_bias': rng.normal(size=(len(stops) + 1, 3))}
+    return {
+        'knock': rng.uniform(0.25, 0.75) * length,
+        'slip': rng.uniform(0.3, 0.7) * length,
+        'gap': rng.uniform(0.2, 0.8) * length,
+        'second_start': rng.uniform(0.2, 0.5) * length,
+        'second_constant': rng.uniform(0.1, 0.3) * length,
+        'direction': _unit(rng.normal(size=3)),
+        'turn': _unit(rng.normal(size=3)),
+        'stops': stops,
+        'stop_bias': rng.normal(size=(len(stops) + 1, 3)),
+    }
 
 
 def _unit(vector):
@@ -136,7 +202,9 @@ class Climate:
     def publish(self, start_ns, duration, rng, rate=1.0):
         """Return what the thermometer sends."""
         time = np.arange(0.0, duration, 1.0 / rate)
-        return TemperatureSamples(start_ns + to_ns(time), np.round(self.at(time) + rng.normal(0.0, 0.01, len(time)), 2))
+        return TemperatureSamples(
+            start_ns + to_ns(time), np.round(self.at(time) + rng.normal(0.0, 0.01, len(time)), 2)
+        )
 
 
 def to_ns(time):

@@ -13,8 +13,24 @@ SETTLES = 0.5
 """Time constant of a grip that gives way, s."""
 
 
-def hold_and_turn(seed, *, n_poses=14, rate_hz=100.0, still=3.0, duration=1.6, force_sd=0.02, rate_sd=0.002, pose_sd=0.002, drift_sd=2e-4,
-                  creep=0.0, settling=0.0, tremor=0.0, attitudes=None, truth=None, largest=2.6):
+def hold_and_turn(
+    seed,
+    *,
+    n_poses=14,
+    rate_hz=100.0,
+    still=3.0,
+    duration=1.6,
+    force_sd=0.02,
+    rate_sd=0.002,
+    pose_sd=0.002,
+    drift_sd=2e-4,
+    creep=0.0,
+    settling=0.0,
+    tremor=0.0,
+    attitudes=None,
+    truth=None,
+    largest=2.6,
+):
     """
     Return (imu, ranges at rest, truth): poses held in a hand that creeps, and turns between them.
 
@@ -40,12 +56,25 @@ def hold_and_turn(seed, *, n_poses=14, rate_hz=100.0, still=3.0, duration=1.6, f
     parts, ranges, total = [], [], 0
     for pose in range(n_poses):
         rate = rng.normal(0, creep, 3)
-        gives, within = rng.normal(0, settling, 3) if settling else np.zeros(3), period * np.arange(count)
-        held = attitude * Rotation.from_rotvec(np.outer(within, rate) + np.outer(-np.expm1(-within / SETTLES), gives))
-        rates = rate + np.outer(np.exp(-within / SETTLES) / SETTLES, gives)   # of small angles
+        gives, within = (
+            rng.normal(0, settling, 3) if settling else np.zeros(3),
+            period * np.arange(count),
+        )
+        held = attitude * Rotation.from_rotvec(
+            np.outer(within, rate) + np.outer(-np.expm1(-within / SETTLES), gives)
+        )
+        rates = rate + np.outer(np.exp(-within / SETTLES) / SETTLES, gives)  # of small angles
         offsets = rng.normal(0, pose_sd, 3), rng.normal(0, drift_sd, 3)
         shake = tremor * np.sin(2 * np.pi * 8 * period * np.arange(count) + rng.uniform(0, 6))
-        parts.append((held.inv().apply([0, 0, GRAVITY]) + np.outer(shake, rng.normal(0, 1, 3)) + offsets[0], rates, offsets[1]))
+        parts.append(
+            (
+                held.inv().apply([0, 0, GRAVITY])
+                + np.outer(shake, rng.normal(0, 1, 3))
+                + offsets[0],
+                rates,
+                offsets[1],
+            )
+        )
         ranges.append(slice(total, total + count))
         total, attitude = total + count, held[-1]
         if pose == n_poses - 1:
@@ -59,9 +88,21 @@ def hold_and_turn(seed, *, n_poses=14, rate_hz=100.0, still=3.0, duration=1.6, f
         total, attitude = total + len(body_rate), attitude * Rotation.from_rotvec(rotvec)
     true_f = np.concatenate([f for f, _, _ in parts])
     force = true_f @ matrix_f.T + bias_f
-    rate = np.concatenate([w @ matrix_w.T + bias_w + drift for _, w, drift in parts]) + true_f @ response.T
+    rate = (
+        np.concatenate([w @ matrix_w.T + bias_w + drift for _, w, drift in parts])
+        + true_f @ response.T
+    )
     stamp_ns = 10**18 + np.round(1e9 * period * np.arange(total)).astype(np.int64)
-    return ImuSamples(stamp_ns, force + rng.normal(0, force_sd, force.shape), rate + rng.normal(0, rate_sd, rate.shape), 'imu_link'), ranges, truth
+    return (
+        ImuSamples(
+            stamp_ns,
+            force + rng.normal(0, force_sd, force.shape),
+            rate + rng.normal(0, rate_sd, rate.shape),
+            'imu_link',
+        ),
+        ranges,
+        truth,
+    )
 
 
 def with_spikes(imu, share, seed, force=30.0, rate=5.0):
@@ -94,7 +135,11 @@ def with_wrong_full_scale(imu, factor):
 def with_stamp_jitter(imu, sd, seed):
     """The sensor samples evenly, the computer stamps on arrival: late by varying times, in order."""
     late = np.abs(np.random.default_rng(seed).normal(0, sd, len(imu)))
-    return replace(imu, stamp_ns=np.maximum.accumulate(imu.stamp_ns + np.round(1e9 * late).astype(np.int64)) + np.arange(len(imu)))
+    return replace(
+        imu,
+        stamp_ns=np.maximum.accumulate(imu.stamp_ns + np.round(1e9 * late).astype(np.int64))
+        + np.arange(len(imu)),
+    )
 
 
 def warmed_up(imu, seed, *, force=0.0, rate=0.0, kelvin=8.0, time_constant=120.0):
@@ -107,14 +152,24 @@ def warmed_up(imu, seed, *, force=0.0, rate=0.0, kelvin=8.0, time_constant=120.0
     time = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
     share = 1 - np.exp(-time / time_constant)
     directions = [v / np.linalg.norm(v) for v in rng.normal(size=(2, 3))]
-    return (replace(imu, force_s=imu.force_s + force * np.outer(share, directions[0]), rate_s=imu.rate_s + rate * np.outer(share, directions[1])),
-            25.0 + kelvin * share + rng.normal(0, 0.05, len(time)))
+    return (
+        replace(
+            imu,
+            force_s=imu.force_s + force * np.outer(share, directions[0]),
+            rate_s=imu.rate_s + rate * np.outer(share, directions[1]),
+        ),
+        25.0 + kelvin * share + rng.normal(0, 0.05, len(time)),
+    )
 
 
 def drifting(imu, force=0.0, rate=0.0):
     """The biases of the x axes move steadily by these amounts over the recording, m/s^2 and rad/s."""
     share = (imu.stamp_ns - imu.stamp_ns[0]) / (imu.stamp_ns[-1] - imu.stamp_ns[0])
-    return replace(imu, force_s=imu.force_s + np.outer(share, [force, 0, 0]), rate_s=imu.rate_s + np.outer(share, [rate, 0, 0]))
+    return replace(
+        imu,
+        force_s=imu.force_s + np.outer(share, [force, 0, 0]),
+        rate_s=imu.rate_s + np.outer(share, [rate, 0, 0]),
+    )
 
 
 def with_slow_turn(seed, rate=0.03, seconds=4.0, **session):
@@ -129,6 +184,10 @@ def with_slow_turn(seed, rate=0.03, seconds=4.0, **session):
     count = int(seconds * 1e9 / period)
     noise = imu.force_s[last].std(axis=0), imu.rate_s[last].std(axis=0)
     speed = np.repeat([1.0, 0.0], count)[:, None] * turning
-    more = ImuSamples(imu.stamp_ns[-1] + period * np.arange(1, 2 * count + 1), mean + noise[0] * rng.normal(size=(2 * count, 3)),
-                      bias + speed + noise[1] * rng.normal(size=(2 * count, 3)), imu.frame_id)
+    more = ImuSamples(
+        imu.stamp_ns[-1] + period * np.arange(1, 2 * count + 1),
+        mean + noise[0] * rng.normal(size=(2 * count, 3)),
+        bias + speed + noise[1] * rng.normal(size=(2 * count, 3)),
+        imu.frame_id,
+    )
     return ImuSamples.concatenate([imu, more]), truth, slice(len(imu), len(imu) + count)

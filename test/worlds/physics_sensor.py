@@ -76,18 +76,33 @@ class Triad:
         for i in range(3):
             scale = np.linalg.norm(self.matrix[i])
             along = inputs[i] @ (self.matrix[i] / scale)
-            output[:, i] = (_of(self.bias, i) + scale * (1.0 + _of(self.thermal_scale, i) * warm) * along
-                            + _of(self.quadratic, i) * along**2 + _of(self.cubic, i) * along**3 + _of(self.asymmetry, i) * np.abs(along)
-                            + _of(self.thermal_bias, i) * warm + _of(self.thermal_bend, i) * warm**2 + _of(self.hysteresis, i) * strained - _of(self.drift, i) * np.expm1(-time / self.drift_constant)
-                            + _of(self.trend, i) * time)
+            output[:, i] = (
+                _of(self.bias, i)
+                + scale * (1.0 + _of(self.thermal_scale, i) * warm) * along
+                + _of(self.quadratic, i) * along**2
+                + _of(self.cubic, i) * along**3
+                + _of(self.asymmetry, i) * np.abs(along)
+                + _of(self.thermal_bias, i) * warm
+                + _of(self.thermal_bend, i) * warm**2
+                + _of(self.hysteresis, i) * strained
+                - _of(self.drift, i) * np.expm1(-time / self.drift_constant)
+                + _of(self.trend, i) * time
+            )
             if self.products is not None:
                 x, y, z = inputs[i].T
-                output[:, i] += self.products[i, 0] * x * y + self.products[i, 1] * y * z + self.products[i, 2] * x * z
+                output[:, i] += (
+                    self.products[i, 0] * x * y
+                    + self.products[i, 1] * y * z
+                    + self.products[i, 2] * x * z
+                )
             if self.to_force is not None:
                 output[:, i] += force_s @ self.to_force[i]
             if self.to_force_squared is not None:
                 x, y, z = force_s.T
-                output[:, i] += np.stack([x * x, y * y, z * z, x * y, y * z, x * z], axis=1) @ self.to_force_squared[i]
+                output[:, i] += (
+                    np.stack([x * x, y * y, z * z, x * y, y * z, x * z], axis=1)
+                    @ self.to_force_squared[i]
+                )
         return output
 
 
@@ -131,7 +146,9 @@ def butterworth(values, step, delay):
     """Return the output of the maximally flat filter ``1 / (1 + d s + d^2 s^2 / 2)`` that was in balance at the start: bilinear, on a fine grid."""
     system = cont2discrete(([1.0], [0.5 * delay**2, delay, 1.0]), step, 'bilinear')
     above, below = system[0].ravel(), system[1]
-    return lfilter(above, below, values, axis=0, zi=lfilter_zi(above, below)[:, None] * values[:1])[0]
+    return lfilter(above, below, values, axis=0, zi=lfilter_zi(above, below)[:, None] * values[:1])[
+        0
+    ]
 
 
 def low_pass(values, step, time_constant, order=1):
@@ -148,5 +165,7 @@ def low_pass(values, step, time_constant, order=1):
     rest = -np.expm1(-step / tau) * tau / step
     ahead, behind = 1.0 - rest, rest - decay
     for _ in range(order):
-        values, _state = lfilter([ahead, behind], [1.0, -decay], values, axis=0, zi=values[:1] * (1.0 - ahead))
+        values, _state = lfilter(
+            [ahead, behind], [1.0, -decay], values, axis=0, zi=values[:1] * (1.0 - ahead)
+        )
     return values

@@ -44,7 +44,19 @@ class World:
         return self.to_sensor(self.force_n + swing)
 
 
-def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None, slip=None, *, sag=None, wobble=None, beside=None):
+def move_table(
+    mapping,
+    time,
+    motion,
+    gravity,
+    tilt=(0.0, 0.0),
+    axis_errors=None,
+    slip=None,
+    *,
+    sag=None,
+    wobble=None,
+    beside=None,
+):
     """
     Return the `World` of a table description under a joint motion.
 
@@ -77,12 +89,20 @@ def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None
     mats = np.broadcast_to(attitude, (count, 3, 3))
     lean = Rotation.from_rotvec([tilt[0], tilt[1], 0.0])
     earth_n = lean.apply(earth_vector(mapping))
-    rate, alpha, acceleration = np.tile(earth_n, (count, 1)), np.zeros((count, 3)), np.zeros((count, 3))
+    rate, alpha, acceleration = (
+        np.tile(earth_n, (count, 1)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+    )
     for k, joint in enumerate(mapping['joints']):
         if np.any(joint.get('xyz') or 0.0):
-            acceleration = acceleration + _swing(rate, alpha, mats @ np.asarray(joint['xyz'], float))
+            acceleration = acceleration + _swing(
+                rate, alpha, mats @ np.asarray(joint['xyz'], float)
+            )
         if beside is not None and k:
-            acceleration = acceleration + _swing(rate, alpha, mats @ (np.asarray(beside[k - 1]) @ _across(axes[k])))
+            acceleration = acceleration + _swing(
+                rate, alpha, mats @ (np.asarray(beside[k - 1]) @ _across(axes[k]))
+            )
         leans = []
         if sag is not None and k:
             leans.append(sag[k - 1] * np.cross(np.swapaxes(mats, 1, 2) @ [0.0, 0.0, 1.0], axes[k]))
@@ -91,7 +111,11 @@ def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None
         for lean_b in leans:
             swing_b = np.gradient(lean_b, time, axis=0, edge_order=2)
             swing_n = np.einsum('nij,nj->ni', mats, swing_b)
-            alpha = alpha + np.einsum('nij,nj->ni', mats, np.gradient(swing_b, time, axis=0, edge_order=2)) + np.cross(rate, swing_n)
+            alpha = (
+                alpha
+                + np.einsum('nij,nj->ni', mats, np.gradient(swing_b, time, axis=0, edge_order=2))
+                + np.cross(rate, swing_n)
+            )
             rate, mats = rate + swing_n, mats @ Rotation.from_rotvec(lean_b).as_matrix()
         axis_n = mats @ axes[k]
         own = motion.rate[:, k, None] * axis_n
@@ -100,7 +124,10 @@ def move_table(mapping, time, motion, gravity, tilt=(0.0, 0.0), axis_errors=None
         mats = mats @ Rotation.from_rotvec(motion.position[:, k, None] * axes[k]).as_matrix()
     if np.any(mount.get('xyz') or 0.0):
         acceleration = acceleration + _swing(rate, alpha, mats @ np.asarray(mount['xyz'], float))
-    mats = mats @ Rotation.from_euler('xyz', mount.get('rpy_deg') or [0, 0, 0], degrees=True).as_matrix()
+    mats = (
+        mats
+        @ Rotation.from_euler('xyz', mount.get('rpy_deg') or [0, 0, 0], degrees=True).as_matrix()
+    )
     if slip is not None:
         mats = mats @ Rotation.from_rotvec(slip).as_matrix()
     force = acceleration + gravity * lean.apply([0.0, 0.0, 1.0])
@@ -117,8 +144,13 @@ def _circles(amplitudes, angle):
     """Return where the tip of an axis is across it, shape (n, 2), that runs on two circles: backwards, and forwards at twice the turn."""
     (c1, s1), (c2, s2) = amplitudes
     one, two = angle, 2 * angle
-    return np.stack([c1 * np.cos(one) + s1 * np.sin(one) + c2 * np.cos(two) - s2 * np.sin(two),
-                     s1 * np.cos(one) - c1 * np.sin(one) + c2 * np.sin(two) + s2 * np.cos(two)], axis=1)
+    return np.stack(
+        [
+            c1 * np.cos(one) + s1 * np.sin(one) + c2 * np.cos(two) - s2 * np.sin(two),
+            s1 * np.cos(one) - c1 * np.sin(one) + c2 * np.sin(two) + s2 * np.cos(two),
+        ],
+        axis=1,
+    )
 
 
 def earth_vector(mapping):
@@ -154,10 +186,15 @@ def stand_up(up):
 
 
 def _true_axes(mapping, axis_errors):
-    axes = [np.asarray(joint['axis'], float) / np.linalg.norm(joint['axis']) for joint in mapping['joints']]
+    axes = [
+        np.asarray(joint['axis'], float) / np.linalg.norm(joint['axis'])
+        for joint in mapping['joints']
+    ]
     true = list(axes)
     for k in range(1, len(axes)):
         if axis_errors is not None:
             normal = np.cross(axes[k - 1], axes[k])
-            true[k] = Rotation.from_rotvec(axis_errors[k - 1] * normal / np.linalg.norm(normal)).apply(axes[k])
+            true[k] = Rotation.from_rotvec(
+                axis_errors[k - 1] * normal / np.linalg.norm(normal)
+            ).apply(axes[k])
     return true

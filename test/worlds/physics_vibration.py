@@ -30,7 +30,9 @@ class Machine:
         self.changes = np.cumsum(rng.uniform(*HOLDS, int(duration / HOLDS[0]) + 1))
         self.gears = np.empty(len(self.changes) + 1, int)
         for k in range(len(self.gears)):
-            self.gears[k] = rng.choice([gear for gear in range(len(LEVELS)) if k == 0 or gear != self.gears[k - 1]])
+            self.gears[k] = rng.choice(
+                [gear for gear in range(len(LEVELS)) if k == 0 or gear != self.gears[k - 1]]
+            )
 
     def level(self, time):
         """Return how loud it is, shape (n,)."""
@@ -48,14 +50,28 @@ class Machine:
         included: the readout passes no twice as fast lines.
         """
         level = self.level(time)
-        felt = [to_sensor(np.tile(part, (len(time), 1))) for along in self.along for part in (along.real, along.imag)]
+        felt = [
+            to_sensor(np.tile(part, (len(time), 1)))
+            for along in self.along
+            for part in (along.real, along.imag)
+        ]
         felt = [level[:, None] * (real + 1j * imag) for real, imag in zip(felt[::2], felt[1::2])]
         band, whole = np.zeros((2, len(time), 3), complex)
-        for line, frequency, phase, wander, passed in zip(felt, self.frequency, self.phase, self.wander, self.passed):
-            line = line * np.exp(1j * (2.0 * np.pi * frequency * time + phase + np.sin(time / wander)))[:, None]
+        for line, frequency, phase, wander, passed in zip(
+            felt, self.frequency, self.phase, self.wander, self.passed
+        ):
+            line = (
+                line
+                * np.exp(1j * (2.0 * np.pi * frequency * time + phase + np.sin(time / wander)))[
+                    :, None
+                ]
+            )
             band, whole = band + passed * line, whole + line
         accel, gyro = triads
-        return (band.real @ accel.matrix.T + self._rectified(whole, accel), ROCKS * band.imag @ gyro.matrix.T + self._rectified(whole, gyro))
+        return (
+            band.real @ accel.matrix.T + self._rectified(whole, accel),
+            ROCKS * band.imag @ gyro.matrix.T + self._rectified(whole, gyro),
+        )
 
     def _rectified(self, whole, triad):
         """Return the mean of what the elements answer to the square of the acceleration; `triad.rectifies` is in terms of what is left in the band."""
@@ -64,5 +80,5 @@ class Machine:
         share = 0.5 * np.mean(self.passed**2)
         if np.ndim(triad.rectifies) == 1:
             axes = triad.matrix / np.linalg.norm(triad.matrix, axis=1, keepdims=True)
-            return share * triad.rectifies * np.abs(whole @ axes.T)**2
-        return share * np.abs(whole)**2 @ np.asarray(triad.rectifies).T
+            return share * triad.rectifies * np.abs(whole @ axes.T) ** 2
+        return share * np.abs(whole) ** 2 @ np.asarray(triad.rectifies).T

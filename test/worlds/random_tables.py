@@ -21,7 +21,13 @@ def random_table(rng, count=3, ends=0.0, speeds_deg=(60, 300)):
     """Return a table with so many joints, each with ends with the chance `ends`, with speeds between these."""
     joints = []
     for number, axis in enumerate(random_axes(rng, count)):
-        lower, upper = (-rng.uniform(40, 170) * DEG, rng.uniform(40, 170) * DEG) if rng.random() < ends else (None, None)
-        limits = JointLimits(lower, upper, rng.uniform(*speeds_deg) * DEG, rng.uniform(150, 900) * DEG)
+        lower, upper = (
+            (-rng.uniform(40, 170) * DEG, rng.uniform(40, 170) * DEG)
+            if rng.random() < ends
+            else (None, None)
+        )
+        limits = JointLimits(
+            lower, upper, rng.uniform(*speeds_deg) * DEG, rng.uniform(150, 900) * DEG
+        )
         joints.append(Joint(f'joint_{number}', tuple(axis), limits=limits))
     return Table(tuple(joints), gravity=9.81, mount_rpy_deg=tuple(rng.uniform(-180, 180, 3)))

@@ -33,12 +33,25 @@ def with_effects(columns):
     """A calibration that carries accelerometer effects with these columns."""
     document = yaml.safe_load(calibration_to_text(random_calibration(0, ())))
     names = [f'mine_{k}' for k in range(len(columns))]
-    document['effects'] = {name: {'sensor': 'accelerometer', 'column': column, 'unit': '1', 'tolerance': 1e-3, 'text': 'mine'}
-                           for name, column in zip(names, columns, strict=True)}
+    document['effects'] = {
+        name: {
+            'sensor': 'accelerometer',
+            'column': column,
+            'unit': '1',
+            'tolerance': 1e-3,
+            'text': 'mine',
+        }
+        for name, column in zip(names, columns, strict=True)
+    }
     document['accelerometer']['effects'] += names
-    document['accelerometer'] |= {name: {'value': [0.1] * 3, 'sd': [0.1] * 3, 'unit': '1', 'status': ['determined'] * 3} for name in names}
+    document['accelerometer'] |= {
+        name: {'value': [0.1] * 3, 'sd': [0.1] * 3, 'unit': '1', 'status': ['determined'] * 3}
+        for name in names
+    }
     old = len(document['covariance']['names'])
-    document['covariance']['names'] += [f'accelerometer.{name}.{axis}' for name in names for axis in 'xyz']
+    document['covariance']['names'] += [
+        f'accelerometer.{name}.{axis}' for name in names for axis in 'xyz'
+    ]
     matrix = 0.01 * np.eye(len(document['covariance']['names']))
     matrix[:old, :old] = document['covariance']['matrix']
     document['covariance']['matrix'] = matrix.tolist()

@@ -20,9 +20,18 @@ def stand(name):
         return table_from_urdf(ROBOTS[name], 'imu_link', {'gravity': 9.81})
     if name == 'three axes with ends':
         return random_table(np.random.default_rng(11), 3, 1.0)
-    axes = {'outer': [0, 0, 1], 'middle': [0, 1, 0], 'inner': [1, 0, 0]} if name == 'three axes' else {'tilt': [0, 1, 0], 'plate': [0, 0, 1]}
-    return Table.from_mapping({'joints': [{'name': joint, 'axis': axis, **LIMITS} for joint, axis in axes.items()], 'gravity': 9.81,
-                               'mount': {'rpy_deg': [0, 0, 0]}})
+    axes = (
+        {'outer': [0, 0, 1], 'middle': [0, 1, 0], 'inner': [1, 0, 0]}
+        if name == 'three axes'
+        else {'tilt': [0, 1, 0], 'plate': [0, 0, 1]}
+    )
+    return Table.from_mapping(
+        {
+            'joints': [{'name': joint, 'axis': axis, **LIMITS} for joint, axis in axes.items()],
+            'gravity': 9.81,
+            'mount': {'rpy_deg': [0, 0, 0]},
+        }
+    )
 
 
 def quarter_tolerances(table):

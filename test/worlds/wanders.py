@@ -17,16 +17,28 @@ def _steps(n, period, instability, rng):
 
 
 def _two_times(n, period, instability, rng):
-    return gauss_markov(n, period, SIZE * instability, 15.0, rng) + gauss_markov(n, period, SIZE * instability, 300.0, rng)
+    return gauss_markov(n, period, SIZE * instability, 15.0, rng) + gauss_markov(
+        n, period, SIZE * instability, 300.0, rng
+    )
 
 
 WANDERS = {
-    'wander_15': lambda n, period, instability, rng: gauss_markov(n, period, SIZE * instability, 15.0, rng),
-    'wander_100': lambda n, period, instability, rng: gauss_markov(n, period, 2.0 * instability, 100.0, rng),
-    'wander_1000': lambda n, period, instability, rng: gauss_markov(n, period, SIZE * instability, 1000.0, rng),
+    'wander_15': lambda n, period, instability, rng: gauss_markov(
+        n, period, SIZE * instability, 15.0, rng
+    ),
+    'wander_100': lambda n, period, instability, rng: gauss_markov(
+        n, period, 2.0 * instability, 100.0, rng
+    ),
+    'wander_1000': lambda n, period, instability, rng: gauss_markov(
+        n, period, SIZE * instability, 1000.0, rng
+    ),
     'two_times': _two_times,
-    'flicker': lambda n, period, instability, rng: flicker(n, period, SIZE * instability / 1.5, rng),
-    'walk': lambda n, period, instability, rng: random_walk(n, period, SIZE * instability / np.sqrt(150.0), rng),
+    'flicker': lambda n, period, instability, rng: flicker(
+        n, period, SIZE * instability / 1.5, rng
+    ),
+    'walk': lambda n, period, instability, rng: random_walk(
+        n, period, SIZE * instability / np.sqrt(150.0), rng
+    ),
     'steps': _steps,
 }
 """Name -> ``draw(n, period, instability, rng)`` of one axis; all but the name of the wander is realistic noise."""
@@ -34,5 +46,8 @@ WANDERS = {
 
 def add_wander(outputs, kind, model, period, rng):
     """Return the outputs of accelerometer and gyroscope with biases that move in this way, of the noise model's instabilities."""
-    return tuple(out + np.stack([WANDERS[kind](len(out), period, instability, rng) for _ in range(3)], axis=1)
-                 for out, instability in zip(outputs, (model.accel_instability, model.gyro_instability)))
+    return tuple(
+        out
+        + np.stack([WANDERS[kind](len(out), period, instability, rng) for _ in range(3)], axis=1)
+        for out, instability in zip(outputs, (model.accel_instability, model.gyro_instability))
+    )

@@ -13,7 +13,12 @@ from imu_calibration.compensation.compensate import compensate
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import judged_from_of, uncorrected_in_time, uncorrected_on_table
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.effects.forward_equations import References, applied_values, not_applied, sensor_output
+from imu_calibration.effects.forward_equations import (
+    References,
+    applied_values,
+    not_applied,
+    sensor_output,
+)
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import all_samples, chunks
@@ -24,8 +29,14 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.saturation import measured
 
 
-def gain_of_findings(found: Investigation, table: Table, before: Sequence[Question], *, after: Sequence[Question],
-                     sensors: Sequence[str]) -> Gain:
+def gain_of_findings(
+    found: Investigation,
+    table: Table,
+    before: Sequence[Question],
+    *,
+    after: Sequence[Question],
+    sensors: Sequence[str],
+) -> Gain:
     """
     Return the Gain of the findings `after` over the findings `before` on the locked windows.
 
@@ -48,7 +59,11 @@ def gain_of_findings(found: Investigation, table: Table, before: Sequence[Questi
     chosen = gain_in_turn(problem, *applied, sensors=sensors)
     sides, sums = [_applied_parameters(found, some) for some in applied], DistanceSums()
     start = max(judged_from_of(model, problem.duration) for model, *_ in sides)
-    held_out = [window for window, locked in zip(found.used, problem.locked) if locked and window.time[0] >= start]
+    held_out = [
+        window
+        for window, locked in zip(found.used, problem.locked)
+        if locked and window.time[0] >= start
+    ]
     for group in chunks(held_out):
         for window, *residuals in zip(group, *(_errors(group, table, *side) for side in sides)):
             sums.add(window, residuals, problem.noise)
@@ -57,9 +72,13 @@ def gain_of_findings(found: Investigation, table: Table, before: Sequence[Questi
 
 def _compensated(found, before, after):
     """Return the findings of two choices that belong into the model, or None if compensation corrects no additional one."""
-    sides = [[question for question in some if question in found.adopted] for some in (before, after)]
+    sides = [
+        [question for question in some if question in found.adopted] for some in (before, after)
+    ]
     additional = [question for question in sides[1] if question not in sides[0]]
-    return sides if any(question.effect.compensation == 'exact' for question in additional) else None
+    return (
+        sides if any(question.effect.compensation == 'exact' for question in additional) else None
+    )
 
 
 def _applied_parameters(found, chosen):
@@ -70,11 +89,19 @@ def _applied_parameters(found, chosen):
         model = model.with_effect(question.sensor, question.name)
     values = model.start_from(wide, problem.values(chosen))
     model = model.at(values)
-    centre = uncorrected_on_table(model, values, problem.recording.accumulated(wide), gathered=wide).centre if not_applied(model) else {}
+    centre = (
+        uncorrected_on_table(
+            model, values, problem.recording.accumulated(wide), gathered=wide
+        ).centre
+        if not_applied(model)
+        else {}
+    )
     return model, values, applied_values(model, values, centre)
 
 
-def gain_by_hand(found: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str) -> Gain:
+def gain_by_hand(
+    found: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str
+) -> Gain:
     """
     Return the Gain of the findings `after` over the findings `before` on the held-out poses and turns.
 
@@ -86,30 +113,47 @@ def gain_by_hand(found: HandInvestigation, before: Sequence[Question], *, after:
         return found.problem.gain(found.held_out, before, after, sensor=sensor)
     block, poses = found.problem.clearest(applied[0], applied[1], sensor), found.baseline.poses
     end = end_by_hand(poses)
-    pair = [np.zeros((len(block.pose), 1 if block.duration is not None else block.known.shape[1])) for _ in applied]
+    pair = [
+        np.zeros((len(block.pose), 1 if block.duration is not None else block.known.shape[1]))
+        for _ in applied
+    ]
     start = 0.0
     for out, named, smaller in found.held_out:
         rows = np.isin(block.pose, out)
         for errors, chosen in zip(pair, applied):
             names = {question.name for question in chosen}
-            model, values, earth = found.extended(smaller, [question for question in named if question.name in names])
+            model, values, earth = found.extended(
+                smaller, [question for question in named if question.name in names]
+            )
             moved = model.model.at(values)
             start = max(start, judged_from_of(moved, end))
-            values = applied_values(moved, values, uncorrected_in_time(moved, values, poses.time, end=end).centre)
+            values = applied_values(
+                moved, values, uncorrected_in_time(moved, values, poses.time, end=end).centre
+            )
             errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, values, earth)
-    return gain_of_poses(block.select(late := block.time >= start), [errors[late] for errors in pair], APPLIED)
+    return gain_of_poses(
+        block.select(late := block.time >= start), [errors[late] for errors in pair], APPLIED
+    )
 
 
 def _pose_errors(found, block, rows, model, values, earth):
     """Return the errors of some rows of a block after correction: of poses m/s^2 or rad/s, of turns the angle over the duration, rad/s."""
     poses = found.baseline.poses
     if block.duration is not None:
-        missed = turn_errors(model, values, poses, turns=[found.turns[row] for row in rows], gyroscope=values)
+        missed = turn_errors(
+            model, values, poses, turns=[found.turns[row] for row in rows], gyroscope=values
+        )
         return (missed / block.duration[rows])[:, None]
     warm = None if poses.temperature_c is None else poses.temperature_c[rows]
-    corrected = corrected_with(model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=warm)
+    corrected = corrected_with(
+        model, values, poses.force[rows], rate=poses.rate[rows], temperature_c=warm
+    )
     norm = np.linalg.norm(corrected.force, axis=1, keepdims=True)
-    return norm - found.baseline.gravity if block.sensor == 'accelerometer' else corrected.rate - earth * corrected.force / norm
+    return (
+        norm - found.baseline.gravity
+        if block.sensor == 'accelerometer'
+        else corrected.rate - earth * corrected.force / norm
+    )
 
 
 def _errors(windows, table, model, values, applied):
@@ -122,9 +166,17 @@ def _errors(windows, table, model, values, applied):
     ref = refs[1].select(rows)
     raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
     known = Calibration(model, applied, np.zeros((len(values),) * 2), (HELD,) * len(values))
-    corrected = compensate(known, *raw, alpha_s=ref.alpha_s, temperature_c=ref.temperature_c, thermal_branch=ref.thermal_branch,
-                           vibration=ref.vibration)
-    errors = [true - sensor_output(at_ideal, sensor, ideal, ref=own)[rows]
-              for true, sensor, own in zip((corrected.force, corrected.rate), SENSORS, refs)]
+    corrected = compensate(
+        known,
+        *raw,
+        alpha_s=ref.alpha_s,
+        temperature_c=ref.temperature_c,
+        thermal_branch=ref.thermal_branch,
+        vibration=ref.vibration,
+    )
+    errors = [
+        true - sensor_output(at_ideal, sensor, ideal, ref=own)[rows]
+        for true, sensor, own in zip((corrected.force, corrected.rate), SENSORS, refs)
+    ]
     for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
         yield {sensor: error[start:stop] for sensor, error in zip(SENSORS, errors)}

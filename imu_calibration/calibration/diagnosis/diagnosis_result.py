@@ -115,18 +115,26 @@ def formula_gain(rest: Unexplained, windows: int = 0) -> Gain:
     ``after = before sqrt(1 - share)`` with `before` the rms of the residual beyond noise and `share` the part of its power that the
     formula removes from the held-out windows, `windows` in number; the interval is that of the share.
     """
-    low, high = (float(1.0 - np.sqrt(np.clip(1.0 - share, 0.0, None))) for share in rest.proposal.ci95)
+    low, high = (
+        float(1.0 - np.sqrt(np.clip(1.0 - share, 0.0, None))) for share in rest.proposal.ci95
+    )
     after = rest.rms * (1.0 - rest.proposal.reduction)
     return Gain(rest.proposal.sensor, 'rms beyond noise', rest.rms, after, (low, high), windows)
 
 
-def parameters_of(solution: Solution, sensor: str, effect: str) -> dict[str, tuple[float, float, str]]:
+def parameters_of(
+    solution: Solution, sensor: str, effect: str
+) -> dict[str, tuple[float, float, str]]:
     """Return parameter name -> (value, sd, unit) of one effect."""
     declared = next(e for e in solution.model.effects if (e.sensor, e.name) == (sensor, effect))
     part = solution.model.slices[sensor, effect]
     sd = np.sqrt(np.maximum(np.diag(solution.covariance)[part], 0.0))
-    return {name: (float(value), float(spread), declared.unit_of(k))
-            for k, (name, value, spread) in enumerate(zip(declared.param_names(), solution.values[part], sd))}
+    return {
+        name: (float(value), float(spread), declared.unit_of(k))
+        for k, (name, value, spread) in enumerate(
+            zip(declared.param_names(), solution.values[part], sd)
+        )
+    }
 
 
 DIAGNOSIS_FORMAT = 'imu_calibration/diagnosis/1'
@@ -134,52 +142,106 @@ DIAGNOSIS_FORMAT = 'imu_calibration/diagnosis/1'
 
 def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for NaN and infinity."""
-    return json_types({
-        'format': DIAGNOSIS_FORMAT,
-        'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
-        'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
-        'stamp_jitter_s': diagnosis.stamp_jitter.to_mapping().get('sd_s'),
-        'findings': [_finding(finding) for finding in diagnosis.findings],
-        'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
-        'dead_reckoning': diagnosis.traces.dead_reckoning,
-        'simulation_distance': {sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()},
-        'unexplained': {sensor: _rest(sensor, diagnosis.unexplained[sensor], diagnosis.locked) for sensor in SENSORS},
-        'not_testable': diagnosis.not_testable,
-        'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
-        'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked}})
+    return json_types(
+        {
+            'format': DIAGNOSIS_FORMAT,
+            'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
+            'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
+            'stamp_jitter_s': diagnosis.stamp_jitter.to_mapping().get('sd_s'),
+            'findings': [_finding(finding) for finding in diagnosis.findings],
+            'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
+            'dead_reckoning': diagnosis.traces.dead_reckoning,
+            'simulation_distance': {
+                sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()
+            },
+            'unexplained': {
+                sensor: _rest(sensor, diagnosis.unexplained[sensor], diagnosis.locked)
+                for sensor in SENSORS
+            },
+            'not_testable': diagnosis.not_testable,
+            'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],
+            'windows': {'used': diagnosis.windows, 'held_out_for_the_gain': diagnosis.locked},
+        }
+    )
 
 
 def _candidate(candidate):
-    beside = {'heldout_log_likelihood_gain': candidate.gain_beside, 'p_value': candidate.p_value_beside}
-    return {'effect': candidate.effect, 'sensor': candidate.sensor, 'verdict': candidate.verdict,
-            'heldout_log_likelihood_gain': candidate.gain_alone, 'p_value': candidate.p_value_alone, 'beside_findings': beside}
+    beside = {
+        'heldout_log_likelihood_gain': candidate.gain_beside,
+        'p_value': candidate.p_value_beside,
+    }
+    return {
+        'effect': candidate.effect,
+        'sensor': candidate.sensor,
+        'verdict': candidate.verdict,
+        'heldout_log_likelihood_gain': candidate.gain_alone,
+        'p_value': candidate.p_value_alone,
+        'beside_findings': beside,
+    }
 
 
 def _baseline(solution, sensor):
     model = solution.model
-    return {'effects': getattr(model, sensor), 'reference_effects': model.reference,
-            'residual_rms': solution.residual_rms[sensor][0], 'window_mean_rms': solution.residual_rms[sensor][1],
-            'noise_rms': np.sqrt(np.mean(solution.noise[sensor].white_variance))}
+    return {
+        'effects': getattr(model, sensor),
+        'reference_effects': model.reference,
+        'residual_rms': solution.residual_rms[sensor][0],
+        'window_mean_rms': solution.residual_rms[sensor][1],
+        'noise_rms': np.sqrt(np.mean(solution.noise[sensor].white_variance)),
+    }
 
 
 def _finding(finding):
-    return {'effect': finding.effect, 'sensor': finding.sensor, 'explanation': finding.explanation,
-            'parameters': {name: {'value': value, 'sd': sd, 'unit': unit} for name, (value, sd, unit) in finding.parameters.items()},
-            'p_value': finding.p_value, 'heldout_log_likelihood_gain': finding.heldout_gain, 'share_of_unexplained': finding.share,
-            'gain': _gain(finding.gain), 'indistinguishable_from': finding.indistinguishable_from,
-            'sizes_of_mates': {mate: {name: {'value': value, 'unit': unit} for name, (value, unit) in sizes.items()}
-                               for mate, sizes in finding.sizes_of_mates.items()},
-            'separating_motion': finding.separating_motion, 'implausible': finding.implausible}
+    return {
+        'effect': finding.effect,
+        'sensor': finding.sensor,
+        'explanation': finding.explanation,
+        'parameters': {
+            name: {'value': value, 'sd': sd, 'unit': unit}
+            for name, (value, sd, unit) in finding.parameters.items()
+        },
+        'p_value': finding.p_value,
+        'heldout_log_likelihood_gain': finding.heldout_gain,
+        'share_of_unexplained': finding.share,
+        'gain': _gain(finding.gain),
+        'indistinguishable_from': finding.indistinguishable_from,
+        'sizes_of_mates': {
+            mate: {name: {'value': value, 'unit': unit} for name, (value, unit) in sizes.items()}
+            for mate, sizes in finding.sizes_of_mates.items()
+        },
+        'separating_motion': finding.separating_motion,
+        'implausible': finding.implausible,
+    }
 
 
 def _gain(gain):
-    names = ('sensor', 'of', 'measure', 'heldout_rms_before', 'heldout_rms_after', 'reduction', 'ci95', 'windows')
+    names = (
+        'sensor',
+        'of',
+        'measure',
+        'heldout_rms_before',
+        'heldout_rms_after',
+        'reduction',
+        'ci95',
+        'windows',
+    )
     return {name: getattr(gain, name) for name in names}
 
 
 def _rest(sensor, rest, locked):
     unit = rest.unit or UNITS[sensor]
-    return {'significant': rest.significant, 'rms': rest.rms, 'unit': unit, 'sigma': rest.sigma, 'correlates_with': rest.correlates_with,
-            'share': rest.share, 'where': '; '.join(regime.text for regime in rest.regimes) or None, 'axes': rest.axes,
-            'regimes': [regime.to_mapping() for regime in rest.regimes], 'tones': [tone.to_mapping() for tone in rest.tones],
-            'proposals': [] if rest.proposal is None else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]}
+    return {
+        'significant': rest.significant,
+        'rms': rest.rms,
+        'unit': unit,
+        'sigma': rest.sigma,
+        'correlates_with': rest.correlates_with,
+        'share': rest.share,
+        'where': '; '.join(regime.text for regime in rest.regimes) or None,
+        'axes': rest.axes,
+        'regimes': [regime.to_mapping() for regime in rest.regimes],
+        'tones': [tone.to_mapping() for tone in rest.tones],
+        'proposals': []
+        if rest.proposal is None
+        else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}],
+    }

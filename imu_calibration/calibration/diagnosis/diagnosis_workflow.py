@@ -8,8 +8,17 @@ import numpy as np
 
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, formula_gain, to_mapping
-from imu_calibration.calibration.diagnosis.findings import DISAGREED, LEAVES_MOST, build_diagnosis, diagnosis_by_hand
+from imu_calibration.calibration.diagnosis.diagnosis_result import (
+    Diagnosis,
+    formula_gain,
+    to_mapping,
+)
+from imu_calibration.calibration.diagnosis.findings import (
+    DISAGREED,
+    LEAVES_MOST,
+    build_diagnosis,
+    diagnosis_by_hand,
+)
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
@@ -34,9 +43,11 @@ MOST_SHOWN = 3
 """Parameters of a change that are printed."""
 MUCH = 100.0
 """Held-out gain of log likelihood from which a refused effect is reported, nats."""
-WHY_NOT = {LEAVES_MOST: 'most of the unexplained residual remains with it, so that both may have another cause',
-           DISAGREED: 'the windows do not agree on it: the evidence comes from few windows, or some contradict it; '
-           'record more windows of the same motions'}
+WHY_NOT = {
+    LEAVES_MOST: 'most of the unexplained residual remains with it, so that both may have another cause',
+    DISAGREED: 'the windows do not agree on it: the evidence comes from few windows, or some contradict it; '
+    'record more windows of the same motions',
+}
 """Verdict on an effect with a large gain -> reason why it is no finding."""
 
 
@@ -62,22 +73,34 @@ class DiagnosisResult:
     @property
     def document(self) -> dict[str, Any]:
         """Return the content of diagnosis.json."""
-        lags = {sensor: {'value': value, 'sd': sd, 'unit': 's'} for sensor, (value, sd) in self.lags.items()}
+        lags = {
+            sensor: {'value': value, 'sd': sd, 'unit': 's'}
+            for sensor, (value, sd) in self.lags.items()
+        }
         return to_mapping(self.diagnosis) | {'lags': lags, 'notes': self.notes}
 
     @property
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        words = [f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms' for sensor, (value, sd) in self.lags.items()]
+        words = [
+            f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms'
+            for sensor, (value, sd) in self.lags.items()
+        ]
         lag = [f'total lag: {", ".join(words)}'] * bool(words)
         return [*diagnosis_lines(self.diagnosis), *(f'note: {note}' for note in self.notes), *lag]
 
     @property
     def notes(self) -> list[str]:
         """Residuals above the noise at rest, and biases that step or wander on every axis, of sensors without an unexplained residual."""
-        quiet = {sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant}
+        quiet = {
+            sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant
+        }
         reasons = [*misfits(self.calibration), *unsteady(self.calibration, self.tolerances)]
-        return [f'{reason.what}; no effect of the catalogue explains it' for reason in reasons if quiet.issuperset(reason.sensors)]
+        return [
+            f'{reason.what}; no effect of the catalogue explains it'
+            for reason in reasons
+            if quiet.issuperset(reason.sensors)
+        ]
 
     @property
     def lags(self) -> dict[str, tuple[float, float]]:
@@ -93,20 +116,32 @@ class StoredRecording:
         self.windows = StoredWindows()
         self._first: SessionData | None = None
 
-    def __call__(self, step: GatherStep, numbered: Iterable[tuple[int, Callable]]) -> list[SessionData]:
+    def __call__(
+        self, step: GatherStep, numbered: Iterable[tuple[int, Callable]]
+    ) -> list[SessionData]:
         """Return the SessionData of the recording, given (its number, callable that yields its blocks)."""
         ((session, source),) = numbered
         if self._first is None:
-            self._first = step.read(source(), session, Preflight(step.table.gravity_value), windows=self.windows)
+            self._first = step.read(
+                source(), session, Preflight(step.table.gravity_value), windows=self.windows
+            )
             return [self._first]
         windows = (self.windows[number] for number in range(len(self.windows)))
-        reduced = (reduce_window(window, step.model, step.table, session=session) for window in windows
-                   if window.kind != 'unused')
+        reduced = (
+            reduce_window(window, step.model, step.table, session=session)
+            for window in windows
+            if window.kind != 'unused'
+        )
         return [self._first.anew(reduced, step.judged_from)]
 
 
-def diagnose_recording(source: Callable, table: Table, options: CalibrationOptions = CalibrationOptions(), *,
-                       provenance: dict[str, Any] | None = None) -> DiagnosisResult:
+def diagnose_recording(
+    source: Callable,
+    table: Table,
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    provenance: dict[str, Any] | None = None,
+) -> DiagnosisResult:
     """
     Calibrate a recording, identify the errors of the model and their causes, and extend it.
 
@@ -125,15 +160,29 @@ def diagnose_recording(source: Callable, table: Table, options: CalibrationOptio
 
     """
     reader = StoredRecording()
-    calibrated = calibrate_by_evidence([source], table, replace(options, as_asked=False), provenance=provenance, mapper=reader)
+    calibrated = calibrate_by_evidence(
+        [source], table, replace(options, as_asked=False), provenance=provenance, mapper=reader
+    )
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
-    result, diagnosis = calibrated.result, build_diagnosis(table, calibrated.found, calibrated=calibrated.result.solution)
+    result, diagnosis = (
+        calibrated.result,
+        build_diagnosis(table, calibrated.found, calibrated=calibrated.result.solution),
+    )
     proposed = _with_proposals(source, table, options, result, diagnosis, provenance, reader)
-    traces = residual_traces(reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution)
+    traces = residual_traces(
+        reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution
+    )
     diagnosis = replace(diagnosis, traces=traces)
-    return DiagnosisResult(diagnosis, result.calibration, result.tolerances, result.needed, result.observations, baseline_options(options),
-                           proposed)
+    return DiagnosisResult(
+        diagnosis,
+        result.calibration,
+        result.tolerances,
+        result.needed,
+        result.observations,
+        baseline_options(options),
+        proposed,
+    )
 
 
 def _with_proposals(source, table, options, result, diagnosis, provenance, reader):
@@ -143,18 +192,43 @@ def _with_proposals(source, table, options, result, diagnosis, provenance, reade
         return None
     model = result.calibration.model
     catalogue = model.catalogue.with_effects(*effects)
-    texts = {sensor: '+'.join([*(e.name for e in model.effects if e.sensor == sensor and e.role is not Role.LIMIT),
-                               *(e.name for e in effects if e.sensor == sensor)]) for sensor in (*SENSORS, 'reference')}
-    chosen = replace(options, accelerometer_model=texts['accelerometer'], gyroscope_model=texts['gyroscope'],
-                     reference_model=texts['reference'] or 'none', catalogue=catalogue, as_asked=True)
+    texts = {
+        sensor: '+'.join(
+            [
+                *(e.name for e in model.effects if e.sensor == sensor and e.role is not Role.LIMIT),
+                *(e.name for e in effects if e.sensor == sensor),
+            ]
+        )
+        for sensor in (*SENSORS, 'reference')
+    }
+    chosen = replace(
+        options,
+        accelerometer_model=texts['accelerometer'],
+        gyroscope_model=texts['gyroscope'],
+        reference_model=texts['reference'] or 'none',
+        catalogue=catalogue,
+        as_asked=True,
+    )
     solution, gathered, gathered_model = solve_recordings([source], table, chosen, mapper=reader)
     # A formula determines changes of the output, not its zero: biases of the affected axes keep the uncertainty.
-    unsure = ModelExtension(moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained)))
-    return conclude(unsure.applied(solution), gathered, gathered_model, table=table, options=chosen, provenance=provenance).calibration
+    unsure = ModelExtension(
+        moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained))
+    )
+    return conclude(
+        unsure.applied(solution),
+        gathered,
+        gathered_model,
+        table=table,
+        options=chosen,
+        provenance=provenance,
+    ).calibration
 
 
-def diagnose_without_table(source: Callable, options: CalibrationOptions = CalibrationOptions(),
-                           provenance: dict[str, Any] | None = None) -> DiagnosisResult:
+def diagnose_without_table(
+    source: Callable,
+    options: CalibrationOptions = CalibrationOptions(),
+    provenance: dict[str, Any] | None = None,
+) -> DiagnosisResult:
     """
     Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `findings`).
 
@@ -176,10 +250,18 @@ def diagnose_without_table(source: Callable, options: CalibrationOptions = Calib
     result, evident = evident_result(recording, replace(options, as_asked=False), provenance)
     if evident.found is None:
         raise too_few_poses(len(evident.hand.poses.start))
-    return DiagnosisResult(diagnosis_by_hand(evident.found, evident.hand), result.calibration, result.tolerances, result.needed,
-                           result.observations,
-                           replace(options, accelerometer_model=options.accelerometer_model or BARE,
-                                   gyroscope_model=options.gyroscope_model or BARE))
+    return DiagnosisResult(
+        diagnosis_by_hand(evident.found, evident.hand),
+        result.calibration,
+        result.tolerances,
+        result.needed,
+        result.observations,
+        replace(
+            options,
+            accelerometer_model=options.accelerometer_model or BARE,
+            gyroscope_model=options.gyroscope_model or BARE,
+        ),
+    )
 
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
@@ -188,17 +270,28 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
     for number, finding in enumerate(diagnosis.findings, 1):
         lines.append(f'{number}. {finding.title}: {finding.explanation}')
         if finding.indistinguishable_from:
-            lines.append(f'   not separable in this recording from {", ".join(finding.indistinguishable_from)}; '
-                         f'to separate them: {finding.separating_motion}')
+            lines.append(
+                f'   not separable in this recording from {", ".join(finding.indistinguishable_from)}; '
+                f'to separate them: {finding.separating_motion}'
+            )
     if not diagnosis.findings and not _proposed_effects(diagnosis):
         lines.append(nothing_named(diagnosis))
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
-            with_what = f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
-            lines.append(f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}')
-        lines += [f'   {line}' if rest.significant else line for line in (*beyond_lines(sensor, rest), *_formula_lines(sensor, rest))]
+            with_what = (
+                f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
+            )
+            lines.append(
+                f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}'
+            )
+        lines += [
+            f'   {line}' if rest.significant else line
+            for line in (*beyond_lines(sensor, rest), *_formula_lines(sensor, rest))
+        ]
     if diagnosis.not_testable:
-        lines.append('not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable))
+        lines.append(
+            'not testable here: ' + ', '.join(entry['effect'] for entry in diagnosis.not_testable)
+        )
     return lines
 
 
@@ -210,19 +303,33 @@ def timing_lines(diagnosis: Diagnosis) -> list[str]:
 def _onset_lines(onset):
     if onset is None:
         return []
-    largest = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))[:MOST_SHOWN]
-    states = [[in_words(state[name], onset.what, onset.units[name]).removesuffix(' 1') for state in (onset.before, onset.after)]
-              for name in largest]
-    values = '; '.join(f'{name} {before} before, {after} after' for name, (before, after) in zip(largest, states))
+    largest = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))[
+        :MOST_SHOWN
+    ]
+    states = [
+        [
+            in_words(state[name], onset.what, onset.units[name]).removesuffix(' 1')
+            for state in (onset.before, onset.after)
+        ]
+        for name in largest
+    ]
+    values = '; '.join(
+        f'{name} {before} before, {after} after' for name, (before, after) in zip(largest, states)
+    )
     axes = f' (axis {", ".join(onset.axes)})' if onset.axes else ''
-    return [f'change at {onset.time:.1f} +- {onset.time_sd:.1g} s of {onset.what}{axes}: {values}',
-            f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the longer part; record again without the change']
+    return [
+        f'change at {onset.time:.1f} +- {onset.time_sd:.1g} s of {onset.what}{axes}: {values}',
+        f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the longer part; record again without the change',
+    ]
 
 
 def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
     """Return the axes, conditions and tones of an unexplained residual, as lines."""
     lines = [f'axis {" and ".join(rest.axes)}'] * bool(rest.axes)
-    lines += [f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)' for regime in rest.regimes]
+    lines += [
+        f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)'
+        for regime in rest.regimes
+    ]
     return [*lines, *(f'spectrum: {tone.text}' for tone in rest.tones)]
 
 
@@ -231,14 +338,25 @@ def _formula_lines(sensor, rest):
     if rest.proposal is None:
         return []
     gain = formula_gain(rest)
-    before, low, high = (in_words(gain.heldout_rms_before * factor, sensor) for factor in (1.0, 1.0 - gain.ci95[1], 1.0 - gain.ci95[0]))
-    return [f'formula: {rest.proposal.sentence}', f'gain of the formula: {gain.measure} of the {sensor} {before} before, {low} to {high} '
-            'after (95 %)']
+    before, low, high = (
+        in_words(gain.heldout_rms_before * factor, sensor)
+        for factor in (1.0, 1.0 - gain.ci95[1], 1.0 - gain.ci95[0])
+    )
+    return [
+        f'formula: {rest.proposal.sentence}',
+        f'gain of the formula: {gain.measure} of the {sensor} {before} before, {low} to {high} '
+        'after (95 %)',
+    ]
 
 
 def _proposed_effects(diagnosis):
     """Return the formulas of a diagnosis as effects."""
-    return [effect for rest in diagnosis.unexplained.values() if rest.proposal is not None for effect in rest.proposal.effects]
+    return [
+        effect
+        for rest in diagnosis.unexplained.values()
+        if rest.proposal is not None
+        for effect in rest.proposal.effects
+    ]
 
 
 def nothing_named(diagnosis: Diagnosis) -> str:
@@ -246,8 +364,10 @@ def nothing_named(diagnosis: Diagnosis) -> str:
     much = [row for row in diagnosis.candidates if row.verdict in WHY_NOT and row.gain_alone > MUCH]
     if not much:
         return 'nothing found: no effect of the catalogue explains more than noise'
-    return (f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), '
-            f'but {WHY_NOT[much[0].verdict]}')
+    return (
+        f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), '
+        f'but {WHY_NOT[much[0].verdict]}'
+    )
 
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:

@@ -7,12 +7,23 @@ import numpy as np
 
 from imu_calibration.calibration.by_evidence import extended_solution
 from imu_calibration.calibration.diagnosis.applied_gain import gain_by_hand, gain_of_findings
-from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate, Diagnosis, Finding, parameters_of
+from imu_calibration.calibration.diagnosis.diagnosis_result import (
+    Candidate,
+    Diagnosis,
+    Finding,
+    parameters_of,
+)
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.base import SENSORS, Effect, Role
-from imu_calibration.estimation.observability import ALL_MOTIONS, MOTIONS, ONE_JOINT, OTHER_MOUNT, added_information
+from imu_calibration.estimation.observability import (
+    ALL_MOTIONS,
+    MOTIONS,
+    ONE_JOINT,
+    OTHER_MOUNT,
+    added_information,
+)
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.table import Table
@@ -29,7 +40,9 @@ MIN_EVIDENCE_GROWTH = 9.0
 """Least growth of the evidence that a motion must promise, in squared standard deviations."""
 
 
-def separating_motion(solution: Solution, question: Question, mate: Question, *, gravity: float) -> str:
+def separating_motion(
+    solution: Solution, question: Question, mate: Question, *, gravity: float
+) -> str:
     """
     Return the standard motion after which the mate could no longer pass for the effect that was found.
 
@@ -53,7 +66,9 @@ def separating_motion(solution: Solution, question: Question, mate: Question, *,
     prior_sd = np.where(model.prior()[1] > 0, model.prior()[1], 1.0)
     own = model.slices[question.sensor, question.name]
     for motion in MOTIONS:
-        total = np.diag(1 / prior_sd**2) + added_information(model, values, solution.noise, motion=motion, gravity=gravity)
+        total = np.diag(1 / prior_sd**2) + added_information(
+            model, values, solution.noise, motion=motion, gravity=gravity
+        )
         left = float(values[own] @ np.linalg.solve(inverse_normal(total)[own, own], values[own]))
         if left > best[0]:
             best = left, motion.text
@@ -62,7 +77,13 @@ def separating_motion(solution: Solution, question: Question, mate: Question, *,
 
 def motions_of(question: Question, mate: Question) -> str:
     """Return the motions that two effects declare as theirs."""
-    return '; '.join(dict.fromkeys(ALL_MOTIONS[name] for name in question.effect.motion + mate.effect.motion if name in ALL_MOTIONS))
+    return '; '.join(
+        dict.fromkeys(
+            ALL_MOTIONS[name]
+            for name in question.effect.motion + mate.effect.motion
+            if name in ALL_MOTIONS
+        )
+    )
 
 
 def motions_of_one_joint(question: Question, mate: Question) -> str:
@@ -78,7 +99,13 @@ DISAGREED = 'refused: the windows do not agree on it'
 """Verdict on an effect with evidence from few windows only, or with contradictory windows."""
 
 
-def sentence(effect: Effect, parameters: dict[str, tuple[float, float, str]], gain: Gain | None, *, n_clipped: int | None = None) -> str:
+def sentence(
+    effect: Effect,
+    parameters: dict[str, tuple[float, float, str]],
+    gain: Gain | None,
+    *,
+    n_clipped: int | None = None,
+) -> str:
     """
     Return a finding in one or two sentences, with its size in common units.
 
@@ -120,8 +147,12 @@ def _with_unit(number, unit):
     return number if unit == '1' else f'{number} {unit}'
 
 
-def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[[Sequence[Question], Question], bool] | None = None,
-                  ) -> tuple[Candidate, ...]:
+def candidates_of(
+    search: Search,
+    named: Sequence[Question],
+    *,
+    agree: Callable[[Sequence[Question], Question], bool] | None = None,
+) -> tuple[Candidate, ...]:
     """
     Return every effect that a search tested in addition to the findings, the strongest first; of a warm-up its best time constant.
 
@@ -139,8 +170,15 @@ def candidates_of(search: Search, named: Sequence[Question], *, agree: Callable[
         verdict = _verdict_of(question.name, alone, beside, found=found, mates=mates)
         if verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question):
             verdict = DISAGREED
-        rows[question.name] = Candidate(question.name, question.sensor, alone.gain, alone.p_value, None if beside is None else beside.gain,
-                                        None if beside is None else beside.p_value, verdict)
+        rows[question.name] = Candidate(
+            question.name,
+            question.sensor,
+            alone.gain,
+            alone.p_value,
+            None if beside is None else beside.gain,
+            None if beside is None else beside.p_value,
+            verdict,
+        )
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
 
 
@@ -173,8 +211,18 @@ def _verdict_of(name, alone, beside, *, found, mates):
     return 'no evidence'
 
 
-def finding(search: Search, named: Sequence[Question], place: int, *, solution: Solution, share: Callable, gain_of: Callable,
-            motion_of: Callable, shows: Callable = lambda place, mate, gain: True, rivals: Sequence[Question] = ()) -> Finding:
+def finding(
+    search: Search,
+    named: Sequence[Question],
+    place: int,
+    *,
+    solution: Solution,
+    share: Callable,
+    gain_of: Callable,
+    motion_of: Callable,
+    shows: Callable = lambda place, mate, gain: True,
+    rivals: Sequence[Question] = (),
+) -> Finding:
     """
     Return the Finding of the effect at `place` among the findings.
 
@@ -201,7 +249,8 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
     question = named[place]
 
     def in_its_place(mate):
-        return fitted(search, [*named[:place], mate, *named[place + 1:]], mate)
+        return fitted(search, [*named[:place], mate, *named[place + 1 :]], mate)
+
     score = search.score([q for q in named if q is not question], question)
     gain, explained = gain_of(place), share(named, question)
     if question.effect.key in solution.model.slices:
@@ -210,21 +259,48 @@ def finding(search: Search, named: Sequence[Question], place: int, *, solution: 
         parameters = fitted(search, named, question)
     text = sentence(question.effect, parameters, gain)
     if score.implausible:
-        text += f' It {beyond_known(explained, question.sensor)}. It is in no model unless requested.'
-    mates = [*rivals, *(mate for mate, _ in search.confounded(named, question)
-                        if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain))]
-    return Finding(question.name, question.sensor, text, parameters, score.p_value, score.gain, explained, gain,
-                   tuple(mate.name for mate in mates),
-                   motion_of(question, mates[0]) if mates else '', question.effect.against,
-                   {mate.name: {name: (value, unit) for name, (value, _, unit) in in_its_place(mate).items()} for mate in mates},
-                   score.implausible)
+        text += (
+            f' It {beyond_known(explained, question.sensor)}. It is in no model unless requested.'
+        )
+    mates = [
+        *rivals,
+        *(
+            mate
+            for mate, _ in search.confounded(named, question)
+            if mate.name not in {rival.name for rival in rivals} and shows(place, mate, gain)
+        ),
+    ]
+    return Finding(
+        question.name,
+        question.sensor,
+        text,
+        parameters,
+        score.p_value,
+        score.gain,
+        explained,
+        gain,
+        tuple(mate.name for mate in mates),
+        motion_of(question, mates[0]) if mates else '',
+        question.effect.against,
+        {
+            mate.name: {
+                name: (value, unit) for name, (value, _, unit) in in_its_place(mate).items()
+            }
+            for mate in mates
+        },
+        score.implausible,
+    )
 
 
-def fitted(search: Search, named: Sequence[Question], question: Question) -> dict[str, tuple[float, float, str]]:
+def fitted(
+    search: Search, named: Sequence[Question], question: Question
+) -> dict[str, tuple[float, float, str]]:
     """Return parameter name -> (value, sd, unit) of a chosen effect as the search fitted it."""
     names = question.effect.param_names()
-    return {name: (float(value), float(sd), question.effect.unit_of(k))
-            for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))}
+    return {
+        name: (float(value), float(sd), question.effect.unit_of(k))
+        for k, (name, value, sd) in enumerate(zip(names, *search.estimate(named, question)))
+    }
 
 
 MATE = 0.5
@@ -233,7 +309,9 @@ HALF = 0.5
 """Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
 
 
-def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution | None = None) -> Diagnosis:
+def build_diagnosis(
+    table: Table, found: Investigation, *, calibrated: Solution | None = None
+) -> Diagnosis:
     """
     Return the result of an investigation as a Diagnosis, without traces.
 
@@ -250,17 +328,32 @@ def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution 
     analysis = ResidualAnalysis.of(found, table)
     rests = analysis.unexplained
     baseline = extended_solution(problem.space, problem.noise, problem.baseline, chosen=[])
-    solution = extended_solution(problem.space, problem.noise, problem.baseline, chosen=named,
-                                 saturations=limits) if named or limits else baseline
+    solution = (
+        extended_solution(
+            problem.space, problem.noise, problem.baseline, chosen=named, saturations=limits
+        )
+        if named or limits
+        else baseline
+    )
 
     def gain_of(place):
-        return gain_of_findings(found, table, named[:place], after=named[:place + 1], sensors=sensors_of(named[place].effect))
+        return gain_of_findings(
+            found,
+            table,
+            named[:place],
+            after=named[: place + 1],
+            sensors=sensors_of(named[place].effect),
+        )
 
     def shows(place, mate, gain):
         if gain.sensor not in sensors_of(mate.effect):
             return False
-        own, other = (gain_in_turn(problem, named[:place], [*named[:place], each], sensors=[gain.sensor]).reduction
-                      for each in (named[place], mate))
+        own, other = (
+            gain_in_turn(
+                problem, named[:place], [*named[:place], each], sensors=[gain.sensor]
+            ).reduction
+            for each in (named[place], mate)
+        )
         return MATE * own <= other
 
     def motion_of(question, mate):
@@ -271,14 +364,34 @@ def build_diagnosis(table: Table, found: Investigation, *, calibrated: Solution 
     reported = calibrated or solution
     findings = [_clipping(limit, reported) for limit in limits]
     strange = found.implausible
-    findings += [finding(problem.search, named, place, solution=solution if named[place] in strange else reported,
-                         share=found.explained.share, gain_of=gain_of, motion_of=motion_of,
-                         shows=shows, rivals=_rivals(found, named[place]))
-                 for place in range(len(named))]
+    findings += [
+        finding(
+            problem.search,
+            named,
+            place,
+            solution=solution if named[place] in strange else reported,
+            share=found.explained.share,
+            gain_of=gain_of,
+            motion_of=motion_of,
+            shows=shows,
+            rivals=_rivals(found, named[place]),
+        )
+        for place in range(len(named))
+    ]
     sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
-    return Diagnosis(tuple(findings), rests, candidates_of(problem.search, named, agree=problem.windows_agree),
-                     tuple(found.not_testable), baseline, solution, gain_of_findings(found, table, [], after=named, sensors=sensors),
-                     len(found.used), int(np.sum(problem.locked)), onset=found.onset, stamp_jitter=analysis.stamp_jitter)
+    return Diagnosis(
+        tuple(findings),
+        rests,
+        candidates_of(problem.search, named, agree=problem.windows_agree),
+        tuple(found.not_testable),
+        baseline,
+        solution,
+        gain_of_findings(found, table, [], after=named, sensors=sensors),
+        len(found.used),
+        int(np.sum(problem.locked)),
+        onset=found.onset,
+        stamp_jitter=analysis.stamp_jitter,
+    )
 
 
 def _rivals(found, question):
@@ -288,32 +401,72 @@ def _rivals(found, question):
     own = [found.problem.space.names[k] for k in question.parameters]
     for other in found.rejected:
         moved = found.search.moved_by(found.named, other, found.problem.space.names)
-        near += [other] if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own) else []
+        near += (
+            [other]
+            if any(abs(moved.get(name, 0.0)) > HALF * abs(values[name]) for name in own)
+            else []
+        )
     return near
 
 
 def _clipping(limit, solution):
     effect = solution.model.find(limit.sensor, Role.LIMIT)
     parameters = parameters_of(solution, limit.sensor, effect.name)
-    gain = Gain(limit.sensor, 'clipped samples', limit.rms_before, limit.rms_after, (float('nan'), float('nan')), 0)
-    return Finding(effect.name, limit.sensor, sentence(effect, parameters, None, n_clipped=limit.n_clipped), parameters, limit.p_value,
-                   limit.n_expected, 1.0, gain, (), '')
+    gain = Gain(
+        limit.sensor,
+        'clipped samples',
+        limit.rms_before,
+        limit.rms_after,
+        (float('nan'), float('nan')),
+        0,
+    )
+    return Finding(
+        effect.name,
+        limit.sensor,
+        sentence(effect, parameters, None, n_clipped=limit.n_clipped),
+        parameters,
+        limit.p_value,
+        limit.n_expected,
+        1.0,
+        gain,
+        (),
+        '',
+    )
 
 
 def _with_residuals(hand):
     """Return the HandCalibration with the rms residual of its poses."""
     residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': hand.rate_rows()[0]}
-    return replace(hand, residual_rms={sensor: np.full(2, np.sqrt(np.mean(residual**2))) for sensor, residual in residuals.items()})
+    return replace(
+        hand,
+        residual_rms={
+            sensor: np.full(2, np.sqrt(np.mean(residual**2)))
+            for sensor, residual in residuals.items()
+        },
+    )
 
 
 def _traces_of(baseline, hand):
     """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
     poses = hand.poses
     true = hand.gravity * hand.state.up
-    errors = [{'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': h.rate_rows()[0]} for h in (baseline, hand)]
+    errors = [
+        {'accelerometer': h.norm_residuals()[:, None] * h.state.up, 'gyroscope': h.rate_rows()[0]}
+        for h in (baseline, hand)
+    ]
     count = len(poses.start)
-    return Traces(poses.time, np.full(count, 'static'), np.zeros((count, 0)), true, np.zeros((count, 3)), poses.temperature_c, errors[0],
-                  errors[1], (poses.stop - poses.start).astype(float), None)
+    return Traces(
+        poses.time,
+        np.full(count, 'static'),
+        np.zeros((count, 0)),
+        true,
+        np.zeros((count, 3)),
+        poses.temperature_c,
+        errors[0],
+        errors[1],
+        (poses.stop - poses.start).astype(float),
+        None,
+    )
 
 
 def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
@@ -322,11 +475,33 @@ def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagno
     before, after = _with_residuals(found.baseline), _with_residuals(hand)
 
     def gain_of(place):
-        return gain_by_hand(found, named[:place], after=named[:place + 1], sensor=named[place].sensor)
+        return gain_by_hand(
+            found, named[:place], after=named[: place + 1], sensor=named[place].sensor
+        )
 
-    findings = tuple(finding(problem.search, named, place, solution=after, share=problem.explained.share, gain_of=gain_of,
-                             motion_of=motions_of) for place in range(len(named)))
+    findings = tuple(
+        finding(
+            problem.search,
+            named,
+            place,
+            solution=after,
+            share=problem.explained.share,
+            gain_of=gain_of,
+            motion_of=motions_of,
+        )
+        for place in range(len(named))
+    )
     gain = gain_by_hand(found, [], after=named, sensor=named[0].sensor) if named else None
     count = len(found.baseline.poses.start)
-    return Diagnosis(findings, found.unexplained, candidates_of(problem.search, named),
-                     tuple(found.not_testable), before, after, gain, count, count if named else 0, _traces_of(found.baseline, hand))
+    return Diagnosis(
+        findings,
+        found.unexplained,
+        candidates_of(problem.search, named),
+        tuple(found.not_testable),
+        before,
+        after,
+        gain,
+        count,
+        count if named else 0,
+        _traces_of(found.baseline, hand),
+    )

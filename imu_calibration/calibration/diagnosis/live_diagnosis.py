@@ -6,7 +6,11 @@ from typing import Any
 
 from imu_calibration.calibration.by_evidence import windows_to_ask
 from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines, in_words, nothing_named
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
+    diagnosis_lines,
+    in_words,
+    nothing_named,
+)
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration, LiveSnapshot
@@ -69,44 +73,78 @@ class DiagnosisQuestion:
         try:
             evidence = self.snapshot.evidence()
             if evidence.found is None:
-                raise too_few_windows(sum(len(spread.windows) for spread in self.snapshot.gathered.spreads))
+                raise too_few_windows(
+                    sum(len(spread.windows) for spread in self.snapshot.gathered.spreads)
+                )
             found, extension = evidence.found, evidence.extension
             calibrated = None if extension.changes.lacking else evidence.solution
-            del evidence   # its columns, of a wider model than those of the session, need much memory
-            return Answer(describe(build_diagnosis(self.snapshot.table, found, calibrated=calibrated)), extension)
+            del (
+                evidence
+            )  # its columns, of a wider model than those of the session, need much memory
+            return Answer(
+                describe(build_diagnosis(self.snapshot.table, found, calibrated=calibrated)),
+                extension,
+            )
         except ImuCalibrationError as error:
             return Answer(LiveState(WAITING, str(error)))
 
 
 def question_about(live: LiveCalibration | None) -> DiagnosisQuestion | None:
     """Return the DiagnosisQuestion about the last solution of a session, or None without a table or while there are too few windows."""
-    return DiagnosisQuestion(live.last) if live is not None and live.last is not None and windows_to_ask(live.last.gathered) else None
+    return (
+        DiagnosisQuestion(live.last)
+        if live is not None and live.last is not None and windows_to_ask(live.last.gathered)
+        else None
+    )
 
 
 def describe(diagnosis: Diagnosis) -> LiveState:
     """Return the LiveState of a Diagnosis: the first finding, or none, or the unexplained residual."""
-    values: dict[str, Any] = {'windows': diagnosis.windows, 'windows held out for the gain': diagnosis.locked}
+    values: dict[str, Any] = {
+        'windows': diagnosis.windows,
+        'windows held out for the gain': diagnosis.locked,
+    }
     rest = [line for line in diagnosis_lines(diagnosis) if line.startswith('unexplained')]
-    values |= {f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)
-               for sensor, found in diagnosis.unexplained.items() if found.significant}
+    values |= {
+        f'unexplained {sensor} rms': in_words(found.rms, sensor, found.unit)
+        for sensor, found in diagnosis.unexplained.items()
+        if found.significant
+    }
     if not diagnosis.findings:
-        return LiveState(UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values)
+        return LiveState(
+            UNEXPLAINED if rest else NOTHING, '; '.join(rest) or nothing_named(diagnosis), values
+        )
     first = diagnosis.findings[0]
     message = f'{first.title}: {first.explanation}'
     if first.indistinguishable_from:
         others = ', '.join(first.indistinguishable_from)
         message += f' This motion does not separate it from {others}; a motion that does: {first.separating_motion}'
     low, high = first.gain.ci95
-    values = {'effect': first.effect, 'sensor': first.sensor, 'explanation': first.explanation,
-              **{name: f'{value:.4g} +- {sd:.2g} {unit}' for name, (value, sd, unit) in first.parameters.items()},
-              'p-value': f'{first.p_value:.2g}', 'held-out reduction': f'{first.gain.reduction:.3f}',
-              'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',
-              'held-out measure': f'{first.gain.sensor} {first.gain.measure}, {first.gain.of}',
-              'indistinguishable from': ' '.join(first.indistinguishable_from),
-              'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]),
-              'implausible': ' '.join(finding.effect for finding in diagnosis.findings if finding.implausible), **values}
+    values = {
+        'effect': first.effect,
+        'sensor': first.sensor,
+        'explanation': first.explanation,
+        **{
+            name: f'{value:.4g} +- {sd:.2g} {unit}'
+            for name, (value, sd, unit) in first.parameters.items()
+        },
+        'p-value': f'{first.p_value:.2g}',
+        'held-out reduction': f'{first.gain.reduction:.3f}',
+        'held-out reduction, 95 % interval': f'{low:.3f} to {high:.3f}',
+        'held-out measure': f'{first.gain.sensor} {first.gain.measure}, {first.gain.of}',
+        'indistinguishable from': ' '.join(first.indistinguishable_from),
+        'further findings': ' '.join(finding.effect for finding in diagnosis.findings[1:]),
+        'implausible': ' '.join(
+            finding.effect for finding in diagnosis.findings if finding.implausible
+        ),
+        **values,
+    }
     for finding in diagnosis.findings:
         values[MATES_KEY + finding.effect] = ' '.join(finding.indistinguishable_from)
         sized = {finding.effect: finding.parameters, **finding.sizes_of_mates}
-        values |= {f'{SIZE_KEY}{effect}.{name}': repr(float(size)) for effect, sizes in sized.items() for name, (size, *_) in sizes.items()}
+        values |= {
+            f'{SIZE_KEY}{effect}.{name}': repr(float(size))
+            for effect, sizes in sized.items()
+            for name, (size, *_) in sizes.items()
+        }
     return LiveState(FOUND, message, values)

@@ -22,7 +22,9 @@ PER_DECADE = 6
 """Frequency bands of the spectrum per decade."""
 LOWEST_DECADE, HIGHEST_DECADE = -2, 5
 """Decades of the lowest and highest edge, Hz."""
-BAND_EDGES = 10.0**np.linspace(LOWEST_DECADE, HIGHEST_DECADE, (HIGHEST_DECADE - LOWEST_DECADE) * PER_DECADE + 1)
+BAND_EDGES = 10.0 ** np.linspace(
+    LOWEST_DECADE, HIGHEST_DECADE, (HIGHEST_DECADE - LOWEST_DECADE) * PER_DECADE + 1
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +55,17 @@ class Distance:
         for each in np.unique(decade):
             rows = decade == each
             if self.power[0, rows].any():
-                found.append((f'{10.0**each:g} to {10.0**(each + 1):g} Hz', self.power[:, rows].sum(axis=1), self.noise[rows].sum(axis=0)))
-        return [(name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise)) for name, power, noise in found]
+                found.append(
+                    (
+                        f'{10.0**each:g} to {10.0 ** (each + 1):g} Hz',
+                        self.power[:, rows].sum(axis=1),
+                        self.noise[rows].sum(axis=0),
+                    )
+                )
+        return [
+            (name, np.sqrt(np.maximum(power - noise, 0.0)), np.sqrt(noise))
+            for name, power, noise in found
+        ]
 
     def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
@@ -63,15 +74,31 @@ class Distance:
         Bands without data and the last one are left out.
         """
         rows = self.power[0].any(axis=1)
-        rows[-1] = False   # the Nyquist frequency cuts it
+        rows[-1] = False  # the Nyquist frequency cuts it
         width = np.diff(self.edges)[rows, None]
-        return (np.sqrt(self.edges[:-1] * self.edges[1:])[rows], np.sqrt(self.power[:, rows] / width), np.sqrt(self.noise[rows] / width))
+        return (
+            np.sqrt(self.edges[:-1] * self.edges[1:])[rows],
+            np.sqrt(self.power[:, rows] / width),
+            np.sqrt(self.noise[rows] / width),
+        )
 
     def to_mapping(self) -> dict:
         """Return plain data: rms beyond noise before and after, and of the noise, by band, in SI units."""
-        return {'bands': [{'band': name, 'before': rms[0].tolist(), 'after': rms[1].tolist(), 'noise': noise.tolist()}
-                          for name, rms, noise in self.bands()],
-                'reduction': {measure: {'value': gain.reduction, 'ci95': list(gain.ci95)} for measure, gain in self.gains.items()}}
+        return {
+            'bands': [
+                {
+                    'band': name,
+                    'before': rms[0].tolist(),
+                    'after': rms[1].tolist(),
+                    'noise': noise.tolist(),
+                }
+                for name, rms, noise in self.bands()
+            ],
+            'reduction': {
+                measure: {'value': gain.reduction, 'ci95': list(gain.ci95)}
+                for measure, gain in self.gains.items()
+            },
+        }
 
 
 class DistanceSums:
@@ -84,10 +111,15 @@ class DistanceSums:
         self._means = {sensor: np.zeros((2, 3)) for sensor in SENSORS}
         self._rows: dict[str, list] = {sensor: [] for sensor in SENSORS}
         self._noise = {sensor: np.zeros(3) for sensor in SENSORS}
-        self._freedom = np.zeros((2, count))   # of all windows, of windows at rest
+        self._freedom = np.zeros((2, count))  # of all windows, of windows at rest
         self._samples = self._windows = 0
 
-    def add(self, window: Window, residuals: Sequence[Mapping[str, np.ndarray]], noise: Mapping[str, NoiseModel]) -> None:
+    def add(
+        self,
+        window: Window,
+        residuals: Sequence[Mapping[str, np.ndarray]],
+        noise: Mapping[str, NoiseModel],
+    ) -> None:
         """Add a window with its residuals (before, after: sensor -> (n, 3)) and the noise of each sensor."""
         n, rest = len(window), window.kind == 'static'
         if n < 4 or not window.period:
@@ -96,7 +128,7 @@ class DistanceSums:
         place = np.clip(np.searchsorted(BAND_EDGES, line, side='right') - 1, 0, len(BAND_EDGES) - 2)
         freedom = np.full(len(line), 2.0)
         freedom[-1] = 1.0 if n % 2 == 0 else 2.0
-        self._freedom[:2 if rest else 1] += np.bincount(place, freedom, len(BAND_EDGES) - 1)
+        self._freedom[: 2 if rest else 1] += np.bincount(place, freedom, len(BAND_EDGES) - 1)
         self._samples += n
         self._windows += 1
         for sensor in SENSORS:
@@ -104,8 +136,11 @@ class DistanceSums:
             row = [n, rest]
             for k, own in enumerate(residuals):
                 mean = own[sensor].mean(axis=0)
-                squares = np.abs(np.fft.rfft(own[sensor], axis=0)[1:])**2 * freedom[:, None] / n
-                band = np.stack([np.bincount(place, column, len(BAND_EDGES) - 1) for column in squares.T], axis=1)
+                squares = np.abs(np.fft.rfft(own[sensor], axis=0)[1:]) ** 2 * freedom[:, None] / n
+                band = np.stack(
+                    [np.bincount(place, column, len(BAND_EDGES) - 1) for column in squares.T],
+                    axis=1,
+                )
                 self._power[sensor][k] += band
                 self._means[sensor][k] += mean**2
                 row += [band.sum(), mean @ mean]
@@ -122,17 +157,33 @@ class DistanceSums:
         known = np.flatnonzero(self._freedom[1])
         density = self._rest[sensor][known] / self._freedom[1][known, None]
         nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1) if len(known) else []
-        noise = density[nearest] * self._freedom[0][:edge - 1, None] if len(known) else np.zeros((edge - 1, 3))
-        return Distance(BAND_EDGES[:edge], self._power[sensor][:, :edge - 1] / self._samples, noise / self._samples,
-                        self._means[sensor] / self._windows, self._noise[sensor] / self._windows, self.gains(sensor))
+        noise = (
+            density[nearest] * self._freedom[0][: edge - 1, None]
+            if len(known)
+            else np.zeros((edge - 1, 3))
+        )
+        return Distance(
+            BAND_EDGES[:edge],
+            self._power[sensor][:, : edge - 1] / self._samples,
+            noise / self._samples,
+            self._means[sensor] / self._windows,
+            self._noise[sensor] / self._windows,
+            self.gains(sensor),
+        )
 
     def gains(self, sensor: str, of: str = OF_MODEL) -> dict[str, Gain]:
         """Return measure -> Gain of the windows up to now, in the order of `MEASURES`."""
         n, rest, *squares = np.array(self._rows[sensor]).T
         models, still = (squares[:2], squares[2:]), rest > 0
-        pairs = ([(within + n * mean, 3 * n) for within, mean in models], [(mean, 0 * n + 3) for _, mean in models],
-                 [(within, 3 * (n - 1)) for within, _ in models], [(mean[still], 3 + 0 * mean[still]) for _, mean in models])
-        return {measure: gain_of(sensor, measure, pair, of=of) for measure, pair in zip(MEASURES, pairs)}
+        pairs = (
+            [(within + n * mean, 3 * n) for within, mean in models],
+            [(mean, 0 * n + 3) for _, mean in models],
+            [(within, 3 * (n - 1)) for within, _ in models],
+            [(mean[still], 3 + 0 * mean[still]) for _, mean in models],
+        )
+        return {
+            measure: gain_of(sensor, measure, pair, of=of) for measure, pair in zip(MEASURES, pairs)
+        }
 
 
 PLOT_BLOCK_SECONDS = 0.25
@@ -188,7 +239,13 @@ class Traces:
     """Sensor -> residual power by band; empty by hand."""
 
 
-def residual_traces(windows: Sequence[Window] | StoredWindows, table: Table, before: Solution, *, after: Solution | Calibration) -> Traces:
+def residual_traces(
+    windows: Sequence[Window] | StoredWindows,
+    table: Table,
+    before: Solution,
+    *,
+    after: Solution | Calibration,
+) -> Traces:
     """
     Return the Traces of two models on a recording.
 
@@ -208,25 +265,62 @@ def residual_traces(windows: Sequence[Window] | StoredWindows, table: Table, bef
     models = [before] if after is before else [before, after]
     sums, parts, counts, warmth, spans = DistanceSums(), [], [], [], []
     for group in chunks(_used(windows, spans)):
-        rest, against = [residuals(group, table, each.model, values=each.values) for each in models], _variables(group, table, before)
+        rest, against = (
+            [residuals(group, table, each.model, values=each.values) for each in models],
+            _variables(group, table, before),
+        )
         ends = np.cumsum([len(window) for window in group])
         for window, stop in zip(group, ends):
             rows = slice(stop - len(window), stop)
-            sums.add(window, [{sensor: own[rows] for sensor, own in each.items()} for each in (rest[0], rest[-1])], before.noise)
+            sums.add(
+                window,
+                [
+                    {sensor: own[rows] for sensor, own in each.items()}
+                    for each in (rest[0], rest[-1])
+                ],
+                before.noise,
+            )
         starts = _starts(group)
-        values = [np.concatenate([w.time for w in group]), *against[:3], *(each[s] for each in (rest[0], rest[-1]) for s in SENSORS)]
+        values = [
+            np.concatenate([w.time for w in group]),
+            *against[:3],
+            *(each[s] for each in (rest[0], rest[-1]) for s in SENSORS),
+        ]
         parts.append([block_means(value, starts) for value in values])
         warmth.append(None if against[3] is None else block_means(against[3], starts))
-        counts.append((np.diff(starts, append=ends[-1]), np.repeat([str(w.kind) for w in group], [len(w) for w in group])[starts]))
+        counts.append(
+            (
+                np.diff(starts, append=ends[-1]),
+                np.repeat([str(w.kind) for w in group], [len(w) for w in group])[starts],
+            )
+        )
     known = [each for each in warmth if each is not None]
     temperature = np.concatenate(known) if len(known) == len(warmth) else None
     time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
-    old, new = (dict(zip(SENSORS, errors[k:k + 2])) for k in (0, 2))
-    segments = {sensor: [_segment(windows, spans, table, models, sensor, axis, *_largest(time, old[sensor][:, axis])) for axis in range(3)]
-                for sensor in SENSORS}
-    return Traces(time, np.concatenate([kind for _, kind in counts]), position, force_s, rate_s, temperature, old, new,
-                  np.concatenate([number for number, _ in counts]), _dead_reckoning(windows, spans, table, models), segments,
-                  sums.distances())
+    old, new = (dict(zip(SENSORS, errors[k : k + 2])) for k in (0, 2))
+    segments = {
+        sensor: [
+            _segment(
+                windows, spans, table, models, sensor, axis, *_largest(time, old[sensor][:, axis])
+            )
+            for axis in range(3)
+        ]
+        for sensor in SENSORS
+    }
+    return Traces(
+        time,
+        np.concatenate([kind for _, kind in counts]),
+        position,
+        force_s,
+        rate_s,
+        temperature,
+        old,
+        new,
+        np.concatenate([number for number, _ in counts]),
+        _dead_reckoning(windows, spans, table, models),
+        segments,
+        sums.distances(),
+    )
 
 
 def _used(windows, spans):
@@ -246,23 +340,37 @@ def _largest(time, residual):
 
 
 def _segment(windows, spans, table, models, sensor, axis, start, stop):
-    inside = [windows[k] for k, (first, last) in enumerate(spans) if last >= start and first <= stop]
+    inside = [
+        windows[k] for k, (first, last) in enumerate(spans) if last >= start and first <= stop
+    ]
     time = np.concatenate([window.time for window in inside])
-    simulated = [predict_windows(inside, table, each.model, values=each.values)[sensor][:, axis] for each in models]
-    found = {'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside]),
-             'simulated before': simulated[0], 'simulated after': simulated[-1]}
+    simulated = [
+        predict_windows(inside, table, each.model, values=each.values)[sensor][:, axis]
+        for each in models
+    ]
+    found = {
+        'measured': np.concatenate([measured(window, sensor)[:, axis] for window in inside]),
+        'simulated before': simulated[0],
+        'simulated after': simulated[-1],
+    }
     rows = np.flatnonzero((time >= start) & (time <= stop))
     size = max(1, len(rows) // POINTS)
-    rows = rows[:len(rows) // size * size].reshape(-1, size)
-    return OverlaySegment(time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()})
+    rows = rows[: len(rows) // size * size].reshape(-1, size)
+    return OverlaySegment(
+        time[rows].mean(axis=1), {name: signal[rows].mean(axis=1) for name, signal in found.items()}
+    )
 
 
 def _variables(windows, table, model):
     """Return position, specific force, rate and temperature (or None) of the reference at the samples, at the values of a model."""
     motion, temperature, rows = all_samples(windows)
     reference = _references(model, table, motion, temperature)
-    return (motion.position[rows], reference['accelerometer'].force_s[rows], reference['gyroscope'].rate_s[rows],
-            None if temperature is None else temperature[rows])
+    return (
+        motion.position[rows],
+        reference['accelerometer'].force_s[rows],
+        reference['gyroscope'].rate_s[rows],
+        None if temperature is None else temperature[rows],
+    )
 
 
 def _references(model, table, motion, temperature):
@@ -273,7 +381,9 @@ def _references(model, table, motion, temperature):
 
 def _starts(windows):
     """Return the first sample of each block of the windows in one piece; blocks end with their window."""
-    places = [((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int) for window in windows]
+    places = [
+        ((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int) for window in windows
+    ]
     return np.flatnonzero(np.concatenate([np.diff(place, prepend=-1) for place in places]))
 
 
@@ -289,11 +399,20 @@ def _dead_reckoning(windows, spans, table, models):
             run = []
     if not stretches:
         return None
-    chosen = [stretches[k] for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))]
+    chosen = [
+        stretches[k]
+        for k in np.unique(np.linspace(0, len(stretches) - 1, MOST_STRETCHES).round().astype(int))
+    ]
     drifts = [_drifts([windows[k] for k in stretch], table, models) for stretch in chosen]
     velocity, position = np.median(drifts, axis=0).T
-    return {'seconds': DEAD_RECKONING, 'position_before': float(position[0]), 'position_after': float(position[-1]),
-            'velocity_before': float(velocity[0]), 'velocity_after': float(velocity[-1]), 'stretches': len(chosen)}
+    return {
+        'seconds': DEAD_RECKONING,
+        'position_before': float(position[0]),
+        'position_after': float(position[-1]),
+        'velocity_before': float(velocity[0]),
+        'velocity_after': float(velocity[-1]),
+        'stretches': len(chosen),
+    }
 
 
 def _drifts(windows, table, models):
@@ -305,9 +424,18 @@ def _drifts(windows, table, models):
         reference, felt = _references(model, table, motion, temperature), {}
         for sensor in SENSORS:
             matrix = model.model.value(sensor, Role.LINEAR, model.values)
-            felt[sensor] = getattr(reference[sensor], INPUT_OF[sensor])[rows] + np.linalg.solve(matrix, error[sensor].T).T
-        true = replace(reference['accelerometer'].select(rows), time=time, rate_s=reference['gyroscope'].rate_s[rows])
+            felt[sensor] = (
+                getattr(reference[sensor], INPUT_OF[sensor])[rows]
+                + np.linalg.solve(matrix, error[sensor].T).T
+            )
+        true = replace(
+            reference['accelerometer'].select(rows),
+            time=time,
+            rate_s=reference['gyroscope'].rate_s[rows],
+        )
         some = slice(np.searchsorted(time, time[0] + DEAD_RECKONING) + 1)
-        errors = dead_reckoning_errors(true.select(some), felt['accelerometer'][some], felt['gyroscope'][some])
+        errors = dead_reckoning_errors(
+            true.select(some), felt['accelerometer'][some], felt['gyroscope'][some]
+        )
         found.append([np.linalg.norm(error[-1]) for error in errors])
     return found

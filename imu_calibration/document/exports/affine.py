@@ -32,11 +32,19 @@ class Capability:
 
     def covers(self, effect: Effect) -> bool:
         """Return whether an effect is of this kind."""
-        return effect.sensor == self.sensor and effect.role is self.role and (self.role is not Role.TERM or effect.groups == self.groups)
+        return (
+            effect.sensor == self.sensor
+            and effect.role is self.role
+            and (self.role is not Role.TERM or effect.groups == self.groups)
+        )
 
     def held(self, values: np.ndarray) -> np.ndarray:
         """Return the representable part of an effect's values, shape as given."""
-        return np.diag(np.diag(values.reshape(3, 3))).reshape(values.shape) if self.own_axis else values
+        return (
+            np.diag(np.diag(values.reshape(3, 3))).reshape(values.shape)
+            if self.own_axis
+            else values
+        )
 
     @property
     def effect(self) -> Effect:
@@ -82,7 +90,9 @@ class AffineImu:
 
     bias: dict[str, np.ndarray] = _zeros(3)
     """Sensor -> readings at zero input, SI, shape (3,)."""
-    matrix: dict[str, np.ndarray] = field(default_factory=lambda: {sensor: np.eye(3) for sensor in SENSORS})
+    matrix: dict[str, np.ndarray] = field(
+        default_factory=lambda: {sensor: np.eye(3) for sensor in SENSORS}
+    )
     """Sensor -> response to the input, shape (3, 3)."""
     thermal: dict[str, np.ndarray] = _zeros(3)
     """Sensor -> change of the bias with temperature, SI per K, shape (3,)."""
@@ -97,13 +107,19 @@ class AffineImu:
 
     def value(self, capability: Capability) -> np.ndarray:
         """Return the values of the effects of one kind."""
-        for kinds, part in ((OFFSETS, self.bias), (MATRICES + SCALES, self.matrix), (THERMAL_OFFSETS, self.thermal)):
+        for kinds, part in (
+            (OFFSETS, self.bias),
+            (MATRICES + SCALES, self.matrix),
+            (THERMAL_OFFSETS, self.thermal),
+        ):
             if capability in kinds:
                 return part[capability.sensor]
         return self.cross if capability in G_SENSITIVITY else self.arms
 
 
-def held_values(calibration: Calibration, effect: Effect, capability: Capability | None) -> np.ndarray:
+def held_values(
+    calibration: Calibration, effect: Effect, capability: Capability | None
+) -> np.ndarray:
     """Return the values of an effect as the target represents them: its prior where it is not represented, shape (size,)."""
     values = calibration.values[calibration.model.slices[effect.key]]
     return effect.prior_values() if capability is None else capability.held(values)
@@ -120,10 +136,15 @@ def undone(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineIm
 def affine_of(calibration: Calibration, capabilities: tuple[Capability, ...]) -> AffineImu:
     """Return that part of a calibration which lies in `capabilities`."""
     limits = calibration.conditions.get('temperature_range_c')
-    found = AffineImu(temperature_ref_c=calibration.model.temperature_ref_c, temperature_range_c=tuple(limits) if limits else None)
+    found = AffineImu(
+        temperature_ref_c=calibration.model.temperature_ref_c,
+        temperature_range_c=tuple(limits) if limits else None,
+    )
     for capability in capabilities:
         for effect in filter(capability.covers, calibration.model.effects):
-            found.value(capability)[...] = held_values(calibration, effect, capability).reshape(effect.shape)
+            found.value(capability)[...] = held_values(calibration, effect, capability).reshape(
+                effect.shape
+            )
     return found
 
 
@@ -140,15 +161,23 @@ class Placement:
 
     def inverse(self) -> 'Placement':
         """Return the placement that undoes this one."""
-        return Placement(mat_ts=self.mat_ts.T, origin_s=-self.mat_ts @ self.origin_s, mat_readings=self.mat_readings.T)
+        return Placement(
+            mat_ts=self.mat_ts.T,
+            origin_s=-self.mat_ts @ self.origin_s,
+            mat_readings=self.mat_readings.T,
+        )
 
     def readings(self, force: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return readings in the program's axes, each shape (n, 3)."""
         return force @ self.mat_readings.T, rate @ self.mat_readings.T
 
-    def truth(self, force: np.ndarray, rate: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def truth(
+        self, force: np.ndarray, rate: np.ndarray, alpha: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate at the program's origin in its frame, each shape (n, 3)."""
-        return (force + lever_matrix(rate, alpha) @ self.origin_s) @ self.mat_ts.T, rate @ self.mat_ts.T
+        return (
+            force + lever_matrix(rate, alpha) @ self.origin_s
+        ) @ self.mat_ts.T, rate @ self.mat_ts.T
 
 
 def moved(imu: AffineImu, to: Placement) -> AffineImu:
@@ -159,9 +188,23 @@ def moved(imu: AffineImu, to: Placement) -> AffineImu:
     (a product of two small terms) is omitted.
     """
     turned = {sensor: to.mat_readings @ imu.matrix[sensor] @ to.mat_ts.T for sensor in SENSORS}
-    arms = np.abs(to.mat_readings) @ ((imu.arms - to.origin_s) @ to.mat_ts.T) if np.any(imu.arms) else imu.arms
-    bias, thermal = ({sensor: to.mat_readings @ part[sensor] for sensor in SENSORS} for part in (imu.bias, imu.thermal))
-    return replace(imu, bias=bias, matrix=turned, thermal=thermal, arms=arms, cross=to.mat_readings @ imu.cross @ to.mat_ts.T)
+    arms = (
+        np.abs(to.mat_readings) @ ((imu.arms - to.origin_s) @ to.mat_ts.T)
+        if np.any(imu.arms)
+        else imu.arms
+    )
+    bias, thermal = (
+        {sensor: to.mat_readings @ part[sensor] for sensor in SENSORS}
+        for part in (imu.bias, imu.thermal)
+    )
+    return replace(
+        imu,
+        bias=bias,
+        matrix=turned,
+        thermal=thermal,
+        arms=arms,
+        cross=to.mat_readings @ imu.cross @ to.mat_ts.T,
+    )
 
 
 PUBLISHER = 'static_transform_publisher'
@@ -175,7 +218,15 @@ def pose_line(placement: Placement, parent: str, child: str) -> str:
     """Return the transform with the arguments of the program of tf2_ros, with all digits."""
     values = [*placement.origin_s, *Rotation.from_matrix(placement.mat_ts.T).as_quat()]
     pose: dict[str, str] = {name: repr(float(value)) for name, value in zip(POSE_NUMBERS, values)}
-    return ' '.join([PUBLISHER, *(f'--{name} {shlex.quote(value)}' for name, value in (pose | {PARENT: parent, CHILD: child}).items())])
+    return ' '.join(
+        [
+            PUBLISHER,
+            *(
+                f'--{name} {shlex.quote(value)}'
+                for name, value in (pose | {PARENT: parent, CHILD: child}).items()
+            ),
+        ]
+    )
 
 
 def find_pose(content: bytes) -> tuple[Placement, str] | None:
@@ -183,14 +234,20 @@ def find_pose(content: bytes) -> tuple[Placement, str] | None:
     line = re.search(rf'{PUBLISHER} (.*)', content.decode(errors='replace'))
     try:
         words = shlex.split(line.group(1).partition('"')[0]) if line else []
-        options = {name.removeprefix('--'): value for name, value in zip(words, words[1:], strict=False) if name.startswith('--')}
+        options = {
+            name.removeprefix('--'): value
+            for name, value in zip(words, words[1:], strict=False)
+            if name.startswith('--')
+        }
         values = np.array([float(options[name]) for name in POSE_NUMBERS])
         parent = options[PARENT]
     except (KeyError, ValueError):
         return None
     if not np.all(np.isfinite(values)) or not 0.99 < np.linalg.norm(values[3:]) < 1.01:
         return None
-    return Placement(mat_ts=Rotation.from_quat(values[3:]).as_matrix().T, origin_s=values[:3]), '' if parent == UNNAMED else parent
+    return Placement(
+        mat_ts=Rotation.from_quat(values[3:]).as_matrix().T, origin_s=values[:3]
+    ), '' if parent == UNNAMED else parent
 
 
 FRD = np.diag([1.0, -1.0, -1.0])
@@ -208,8 +265,11 @@ def lower_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     """
     if np.linalg.det(matrix) <= 0:
-        raise InputError('the axes of a sensor must be right-handed, the matrix of this calibration turns them into their mirror image; '
-                         'check for an exchanged axis', code='left_handed')
+        raise InputError(
+            'the axes of a sensor must be right-handed, the matrix of this calibration turns them into their mirror image; '
+            'check for an exchanged axis',
+            code='left_handed',
+        )
     q, r = np.linalg.qr(matrix.T)
     signs = np.sign(np.diag(r))
     return np.tril((r * signs[:, None]).T), (q * signs).T

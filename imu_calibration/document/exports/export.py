@@ -16,8 +16,22 @@ from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import to_mapping
 from imu_calibration.document.exports import targets
-from imu_calibration.document.exports.affine import ARMS, MATRICES, UNNAMED, Placement, affine_of, moved, pose_line
-from imu_calibration.document.exports.loss import ROUNDING_LOSS, Loss, TrialMotion, loss_of, standard_motion
+from imu_calibration.document.exports.affine import (
+    ARMS,
+    MATRICES,
+    UNNAMED,
+    Placement,
+    affine_of,
+    moved,
+    pose_line,
+)
+from imu_calibration.document.exports.loss import (
+    ROUNDING_LOSS,
+    Loss,
+    TrialMotion,
+    loss_of,
+    standard_motion,
+)
 from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
 from imu_calibration.document.trust import Usable, caveats, usable
 from imu_calibration.effects.base import SENSORS, UNITS, Role
@@ -46,8 +60,15 @@ class Export:
         return 3 if self.refused else 0
 
 
-def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | None = None, rate: float | None = None,
-           motion: TrialMotion | None = None, anyway: bool = False) -> Export:
+def export(
+    calibration: Calibration,
+    target: Target,
+    *,
+    noise: NoiseFigures | None = None,
+    rate: float | None = None,
+    motion: TrialMotion | None = None,
+    anyway: bool = False,
+) -> Export:
     """
     Return the file of a target.
 
@@ -75,23 +96,44 @@ def export(calibration: Calibration, target: Target, *, noise: NoiseFigures | No
         When no sensor should be corrected with the calibration.
 
     """
-    used = Usable(calibration) if target.whole or target.only_noise else usable(calibration, anyway=anyway)
+    used = (
+        Usable(calibration)
+        if target.whole or target.only_noise
+        else usable(calibration, anyway=anyway)
+    )
     applied = used.calibration
     if rate is not None and not 0 < rate < np.inf:
-        raise InputError(f'the rate must be above zero, got {rate:g} Hz; correct it', code='rate_not_positive')
+        raise InputError(
+            f'the rate must be above zero, got {rate:g} Hz; correct it', code='rate_not_positive'
+        )
     found, unknown = _noise_numbers(applied, target, noise, rate)
     placement, numbers = placed_numbers(applied, target)
     motion = motion or standard_motion(applied)
     loss = loss_of(target, calibration, numbers, placement=placement, motion=motion)
     trust = [f'of the calibration: {line}' for line in (*used.lines, *caveats(applied))]
-    lines = [*_placement_lines(applied, target, placement), *_worked_sample(target, numbers, placement, applied),
-             *loss_lines(target, loss), *(f'note: {line}' for line in (*trust, *target.ignored(numbers), *unknown)),
-             *(f'note: {hint}' for hint in [target.hint] if hint)]
-    head = [f'{target.title}, written by imu_calibration {imu_calibration.__version__}', *target.formula.splitlines(), f'({target.source})']
+    lines = [
+        *_placement_lines(applied, target, placement),
+        *_worked_sample(target, numbers, placement, applied),
+        *loss_lines(target, loss),
+        *(f'note: {line}' for line in (*trust, *target.ignored(numbers), *unknown)),
+        *(f'note: {hint}' for hint in [target.hint] if hint),
+    ]
+    head = [
+        f'{target.title}, written by imu_calibration {imu_calibration.__version__}',
+        *target.formula.splitlines(),
+        f'({target.source})',
+    ]
     rate = rate or (noise.rate if noise else None)
-    assert target.write is not None   # `find_target` gives no other
+    assert target.write is not None  # `find_target` gives no other
     content = target.write(Page(numbers, found, [*head, *lines], applied, rate))
-    return Export(content.encode() if isinstance(content, str) else content, numbers, placement, loss, tuple(lines), used.refused)
+    return Export(
+        content.encode() if isinstance(content, str) else content,
+        numbers,
+        placement,
+        loss,
+        tuple(lines),
+        used.refused,
+    )
 
 
 def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement, Numbers]:
@@ -100,7 +142,9 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
         return Placement(), to_mapping(calibration)
     held = affine_of(calibration, target.holds)
     # a target with diagonals only chooses its axes by the full matrices too
-    placement = target.placement(affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES))
+    placement = target.placement(
+        affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES)
+    )
     return placement, target.numbers(moved(held, placement))
 
 
@@ -110,27 +154,50 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
         return None, []
     found = _noise_of(calibration, figures, rate)
     if found is None or (target.needs_walk and not found.walk_known):
-        lacks = 'noise with random walks' if target.needs_walk else 'noise, or the rate of the readings of the calibration,'
+        lacks = (
+            'noise with random walks'
+            if target.needs_walk
+            else 'noise, or the rate of the readings of the calibration,'
+        )
         if target.only_noise:
-            raise InputError(f'for {target.title} there must be {lacks} and there is none; give a noise document', key='noise',
-                             code='noise_missing')
-        return None, [f'the noise figures are left out: there must be {lacks} from a noise document']
+            raise InputError(
+                f'for {target.title} there must be {lacks} and there is none; give a noise document',
+                key='noise',
+                code='noise_missing',
+            )
+        return None, [
+            f'the noise figures are left out: there must be {lacks} from a noise document'
+        ]
     bases = {sensor: getattr(found, sensor).basis for sensor in SENSORS if target.needs_walk}
-    return target.noise(found), [f'random walk of the {sensor}: {BASIS[basis]}' for sensor, basis in bases.items() if basis != 'walk']
+    return target.noise(found), [
+        f'random walk of the {sensor}: {BASIS[basis]}'
+        for sensor, basis in bases.items()
+        if basis != 'walk'
+    ]
 
 
 def _noise_of(calibration, figures, rate) -> Noise | None:
     if figures is not None:
         accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
-        unbounded = [sensor for sensor, found in zip(SENSORS, (accelerometer, gyroscope)) if not np.isfinite(found.walk)]
+        unbounded = [
+            sensor
+            for sensor, found in zip(SENSORS, (accelerometer, gyroscope))
+            if not np.isfinite(found.walk)
+        ]
         if unbounded:
-            raise InputError(f'the noise document must bound the random walk of both sensors, that of the {" and ".join(unbounded)} has no '
-                             'bound; record a longer rest', key='noise', code='walk_unbounded')
+            raise InputError(
+                f'the noise document must bound the random walk of both sensors, that of the {" and ".join(unbounded)} has no '
+                'bound; record a longer rest',
+                key='noise',
+                code='walk_unbounded',
+            )
         return Noise(accelerometer, gyroscope, rate or figures.rate)
     white = {sensor: float(calibration.noise(sensor)[0].max()) for sensor in SENSORS}
     if rate is None or not all(white.values()):
         return None
-    accelerometer, gyroscope = (Densities(white[sensor] / float(np.sqrt(rate)), 0.0, 'bound') for sensor in SENSORS)
+    accelerometer, gyroscope = (
+        Densities(white[sensor] / float(np.sqrt(rate)), 0.0, 'bound') for sensor in SENSORS
+    )
     return Noise(accelerometer, gyroscope, rate, walk_known=False)
 
 
@@ -139,13 +206,19 @@ def _placement_lines(calibration, target, placement) -> list[str]:
     name = calibration.frame_id or UNNAMED
     if target.only_noise:
         return []
-    if np.array_equal(placement.mat_readings, np.eye(3)) and np.array_equal(placement.mat_ts, np.eye(3)) and not np.any(placement.origin_s):
+    if (
+        np.array_equal(placement.mat_readings, np.eye(3))
+        and np.array_equal(placement.mat_ts, np.eye(3))
+        and not np.any(placement.origin_s)
+    ):
         return [f'frame: {name}, axes as in the calibration']
     if not np.array_equal(placement.mat_readings, np.eye(3)):
         return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
     child = f'{name}_{target.name}'
-    return [f"frame: {child}, turned and moved against {name} as the target's conventions demand; extrinsics change with it:",
-            f'  {pose_line(placement, name, child)}']
+    return [
+        f"frame: {child}, turned and moved against {name} as the target's conventions demand; extrinsics change with it:",
+        f'  {pose_line(placement, name, child)}',
+    ]
 
 
 def _worked_sample(target, numbers, placement, calibration) -> list[str]:
@@ -157,29 +230,41 @@ def _worked_sample(target, numbers, placement, calibration) -> list[str]:
     force, rate = placement.readings(*raw)
     made = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
     shown = [', '.join(f'{value:.9g}' for value in values[0]) for values in (force, rate, *made)]
-    return [f'worked sample: readings [{shown[0]}] m/s^2, [{shown[1]}] rad/s become [{shown[2]}], [{shown[3]}]']
+    return [
+        f'worked sample: readings [{shown[0]}] m/s^2, [{shown[1]}] rad/s become [{shown[2]}], [{shown[3]}]'
+    ]
 
 
 def loss_lines(target: Target, loss: Loss) -> list[str]:
     """Return the losses, a line each."""
     if target.only_noise:
-        left = ', '.join(f'{sensor} {error_text(value, UNITS[sensor])}' for sensor, value in loss.left.items())
+        left = ', '.join(
+            f'{sensor} {error_text(value, UNITS[sensor])}' for sensor, value in loss.left.items()
+        )
         beside = ' in addition to a constant bias' if target.estimates else ''
-        return ['accepts no calibration: use compensated readings (compensator_node, or the verb compensate)',
-                f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}']
+        return [
+            'accepts no calibration: use compensated readings (compensator_node, or the verb compensate)',
+            f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}',
+        ]
     lines = []
     if loss.estimated:
-        lines.append('not written, because the target estimates it while it runs: '
-                     + ', '.join(f'{effect.sensor} {effect.name}' for effect in loss.estimated))
+        lines.append(
+            'not written, because the target estimates it while it runs: '
+            + ', '.join(f'{effect.sensor} {effect.name}' for effect in loss.estimated)
+        )
     if loss.nothing:
         return [*lines, 'lost: nothing']
     for lost in loss.effects:
         what = 'held in part' if lost.in_part else 'lost'
-        lines.append(f'{what}: {lost.effect.sensor} {lost.effect.name}, {error_text(lost.rms, UNITS[lost.effect.sensor])} rms')
+        lines.append(
+            f'{what}: {lost.effect.sensor} {lost.effect.name}, {error_text(lost.rms, UNITS[lost.effect.sensor])} rms'
+        )
     for sensor in SENSORS:
         left, raw = (error_text(error[sensor], UNITS[sensor]) for error in (loss.left, loss.raw))
         left = f'{left} rms' if loss.left[sensor] > ROUNDING_LOSS else 'none'
-        lines.append(f'remaining error of the {sensor}: {left} (raw readings: {raw}), on {loss.motion}')
+        lines.append(
+            f'remaining error of the {sensor}: {left} (raw readings: {raw}), on {loss.motion}'
+        )
     return lines
 
 
@@ -189,19 +274,39 @@ def holds_in_words(target: Target) -> str:
         return 'everything'
     parts: dict[str, list[str]] = {}
     for capability in target.holds:
-        name = 'scale factors' if capability.own_axis else 'matrix' if capability.role is Role.LINEAR else capability.effect.heading
+        name = (
+            'scale factors'
+            if capability.own_axis
+            else 'matrix'
+            if capability.role is Role.LINEAR
+            else capability.effect.heading
+        )
         name = name.split(' (')[0].split(':')[0]
-        for sensor in SENSORS:   # a heading may begin with its sensor
+        for sensor in SENSORS:  # a heading may begin with its sensor
             name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
         parts.setdefault(name, []).append(capability.sensor)
-    return ', '.join(name if len(sensors) == 2 else f'{name} ({sensors[0]})' for name, sensors in parts.items()) or '-'
+    return (
+        ', '.join(
+            name if len(sensors) == 2 else f'{name} ({sensors[0]})'
+            for name, sensors in parts.items()
+        )
+        or '-'
+    )
 
 
 @cache
 def all_targets() -> dict[str, Target]:
     """Return every target by name, in alphabetical order."""
-    modules = [import_module(f'{targets.__name__}.{found.name}') for found in iter_modules(targets.__path__)]
-    return {target.name: target for target in sorted((t for module in modules for t in module.TARGETS), key=lambda t: t.name)}
+    modules = [
+        import_module(f'{targets.__name__}.{found.name}')
+        for found in iter_modules(targets.__path__)
+    ]
+    return {
+        target.name: target
+        for target in sorted(
+            (t for module in modules for t in module.TARGETS), key=lambda t: t.name
+        )
+    }
 
 
 def find_target(name: str, *, read: bool = False) -> Target:
@@ -214,8 +319,14 @@ def find_target(name: str, *, read: bool = False) -> Target:
         When there is none.
 
     """
-    fitting = {target.name: target for target in all_targets().values() if (target.read if read else target.write) is not None}
+    fitting = {
+        target.name: target
+        for target in all_targets().values()
+        if (target.read if read else target.write) is not None
+    }
     if name not in fitting:
-        raise InputError(f"the name of a program whose files can be {'read' if read else 'written'} is required, got '{name}'"
-                         f"{did_you_mean(name, fitting)}; choose from {', '.join(fitting)}")
+        raise InputError(
+            f"the name of a program whose files can be {'read' if read else 'written'} is required, got '{name}'"
+            f'{did_you_mean(name, fitting)}; choose from {", ".join(fitting)}'
+        )
     return fitting[name]

@@ -42,10 +42,14 @@ class TrialMotion:
     """Description."""
 
 
-def motion_of(force: np.ndarray, rate: np.ndarray, alpha: np.ndarray, *, temperature_c: np.ndarray, text: str) -> TrialMotion:
+def motion_of(
+    force: np.ndarray, rate: np.ndarray, alpha: np.ndarray, *, temperature_c: np.ndarray, text: str
+) -> TrialMotion:
     """Return a motion from its arrays, shapes (n, 3) and (n,)."""
     attitude = np.broadcast_to(np.eye(3), (len(force), 3, 3))
-    reference = Reference(np.zeros(len(force)), attitude, force, rate, alpha, STANDARD_GRAVITY, temperature_c)
+    reference = Reference(
+        np.zeros(len(force)), attitude, force, rate, alpha, STANDARD_GRAVITY, temperature_c
+    )
     return TrialMotion(reference, text)
 
 
@@ -73,7 +77,9 @@ def standard_motion(calibration: Calibration) -> TrialMotion:
     return motion_of(force, rate, alpha, temperature_c=temperature, text=text)
 
 
-def recorded_motion(calibration: Calibration, imu: ImuSamples, temperature: TemperatureSamples | None, *, name: str) -> TrialMotion:
+def recorded_motion(
+    calibration: Calibration, imu: ImuSamples, temperature: TemperatureSamples | None, *, name: str
+) -> TrialMotion:
     """
     Return the motion of a recording as the calibration sees it: its compensated readings.
 
@@ -86,22 +92,37 @@ def recorded_motion(calibration: Calibration, imu: ImuSamples, temperature: Temp
 
     """
     corrected = CompensationStream(calibration, temperature=temperature).correct(imu)
-    kept = np.isfinite(corrected.force).all(axis=1) & np.isfinite(corrected.rate).all(axis=1) & ~corrected.flagged
+    kept = (
+        np.isfinite(corrected.force).all(axis=1)
+        & np.isfinite(corrected.rate).all(axis=1)
+        & ~corrected.flagged
+    )
     if not kept.any():
-        raise InputError(f'{name} must have readings that can be compensated, it has none; give another recording')
+        raise InputError(
+            f'{name} must have readings that can be compensated, it has none; give another recording'
+        )
     stamps = imu.stamp_ns[kept]
     slope = StampedDerivative(derivative_for(calibration, typical_period(stamps[:10_000]) or 0.01))
     alpha = slope.push_block(stamps, corrected.rate[kept])
-    return motion_of(corrected.force[kept], corrected.rate[kept], alpha, temperature_c=temperature_at(calibration, temperature, stamps),
-                     text=f'{name} ({int(kept.sum())} samples)')
+    return motion_of(
+        corrected.force[kept],
+        corrected.rate[kept],
+        alpha,
+        temperature_c=temperature_at(calibration, temperature, stamps),
+        text=f'{name} ({int(kept.sum())} samples)',
+    )
 
 
-def temperature_at(calibration: Calibration, temperature: TemperatureSamples | None, stamp_ns: np.ndarray) -> np.ndarray:
+def temperature_at(
+    calibration: Calibration, temperature: TemperatureSamples | None, stamp_ns: np.ndarray
+) -> np.ndarray:
     """Return the temperature at stamps, shape (n,): the calibration's reference where none was measured."""
     if temperature is None or not len(temperature):
         return np.full(len(stamp_ns), calibration.model.temperature_ref_c)
     first = temperature.stamp_ns[0]
-    return np.interp((stamp_ns - first) * 1e-9, (temperature.stamp_ns - first) * 1e-9, temperature.temperature_c)
+    return np.interp(
+        (stamp_ns - first) * 1e-9, (temperature.stamp_ns - first) * 1e-9, temperature.temperature_c
+    )
 
 
 ROUNDING_LOSS = 1e-9
@@ -141,7 +162,14 @@ class Loss:
         return not self.effects and max(self.left.values()) < ROUNDING_LOSS
 
 
-def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, placement: affine.Placement, motion: TrialMotion) -> Loss:
+def loss_of(
+    target: Target,
+    calibration: Calibration,
+    numbers: Numbers,
+    *,
+    placement: affine.Placement,
+    motion: TrialMotion,
+) -> Loss:
     """
     Return the loss of a target on a motion.
 
@@ -163,21 +191,34 @@ def loss_of(target: Target, calibration: Calibration, numbers: Numbers, *, place
     ref, effects = motion.reference, {effect.key: effect for effect in model.effects}
     read = {sensor: sensor_output(model, sensor, values, ref=ref) for sensor in SENSORS}
     without = values.copy()
-    estimated = tuple(e for e in effects.values() if affine.capability_of(e, target.estimates) and e.key in calibration.model.slices)
+    estimated = tuple(
+        e
+        for e in effects.values()
+        if affine.capability_of(e, target.estimates) and e.key in calibration.model.slices
+    )
     for effect in estimated:
         without[model.slices[effect.key]] = effect.prior_values()
     seen = {sensor: sensor_output(model, sensor, without, ref=ref) for sensor in SENSORS}
     true = placement.truth(ref.force_s, ref.rate_s, ref.alpha_s)
-    made, lost = true, ()   # the whole document represents all effects of the full compensation
+    made, lost = true, ()  # the whole document represents all effects of the full compensation
     if not target.whole:
-        assert ref.temperature_c is not None   # a trial motion has it
+        assert ref.temperature_c is not None  # a trial motion has it
         force, rate = placement.readings(*seen.values())
         readings = Readings(force, rate, ref.alpha_s @ placement.mat_ts.T, ref.temperature_c)
         made = target.corrected(numbers, readings)
-        parts = (_lost(calibration, effect, target.holds, motion) for effect in effects.values() if effect not in estimated)
+        parts = (
+            _lost(calibration, effect, target.holds, motion)
+            for effect in effects.values()
+            if effect not in estimated
+        )
         lost = tuple(part for part in parts if part is not None)
-    return Loss(lost, estimated, {s: _rms(m - t) for s, m, t in zip(SENSORS, made, true)},
-                {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))}, motion.text)
+    return Loss(
+        lost,
+        estimated,
+        {s: _rms(m - t) for s, m, t in zip(SENSORS, made, true)},
+        {s: _rms(read[s] - t) for s, t in zip(SENSORS, (ref.force_s, ref.rate_s))},
+        motion.text,
+    )
 
 
 def _lost(calibration, effect, holds, motion):
@@ -197,7 +238,7 @@ def _rms(values):
     return float(np.sqrt(np.mean(values**2)))
 
 
-@np.errstate(all='ignore')   # `check_numbers` refuses non-finite values
+@np.errstate(all='ignore')  # `check_numbers` refuses non-finite values
 def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = '') -> Calibration:
     """
     Return the calibration in a file of another program.
@@ -222,23 +263,36 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
         When it is no such file, or its numbers can belong to no IMU.
 
     """
-    assert target.read is not None   # `find_target` gives no other
+    assert target.read is not None  # `find_target` gives no other
     found = target.read(content, path)
     if target.whole:
         return from_mapping(found.numbers)
     assert target.imu is not None
     read, own = target.imu(found.numbers), affine.find_pose(content)
     if own is None:
-        return _document(target, found, affine.moved(read, target.back(read)), target.axes, path, frame_id)
+        return _document(
+            target, found, affine.moved(read, target.back(read)), target.axes, path, frame_id
+        )
     placement, parent = own
-    return _document(target, found, affine.moved(read, placement.inverse()), 'mount', path, frame_id or parent)
+    return _document(
+        target, found, affine.moved(read, placement.inverse()), 'mount', path, frame_id or parent
+    )
 
 
-def _document(target: Target, found: Read, imu: affine.AffineImu, axes: str, path: Any, frame_id: str) -> Calibration:
+def _document(
+    target: Target, found: Read, imu: affine.AffineImu, axes: str, path: Any, frame_id: str
+) -> Calibration:
     holds = tuple(capability for capability in target.holds if capability not in found.lacks)
     # Bias and matrix always, further effects where the file gives them a value.
-    named = [*affine.OFFSETS, *affine.MATRICES, *(capability for capability in holds if np.any(imu.value(capability)))]
-    accelerometer, gyroscope = (tuple(dict.fromkeys(each.effect.name for each in affine.of(sensor, named))) for sensor in SENSORS)
+    named = [
+        *affine.OFFSETS,
+        *affine.MATRICES,
+        *(capability for capability in holds if np.any(imu.value(capability))),
+    ]
+    accelerometer, gyroscope = (
+        tuple(dict.fromkeys(each.effect.name for each in affine.of(sensor, named)))
+        for sensor in SENSORS
+    )
     model = SensorModel(accelerometer, gyroscope, temperature_ref_c=imu.temperature_ref_c)
     values, sd = model.prior()
     status = np.full(len(values), HELD, dtype=object)
@@ -251,10 +305,28 @@ def _document(target: Target, found: Read, imu: affine.AffineImu, axes: str, pat
     name = getattr(path, 'name', str(path))
     reason = f'imported from {target.title} ({name}) without uncertainties, its error was not measured on a recording'
     statistics = {sensor: {'noise_sd': [value] * 3} for sensor, value in found.sample_sd.items()}
-    conditions = {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}
+    conditions = (
+        {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}
+    )
     gauge = {'origin': 'mean_of_sensitive_points' if np.any(imu.arms) else UNKNOWN_SD, 'axes': axes}
-    provenance = {'software': imu_calibration.__version__, 'imported': {'from': target.name, 'file': name}, 'uncertainty': UNKNOWN_SD}
-    return check_numbers(Calibration(
-        model, values, np.diag(sd**2), tuple(status), frame_id, gauge, statistics=statistics, conditions=conditions, provenance=provenance,
-        decision=dict.fromkeys(SENSORS, str(UNPROVEN)), decision_reasons=dict.fromkeys(SENSORS, reason),
-        notes=("next: measure its error on a recording: 'imu_calibration check'",)))
+    provenance = {
+        'software': imu_calibration.__version__,
+        'imported': {'from': target.name, 'file': name},
+        'uncertainty': UNKNOWN_SD,
+    }
+    return check_numbers(
+        Calibration(
+            model,
+            values,
+            np.diag(sd**2),
+            tuple(status),
+            frame_id,
+            gauge,
+            statistics=statistics,
+            conditions=conditions,
+            provenance=provenance,
+            decision=dict.fromkeys(SENSORS, str(UNPROVEN)),
+            decision_reasons=dict.fromkeys(SENSORS, reason),
+            notes=("next: measure its error on a recording: 'imu_calibration check'",),
+        )
+    )

@@ -40,11 +40,18 @@ def read_yaml(content: bytes, what: str) -> dict:
 def read_json(content: bytes, what: str) -> dict:
     """Return the mapping in a JSON file."""
     try:
-        found = json.loads(text_of(content, what), parse_int=lambda digits: int(digits) if len(digits) < 100 else float(digits))
+        found = json.loads(
+            text_of(content, what),
+            parse_int=lambda digits: int(digits) if len(digits) < 100 else float(digits),
+        )
     except (ValueError, RecursionError) as error:
-        raise InputError(f'the {what} must be JSON: {shortened(str(error))}; give another file') from error
+        raise InputError(
+            f'the {what} must be JSON: {shortened(str(error))}; give another file'
+        ) from error
     if not isinstance(found, dict):
-        raise InputError(f'the {what} must hold a mapping, got {type(found).__name__}; give another file')
+        raise InputError(
+            f'the {what} must hold a mapping, got {type(found).__name__}; give another file'
+        )
     return found
 
 
@@ -53,7 +60,9 @@ def text_of(content: bytes, what: str) -> str:
     try:
         return content.decode()
     except UnicodeDecodeError as error:
-        raise InputError(f'the {what} must be a text file, it is none; give another file') from error
+        raise InputError(
+            f'the {what} must be a text file, it is none; give another file'
+        ) from error
 
 
 def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -> np.ndarray:
@@ -69,11 +78,15 @@ def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -
     try:
         array = np.asarray(mapping[name], float)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"the {what} must have '{name}', numbers of shape {shape}, got {shortened(repr(mapping.get(name)))}; "
-                         'correct it') from error
+        raise InputError(
+            f"the {what} must have '{name}', numbers of shape {shape}, got {shortened(repr(mapping.get(name)))}; "
+            'correct it'
+        ) from error
     if array.size != np.prod(shape, dtype=int) or not np.all(np.isfinite(array)):
-        raise InputError(f"'{name}' of the {what} must be finite numbers of shape {shape}, got {shortened(repr(mapping[name]))}; "
-                         'correct it')
+        raise InputError(
+            f"'{name}' of the {what} must be finite numbers of shape {shape}, got {shortened(repr(mapping[name]))}; "
+            'correct it'
+        )
     return array.reshape(shape)
 
 
@@ -81,7 +94,9 @@ def section(mapping: dict, name: str, what: str) -> dict:
     """Return a mapping in a mapping."""
     found = mapping.get(name)
     if not isinstance(found, dict):
-        raise InputError(f"the {what} must have a section '{name}', got {shortened(repr(found))}; give another file")
+        raise InputError(
+            f"the {what} must have a section '{name}', got {shortened(repr(found))}; give another file"
+        )
     return found
 
 
@@ -95,15 +110,21 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     found = {}
     for line in text_of(content, what).splitlines():
         words = re.split(r'[\s,=]+', line.partition('#')[0].strip())
-        name = next((k for k, word in enumerate(words) if re.fullmatch(r'[A-Z][A-Z0-9_]+', word)), None)
+        name = next(
+            (k for k, word in enumerate(words) if re.fullmatch(r'[A-Z][A-Z0-9_]+', word)), None
+        )
         if name is None or name + 1 >= len(words):
             continue
         try:
             found[words[name]] = float(words[name + 1])
         except ValueError as error:
-            raise InputError(f"the {what} must give '{words[name]}' a number, got {shortened(words[name + 1])}; correct it") from error
+            raise InputError(
+                f"the {what} must give '{words[name]}' a number, got {shortened(words[name + 1])}; correct it"
+            ) from error
     if not found:
-        raise InputError(f'the {what} must hold parameters, one NAME and value a line, it holds none; give another file')
+        raise InputError(
+            f'the {what} must hold parameters, one NAME and value a line, it holds none; give another file'
+        )
     return found
 
 
@@ -124,8 +145,11 @@ def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
     """
     curved = [name for name, value in found.items() if name.startswith(tuple(beginnings)) and value]
     if curved:
-        raise InputError(f'thermal offsets must be linear in the temperature to be read, got {curved[0]} = {found[curved[0]]:g}; '
-                         'set it to 0, or calibrate with a temperature topic', code='not_linear')
+        raise InputError(
+            f'thermal offsets must be linear in the temperature to be read, got {curved[0]} = {found[curved[0]]:g}; '
+            'set it to 0, or calibrate with a temperature topic',
+            code='not_linear',
+        )
 
 
 Numbers = dict[str, Any]
@@ -167,8 +191,11 @@ def inverted(imu: AffineImu, readings: Readings) -> tuple[np.ndarray, np.ndarray
     """Return true (force, rate), the inverse of `AffineImu`; beyond its range of temperature the thermal part is that of the end."""
     low, high = imu.temperature_range_c or (-np.inf, np.inf)
     warmth = np.clip(readings.temperature_c, low, high) - imu.temperature_ref_c
-    force, turning = ((raw - imu.bias[sensor] - np.outer(warmth, imu.thermal[sensor])) @ np.linalg.inv(imu.matrix[sensor]).T
-                      for sensor, raw in zip(SENSORS, (readings.force, readings.rate)))
+    force, turning = (
+        (raw - imu.bias[sensor] - np.outer(warmth, imu.thermal[sensor]))
+        @ np.linalg.inv(imu.matrix[sensor]).T
+        for sensor, raw in zip(SENSORS, (readings.force, readings.rate))
+    )
     apparent, cross = force, np.linalg.solve(imu.matrix['gyroscope'], imu.cross)
     for _ in range(EXPORT_INVERSION_STEPS):
         rate = turning - force @ cross.T
@@ -251,7 +278,11 @@ class Target:
 
     def corrected(self, numbers: Numbers, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
         """Return specific force and rate that the program makes of readings with these numbers."""
-        return (readings.force, readings.rate) if self.imu is None else inverted(self.imu(numbers), readings)
+        return (
+            (readings.force, readings.rate)
+            if self.imu is None
+            else inverted(self.imu(numbers), readings)
+        )
 
     @property
     def only_noise(self) -> bool:

@@ -41,13 +41,16 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
     true = model.compensate(values, poses.force, np.zeros_like(poses.force), **poses.conditions)[0]
     turning = model.rate_rows(values, true, poses.rate, **poses.conditions)[0]
     base = columns[:, model.base_index('accelerometer')]
-    found = {'accelerometer': _of_norms(time, residual, base), 'gyroscope': _of_rates(time, turning)}
+    found = {
+        'accelerometer': _of_norms(time, residual, base),
+        'gyroscope': _of_rates(time, turning),
+    }
     return {sensor: movement for sensor, movement in found.items() if movement is not None}
 
 
 def _powers(time, count):
     """Return time and, with enough poses, its square, without their means, shape (k, 1 or 2)."""
-    powers = np.column_stack([time, time**2][:2 if count >= 2 * MIN_DRIFT_FREEDOM else 1])
+    powers = np.column_stack([time, time**2][: 2 if count >= 2 * MIN_DRIFT_FREEDOM else 1])
     return powers - powers.mean(axis=0)
 
 
@@ -58,13 +61,20 @@ def _of_norms(time, residual, base):
     added = np.hstack([power[:, None] * back for power in powers.T])
     known, new = orthonormal_basis(base), orthonormal_basis(np.hstack([base, added]))
     spare = len(time) - new.shape[1]
-    if spare < MIN_DRIFT_FREEDOM or not _shown(*(np.sum((residual - basis @ (basis.T @ residual))**2) for basis in (known, new)),
-                                               new.shape[1] - known.shape[1], spare):
+    if spare < MIN_DRIFT_FREEDOM or not _shown(
+        *(np.sum((residual - basis @ (basis.T @ residual)) ** 2) for basis in (known, new)),
+        new.shape[1] - known.shape[1],
+        spare,
+    ):
         return None
     both = np.hstack([base, added])
-    fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][base.shape[1]:].reshape(-1, 3)
-    alone, beside = (np.diag(np.linalg.pinv(part.T @ part))[:base.shape[1]] for part in (base, both))
-    return BiasMovement(powers @ fitted, np.sqrt(np.maximum(beside / np.maximum(alone, 1e-300), 1.0)))
+    fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][base.shape[1] :].reshape(-1, 3)
+    alone, beside = (
+        np.diag(np.linalg.pinv(part.T @ part))[: base.shape[1]] for part in (base, both)
+    )
+    return BiasMovement(
+        powers @ fitted, np.sqrt(np.maximum(beside / np.maximum(alone, 1e-300), 1.0))
+    )
 
 
 def _of_rates(time, rates):
@@ -74,8 +84,10 @@ def _of_rates(time, rates):
         return None
     rates = rates - rates.mean(axis=0)
     course = powers @ np.linalg.lstsq(powers, rates, rcond=None)[0]
-    scale = np.mean((rates - course)**2, axis=0) + 1e-300
-    if not _shown(np.sum(rates**2 / scale), np.sum((rates - course)**2 / scale), 3 * powers.shape[1], spare):
+    scale = np.mean((rates - course) ** 2, axis=0) + 1e-300
+    if not _shown(
+        np.sum(rates**2 / scale), np.sum((rates - course) ** 2 / scale), 3 * powers.shape[1], spare
+    ):
         return None
     return BiasMovement(course, np.ones(12))
 
@@ -101,7 +113,9 @@ def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Pos
     return poses if moved is None else replace(poses, force=poses.force - moved.course)
 
 
-def with_movement(covariance: np.ndarray, model: HandModel, movements: Mapping[str, BiasMovement]) -> np.ndarray:
+def with_movement(
+    covariance: np.ndarray, model: HandModel, movements: Mapping[str, BiasMovement]
+) -> np.ndarray:
     """Return the covariance with the drift: the bias at any time of the recording is within one sd of the reported mean."""
     grown = covariance.copy()
     for sensor, movement in movements.items():
@@ -109,7 +123,7 @@ def with_movement(covariance: np.ndarray, model: HandModel, movements: Mapping[s
         factor = np.ones(model.size)
         factor[index] = movement.growth
         grown *= np.outer(factor, factor)
-        grown[index[:3], index[:3]] += (movement.size / 2)**2
+        grown[index[:3], index[:3]] += (movement.size / 2) ** 2
     return grown
 
 
@@ -117,7 +131,13 @@ def notes(moved: Mapping[str, float], duration: float) -> tuple[CheckFinding, ..
     """Return the notes for the user: sensor -> distance moved in SI, over `duration` s."""
     span = f'{duration / 60:.0f} minutes' if duration >= 90 else f'{duration:.0f} s'
     sizes = {'accelerometer': (1e3 / STANDARD_GRAVITY, 'mg'), 'gyroscope': (1 / DEG, 'deg/s')}
-    return tuple(CheckFinding('bias_drift', WARNING, f'{sensor} bias moved by {size * sizes[sensor][0]:.2g} {sizes[sensor][1]} in {span}, '
-                              'which is in its sd; let the sensor warm up before recording, '
-                              'or record imu/temperature and request a thermal bias')
-                              for sensor, size in moved.items())
+    return tuple(
+        CheckFinding(
+            'bias_drift',
+            WARNING,
+            f'{sensor} bias moved by {size * sizes[sensor][0]:.2g} {sizes[sensor][1]} in {span}, '
+            'which is in its sd; let the sensor warm up before recording, '
+            'or record imu/temperature and request a thermal bias',
+        )
+        for sensor, size in moved.items()
+    )

@@ -121,17 +121,24 @@ class GravityRows:
 
     def moved(self, state: State, step: np.ndarray) -> State:
         """Return the state after a step: pose after pose 2 components of its direction and 3 of its drift, then the parameters."""
-        own = step[:5 * len(state.up)].reshape(-1, 5)
+        own = step[: 5 * len(state.up)].reshape(-1, 5)
         up = state.up + np.einsum('kij,kj->ki', tangent(state.up), own[:, :2])
-        return State(state.values + step[own.size:], unit_rows(up), state.drift + own[:, 2:])
+        return State(state.values + step[own.size :], unit_rows(up), state.drift + own[:, 2:])
 
     def linearise(self, state: State) -> RowSet:
         """Return the rows of poses, bias drifts, calm drifts and turns at a state."""
         model, poses, across = self.model, self.poses, tangent(state.up)
-        rows = [_pose_rows(model, state, poses, across), _drift_rows(model, state, poses), _calm_rows(model, state, poses)]
+        rows = [
+            _pose_rows(model, state, poses, across),
+            _drift_rows(model, state, poses),
+            _calm_rows(model, state, poses),
+        ]
         for key, turn in enumerate(self.turns):
-            rows.append(_gravity_turn_rows(model, state, turn, key, self.memory, across, poses) if turn.rotation is None
-                        else _known_turn_rows(model, state, turn))
+            rows.append(
+                _gravity_turn_rows(model, state, turn, key, self.memory, across, poses)
+                if turn.rotation is None
+                else _known_turn_rows(model, state, turn)
+            )
         return RowSet(*(np.concatenate(parts) for parts in zip(*rows)))
 
 
@@ -144,20 +151,36 @@ def _pose_rows(model, state, poses, across):
     main = np.zeros((count, 3, model.size))
     main[:, :, 0:3] = np.eye(3)
     for i in range(3):
-        main[:, i, 3 + 3 * i:4 + 4 * i] = true[:, :i + 1]
+        main[:, i, 3 + 3 * i : 4 + 4 * i] = true[:, : i + 1]
     main[:, :, model.extra_index('accelerometer')] = slopes
-    return _flat(poses.force - bias - true @ matrix.T - more, OF_DIRECTION, model.gravity * matrix @ across, main, poses.force_sem**2, 0)
+    return _flat(
+        poses.force - bias - true @ matrix.T - more,
+        OF_DIRECTION,
+        model.gravity * matrix @ across,
+        main,
+        poses.force_sem**2,
+        0,
+    )
 
 
 def _drift_rows(model, state, poses):
     """``rate = bias + further effects (gravity * up) + drift`` at rest."""
-    rate, main = model.rate_rows(state.values, model.gravity * state.up, poses.rate, **poses.conditions)
+    rate, main = model.rate_rows(
+        state.values, model.gravity * state.up, poses.rate, **poses.conditions
+    )
     return _flat(rate - state.drift, OF_DRIFT, np.eye(3), main, poses.rate_sem**2, -1)
 
 
 def _calm_rows(model, state, poses):
     """``0 = drift`` within the scatter of the drifts."""
-    return _flat(-state.drift, OF_DRIFT, np.eye(3), np.zeros((len(state.up), 3, model.size)), (CALM * poses.rate_sem)**2, 1)
+    return _flat(
+        -state.drift,
+        OF_DRIFT,
+        np.eye(3),
+        np.zeros((len(state.up), 3, model.size)),
+        (CALM * poses.rate_sem) ** 2,
+        1,
+    )
 
 
 def _integrated(model, state, data, bias, key, memory):
@@ -165,11 +188,20 @@ def _integrated(model, state, data, bias, key, memory):
     matrix, further = model.linear(state.values)[3], state.values[model.extra_index('gyroscope')]
     if key in memory:
         (old_bias, old_matrix, old_further), turn = memory[key]
-        psi = (turn.by_bias @ (bias - old_bias) + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
-               + turn.by_further @ (further - old_further))
+        psi = (
+            turn.by_bias @ (bias - old_bias)
+            + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
+            + turn.by_further @ (further - old_further)
+        )
         if np.linalg.norm(psi) < MAX_FIRST_ORDER_ANGLE:
             return small_rotation(-psi) @ turn.mat_ji, turn
-    turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=_further_of_turn(model, state, data, bias))
+    turn = integrate_turn(
+        data.time,
+        data.rate,
+        bias=bias,
+        matrix=matrix,
+        further=_further_of_turn(model, state, data, bias),
+    )
     memory[key] = ((bias, matrix, further), turn)
     return turn.mat_ji, turn
 
@@ -178,13 +210,24 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
     """Return the matrix of a turn, (3, 3), from the middle of the pose before it to that of the one after."""
     if poses.half_turn is None:
         return mat_ji
-    return small_rotation(-poses.half_turn[turn.last]) @ mat_ji @ small_rotation(-poses.half_turn[turn.first])
+    return (
+        small_rotation(-poses.half_turn[turn.last])
+        @ mat_ji
+        @ small_rotation(-poses.half_turn[turn.first])
+    )
 
 
 def _gravity_turn_rows(model, state, data, key, memory, across, poses):
     """The direction before the turn, rotated by the gyroscope, against the direction after it: two rows, from middle to middle."""
     i, j = data.first, data.last
-    mat_ji, turn = _integrated(model, state, data, state.values[model.gyro_bias] + 0.5 * (state.drift[i] + state.drift[j]), key, memory)
+    mat_ji, turn = _integrated(
+        model,
+        state,
+        data,
+        state.values[model.gyro_bias] + 0.5 * (state.drift[i] + state.drift[j]),
+        key,
+        memory,
+    )
     mat_ji = between_middles(poses, data, mat_ji)
     carried = mat_ji @ state.up[i]
     across_i, across_j = across[i], across[j]
@@ -196,7 +239,14 @@ def _gravity_turn_rows(model, state, data, key, memory, across, poses):
     nuisance[:, i, OF_DIRECTION] = across_j.T @ mat_ji @ across_i
     nuisance[:, j, OF_DIRECTION] = -(carried @ state.up[j]) * np.eye(2)
     nuisance[:, [i, j], OF_DRIFT] = 0.5 * main[:, None, model.gyro_bias]
-    return -across_j.T @ carried, nuisance.reshape(2, -1), main, np.full(2, data.noise_variance), np.full(2, 2), np.tile([i, j], (2, 1))
+    return (
+        -across_j.T @ carried,
+        nuisance.reshape(2, -1),
+        main,
+        np.full(2, data.noise_variance),
+        np.full(2, 2),
+        np.tile([i, j], (2, 1)),
+    )
 
 
 def _known_turn_rows(model, state, data):
@@ -213,19 +263,42 @@ def _known_turn_rows(model, state, data):
     main[:, model.extra_index('gyroscope')] = -inverse @ impulse
     white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
     count = len(state.up)
-    return white @ (data.rotation - rotation), np.zeros((3, 5 * count)), white @ main, np.ones(3), np.full(3, -1), np.full((3, 2), count)
+    return (
+        white @ (data.rotation - rotation),
+        np.zeros((3, 5 * count)),
+        white @ main,
+        np.ones(3),
+        np.full(3, -1),
+        np.full((3, 2), count),
+    )
 
 
 def _further_of_turn(model, state, data, bias):
     """Return output and columns of the gyroscope's further effects along a turn, at the forces and rates without them."""
     bias_f, matrix_f, _, matrix = model.linear(state.values)
-    force, rate = np.linalg.solve(matrix_f, (data.force - bias_f).T).T, np.linalg.solve(matrix, (data.rate - bias).T).T
-    return model.further('gyroscope', state.values, force, rate=rate, time=data.time, temperature_c=data.temperature_c)
+    force, rate = (
+        np.linalg.solve(matrix_f, (data.force - bias_f).T).T,
+        np.linalg.solve(matrix, (data.rate - bias).T).T,
+    )
+    return model.further(
+        'gyroscope',
+        state.values,
+        force,
+        rate=rate,
+        time=data.time,
+        temperature_c=data.temperature_c,
+    )
 
 
 def _flat(residual, place, blocks, main, noise, component):
     """Return three rows per pose; `blocks`: their columns of the pose's own nuisances at `place`."""
     own, nuisance = np.arange(len(residual)), np.zeros((*residual.shape, len(residual), 5))
     nuisance[own, :, own, place] = blocks
-    return (residual.ravel(), nuisance.reshape(residual.size, -1), main.reshape(residual.size, -1), noise.ravel(),
-            np.full(residual.size, component), np.repeat(own, 3)[:, None].repeat(2, axis=1))
+    return (
+        residual.ravel(),
+        nuisance.reshape(residual.size, -1),
+        main.reshape(residual.size, -1),
+        noise.ravel(),
+        np.full(residual.size, component),
+        np.repeat(own, 3)[:, None].repeat(2, axis=1),
+    )

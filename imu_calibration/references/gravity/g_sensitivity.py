@@ -44,37 +44,53 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
     """
     count = len(poses.force)
     time = (poses.time - poses.time.mean()) / max(np.ptp(poses.time), 1e-9)
-    course = np.column_stack([np.ones(count), time, time**2][:3 if count >= 12 else 2])
+    course = np.column_stack([np.ones(count), time, time**2][: 3 if count >= 12 else 2])
     if poses.temperature_c is not None and np.ptp(poses.temperature_c) > 0:
-        course = np.column_stack([course, (poses.temperature_c - poses.temperature_c.mean()) / np.ptp(poses.temperature_c)])
+        course = np.column_stack(
+            [
+                course,
+                (poses.temperature_c - poses.temperature_c.mean()) / np.ptp(poses.temperature_c),
+            ]
+        )
     full = np.column_stack([course, poses.force / np.linalg.norm(poses.force, axis=1).mean()])
     if count < full.shape[1] + MIN_PROCESS_FREEDOM:
         return dict(NO_EVIDENCE)
-    up, first = full[:, course.shape[1]:], course.shape[1]
+    up, first = full[:, course.shape[1] :], course.shape[1]
     upwards = np.trace(np.linalg.lstsq(full, poses.rate, rcond=None)[0][first:]) / 3
     rate = poses.rate - np.clip(upwards, -EARTH_RATE, EARTH_RATE) * up
     apart = np.abs(time[:, None] - time)
-    candidates = ((1 - share) * np.eye(count) + share * np.exp(-apart / tau) for share, tau in product(SHARES, RELATIVE_TIMES))
+    candidates = (
+        (1 - share) * np.eye(count) + share * np.exp(-apart / tau)
+        for share, tau in product(SHARES, RELATIVE_TIMES)
+    )
     covariance = min(candidates, key=lambda candidate: _loss(candidate, full, rate))
-    (least, kept_out), (rest, rest_out) = (_left(covariance, design, rate) for design in (full, course))
+    (least, kept_out), (rest, rest_out) = (
+        _left(covariance, design, rate) for design in (full, course)
+    )
     dof = count - full.shape[1] - CHOSEN
     scale = least / dof + 1e-300
     ratio = float(np.mean((rest - least) / 3 / scale))
     heldout = np.sqrt(np.sum(kept_out**2 / scale) / max(np.sum(rest_out**2 / scale), 1e-300))
-    return {'g_sensitivity_p_value': float(fdtrc(9, 3 * dof, max(ratio, 0.0))), 'g_sensitivity_heldout_ratio': float(heldout)}
+    return {
+        'g_sensitivity_p_value': float(fdtrc(9, 3 * dof, max(ratio, 0.0))),
+        'g_sensitivity_heldout_ratio': float(heldout),
+    }
 
 
 def shown(evidence: dict) -> bool:
     """Return whether the g-sensitivity is significant enough to enter the model without a request."""
-    return evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE and evidence['g_sensitivity_heldout_ratio'] < 1
+    return (
+        evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE
+        and evidence['g_sensitivity_heldout_ratio'] < 1
+    )
 
 
 def _loss(covariance, design, values):
     """Return minus twice the restricted log likelihood, with the best scale of each axis."""
     factor = np.linalg.cholesky(covariance)
     white = scipy.linalg.solve_triangular(factor, np.hstack([design, values]), lower=True)
-    orthogonal, triangle = np.linalg.qr(white[:, :design.shape[1]])
-    rest = white[:, design.shape[1]:] - orthogonal @ (orthogonal.T @ white[:, design.shape[1]:])
+    orthogonal, triangle = np.linalg.qr(white[:, : design.shape[1]])
+    rest = white[:, design.shape[1] :] - orthogonal @ (orthogonal.T @ white[:, design.shape[1] :])
     spare = len(values) - design.shape[1]
     logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(np.abs(np.diag(triangle))).sum()
     return spare * np.log((rest**2).sum(axis=0) + 1e-300).sum() + values.shape[1] * logs
@@ -86,4 +102,6 @@ def _left(covariance, design, values):
     weighted = inverse @ design
     projector = inverse - weighted @ np.linalg.solve(design.T @ weighted, weighted.T)
     left = projector @ values
-    return np.einsum('ki,ki->i', values, left), left / np.maximum(np.diag(projector), 1e-300)[:, None]
+    return np.einsum('ki,ki->i', values, left), left / np.maximum(np.diag(projector), 1e-300)[
+        :, None
+    ]

@@ -11,13 +11,36 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
-from imu_calibration.estimation.solution import DRIFT, GRAVITY, Solution, Status, statuses, tolerances_of, total, with_term
+from imu_calibration.estimation.solution import (
+    DRIFT,
+    GRAVITY,
+    Solution,
+    Status,
+    statuses,
+    tolerances_of,
+    total,
+    with_term,
+)
 from imu_calibration.preprocessing.rest_detection import find_still
-from imu_calibration.references.gravity.bias_movement import bias_movements, with_movement, without_movement
+from imu_calibration.references.gravity.bias_movement import (
+    bias_movements,
+    with_movement,
+    without_movement,
+)
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel, HandOptions, KnownTurn
-from imu_calibration.references.gravity.pose_solver import first_state, possible_turns, solve_joint, without_outliers
+from imu_calibration.references.gravity.hand_parameters import (
+    CROSS_TERMS,
+    HandModel,
+    HandOptions,
+    KnownTurn,
+)
+from imu_calibration.references.gravity.pose_solver import (
+    first_state,
+    possible_turns,
+    solve_joint,
+    without_outliers,
+)
 from imu_calibration.references.gravity.poses import (
     average_poses,
     collect_turns,
@@ -97,13 +120,25 @@ class HandCalibration(Solution):
     def gyroscope(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
         effect = self.model.find('gyroscope', Role.CROSS)
-        response = np.zeros((3, 3)) if effect is None else self.values[self.model.slices[effect.key]].reshape(3, 3)
+        response = (
+            np.zeros((3, 3))
+            if effect is None
+            else self.values[self.model.slices[effect.key]].reshape(3, 3)
+        )
         return *self.hand_model.linear(self.values)[2:], response
 
-    def compensate(self, force: np.ndarray, rate: np.ndarray, time: np.ndarray | None = None, *,
-                   temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def compensate(
+        self,
+        force: np.ndarray,
+        rate: np.ndarray,
+        time: np.ndarray | None = None,
+        *,
+        temperature_c: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` for effects that need them."""
-        return self.hand_model.compensate(self.values, force, rate, time=time, temperature_c=temperature_c)
+        return self.hand_model.compensate(
+            self.values, force, rate, time=time, temperature_c=temperature_c
+        )
 
     def norm_residuals(self) -> np.ndarray:
         """Return ``|compensated force| - gravity`` of the poses, shape (k,)."""
@@ -112,11 +147,19 @@ class HandCalibration(Solution):
 
     def rate_rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the residual rates of the poses, shape (k, 3), and their columns, shape (k, 3, n)."""
-        return self.hand_model.rate_rows(self.values, self.gravity * self.state.up, self.poses.rate, **self.poses.conditions)
+        return self.hand_model.rate_rows(
+            self.values, self.gravity * self.state.up, self.poses.rate, **self.poses.conditions
+        )
 
 
-def calibrate_by_hand(imu: ImuSamples, options: HandOptions = HandOptions(), stills: Sequence | None = None, *,
-                      known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandCalibration:
+def calibrate_by_hand(
+    imu: ImuSamples,
+    options: HandOptions = HandOptions(),
+    stills: Sequence | None = None,
+    *,
+    known_turns: Sequence[KnownTurn] = (),
+    temperature_c: np.ndarray | None = None,
+) -> HandCalibration:
     """
     Calibrate accelerometer and gyroscope from poses held still and the turns between them.
 
@@ -163,8 +206,13 @@ class HandData:
     """Attitudes, excluded turns, noise and period of the samples."""
 
 
-def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, *,
-                   known_turns: Sequence[KnownTurn] = (), temperature_c: np.ndarray | None = None) -> HandData:
+def gather_by_hand(
+    imu: ImuSamples,
+    stills: Sequence | None = None,
+    *,
+    known_turns: Sequence[KnownTurn] = (),
+    temperature_c: np.ndarray | None = None,
+) -> HandData:
     """Return the `HandData` of samples; arguments and errors as in `calibrate_by_hand`."""
     time = sample_times(imu)
     poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
@@ -173,13 +221,23 @@ def gather_by_hand(imu: ImuSamples, stills: Sequence | None = None, *,
         raise NotObservableError(
             f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still ({POSES_FULL} or more for all parameters), '
             f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes, '
-            'or describe the table or arm that moved it', key='table', code='too_few_attitudes')
+            'or describe the table or arm that moved it',
+            key='table',
+            code='too_few_attitudes',
+        )
     turns, dropped = collect_turns(time, imu, poses=poses, temperature_c=temperature_c)
-    turns += [known_turn_data(time, imu, turn, poses=poses, temperature_c=temperature_c) for turn in known_turns]
-    return HandData(poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)})
+    turns += [
+        known_turn_data(time, imu, turn, poses=poses, temperature_c=temperature_c)
+        for turn in known_turns
+    ]
+    return HandData(
+        poses, turns, {'attitudes': attitudes, 'turns_dropped': dropped, **noise_statistics(poses)}
+    )
 
 
-def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = None) -> HandCalibration:
+def solve_by_hand(
+    data: HandData, options: HandOptions, point: dict | None = None
+) -> HandCalibration:
     """
     Estimate from given poses and turns.
 
@@ -188,56 +246,120 @@ def solve_by_hand(data: HandData, options: HandOptions, point: dict | None = Non
     report('solving')
     poses, turns = data.poses, data.turns
     default, evidence = default_gyroscope(poses)
-    reference_c = 25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
-    sensors = SensorModel(options.accelerometer or BASE, options.gyroscope or default, temperature_ref_c=reference_c, point=point or {},
-                          catalogue=options.catalogue)
+    reference_c = (
+        25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
+    )
+    sensors = SensorModel(
+        options.accelerometer or BASE,
+        options.gyroscope or default,
+        temperature_ref_c=reference_c,
+        point=point or {},
+        catalogue=options.catalogue,
+    )
     model = HandModel(sensors, options.gravity)
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
-        raise InputError(f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it')
+        raise InputError(
+            f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it'
+        )
     state = first_state(model, poses)
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
     turns, contradicted = possible_turns(model, state, poses, turns=turns)
     left = {'contradicted by gravity': contradicted} if contradicted else {}
     solved = partial(solve_joint, gravity_sd=options.gravity_sd)
     for effect in model.extras:
-        if effect.time_constant and effect.name not in (point or {}):   # a time constant far from the prior does not converge from there
-            trials = [replace(model, model=each) for each in at_time_constants(model.model, effect, float(poses.time[-1]))]
-            scatter = [solved(trial, poses, turns)[0].scatter.variance[SENSORS.index(effect.sensor)] for trial in trials]
+        if effect.time_constant and effect.name not in (
+            point or {}
+        ):  # a time constant far from the prior does not converge from there
+            trials = [
+                replace(model, model=each)
+                for each in at_time_constants(model.model, effect, float(poses.time[-1]))
+            ]
+            scatter = [
+                solved(trial, poses, turns)[0].scatter.variance[SENSORS.index(effect.sensor)]
+                for trial in trials
+            ]
             model = trials[int(np.argmin(scatter))]
     for _ in range(MAX_HAND_PASSES):
         found, integrated = solved(model, poses, turns)
-        integrated = {} if model.model.relinearised else integrated   # the columns below are computed at the estimate
+        integrated = (
+            {} if model.model.relinearised else integrated
+        )  # the columns below are computed at the estimate
         settled, model = _settled(model, found), model.at(found.state.values)
-        poses, turns, out = without_outliers(model, found, poses=poses, turns=turns, integrated=integrated)
-        left |= {f'outlying {kind}': left.get(f'outlying {kind}', 0) + count for kind, count in out.items()}
+        poses, turns, out = without_outliers(
+            model, found, poses=poses, turns=turns, integrated=integrated
+        )
+        left |= {
+            f'outlying {kind}': left.get(f'outlying {kind}', 0) + count
+            for kind, count in out.items()
+        }
         if settled and not out:
             break
     movements = bias_movements(model, found.state.values, poses)
     if 'accelerometer' in movements:
         poses = without_movement(poses, movements)
         found, _ = solved(model, poses, turns)
-    terms = with_term(found.terms, DRIFT, with_movement(covariance := total(found.terms), model, movements) - covariance)
-    used, poses = poses, data.poses   # the result has all poses unchanged, also excluded and drifting ones
+    terms = with_term(
+        found.terms,
+        DRIFT,
+        with_movement(covariance := total(found.terms), model, movements) - covariance,
+    )
+    used, poses = (
+        poses,
+        data.poses,
+    )  # the result has all poses unchanged, also excluded and drifting ones
     goals = tolerances_of(model.model, options.tolerances)
-    statistics = {**data.statistics, **evidence, 'gyro_factor': model.gyro_factor, 'left_out': left,
-                  'bias_moved': {sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()},
-                  **_statistics(model, found, poses, turns)}
+    statistics = {
+        **data.statistics,
+        **evidence,
+        'gyro_factor': model.gyro_factor,
+        'left_out': left,
+        'bias_moved': {
+            sensor: float(np.linalg.norm(movement.size)) for sensor, movement in movements.items()
+        },
+        **_statistics(model, found, poses, turns),
+    }
     if options.gravity_sd:
         sd, goal = options.gravity_sd / options.gravity, float(goals[3])
-        statistics['common_scale'] = {'sd': sd, 'tolerance': goal, 'status': str(statuses([sd], [False], [goal])[0])}
-    noise = {sensor: replace(poses.noise[sensor], offset_sd=statistics[f'{name}_scatter_sd'])
-             for sensor, name in zip(SENSORS, COMPONENTS)}
+        statistics['common_scale'] = {
+            'sd': sd,
+            'tolerance': goal,
+            'status': str(statuses([sd], [False], [goal])[0]),
+        }
+    noise = {
+        sensor: replace(poses.noise[sensor], offset_sd=statistics[f'{name}_scatter_sd'])
+        for sensor, name in zip(SENSORS, COMPONENTS)
+    }
     return HandCalibration(
-        model=model.model, values=found.state.values, terms=terms, held=found.held, noise=noise, residual_rms={},
-        chi2_per_dof={sensor: {'mean': None} for sensor in SENSORS}, information=found.factor.T @ found.factor, hand_model=model,
-        tolerances=goals, statistics=statistics, poses=poses, state=found.state, used_poses=used, used_turns=turns)
+        model=model.model,
+        values=found.state.values,
+        terms=terms,
+        held=found.held,
+        noise=noise,
+        residual_rms={},
+        chi2_per_dof={sensor: {'mean': None} for sensor in SENSORS},
+        information=found.factor.T @ found.factor,
+        hand_model=model,
+        tolerances=goals,
+        statistics=statistics,
+        poses=poses,
+        state=found.state,
+        used_poses=used,
+        used_turns=turns,
+    )
 
 
 def _settled(model, found):
     """Return whether the columns of warm-ups were computed close enough to the solution."""
-    known = [(model.model.slices[e.key].stop - 1, model.model.point_of(e)[-1]) for e in model.extras if e.time_constant]
-    return all(found.held[k] or abs(found.state.values[k] / time - 1) <= MAX_SETTLED_CHANGE for k, time in known)
+    known = [
+        (model.model.slices[e.key].stop - 1, model.model.point_of(e)[-1])
+        for e in model.extras
+        if e.time_constant
+    ]
+    return all(
+        found.held[k] or abs(found.state.values[k] / time - 1) <= MAX_SETTLED_CHANGE
+        for k, time in known
+    )
 
 
 def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
@@ -247,14 +369,21 @@ def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
 
 
 def _statistics(model, found, poses, turns):
-    before, after = (model.norm_rows(values, poses.force, **poses.conditions)[0]
-                     for values in (model.nominal, found.state.values))
+    before, after = (
+        model.norm_rows(values, poses.force, **poses.conditions)[0]
+        for values in (model.nominal, found.state.values)
+    )
     sem = np.sqrt(np.mean(poses.force_sem**2, axis=1))
     of_accelerometer = np.char.startswith(model.model.param_names, 'accelerometer')
     spare = len(after) - int(np.sum(of_accelerometer & found.free))
-    result = {'poses': len(poses.start), 'turns': len(turns), 'steps': found.steps,
-              'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))), 'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
-              'norm_chi2_per_dof': float(np.sum((after / sem)**2) / spare) if spare > 0 else None}
+    result = {
+        'poses': len(poses.start),
+        'turns': len(turns),
+        'steps': found.steps,
+        'norm_residual_rms_before': float(np.sqrt(np.mean(before**2))),
+        'norm_residual_rms': float(np.sqrt(np.mean(after**2))),
+        'norm_chi2_per_dof': float(np.sum((after / sem) ** 2) / spare) if spare > 0 else None,
+    }
     for index, name in enumerate(COMPONENTS):
         result[f'{name}_scatter_sd'] = float(np.sqrt(found.scatter.variance[index]))
         result[f'{name}_dof'] = float(found.scatter.dof[index])
@@ -267,7 +396,11 @@ def _as_ranges(imu, stills):
     ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]
     ranges = [(a, b) for a, b in ranges if b - a >= 2]
     if not ranges:
-        raise NotObservableError(f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still, '
-                                 'got no interval at rest; hold the IMU still for a second or more in each attitude, '
-                                 'or describe the table or arm that moved it', key='table', code='no_rest')
+        raise NotObservableError(
+            f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still, '
+            'got no interval at rest; hold the IMU still for a second or more in each attitude, '
+            'or describe the table or arm that moved it',
+            key='table',
+            code='no_rest',
+        )
     return ranges

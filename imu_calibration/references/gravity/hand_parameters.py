@@ -28,7 +28,11 @@ REPEATS = 4
 
 def possible_by_hand(effect: Effect) -> bool:
     """Return whether an effect is observable from gravity in poses and the turns between them: it has columns, and none needs a table."""
-    return bool(effect.groups) and effect.warp is None and not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
+    return (
+        bool(effect.groups)
+        and effect.warp is None
+        and not any(group.uses & UNKNOWN_BY_HAND for group in effect.groups)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +58,12 @@ class HandModel:
         """Refuse effects that are not observable by hand."""
         strange = [e.name for e in self.model.further if not possible_by_hand(e)]
         if strange:
-            raise InputError('the reference by hand is gravity and the turns between poses, '
-                             f'{", ".join(strange)} cannot be estimated from it; give a table, or omit it', key='table',
-                             code='table_needed')
+            raise InputError(
+                'the reference by hand is gravity and the turns between poses, '
+                f'{", ".join(strange)} cannot be estimated from it; give a table, or omit it',
+                key='table',
+                code='table_needed',
+            )
 
     @cached_property
     def extras(self) -> list[Effect]:
@@ -100,7 +107,9 @@ class HandModel:
     def base_index(self, sensor: str) -> np.ndarray:
         """Return the estimated parameters of bias and matrix of one sensor."""
         parts = [self.model.part(sensor, role) for role in (Role.OFFSET, Role.LINEAR)]
-        return np.array([k for part in parts for k in range(part.start, part.stop) if not self.fixed[k]])
+        return np.array(
+            [k for part in parts for k in range(part.start, part.stop) if not self.fixed[k]]
+        )
 
     def extra_index(self, sensor: str) -> np.ndarray:
         """Return the parameters of the further effects of one sensor."""
@@ -109,7 +118,11 @@ class HandModel:
 
     def linear(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix) of a parameter vector."""
-        found = (values[self.model.part(sensor, role)] for sensor in SENSORS for role in (Role.OFFSET, Role.LINEAR))
+        found = (
+            values[self.model.part(sensor, role)]
+            for sensor in SENSORS
+            for role in (Role.OFFSET, Role.LINEAR)
+        )
         bias_f, matrix_f, bias_w, matrix_w = found
         return bias_f, matrix_f.reshape(3, 3), bias_w, matrix_w.reshape(3, 3)
 
@@ -117,8 +130,16 @@ class HandModel:
         """Return the same model with the columns of warm-ups computed at `values`."""
         return replace(self, model=self.model.at(values))
 
-    def further(self, sensor: str, values: np.ndarray, force: np.ndarray, *, rate: np.ndarray | None = None,
-                time: np.ndarray | None = None, temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def further(
+        self,
+        sensor: str,
+        values: np.ndarray,
+        force: np.ndarray,
+        *,
+        rate: np.ndarray | None = None,
+        time: np.ndarray | None = None,
+        temperature_c: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the contribution of the further effects to the output of a sensor, and its derivative by their parameters.
 
@@ -143,28 +164,61 @@ class HandModel:
             return output, columns[0]
         time = np.zeros(len(force)) if time is None else np.asarray(time, float)
         rate = np.zeros_like(force) if rate is None else rate
-        ref = Reference(time, np.zeros((len(force), 3, 3)), force, rate, np.zeros_like(force), self.gravity, temperature_c)
+        ref = Reference(
+            time,
+            np.zeros((len(force), 3, 3)),
+            force,
+            rate,
+            np.zeros_like(force),
+            self.gravity,
+            temperature_c,
+        )
         point, own = self.model.full_point(), self.model.values_of(sensor, values)
         for effect in effects:
             basis = {group.name: group.columns(ref, point) for group in effect.groups}
             coefficients, slopes = effect_slopes(effect, own, point)
             output = output + sum(basis[group] @ block for group, block in coefficients.items())
-            columns.append(sum(np.einsum('mw,wip->mip', basis[group], block) for group, block in slopes.items()))
+            columns.append(
+                sum(
+                    np.einsum('mw,wip->mip', basis[group], block) for group, block in slopes.items()
+                )
+            )
         return output, np.concatenate(columns, axis=2)
 
-    def compensate(self, values: np.ndarray, force: np.ndarray, rate: np.ndarray, *, time: np.ndarray | None = None,
-                   temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def compensate(
+        self,
+        values: np.ndarray,
+        force: np.ndarray,
+        rate: np.ndarray,
+        *,
+        time: np.ndarray | None = None,
+        temperature_c: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return true specific force and rate for readings of shape (m, 3)."""
         bias_f, matrix_f, bias_w, matrix_w = self.linear(values)
-        true_f, true_w = np.linalg.solve(matrix_f, (force - bias_f).T).T, np.linalg.solve(matrix_w, (rate - bias_w).T).T
+        true_f, true_w = (
+            np.linalg.solve(matrix_f, (force - bias_f).T).T,
+            np.linalg.solve(matrix_w, (rate - bias_w).T).T,
+        )
         for _ in range(REPEATS if self.extras else 0):
-            more_f, more_w = (self.further(s, values, true_f, rate=true_w, time=time, temperature_c=temperature_c)[0] for s in SENSORS)
+            more_f, more_w = (
+                self.further(
+                    s, values, true_f, rate=true_w, time=time, temperature_c=temperature_c
+                )[0]
+                for s in SENSORS
+            )
             true_f = np.linalg.solve(matrix_f, (force - bias_f - more_f).T).T
             true_w = np.linalg.solve(matrix_w, (rate - bias_w - more_w).T).T
         return true_f, true_w
 
-    def norm_rows(self, values: np.ndarray, force: np.ndarray, *, time: np.ndarray | None = None,
-                  temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def norm_rows(
+        self,
+        values: np.ndarray,
+        force: np.ndarray,
+        *,
+        time: np.ndarray | None = None,
+        temperature_c: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return ``|true force| - gravity`` of mean readings at rest, shape (k,), and minus its derivative by all parameters, shape (k, n).
 
@@ -177,20 +231,35 @@ class HandModel:
 
         """
         matrix = self.linear(values)[1]
-        true = self.compensate(values, force, np.zeros_like(force), time=time, temperature_c=temperature_c)[0]
+        true = self.compensate(
+            values, force, np.zeros_like(force), time=time, temperature_c=temperature_c
+        )[0]
         norm = np.linalg.norm(true, axis=1)
         back = np.linalg.solve(matrix.T, (true / norm[:, None]).T).T
         columns = np.zeros((len(force), self.size))
         columns[:, 0:3] = back
-        columns[:, 3:12] = (back[:, :, None] * np.tril(true[:, None].repeat(3, axis=1))).reshape(-1, 9)
-        slopes = self.further('accelerometer', values, true, time=time, temperature_c=temperature_c)[1]
+        columns[:, 3:12] = (back[:, :, None] * np.tril(true[:, None].repeat(3, axis=1))).reshape(
+            -1, 9
+        )
+        slopes = self.further(
+            'accelerometer', values, true, time=time, temperature_c=temperature_c
+        )[1]
         columns[:, self.extra_index('accelerometer')] = np.einsum('ki,kip->kp', back, slopes)
         return norm - self.gravity, columns
 
-    def rate_rows(self, values: np.ndarray, force: np.ndarray, rate: np.ndarray, *, time: np.ndarray | None = None,
-                  temperature_c: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def rate_rows(
+        self,
+        values: np.ndarray,
+        force: np.ndarray,
+        rate: np.ndarray,
+        *,
+        time: np.ndarray | None = None,
+        temperature_c: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return ``rate - bias - further effects`` of mean rates at rest, (k, 3), and its columns, (k, 3, n), at true specific forces."""
-        more, slopes = self.further('gyroscope', values, force, time=time, temperature_c=temperature_c)
+        more, slopes = self.further(
+            'gyroscope', values, force, time=time, temperature_c=temperature_c
+        )
         columns = np.zeros((len(rate), 3, self.size))
         columns[:, :, self.gyro_bias] = np.eye(3)
         columns[:, :, self.extra_index('gyroscope')] = slopes
@@ -244,14 +313,32 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
 
     """
     if options.noise is not None:
-        raise InputError('a separate noise file is for tables only; by hand it must be omitted', key='table',
-                         code='table_only')
+        raise InputError(
+            'a separate noise file is for tables only; by hand it must be omitted',
+            key='table',
+            code='table_only',
+        )
     asked = (options.accelerometer_model, options.gyroscope_model)
-    accelerometer, gyroscope = (None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
-                                for sensor, text in zip(SENSORS, asked, strict=True))
+    accelerometer, gyroscope = (
+        None if text is None else parse_effects(sensor, text, catalogue=options.catalogue)
+        for sensor, text in zip(SENSORS, asked, strict=True)
+    )
     if options.gravity is not None and not GRAVITY_LEAST <= options.gravity <= GRAVITY_MOST:
-        raise InputError(f'gravity must be {GRAVITY_LEAST} to {GRAVITY_MOST} m/s^2, which covers the surface of the Earth, '
-                         f'got {options.gravity:g}; give the local gravity in m/s^2, or none', key='gravity')
-    gravity, spread = (STANDARD_GRAVITY, STANDARD_GRAVITY_SD) if options.gravity is None else (options.gravity, options.gravity_sd)
-    return HandOptions(gravity, spread, tolerances=options.tolerances, accelerometer=accelerometer, gyroscope=gyroscope,
-                       catalogue=options.catalogue)
+        raise InputError(
+            f'gravity must be {GRAVITY_LEAST} to {GRAVITY_MOST} m/s^2, which covers the surface of the Earth, '
+            f'got {options.gravity:g}; give the local gravity in m/s^2, or none',
+            key='gravity',
+        )
+    gravity, spread = (
+        (STANDARD_GRAVITY, STANDARD_GRAVITY_SD)
+        if options.gravity is None
+        else (options.gravity, options.gravity_sd)
+    )
+    return HandOptions(
+        gravity,
+        spread,
+        tolerances=options.tolerances,
+        accelerometer=accelerometer,
+        gyroscope=gyroscope,
+        catalogue=options.catalogue,
+    )

@@ -12,13 +12,33 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.references.gravity.equations import TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
-from imu_calibration.references.gravity.hand_calibration import HandCalibration, HandData, solve_by_hand
-from imu_calibration.references.gravity.hand_parameters import HandModel, HandOptions, possible_by_hand
-from imu_calibration.references.gravity.pose_evidence import Block, HandEvidence, HandSpace, build_rows, gravity_turns, unexplained_by_hand
+from imu_calibration.references.gravity.hand_calibration import (
+    HandCalibration,
+    HandData,
+    solve_by_hand,
+)
+from imu_calibration.references.gravity.hand_parameters import (
+    HandModel,
+    HandOptions,
+    possible_by_hand,
+)
+from imu_calibration.references.gravity.pose_evidence import (
+    Block,
+    HandEvidence,
+    HandSpace,
+    build_rows,
+    gravity_turns,
+    unexplained_by_hand,
+)
 from imu_calibration.selection.evidence import agree
 from imu_calibration.selection.explained_share import Explained, pruned
 from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
-from imu_calibration.selection.questions import TEMPERATURE_SPAN, Question, sort_effects, time_constants
+from imu_calibration.selection.questions import (
+    TEMPERATURE_SPAN,
+    Question,
+    sort_effects,
+    time_constants,
+)
 from imu_calibration.selection.search import Search, SelectedEffects
 from imu_calibration.selection.unexplained import Unexplained
 
@@ -33,16 +53,32 @@ MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 class HandProblem:
     """Rows of a recording, the evidence on a subset of its poses, and the search."""
 
-    def __init__(self, blocks: Sequence[Block], space: HandSpace, questions: Sequence[Question], *, baseline: Sequence[int]):
-        smooth = [k for q in questions if q.effect.smooth and not q.effect.time_constant for k in q.parameters]
+    def __init__(
+        self,
+        blocks: Sequence[Block],
+        space: HandSpace,
+        questions: Sequence[Question],
+        *,
+        baseline: Sequence[int],
+    ):
+        smooth = [
+            k
+            for q in questions
+            if q.effect.smooth and not q.effect.time_constant
+            for k in q.parameters
+        ]
         self.blocks, self.space, self.questions = blocks, space, questions
         self.evidence = HandEvidence(blocks, space, smooth, baseline=baseline)
         self.search = Search(self.evidence, baseline, questions)
-        self.explained = Explained(self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf)
+        self.explained = Explained(
+            self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf
+        )
 
     def without(self, poses: np.ndarray) -> 'HandProblem':
         """Return the same inquiry without some poses."""
-        return HandProblem(self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline)
+        return HandProblem(
+            self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline
+        )
 
     def _blocks_without(self, poses):
         blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
@@ -75,11 +111,20 @@ class HandProblem:
         used = self.search.indices(chosen)
         poses = np.unique(np.concatenate([block.pose for block in self.blocks]))
         # the chosen effects are no noise here, so they are part of the baseline
-        first, second, whole = (HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
-                                for out in (*np.array_split(poses, 2), ()))
+        first, second, whole = (
+            HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
+            for out in (*np.array_split(poses, 2), ())
+        )
         return agree((first, second), whole, [used.index(k) for k in question.parameters])
 
-    def gain(self, held_out: Sequence, before: Sequence[Question], after: Sequence[Question], *, sensor: str) -> Gain:
+    def gain(
+        self,
+        held_out: Sequence,
+        before: Sequence[Question],
+        after: Sequence[Question],
+        *,
+        sensor: str,
+    ) -> Gain:
         """Return the Gain of one choice over another on the poses of `HandInvestigation.held_out`, held out from both fit and choice."""
         block = self.clearest(before, after, sensor)
         pair = [np.full(block.known.shape, np.nan) for _ in range(2)]
@@ -87,13 +132,21 @@ class HandProblem:
             rows = np.isin(block.pose, out)
             for residual, choice in zip(pair, (before, after)):
                 allowed = {question.name for question in choice}
-                values = smaller.search.values([question for question in named if question.name in allowed])
+                values = smaller.search.values(
+                    [question for question in named if question.name in allowed]
+                )
                 residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
         return gain_of_poses(block, pair)
 
     def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Block:
         """Return the rows of a sensor in which one choice improves most over another by cross-validation of the fit."""
-        squares = [[np.sum(rest**2) for rest in self.evidence.heldout_residuals(self.search.indices(choice))] for choice in (before, after)]
+        squares = [
+            [
+                np.sum(rest**2)
+                for rest in self.evidence.heldout_residuals(self.search.indices(choice))
+            ]
+            for choice in (before, after)
+        ]
         own = [k for k, block in enumerate(self.blocks) if block.sensor == sensor]
         return self.blocks[min(own, key=lambda k: squares[1][k] / max(squares[0][k], 1e-300))]
 
@@ -122,20 +175,37 @@ class HandInvestigation(SelectedEffects):
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
         """Sensor -> effects for the model."""
-        return {sensor: tuple(q.name for q in self.adopted if q.sensor == sensor) for sensor in SENSORS}
+        return {
+            sensor: tuple(q.name for q in self.adopted if q.sensor == sensor) for sensor in SENSORS
+        }
 
     @cached_property
     def unexplained(self) -> dict[str, Unexplained]:
         """Sensor -> the residual that no finding explains."""
-        blocks, evidence, used = self.problem.blocks, self.problem.evidence, self.search.indices(self.named)
-        return {sensor: unexplained_by_hand(self.baseline, blocks, evidence, used=used, sensor=sensor) for sensor in SENSORS}
+        blocks, evidence, used = (
+            self.problem.blocks,
+            self.problem.evidence,
+            self.search.indices(self.named),
+        )
+        return {
+            sensor: unexplained_by_hand(self.baseline, blocks, evidence, used=used, sensor=sensor)
+            for sensor in SENSORS
+        }
 
     def point(self, problem: HandProblem, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `problem`."""
-        fit, warm = problem.search.values(chosen), [question for question in chosen if '@' in question.label]
-        return {q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])]) for q in warm}
+        fit, warm = (
+            problem.search.values(chosen),
+            [question for question in chosen if '@' in question.label],
+        )
+        return {
+            q.name: np.append(fit[list(q.parameters)], self.constants[int(q.label.split('@')[1])])
+            for q in warm
+        }
 
-    def extended(self, problem: HandProblem, chosen: Sequence[Question]) -> tuple[HandModel, np.ndarray, float]:
+    def extended(
+        self, problem: HandProblem, chosen: Sequence[Question]
+    ) -> tuple[HandModel, np.ndarray, float]:
         """
         Return the baseline extended by some effects: (model, parameters, the Earth's rate about the vertical, rad/s).
 
@@ -143,9 +213,14 @@ class HandInvestigation(SelectedEffects):
         """
         hand, point, fit = self.baseline, self.point(problem, chosen), problem.search.values(chosen)
         base = hand.model
-        names = {sensor: getattr(base, sensor) + tuple(q.name for q in chosen if q.sensor == sensor) for sensor in SENSORS}
-        model = replace(hand.hand_model, model=replace(base, **names, point={**base.point, **point}))
-        values = model.model.start_from(base, hand.values + fit[:hand.hand_model.size])
+        names = {
+            sensor: getattr(base, sensor) + tuple(q.name for q in chosen if q.sensor == sensor)
+            for sensor in SENSORS
+        }
+        model = replace(
+            hand.hand_model, model=replace(base, **names, point={**base.point, **point})
+        )
+        values = model.model.start_from(base, hand.values + fit[: hand.hand_model.size])
         for question in chosen:
             if question.name not in point:
                 values[model.model.slices[question.effect.key]] = fit[list(question.parameters)]
@@ -176,12 +251,23 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     poses = data.poses
     if len(poses.start) < MIN_FOLD_POSES:
         raise too_few_poses(len(poses.start))
-    baseline = solve_by_hand(data, replace(options, accelerometer=options.accelerometer or BASE, gyroscope=options.gyroscope or BASE))
+    baseline = solve_by_hand(
+        data,
+        replace(
+            options,
+            accelerometer=options.accelerometer or BASE,
+            gyroscope=options.gyroscope or BASE,
+        ),
+    )
     follows_gravity = shown(g_sensitivity_evidence(poses))
-    effects, not_testable = sort_effects(baseline.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity))
+    effects, not_testable = sort_effects(
+        baseline.model, lambda effect: _why_not(effect, poses, data.turns, follows_gravity)
+    )
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
-    base = tuple(range(baseline.hand_model.size + 1))   # including fixed parameters and the Earth's rate: their uncertainty is no finding
+    base = tuple(
+        range(baseline.hand_model.size + 1)
+    )  # including fixed parameters and the Earth's rate: their uncertainty is no finding
     questions = _questions(effects, blocks, space, base, not_testable)
     problem = HandProblem(blocks, space, questions, baseline=base)
     named = problem.named()
@@ -189,22 +275,38 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     named = _that_predict(problem, held_out, named)
     unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
     if unstable:
-        named = _that_predict(problem, held_out, [question for question in named if question not in unstable])
-    return HandInvestigation(baseline, problem, named, held_out, not_testable, constants, gravity_turns(data.turns), unstable)
+        named = _that_predict(
+            problem, held_out, [question for question in named if question not in unstable]
+        )
+    return HandInvestigation(
+        baseline,
+        problem,
+        named,
+        held_out,
+        not_testable,
+        constants,
+        gravity_turns(data.turns),
+        unstable,
+    )
 
 
 def too_few_poses(count: int) -> NotObservableError:
     """Return the error of a recording with so few poses that none can be held out."""
-    return NotObservableError(f'a diagnosis by hand needs at least {MIN_FOLD_POSES} poses held still, so that some can be held out, '
-                              f'{count} were found; hold the IMU still in more attitudes',
-                              code='too_few_poses')
+    return NotObservableError(
+        f'a diagnosis by hand needs at least {MIN_FOLD_POSES} poses held still, so that some can be held out, '
+        f'{count} were found; hold the IMU still in more attitudes',
+        code='too_few_poses',
+    )
 
 
 def _that_predict(problem, held_out, named):
     """Return the findings that improve the prediction of poses held out from their choice."""
     named = list(named)
     while named:
-        gains = [problem.gain(held_out, named[:k], named[:k + 1], sensor=q.sensor) for k, q in enumerate(named)]
+        gains = [
+            problem.gain(held_out, named[:k], named[: k + 1], sensor=q.sensor)
+            for k, q in enumerate(named)
+        ]
         poor = [q for q, gain in zip(named, gains) if not gain.ci95[0] > 0]
         if not poor:
             break
@@ -214,7 +316,10 @@ def _that_predict(problem, held_out, named):
 
 def _why_not(effect, poses, turns, follows_gravity):
     if effect.role is Role.LIMIT:
-        return 'the true values of clipped samples are unknown; turns that reach a limit are excluded', 'record on a table'
+        return (
+            'the true values of clipped samples are unknown; turns that reach a limit are excluded',
+            'record on a table',
+        )
     if 'cooling' in effect.needs:
         return 'the thermal branch is not tracked between poses', 'record on a table'
     if 'vibration' in effect.needs:
@@ -224,13 +329,21 @@ def _why_not(effect, poses, turns, follows_gravity):
     if 'temperature' in effect.needs and poses.temperature_c is None:
         return 'no temperature was recorded', 'record imu/temperature'
     if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
-        return (f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only',
-                'record while the sensor warms up by at least some kelvins')
-    if effect.role is Role.CROSS and not follows_gravity:   # the same test as in calibration
-        return ('rates at rest do not separate it from a bias that moves in time', 'hold each attitude again later, in a different order')
+        return (
+            f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only',
+            'record while the sensor warms up by at least some kelvins',
+        )
+    if effect.role is Role.CROSS and not follows_gravity:  # the same test as in calibration
+        return (
+            'rates at rest do not separate it from a bias that moves in time',
+            'hold each attitude again later, in a different order',
+        )
     moving = effect.sensor == 'gyroscope' and any('rate' in group.uses for group in effect.groups)
     if moving and len(gravity_turns(turns)) < 6:
-        return 'there are fewer than six turns between poses', 'turn it by half a turn between poses'
+        return (
+            'there are fewer than six turns between poses',
+            'turn it by half a turn between poses',
+        )
     return None
 
 
@@ -245,9 +358,14 @@ def _questions(effects, blocks, space, base, not_testable):
         if rank:
             asked.append(Question(by_name[name], parameters, rank + ('@' in label), label))
     lacking = sorted(by_name.keys() - {q.name for q in asked})
-    not_testable += [{'effect': name, 'why': 'in these poses bias and matrix imitate it',
-                      'needs': 'more poses, in steps of 30 degrees about each axis'}
-                     for name in lacking]
+    not_testable += [
+        {
+            'effect': name,
+            'why': 'in these poses bias and matrix imitate it',
+            'needs': 'more poses, in steps of 30 degrees about each axis',
+        }
+        for name in lacking
+    ]
     return asked
 
 
@@ -266,5 +384,9 @@ def gain_of_poses(block: Block, pair: Sequence[np.ndarray], of: str = OF_MODEL) 
     """Return the Gain from residuals of each row of a block before and after, shape (m, n), resampled by pose."""
     place = np.unique(block.pose, return_inverse=True)[1]
     numbers = np.bincount(place) * block.known.shape[1]
-    return gain_of(block.sensor, block.name, [(np.bincount(place, (residuals**2).sum(axis=1)), numbers) for residuals in pair],
-                   of=of)
+    return gain_of(
+        block.sensor,
+        block.name,
+        [(np.bincount(place, (residuals**2).sum(axis=1)), numbers) for residuals in pair],
+        of=of,
+    )

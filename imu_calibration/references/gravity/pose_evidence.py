@@ -26,9 +26,21 @@ from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.selection.evidence import Evidence
 from imu_calibration.selection.regime_variables import Variable, ranged
-from imu_calibration.selection.regimes import REGIME_LEVEL, AxisResidual, RegimeSearch, RestRegime, exchanges
+from imu_calibration.selection.regimes import (
+    REGIME_LEVEL,
+    AxisResidual,
+    RegimeSearch,
+    RestRegime,
+    exchanges,
+)
 from imu_calibration.selection.residual_blocks import largest_axes
-from imu_calibration.selection.unexplained import MIN_EXPLAINED_WINDOWS, SIGNIFICANT_SDS, Unexplained, correlate, slow_explanations
+from imu_calibration.selection.unexplained import (
+    MIN_EXPLAINED_WINDOWS,
+    SIGNIFICANT_SDS,
+    Unexplained,
+    correlate,
+    slow_explanations,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +77,13 @@ class HandSpace:
     """Number of parameters."""
 
 
-def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequence[Effect], *,
-               constants: np.ndarray) -> tuple[list[Block], HandSpace]:
+def build_rows(
+    hand: HandCalibration,
+    turns: Sequence[TurnData],
+    effects: Sequence[Effect],
+    *,
+    constants: np.ndarray,
+) -> tuple[list[Block], HandSpace]:
     """
     Return (blocks, HandSpace).
 
@@ -82,18 +99,42 @@ def build_rows(hand: HandCalibration, turns: Sequence[TurnData], effects: Sequen
         Time constants of warm-ups under test, s.
 
     """
-    sets: list[tuple[Effect, str, float | None]] = [(effect, effect.name, None) for effect in effects if not effect.time_constant]
-    sets += [(e, f'{e.name}@{k}', float(tau)) for e in effects if e.time_constant for k, tau in enumerate(constants)]
+    sets: list[tuple[Effect, str, float | None]] = [
+        (effect, effect.name, None) for effect in effects if not effect.time_constant
+    ]
+    sets += [
+        (e, f'{e.name}@{k}', float(tau))
+        for e in effects
+        if e.time_constant
+        for k, tau in enumerate(constants)
+    ]
     base = hand.hand_model.size
     sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
     ends = np.cumsum([base + 1] + sizes)
-    widths = np.concatenate([1e3 * hand.hand_model.priors, [EARTH_UPWARDS_SD], *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes))])
+    widths = np.concatenate(
+        [
+            1e3 * hand.hand_model.priors,
+            [EARTH_UPWARDS_SD],
+            *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes)),
+        ]
+    )
     parts = {label: slice(a, b) for (_, label, _), a, b in zip(sets, ends, ends[1:])}
     space = HandSpace(parts, widths, int(ends[-1]))
     true, zero = hand.gravity * hand.state.up, np.zeros_like(hand.state.up)
-    at_rest = {sensor: {label: _columns(hand, effect, tau, true, zero, hand.poses.time, hand.poses.temperature_c)[:, :, :size]
-                        for (effect, label, tau), size in zip(sets, sizes) if effect.sensor == sensor} for sensor in SENSORS}
-    blocks = [_norm_block(hand, space, at_rest['accelerometer']), _rest_block(hand, space, at_rest['gyroscope'])]
+    at_rest = {
+        sensor: {
+            label: _columns(
+                hand, effect, tau, true, zero, hand.poses.time, hand.poses.temperature_c
+            )[:, :, :size]
+            for (effect, label, tau), size in zip(sets, sizes)
+            if effect.sensor == sensor
+        }
+        for sensor in SENSORS
+    }
+    blocks = [
+        _norm_block(hand, space, at_rest['accelerometer']),
+        _rest_block(hand, space, at_rest['gyroscope']),
+    ]
     if between := gravity_turns(turns):
         moving = [effect for effect, _, tau in sets if effect.sensor == 'gyroscope' and tau is None]
         blocks.append(_turn_block(hand, between, space, at_rest['gyroscope'], moving))
@@ -108,10 +149,14 @@ def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
 def _columns(hand, effect, tau, force, rate, time, temperature_c):
     """Return the contribution of the effect's parameters to its sensor's output, shape (m, 3, p), at the baseline's solution."""
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
-    names = {sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS}
+    names = {
+        sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS
+    }
     model = HandModel(replace(hand.model, **names, point=point), hand.gravity)
     values = model.model.start_from(hand.model, hand.values)
-    return model.further(effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c)[1]
+    return model.further(
+        effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c
+    )[1]
 
 
 def _natural(poses, sensor):
@@ -125,12 +170,20 @@ def _norm_block(hand, space, at_rest):
     residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
     back = base[:, 0:3]
     rows = np.zeros((count, space.size + 1))
-    rows[:, :base.shape[1]], rows[:, -1] = base, residual
+    rows[:, : base.shape[1]], rows[:, -1] = base, residual
     for label, columns in at_rest.items():
         rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
-    known = np.sum((back * poses.force_sem)**2, axis=1)
+    known = np.sum((back * poses.force_sem) ** 2, axis=1)
     floor = known + back**2 @ _natural(poses, 'accelerometer')
-    return Block('poses', 'accelerometer', rows[:, None], known[:, None], floor[:, None], np.arange(count), poses.time)
+    return Block(
+        'poses',
+        'accelerometer',
+        rows[:, None],
+        known[:, None],
+        floor[:, None],
+        np.arange(count),
+        poses.time,
+    )
 
 
 def _rest_block(hand, space, at_rest):
@@ -138,7 +191,11 @@ def _rest_block(hand, space, at_rest):
     poses, count = hand.poses, len(hand.poses.start)
     residual, base = hand.rate_rows()
     rows = np.zeros((count, 3, space.size + 1))
-    rows[:, :, :base.shape[2]], rows[:, :, base.shape[2]], rows[:, :, -1] = base, hand.state.up, residual
+    rows[:, :, : base.shape[2]], rows[:, :, base.shape[2]], rows[:, :, -1] = (
+        base,
+        hand.state.up,
+        residual,
+    )
     for label, columns in at_rest.items():
         rows[:, :, space.parts[label]] = columns
     known = poses.rate_sem**2
@@ -160,26 +217,44 @@ def _turn_block(hand, turns, space, at_rest, moving):
     for turn in turns:
         i, j = turn.first, turn.last
         bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
-        force, rate = np.linalg.solve(matrix_f, (turn.force - bias_f).T).T, np.linalg.solve(matrix, (turn.rate - bias).T).T
-        further = [_columns(hand, e, None, force, rate, turn.time, turn.temperature_c) - 0.5 * (at_rest[e.name][i] + at_rest[e.name][j])
-                   for e in moving]
+        force, rate = (
+            np.linalg.solve(matrix_f, (turn.force - bias_f).T).T,
+            np.linalg.solve(matrix, (turn.rate - bias).T).T,
+        )
+        further = [
+            _columns(hand, e, None, force, rate, turn.time, turn.temperature_c)
+            - 0.5 * (at_rest[e.name][i] + at_rest[e.name][j])
+            for e in moving
+        ]
         stacked = np.concatenate([np.zeros((len(force), 3, 0)), *further], axis=2)
-        found = integrate_turn(turn.time, turn.rate, bias=bias, matrix=matrix, further=(np.zeros_like(force), stacked))
+        found = integrate_turn(
+            turn.time, turn.rate, bias=bias, matrix=matrix, further=(np.zeros_like(force), stacked)
+        )
         carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
         by_psi = across[j].T @ skew(carried) / found.duration
         row = np.zeros((2, space.size + 1))
         row[:, hand.hand_model.gyro_matrix] = by_psi @ found.by_matrix.reshape(3, 9)
         place = 0
         for effect in moving:
-            row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, place:place + effect.size]
+            row[:, space.parts[effect.name]] = (
+                by_psi @ found.by_further[:, place : place + effect.size]
+            )
             place += effect.size
         row[:, -1] = -across[j].T @ carried / found.duration
         rows.append(row)
         durations.append(found.duration)
-        of_bias = 0.25 * np.mean(hand.poses.rate_sem[[i, j]]**2, axis=1).sum()
+        of_bias = 0.25 * np.mean(hand.poses.rate_sem[[i, j]] ** 2, axis=1).sum()
         known.append(np.full(2, turn.noise_variance / found.duration**2 + of_bias))
-    return Block('turns', 'gyroscope', np.array(rows), np.array(known), np.array(known), np.array([turn.first for turn in turns]),
-                 np.array([turn.time.mean() for turn in turns]), np.array(durations))
+    return Block(
+        'turns',
+        'gyroscope',
+        np.array(rows),
+        np.array(known),
+        np.array(known),
+        np.array([turn.first for turn in turns]),
+        np.array([turn.time.mean() for turn in turns]),
+        np.array(durations),
+    )
 
 
 POSE_FOLDS = 12
@@ -216,53 +291,90 @@ class HandEvidence(Evidence):
 
     """
 
-    def __init__(self, blocks: Sequence[Block], space: HandSpace, smooth: Sequence[int], *, baseline: Sequence[int]):
+    def __init__(
+        self,
+        blocks: Sequence[Block],
+        space: HandSpace,
+        smooth: Sequence[int],
+        *,
+        baseline: Sequence[int],
+    ):
         self.blocks, self.space = blocks, space
-        self._noise = [_noise(block, [*baseline, *(k for k in smooth if np.any(block.rows[:, :, k]))]) for block in blocks]
+        self._noise = [
+            _noise(block, [*baseline, *(k for k in smooth if np.any(block.rows[:, :, k]))])
+            for block in blocks
+        ]
         poses = np.unique(np.concatenate([block.pose for block in blocks]))
         n_folds = len(poses) if len(poses) <= ONE_BY_ONE else POSE_FOLDS
         self.folds = [np.searchsorted(poses, block.pose) % n_folds for block in blocks]
         self._white = self._whitened()
-        total, *without = (sum(rows.T @ rows for rows in white) for white in (self._white, *map(self._whitened, range(n_folds))))
-        super().__init__(total, np.array(without), prior_sd=space.prior_sd, prior_mean=np.zeros(space.size))
+        total, *without = (
+            sum(rows.T @ rows for rows in white)
+            for white in (self._white, *map(self._whitened, range(n_folds)))
+        )
+        super().__init__(
+            total, np.array(without), prior_sd=space.prior_sd, prior_mean=np.zeros(space.size)
+        )
 
     def _whitened(self, number=None):
         """Return the rows of each block, without fold `number`, as independent rows of unit variance, a list of (m, q + 1)."""
         white = []
         for block, (variance, processes), fold in zip(self.blocks, self._noise, self.folds):
             kept = fold != number
-            whitening = Whitening(variance[kept], block.time[kept], [np.arange(kept.sum())], processes=processes)
+            whitening = Whitening(
+                variance[kept], block.time[kept], [np.arange(kept.sum())], processes=processes
+            )
             white.append(whitening(block.rows[kept]).reshape(-1, self.space.size + 1))
         return white
 
     def residuals(self, used: Sequence[int]) -> list[np.ndarray]:
         """Return the residual rows of each block under the fit to all poses, shape (m, n_axes)."""
         values = self.fit(used)[0]
-        return [block.rows[:, :, -1] - block.rows[:, :, list(used)] @ values for block in self.blocks]
+        return [
+            block.rows[:, :, -1] - block.rows[:, :, list(used)] @ values for block in self.blocks
+        ]
 
     def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
         """Return the residual of every row under the fit without its pose, shape (m, n_axes) per block."""
         left = self.left_by_others(used)
-        return [np.einsum('mac,mc->ma', block.rows, left[fold]) for block, fold in zip(self.blocks, self.folds)]
+        return [
+            np.einsum('mac,mc->ma', block.rows, left[fold])
+            for block, fold in zip(self.blocks, self.folds)
+        ]
 
     def against_noise(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """Return sensor -> squares of the same in units of noise and usual bias drift, of each block, shape (n_blocks, 1)."""
         left = self.heldout_residuals(used)
-        return {sensor: np.array([[np.sum(r**2 / block.floor)] for block, r in zip(self.blocks, left) if block.sensor == sensor])
-                for sensor in SENSORS}
+        return {
+            sensor: np.array(
+                [
+                    [np.sum(r**2 / block.floor)]
+                    for block, r in zip(self.blocks, left)
+                    if block.sensor == sensor
+                ]
+            )
+            for sensor in SENSORS
+        }
 
     @property
     def numbers(self) -> dict[str, np.ndarray]:
         """Sensor -> number of the squares of each block."""
-        return {sensor: np.array([block.known.size for block in self.blocks if block.sensor == sensor]) for sensor in SENSORS}
+        return {
+            sensor: np.array([block.known.size for block in self.blocks if block.sensor == sensor])
+            for sensor in SENSORS
+        }
 
     def _heldout(self, used):
-        squares = [r**2 / (variance + sum(process.sd**2 for process in processes))
-                   for r, (variance, processes) in zip(self.heldout_residuals(used), self._noise)]
+        squares = [
+            r**2 / (variance + sum(process.sd**2 for process in processes))
+            for r, (variance, processes) in zip(self.heldout_residuals(used), self._noise)
+        ]
         return float(sum(s.size * np.log(s.mean()) for s in squares))
 
     def _loss(self, used):
-        return float(sum(len(white) * np.log(np.mean(self._left(white, used)**2)) for white in self._white))
+        return float(
+            sum(len(white) * np.log(np.mean(self._left(white, used) ** 2)) for white in self._white)
+        )
 
     def _left(self, white, used):
         return white[:, -1] - white[:, list(used)] @ self.fit(used)[0]
@@ -271,18 +383,28 @@ class HandEvidence(Evidence):
         """Return the p-value of `larger` against `smaller`: F test on the blocks that contain the new columns."""
         added = [k for k in larger if k not in set(smaller)]
         concerned = [white for white in self._white if np.any(white[:, added])]
-        squares = [sum(np.sum(self._left(white, used)**2) for white in concerned) for used in (smaller, larger)]
+        squares = [
+            sum(np.sum(self._left(white, used) ** 2) for white in concerned)
+            for used in (smaller, larger)
+        ]
         rank = max(self.rank(added, smaller), 1)
-        in_use = np.any([np.any(white[:, list(larger)] != 0, axis=0) for white in concerned], axis=0).sum()
+        in_use = np.any(
+            [np.any(white[:, list(larger)] != 0, axis=0) for white in concerned], axis=0
+        ).sum()
         spare = sum(map(len, concerned)) - int(in_use)
         if spare < 3 or squares[1] <= 0:
             return 1.0
-        return float(f_sf(max(squares[0] - squares[1], 0.0) / rank / (squares[1] / spare), rank, spare))
+        return float(
+            f_sf(max(squares[0] - squares[1], 0.0) / rank / (squares[1] / spare), rank, spare)
+        )
 
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
         """Return how many combinations of the added columns are not collinear with the smaller choice."""
         white = np.concatenate(self._white)
-        known, new = orthonormal_basis(white[:, list(smaller)], DEPENDENT), orthonormal_basis(white[:, list(added)], MIN_COLUMN_DIFFERENCE)
+        known, new = (
+            orthonormal_basis(white[:, list(smaller)], DEPENDENT),
+            orthonormal_basis(white[:, list(added)], MIN_COLUMN_DIFFERENCE),
+        )
         if not new.shape[1]:
             return 0
         sines = np.linalg.svd(new - known @ (known.T @ new), compute_uv=False)
@@ -295,11 +417,19 @@ def _noise(block, used):
     basis = orthonormal_basis(block.rows.reshape(-1, width)[:, used], DEPENDENT)
     rows = np.concatenate([basis.reshape(count, axes, -1), block.rows[:, :, -1:]], axis=2)
     likelihood = NoiseLikelihood(rows, block.known, block.time, sessions=[np.arange(count)])
-    biases = [(share, time) for share in BIASES[1:] for time in BIAS_TIMES] if block.name == 'poses' else []
-    shapes = [(offset, share * max(offset, 1.0), time) for offset in SCATTER_RATIOS for share, time in [(0.0, BIAS_TIMES[0]), *biases]]
+    biases = (
+        [(share, time) for share in BIASES[1:] for time in BIAS_TIMES]
+        if block.name == 'poses'
+        else []
+    )
+    shapes = [
+        (offset, share * max(offset, 1.0), time)
+        for offset in SCATTER_RATIOS
+        for share, time in [(0.0, BIAS_TIMES[0]), *biases]
+    ]
     offset, bias, time = min(shapes, key=likelihood.loss)
     unit = likelihood.typical
-    return block.known + (offset * unit)**2, (BiasProcess(bias * unit, time),) if bias else ()
+    return block.known + (offset * unit) ** 2, (BiasProcess(bias * unit, time),) if bias else ()
 
 
 NORM = 'norm'
@@ -308,8 +438,14 @@ TURN_RESIDUAL_UNIT = 'rad/turn'
 """Unit of the residual of turns: the angle between predicted and measured gravity after a turn."""
 
 
-def unexplained_by_hand(hand: HandCalibration, blocks: Sequence[Block], evidence: HandEvidence, *,
-                        used: Sequence[int], sensor: str) -> Unexplained:
+def unexplained_by_hand(
+    hand: HandCalibration,
+    blocks: Sequence[Block],
+    evidence: HandEvidence,
+    *,
+    used: Sequence[int],
+    sensor: str,
+) -> Unexplained:
     """
     Return the unexplained residual of one sensor: its rows at rest and its turns against the expectation from noise.
 
@@ -330,12 +466,16 @@ def unexplained_by_hand(hand: HandCalibration, blocks: Sequence[Block], evidence
     for block, residual in zip(blocks, residuals):
         if block.sensor != sensor:
             continue
-        spare = residual.size - np.linalg.matrix_rank(block.rows[:, :, used].reshape(residual.size, -1))
+        spare = residual.size - np.linalg.matrix_rank(
+            block.rows[:, :, used].reshape(residual.size, -1)
+        )
         if spare < 3:
             continue
         own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
         if block.name == 'poses' or own > max(sigma, SIGNIFICANT_SDS):
-            size = 1.0 if block.duration is None else block.duration[:, None]**2   # the residual of a turn is an angle, of a pose a rate
+            size = (
+                1.0 if block.duration is None else block.duration[:, None] ** 2
+            )  # the residual of a turn is an angle, of a pose a rate
             excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
             if own > sigma:
                 sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block
@@ -350,22 +490,48 @@ def unexplained_by_hand(hand: HandCalibration, blocks: Sequence[Block], evidence
     if chosen is not None and chosen.name == 'turns' and name is None:
         name = 'motion (turns between poses)'
     heldout = evidence.heldout_residuals(used)[first]
-    excess = ((heldout / noise_sd)**2 - 1.0).sum(axis=0)
+    excess = ((heldout / noise_sd) ** 2 - 1.0).sum(axis=0)
     axes = largest_axes(excess) if len(excess) == len(AXES) and excess.max() > 0 else ()
-    return Unexplained(True, rms, float(sigma), name, share, layers, noise_sd, unit,
-                       axes, regimes_by_hand(hand, blocks[first], heldout))
+    return Unexplained(
+        True,
+        rms,
+        float(sigma),
+        name,
+        share,
+        layers,
+        noise_sd,
+        unit,
+        axes,
+        regimes_by_hand(hand, blocks[first], heldout),
+    )
 
 
 def _explanations(hand):
     poses, up = hand.poses, hand.state.up
     every = np.ones(len(up), bool)
-    yield from slow_explanations(poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c)
+    yield from slow_explanations(
+        poses.time, np.full(len(up), np.nan) if poses.temperature_c is None else poses.temperature_c
+    )
     yield 'direction of gravity', up, every
-    yield 'direction of gravity', np.stack([up[:, 0]**2 - up[:, 1]**2, up[:, 2]**2, up[:, 0] * up[:, 1], up[:, 1] * up[:, 2],
-                                            up[:, 0] * up[:, 2]], axis=1), every
+    yield (
+        'direction of gravity',
+        np.stack(
+            [
+                up[:, 0] ** 2 - up[:, 1] ** 2,
+                up[:, 2] ** 2,
+                up[:, 0] * up[:, 1],
+                up[:, 1] * up[:, 2],
+                up[:, 0] * up[:, 2],
+            ],
+            axis=1,
+        ),
+        every,
+    )
 
 
-def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -> tuple[RestRegime, ...]:
+def regimes_by_hand(
+    hand: HandCalibration, block: Block, residual: np.ndarray
+) -> tuple[RestRegime, ...]:
     """
     Return the clearest regime of each axis.
 
@@ -384,11 +550,20 @@ def regimes_by_hand(hand: HandCalibration, block: Block, residual: np.ndarray) -
     names = AXES if residual.shape[1] == len(AXES) else (NORM,)
     poses = np.arange(len(residual))
     exchange = exchanges(poses, np.zeros(len(poses)), np.zeros(len(poses)))
-    search, found = RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange), []
+    search, found = (
+        RegimeSearch(block.sensor, block.time, _variables(hand, block), exchange=exchange),
+        [],
+    )
     for axis, name in enumerate(names):
         sd = np.sqrt(block.floor[:, axis])
-        rest = AxisResidual(np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None], np.zeros(1), np.zeros(1))
-        found += search.offsets(name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=REGIME_LEVEL / len(names))[:1]
+        rest = AxisResidual(
+            np.column_stack([np.ones(len(sd)), residual[:, axis]]) / sd[:, None],
+            np.zeros(1),
+            np.zeros(1),
+        )
+        found += search.offsets(
+            name, rest, partial(np.multiply, 1.0 / sd[:, None]), level=REGIME_LEVEL / len(names)
+        )[:1]
     return tuple(found)
 
 
@@ -400,6 +575,11 @@ def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
     found = of('time', block.time, 's')
     for k, axis in enumerate(AXES):
         found += of(f'specific force along {axis}', force[block.pose, k], 'm/s^2', least=0.5)
-        found += of(f'specific force along {axis} in the pose before', before[block.pose, k], 'm/s^2', least=0.5)
+        found += of(
+            f'specific force along {axis} in the pose before',
+            before[block.pose, k],
+            'm/s^2',
+            least=0.5,
+        )
     warm = hand.poses.temperature_c
     return found if warm is None else found + of('temperature', warm[block.pose], 'C', least=0.5)

@@ -8,19 +8,32 @@ from scipy.linalg import solve_triangular
 
 from imu_calibration.core.distributions import chance_of_fall
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.model_error import MIN_SCATTER_BLOCKS, ModelError, model_error_of_rows
+from imu_calibration.estimation.model_error import (
+    MIN_SCATTER_BLOCKS,
+    ModelError,
+    model_error_of_rows,
+)
 from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import GRAVITY, UNMODELLED_EARTH_RATE, total
 from imu_calibration.estimation.solver import OUTLIER_P_VALUE
 from imu_calibration.kinematics.rotations import unit_rows
-from imu_calibration.references.gravity.equations import COMPONENTS, SCATTER_SD, GravityRows, Poses, State, TurnData
+from imu_calibration.references.gravity.equations import (
+    COMPONENTS,
+    SCATTER_SD,
+    GravityRows,
+    Poses,
+    State,
+    TurnData,
+)
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import missed_angle
 
 
-def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float) -> tuple[RowEstimate, dict]:
+def solve_joint(
+    model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float
+) -> tuple[RowEstimate, dict]:
     """
     Return the estimate of all parameters from poses and turns, and the turns integrated there.
 
@@ -34,11 +47,16 @@ def solve_joint(model: HandModel, poses: Poses, turns: list[TurnData], *, gravit
         Sd of gravity, m/s^2.
 
     """
-    found = estimate_rows(GravityRows(model, poses, turns), first_state(model, poses), fallback=np.square(SCATTER_SD))
+    found = estimate_rows(
+        GravityRows(model, poses, turns), first_state(model, poses), fallback=np.square(SCATTER_SD)
+    )
     reference, values = GravityRows(model, poses, turns), found.state.values
-    terms = {**found.terms, **_model_error(reference, found).terms(total(found.terms)),
-             GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
-             UNMODELLED_EARTH_RATE: _of_earth(model, found.state, poses, found.free)}
+    terms = {
+        **found.terms,
+        **_model_error(reference, found).terms(total(found.terms)),
+        GRAVITY: _of_gravity(model, values, gravity_sd / model.gravity),
+        UNMODELLED_EARTH_RATE: _of_earth(model, found.state, poses, found.free),
+    }
     return replace(found, terms=terms), reference.memory
 
 
@@ -48,21 +66,37 @@ def _model_error(reference, found):
 
     None where parts are fitted almost exactly: they have no scatter to compare.
     """
-    model, free, count, rows = reference.model, found.free, len(reference.poses.start), reference.linearise(found.state)
-    spare = np.isin(rows.component, (0, 2)).sum() - 2 * count - free.sum() + free[model.gyro_bias].sum()
+    model, free, count, rows = (
+        reference.model,
+        found.free,
+        len(reference.poses.start),
+        reference.linearise(found.state),
+    )
+    spare = (
+        np.isin(rows.component, (0, 2)).sum() - 2 * count - free.sum() + free[model.gyro_bias].sum()
+    )
     if min(count, spare) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
-    return model_error_of_rows(rows, found, model.model, block=np.minimum(rows.group[:, 0], count - 1))
+    return model_error_of_rows(
+        rows, found, model.model, block=np.minimum(rows.group[:, 0], count - 1)
+    )
 
 
 def first_state(model: HandModel, poses: Poses) -> State:
     """Return a `State` from the norms in poses, which determine directions too, and the rates at rest."""
-    values, nominal, priors, gravity = model.nominal.copy(), model.nominal, model.priors, model.gravity
+    values, nominal, priors, gravity = (
+        model.nominal.copy(),
+        model.nominal,
+        model.priors,
+        model.gravity,
+    )
     own = model.base_index('accelerometer')
     for _ in range(MAX_NEWTON_STEPS):
         residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
         rows = np.vstack([columns[:, own] / (1e-3 * gravity), np.diag(1 / priors[own])])
-        target = np.concatenate([residual / (1e-3 * gravity), (nominal - values)[own] / priors[own]])
+        target = np.concatenate(
+            [residual / (1e-3 * gravity), (nominal - values)[own] / priors[own]]
+        )
         step = np.linalg.lstsq(rows, target, rcond=None)[0]
         values[own] += step
         if np.max(np.abs(step)) < 1e-10:
@@ -82,10 +116,14 @@ def _of_gravity(model, values, relative_sd):
 
 def _of_earth(model, state, poses, free):
     """Return the contribution of the Earth's rate about the vertical to the covariance, through biases and responses to gravity."""
-    columns = model.rate_rows(state.values, model.gravity * state.up, poses.rate, **poses.conditions)[1].reshape(-1, model.size)
+    columns = model.rate_rows(
+        state.values, model.gravity * state.up, poses.rate, **poses.conditions
+    )[1].reshape(-1, model.size)
     own = np.concatenate([np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')])
     taken, kept = np.zeros(model.size), own[free[own]]
-    taken[kept] = np.linalg.lstsq(columns[:, kept], EARTH_UPWARDS_SD * state.up.ravel(), rcond=None)[0]
+    taken[kept] = np.linalg.lstsq(
+        columns[:, kept], EARTH_UPWARDS_SD * state.up.ravel(), rcond=None
+    )[0]
     return np.outer(taken, taken)
 
 
@@ -103,15 +141,27 @@ OUTLIER_SD_FACTOR = 1e3
 """Sd factor that excludes an outlying pose; its direction is still estimated from the turns."""
 
 
-def possible_turns(model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]) -> tuple[list[TurnData], int]:
+def possible_turns(
+    model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]
+) -> tuple[list[TurnData], int]:
     """Return (turns whose rates match gravity approximately, number of excluded turns): in a pause of the recorder, rates miss a turn."""
-    kept = [turn for turn in turns if turn.rotation is not None
-            or missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3)) < CONTRADICTED]
+    kept = [
+        turn
+        for turn in turns
+        if turn.rotation is not None
+        or missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3)) < CONTRADICTED
+    ]
     return kept, len(turns) - len(kept)
 
 
-def without_outliers(model: HandModel, found: RowEstimate, *, poses: Poses, turns: list[TurnData],
-                     integrated: dict | None = None) -> tuple[Poses, list[TurnData], dict]:
+def without_outliers(
+    model: HandModel,
+    found: RowEstimate,
+    *,
+    poses: Poses,
+    turns: list[TurnData],
+    integrated: dict | None = None,
+) -> tuple[Poses, list[TurnData], dict]:
     """
     Return (poses, turns, {kind: number}) without outliers: leave-one-out F tests per kind, with Bonferroni correction.
 
@@ -119,14 +169,20 @@ def without_outliers(model: HandModel, found: RowEstimate, *, poses: Poses, turn
     """
     rows = GravityRows(model, poses, turns, integrated or {}).linearise(found.state)
     rest, leverage = _whitened(rows, found)
-    left, first, of_turn = {}, rows.group[:, 0], {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
+    left, first, of_turn = (
+        {},
+        rows.group[:, 0],
+        {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None},
+    )
     for kind in range(len(COMPONENTS)):
         of_kind = rows.component == kind
         index = of_turn if COMPONENTS[kind] == 'turn' else range(len(poses.start))
         own = [(index[number], of_kind & (first == number)) for number in np.unique(first[of_kind])]
         total, spare = _distance(rest[of_kind], leverage[of_kind], 1e-3)
         allowed = max(1, int(MAX_POSE_OUTLIERS * len(own)))
-        worst = sorted((_p_value(rest[at], leverage[at], total, spare), number) for number, at in own)
+        worst = sorted(
+            (_p_value(rest[at], leverage[at], total, spare), number) for number, at in own
+        )
         out = [number for p, number in worst[:allowed] if p * max(len(own), 1) < OUTLIER_P_VALUE]
         if out:
             left[COMPONENTS[kind]] = out
@@ -143,7 +199,9 @@ def _whitened(rows, found):
     root = np.sqrt(found.scatter.total(rows.noise, rows.component))
     design = np.hstack([rows.nuisance, rows.main[:, found.free]]) / root[:, None]
     rest = rows.residual / root
-    factor = triangular_of_band(np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)]))
+    factor = triangular_of_band(
+        np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)])
+    )
     basis = solve_triangular(factor, design.T, trans='T').T
     return rest - basis @ (basis.T @ rest), basis
 
@@ -152,7 +210,9 @@ def _distance(rest, basis, least):
     """Return (squared Mahalanobis distance of some residuals, with the covariance of residuals after the fit, and its rank)."""
     values, vectors = np.linalg.eigh(np.eye(len(rest)) - basis @ basis.T)
     seen = values > least
-    return float(np.sum((vectors[:, seen].T @ rest)**2 / values[seen])), int(np.count_nonzero(seen))
+    return float(np.sum((vectors[:, seen].T @ rest) ** 2 / values[seen])), int(
+        np.count_nonzero(seen)
+    )
 
 
 def _p_value(rest, basis, total, spare):

@@ -10,7 +10,12 @@ from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.strapdown import total_rotation
 from imu_calibration.preprocessing.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
-from imu_calibration.preprocessing.stamping import LAG, MAX_REGULAR_STEP, MOST_LOST, WHOLE_STEP_SHARE
+from imu_calibration.preprocessing.stamping import (
+    LAG,
+    MAX_REGULAR_STEP,
+    MOST_LOST,
+    WHOLE_STEP_SHARE,
+)
 from imu_calibration.references.gravity.equations import Poses, State, TurnData
 from imu_calibration.references.gravity.hand_parameters import KnownTurn
 
@@ -23,7 +28,9 @@ DITHER = 3.0
 """Variance of readings over that of rounding below which rounding is not averaged: half a step; 1 % of a step remains above."""
 
 
-def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperature_c: np.ndarray | None = None) -> Poses:
+def average_poses(
+    imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperature_c: np.ndarray | None = None
+) -> Poses:
     """
     Return the means over the intervals, with their sd from the noise within the intervals.
 
@@ -31,19 +38,45 @@ def average_poses(imu: ImuSamples, ranges: Sequence[tuple[int, int]], temperatur
 
     The noise need not be white: the scatter of means of pieces of half a second or more determines the factor over white noise.
     """
-    parts = {'accelerometer': [imu.force_s[a:b] for a, b in ranges], 'gyroscope': [imu.rate_s[a:b] for a, b in ranges]}
-    rounding = {'accelerometer': rounding_variance(imu.force_s), 'gyroscope': rounding_variance(imu.rate_s)}
+    parts = {
+        'accelerometer': [imu.force_s[a:b] for a, b in ranges],
+        'gyroscope': [imu.rate_s[a:b] for a, b in ranges],
+    }
+    rounding = {
+        'accelerometer': rounding_variance(imu.force_s),
+        'gyroscope': rounding_variance(imu.rate_s),
+    }
     noise = {sensor: _pooled_noise(part, rounding[sensor]) for sensor, part in parts.items()}
     count, kinds = np.array([b - a for a, b in ranges]), ['static'] * len(ranges)
     means = [np.array([part.mean(0) for part in parts[sensor]]) for sensor in SENSORS]
-    sems = [np.sqrt(_with_rounding(noise[sensor].mean_variance(kinds, count), parts[sensor], rounding[sensor])) for sensor in SENSORS]
+    sems = [
+        np.sqrt(
+            _with_rounding(
+                noise[sensor].mean_variance(kinds, count), parts[sensor], rounding[sensor]
+            )
+        )
+        for sensor in SENSORS
+    ]
     start, stop = np.array(ranges).T
     time = 1e-9 * (0.5 * (imu.stamp_ns[start] + imu.stamp_ns[stop - 1]) - imu.stamp_ns[0])
     length = 1e-9 * (imu.stamp_ns[stop - 1] - imu.stamp_ns[start])
     creep = _creep(parts['accelerometer'], length, noise['accelerometer'])
-    warm = None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges])
-    return Poses(means[0], means[1] - creep, sems[0], sems[1], start=start, stop=stop, time=time, temperature_c=warm, noise=noise,
-                 half_turn=0.5 * length[:, None] * creep, period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9)
+    warm = (
+        None if temperature_c is None else np.array([temperature_c[a:b].mean() for a, b in ranges])
+    )
+    return Poses(
+        means[0],
+        means[1] - creep,
+        sems[0],
+        sems[1],
+        start=start,
+        stop=stop,
+        time=time,
+        temperature_c=warm,
+        noise=noise,
+        half_turn=0.5 * length[:, None] * creep,
+        period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9,
+    )
 
 
 def _with_rounding(variance, parts, rounding):
@@ -73,21 +106,26 @@ def noise_statistics(poses: Poses) -> dict:
     found = {}
     for sensor, name in zip(SENSORS, ('force', 'rate')):
         noise = poses.noise[sensor]
-        found |= {f'{name}_noise_sd': noise.white_sd.tolist(), f'{name}_noise_colour': np.sqrt(noise.inflation).tolist()}
+        found |= {
+            f'{name}_noise_sd': noise.white_sd.tolist(),
+            f'{name}_noise_colour': np.sqrt(noise.inflation).tolist(),
+        }
     return found | {'period': poses.period}
 
 
 def _pooled_noise(parts, rounding, pieces=8):
     """Return the NoiseModel of samples, from the median of the intervals and how much means of pieces scatter more than white noise."""
     floor = 1e-9 * max(1e-3, max(np.max(np.abs(p)) for p in parts))
-    within = np.sqrt(np.maximum(np.median([p.var(0, ddof=1) for p in parts], axis=0), rounding)) + floor
+    within = (
+        np.sqrt(np.maximum(np.median([p.var(0, ddof=1) for p in parts], axis=0), rounding)) + floor
+    )
     ratios = []
     for part in parts:
         length = len(part) // pieces
         if length >= 4:
-            means = part[:length * pieces].reshape(pieces, length, 3).mean(1)
+            means = part[: length * pieces].reshape(pieces, length, 3).mean(1)
             # differences of neighbours: a slow drift belongs to the scatter between poses, not here
-            ratios.append(0.5 * np.mean(np.diff(means, axis=0)**2, axis=0) * length / within**2)
+            ratios.append(0.5 * np.mean(np.diff(means, axis=0) ** 2, axis=0) * length / within**2)
     if not ratios:
         return NoiseModel(within**2, np.ones(3))
     ratio, margin = np.mean(ratios, axis=0), 2 * np.sqrt(3 / (len(ratios) * (pieces - 1)))
@@ -127,8 +165,9 @@ SUMMIT = 3
 """Neighbours in one coarse step at the top of a smooth turn."""
 
 
-def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses,
-                  temperature_c: np.ndarray | None = None) -> tuple[list[TurnData], dict[str, int]]:
+def collect_turns(
+    time: np.ndarray, imu: ImuSamples, *, poses: Poses, temperature_c: np.ndarray | None = None
+) -> tuple[list[TurnData], dict[str, int]]:
     """Return (turns between consecutive poses, {reason: count of excluded ones}); `temperature_c` is that of the samples or None."""
     turns, dropped, rate = [], {}, imu.rate_s
     limit = max(MAX_TURN_GAP, 5 * poses.period)
@@ -140,8 +179,17 @@ def collect_turns(time: np.ndarray, imu: ImuSamples, *, poses: Poses,
         if reason:
             dropped[reason] = dropped.get(reason, 0) + 1
             continue
-        turns.append(TurnData(time[piece], rate[piece], imu.force_s[piece], first, first + 1, density * (time[piece][-1] - time[piece][0]),
-                              temperature_c=None if temperature_c is None else temperature_c[piece]))
+        turns.append(
+            TurnData(
+                time[piece],
+                rate[piece],
+                imu.force_s[piece],
+                first,
+                first + 1,
+                density * (time[piece][-1] - time[piece][0]),
+                temperature_c=None if temperature_c is None else temperature_c[piece],
+            )
+        )
     return turns, dropped
 
 
@@ -166,20 +214,27 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
         Readings in any unit.
 
     """
-    fresh = np.ones(len(rate), bool)   # a reading published twice is one reading
+    fresh = np.ones(len(rate), bool)  # a reading published twice is one reading
     fresh[1:] = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rate.T])
     ended = np.zeros(len(rate), bool)
-    for signed, axes in ((np.abs, range(3)), *((signed, [axis]) for axis in range(3) for signed in (np.positive, np.negative))):
+    for signed, axes in (
+        (np.abs, range(3)),
+        *((signed, [axis]) for axis in range(3) for signed in (np.positive, np.negative)),
+    ):
         ended |= _at_end(signed, rate.T[axes], fresh)
     return ended
 
 
 def _at_end(signed, axes, fresh):
     """Return the samples at the largest value of ``signed(axes)``, shape (m, n), when that is the end of a range."""
-    some = np.sort(np.concatenate([_largest(signed, axis, fresh) for axis in axes]))[-MAX_RANGE_READINGS:]
+    some = np.sort(np.concatenate([_largest(signed, axis, fresh) for axis in axes]))[
+        -MAX_RANGE_READINGS:
+    ]
     step = np.diff(some)
     step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
-    margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step   # two's complement: one end is larger by a step
+    margin = (
+        1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step
+    )  # two's complement: one end is larger by a step
     margin = min(margin, 1e-4 * np.abs(some[-1]))
     at = np.logical_or.reduce([signed(axis) >= some[-1] - margin for axis in axes])
     below = some[some < some[-1] - margin][-TOP:]
@@ -196,25 +251,38 @@ def _largest(signed, axis, fresh):
     """Return the largest values of ``signed(axis[fresh])``, block by block."""
     largest, least = np.zeros(0), -np.inf
     for start in range(0, len(axis), BLOCK):
-        values = signed(axis[start:start + BLOCK])
-        largest = np.append(largest, values[(values > least) & fresh[start:start + BLOCK]])
+        values = signed(axis[start : start + BLOCK])
+        largest = np.append(largest, values[(values > least) & fresh[start : start + BLOCK]])
         if len(largest) > MAX_RANGE_READINGS:
             largest = np.partition(largest, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:]
             least = largest[0]
     return largest
 
 
-def known_turn_data(time: np.ndarray, imu: ImuSamples, turn: KnownTurn, *, poses: Poses,
-                    temperature_c: np.ndarray | None = None) -> TurnData:
+def known_turn_data(
+    time: np.ndarray,
+    imu: ImuSamples,
+    turn: KnownTurn,
+    *,
+    poses: Poses,
+    temperature_c: np.ndarray | None = None,
+) -> TurnData:
     """Return the data of a `KnownTurn`; `KNOWN_TURN_SD` applies along and, for the axis, across it."""
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
-    cov = KNOWN_TURN_SD**2 * along + (turn.angle * KNOWN_TURN_SD)**2 * (np.eye(3) - along)
+    cov = KNOWN_TURN_SD**2 * along + (turn.angle * KNOWN_TURN_SD) ** 2 * (np.eye(3) - along)
     piece = slice(turn.start, turn.stop)
     density = np.mean(poses.noise['gyroscope'].white_variance) * poses.period
     noise_variance = density * (time[piece][-1] - time[piece][0])
-    return TurnData(time[piece], imu.rate_s[piece], imu.force_s[piece], noise_variance=noise_variance, rotation=turn.angle * axis,
-                    rotation_cov=cov, temperature_c=None if temperature_c is None else temperature_c[piece])
+    return TurnData(
+        time[piece],
+        imu.rate_s[piece],
+        imu.force_s[piece],
+        noise_variance=noise_variance,
+        rotation=turn.angle * axis,
+        rotation_cov=cov,
+        temperature_c=None if temperature_c is None else temperature_c[piece],
+    )
 
 
 def sample_times(imu: ImuSamples) -> np.ndarray:
@@ -228,30 +296,44 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
     even, step = stamps.copy(), np.diff(stamps)
     period = float(np.median(step))
     edges = np.flatnonzero(step / period > MOST_LOST + MAX_REGULAR_STEP) + 1
-    del step   # a long recording is large
+    del step  # a long recording is large
     for start, stop in zip([0, *edges], [*edges, len(stamps)]):
         if stop - start >= 2 * LAG:
             even[start:stop] = _clock_times(stamps[start:stop], period)
-    return even if np.all(np.diff(even) > 0) and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s) else stamps
+    return (
+        even
+        if np.all(np.diff(even) > 0)
+        and _roughness(even, imu.rate_s) <= UNDECIDED * _roughness(stamps, imu.rate_s)
+        else stamps
+    )
 
 
 def _clock_times(stamps, period):
     """Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed."""
     step, numbers = np.diff(stamps) / period, [np.arange(float(len(stamps)))]
     lost = (step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE)
-    if lost.any():   # long steps of a rebuilt clock need not be lost samples
+    if lost.any():  # long steps of a rebuilt clock need not be lost samples
         numbers.insert(0, np.concatenate([[0.0], np.cumsum(np.where(lost, np.rint(step), 1.0))]))
-    lines = (_clock_line(number, stamps, max(1, int(period * len(stamps) / LINE))) for number in numbers)
-    line = min(lines, key=lambda line: np.sum((stamps - line)**2))
+    lines = (
+        _clock_line(number, stamps, max(1, int(period * len(stamps) / LINE))) for number in numbers
+    )
+    line = min(lines, key=lambda line: np.sum((stamps - line) ** 2))
     part = np.arange(len(stamps) // LAG)
     size, longer = divmod(len(stamps), len(part))
-    late = np.add.reduceat(stamps - line, part * size + np.minimum(part, longer)) / (size + (part < longer))
+    late = np.add.reduceat(stamps - line, part * size + np.minimum(part, longer)) / (
+        size + (part < longer)
+    )
     return line if np.abs(late).max() < 0.6 * period else stamps
 
 
 def _clock_line(number, time, pieces):
     line = np.polynomial.Polynomial.fit(number, time, 1)(number)
-    means = np.array([[part.mean() for part in np.array_split(values, pieces)] for values in (number, time - line)])
+    means = np.array(
+        [
+            [part.mean() for part in np.array_split(values, pieces)]
+            for values in (number, time - line)
+        ]
+    )
     return line + np.interp(number, *means)
 
 
@@ -259,9 +341,9 @@ def _roughness(time, rate):
     """Return the sum of squared errors of linear interpolation between the two neighbours of each reading."""
     total = 0.0
     for start in range(0, len(time) - 2, BLOCK):
-        some, own = time[start:start + BLOCK + 2], rate[start:start + BLOCK + 2].T
+        some, own = time[start : start + BLOCK + 2], rate[start : start + BLOCK + 2].T
         share = (some[1:-1] - some[:-2]) / (some[2:] - some[:-2])
-        total += float(np.sum((own[:, 1:-1] - (1 - share) * own[:, :-2] - share * own[:, 2:])**2))
+        total += float(np.sum((own[:, 1:-1] - (1 - share) * own[:, :-2] - share * own[:, 2:]) ** 2))
     return total
 
 
@@ -270,7 +352,9 @@ def rising(time: np.ndarray) -> np.ndarray:
     if np.all(np.diff(time) > 0):
         return time
     kept = np.concatenate([[True], np.diff(time) > 0])
-    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(len(time))
+    return np.interp(np.arange(len(time)), np.flatnonzero(kept), time[kept]) + 1e-9 * np.arange(
+        len(time)
+    )
 
 
 def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> float:
@@ -292,7 +376,11 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
         return 1.0
 
     def missed(factor):
-        return float(np.median([missed_angle(state, poses, turn, matrix=factor * np.eye(3)) for turn in some]))
+        return float(
+            np.median(
+                [missed_angle(state, poses, turn, matrix=factor * np.eye(3)) for turn in some]
+            )
+        )
 
     return believed_factor(missed)
 

@@ -50,9 +50,18 @@ class HandStore:
             if not len(samples):
                 continue
             if epoch != self._epoch and self._parts:
-                self._shift = int(self._parts[-1].stamp_ns[-1]) + RESET_PAUSE_NS - int(samples.stamp_ns[0])
+                self._shift = (
+                    int(self._parts[-1].stamp_ns[-1]) + RESET_PAUSE_NS - int(samples.stamp_ns[0])
+                )
             self._epoch = epoch
-            self._parts.append(ImuSamples(samples.stamp_ns + self._shift, samples.force_s, samples.rate_s, samples.frame_id))
+            self._parts.append(
+                ImuSamples(
+                    samples.stamp_ns + self._shift,
+                    samples.force_s,
+                    samples.rate_s,
+                    samples.frame_id,
+                )
+            )
 
     def samples(self) -> ImuSamples | None:
         """Return all samples, or None."""
@@ -89,9 +98,17 @@ class HandStore:
         return True
 
     def _least_telling(self, imu, rests, count):
-        long = max(_across_holes(imu.stamp_ns, rests), key=lambda rest: rest.stop - rest.start, default=slice(0, 0))
+        long = max(
+            _across_holes(imu.stamp_ns, rests),
+            key=lambda rest: rest.stop - rest.start,
+            default=slice(0, 0),
+        )
         kept = int(REST_KEPT * 1e9 / max(np.median(np.diff(imu.stamp_ns)), 1))
-        return slice(long.start + kept, long.start + kept + count) if long.stop - long.start >= count + 2 * kept else slice(0, count)
+        return (
+            slice(long.start + kept, long.start + kept + count)
+            if long.stop - long.start >= count + 2 * kept
+            else slice(0, count)
+        )
 
     def _drop(self, imu, gone):
         keep = np.ones(len(imu), bool)
@@ -104,8 +121,14 @@ class HandStore:
         target, imu = io.BytesIO(), self.samples()
         if imu is None:
             imu = ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-        np.savez(target, format=np.array(SAMPLES_FORMAT), frame_id=np.array(imu.frame_id), stamp_ns=imu.stamp_ns, force_s=imu.force_s,
-                 rate_s=imu.rate_s)
+        np.savez(
+            target,
+            format=np.array(SAMPLES_FORMAT),
+            frame_id=np.array(imu.frame_id),
+            stamp_ns=imu.stamp_ns,
+            force_s=imu.force_s,
+            rate_s=imu.rate_s,
+        )
         return target.getvalue()
 
     def load(self, data: bytes) -> None:
@@ -121,18 +144,28 @@ class HandStore:
         try:
             with load_arrays(data) as arrays:
                 if str(arrays['format']) != SAMPLES_FORMAT:
-                    raise DocumentError(f"samples must have the format '{SAMPLES_FORMAT}', got '{arrays['format']}'; remove the file, or "
-                                        'start without resume')
-                imu = ImuSamples(arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id']))
-            for values, kind, shape in ((imu.stamp_ns, 'i', ()), (imu.force_s, 'f', (3,)), (imu.rate_s, 'f', (3,))):
+                    raise DocumentError(
+                        f"samples must have the format '{SAMPLES_FORMAT}', got '{arrays['format']}'; remove the file, or "
+                        'start without resume'
+                    )
+                imu = ImuSamples(
+                    arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id'])
+                )
+            for values, kind, shape in (
+                (imu.stamp_ns, 'i', ()),
+                (imu.force_s, 'f', (3,)),
+                (imu.rate_s, 'f', (3,)),
+            ):
                 if values.dtype.kind != kind or values.shape != (imu.stamp_ns.size, *shape):
                     raise ValueError(f'it holds {values.dtype} of shape {values.shape}')
         except ImuCalibrationError:
             raise
-        except Exception as error:   # damaged archives and arrays raise many kinds
-            raise DocumentError(f'saved samples must be a whole file of {SAMPLES_FORMAT}, this is not '
-                                f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume',
-                                code='samples_damaged') from error
+        except Exception as error:  # damaged archives and arrays raise many kinds
+            raise DocumentError(
+                f'saved samples must be a whole file of {SAMPLES_FORMAT}, this is not '
+                f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume',
+                code='samples_damaged',
+            ) from error
         if len(imu):
             self._parts, self._epoch = [imu], -1
 
@@ -141,7 +174,11 @@ def _across_holes(stamp_ns, rests):
     """Return the ranges at rest, joined where only discarded samples and the time excluded after a hole lie between them."""
     joined, hole = [], 5 * np.median(np.diff(stamp_ns)) * 1e-9
     for rest in rests:
-        between = np.diff(stamp_ns[joined[-1].stop - 1:rest.start + 1]) * 1e-9 if joined else np.zeros(0)
+        between = (
+            np.diff(stamp_ns[joined[-1].stop - 1 : rest.start + 1]) * 1e-9
+            if joined
+            else np.zeros(0)
+        )
         if len(between) and between.max() > hole and between.sum() - between.max() < HELD_OUT:
             joined[-1] = slice(joined[-1].start, rest.stop)
         else:

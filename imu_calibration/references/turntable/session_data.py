@@ -14,7 +14,13 @@ from imu_calibration.estimation.accumulator import Accumulator, restrict, select
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters, make_prior
-from imu_calibration.estimation.window_statistics import N_AXES, WindowStatistics, count_pieces, pieces_at_rest, reduce_window
+from imu_calibration.estimation.window_statistics import (
+    N_AXES,
+    WindowStatistics,
+    count_pieces,
+    pieces_at_rest,
+    reduce_window,
+)
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
@@ -54,7 +60,9 @@ class WindowStore:
             return
         if window.kind == 'static':
             self._n_static += 1
-            temperature = None if window.temperature_c is None else np.array([window.temperature_c.mean()])
+            temperature = (
+                None if window.temperature_c is None else np.array([window.temperature_c.mean()])
+            )
             self._entries.append((reduced, window.motion, temperature))
         else:
             self._n_samples += len(window)
@@ -75,17 +83,35 @@ def _again(entry, model, table):
     """Return a static window's statistics with recomputed columns."""
     reduced, motion, temperature = entry
     references = References(model, table, motion, temperature_c=temperature)
-    sensors = {name: replace(known, mean=np.concatenate([columns(references, name).mean(axis=0), known.mean[-3:]]))
-               for name, known in reduced.sensors.items()}
-    return replace(reduced, sensors=sensors, pieces={name: pieces_at_rest(known.mean, reduced.duration) for name, known in sensors.items()})
+    sensors = {
+        name: replace(
+            known, mean=np.concatenate([columns(references, name).mean(axis=0), known.mean[-3:]])
+        )
+        for name, known in reduced.sensors.items()
+    }
+    return replace(
+        reduced,
+        sensors=sensors,
+        pieces={
+            name: pieces_at_rest(known.mean, reduced.duration) for name, known in sensors.items()
+        },
+    )
 
 
 def owned_window(window: Window) -> Window:
     """Return a copy of the window in separate memory: slices would keep the complete chunk in memory."""
     motion = JointMotion.concatenate([window.motion])
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)
-    return Window(window.kind, window.stamp_ns.copy(), window.time.copy(), window.force_s.copy(), window.rate_s.copy(), motion, temperature,
-                  joint_step=window.joint_step)
+    return Window(
+        window.kind,
+        window.stamp_ns.copy(),
+        window.time.copy(),
+        window.force_s.copy(),
+        window.rate_s.copy(),
+        motion,
+        temperature,
+        joint_step=window.joint_step,
+    )
 
 
 TABLE_FOLDS = 8
@@ -98,7 +124,9 @@ BLOCKS = 3 * TABLE_FOLDS
 class HeldOutBlock:
     """Every so many-th window of each kind."""
 
-    accumulator: Accumulator = field(default_factory=lambda: Accumulator(in_blocks=False, share=BLOCKS))
+    accumulator: Accumulator = field(
+        default_factory=lambda: Accumulator(in_blocks=False, share=BLOCKS)
+    )
     """For fitting."""
     pieces: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
     """(sensor, regime) -> triangular factor of the rows of short pieces, for judging."""
@@ -115,7 +143,11 @@ class HeldOutBlock:
         self.judged += 1
         for sensor in SENSORS:
             for regime, rows in window.pieces[sensor].items():
-                stack(self.pieces, (sensor, regime), rows if len(rows) <= rows.shape[1] else triangular(rows))
+                stack(
+                    self.pieces,
+                    (sensor, regime),
+                    rows if len(rows) <= rows.shape[1] else triangular(rows),
+                )
         for regime, rows in window.pieces[SENSORS[0]].items():
             count = count_pieces(window.duration) if window.kind == 'static' else len(rows)
             self.counts[regime] = self.counts.get(regime, 0) + count
@@ -131,14 +163,22 @@ class HeldOutBlock:
 
     def copy(self) -> 'HeldOutBlock':
         """Return an independent copy."""
-        return HeldOutBlock(self.accumulator.copy(), dict(self.pieces), dict(self.counts), self.judged)
+        return HeldOutBlock(
+            self.accumulator.copy(), dict(self.pieces), dict(self.counts), self.judged
+        )
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
         """Return the block with the columns of the model `narrow` only."""
-        chosen = {sensor: np.concatenate([columns[:-N_AXES], np.arange(-2 * N_AXES, 0)])
-                  for sensor, columns in selected_columns(wide, narrow).items()}
-        return HeldOutBlock(restrict(self.accumulator, wide, narrow), {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
-                            self.counts, self.judged)
+        chosen = {
+            sensor: np.concatenate([columns[:-N_AXES], np.arange(-2 * N_AXES, 0)])
+            for sensor, columns in selected_columns(wide, narrow).items()
+        }
+        return HeldOutBlock(
+            restrict(self.accumulator, wide, narrow),
+            {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
+            self.counts,
+            self.judged,
+        )
 
 
 @dataclass(eq=False)
@@ -150,7 +190,9 @@ class HeldOut:
     with the session.
     """
 
-    blocks: list[HeldOutBlock] = field(default_factory=lambda: [HeldOutBlock() for _ in range(BLOCKS)])
+    blocks: list[HeldOutBlock] = field(
+        default_factory=lambda: [HeldOutBlock() for _ in range(BLOCKS)]
+    )
 
     def add(self, window: WindowStatistics, judged: bool = True) -> None:
         """Add a window, and its pieces if it is judged."""
@@ -168,7 +210,11 @@ class HeldOut:
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOut':
         """Return the same with the columns of the model `narrow` only."""
-        return self if wide is narrow else HeldOut([block.restricted(wide, narrow) for block in self.blocks])
+        return (
+            self
+            if wide is narrow
+            else HeldOut([block.restricted(wide, narrow) for block in self.blocks])
+        )
 
     @property
     def n_windows(self) -> int:
@@ -188,7 +234,10 @@ class HeldOut:
         """
         model, prior, values = solution.model, make_prior(solution.model), solution.values
         free = ~fixed_parameters(model) & ~solution.held
-        parts = [_linearised(self.blocks[fold::TABLE_FOLDS], solution, prior) for fold in range(TABLE_FOLDS)]
+        parts = [
+            _linearised(self.blocks[fold::TABLE_FOLDS], solution, prior)
+            for fold in range(TABLE_FOLDS)
+        ]
         known = np.column_stack([prior.root, prior.root @ (values - prior.mean)])
         found = []
         for fold in range(TABLE_FOLDS):
@@ -206,7 +255,7 @@ def _linearised(blocks, solution, prior):
         if block.accumulator.rows:
             system = WeightedSystem(block.accumulator, solution.model)
             factors = {sensor: system.factors(sensor, solution.noise[sensor]) for sensor in SENSORS}
-            residuals = system.residuals(solution.values, factors)[:-len(prior.root)]
+            residuals = system.residuals(solution.values, factors)[: -len(prior.root)]
             rows.append(np.column_stack([system.jacobian(solution.values, factors), residuals]))
     return triangular(np.concatenate(rows)) if rows else np.zeros((0, n_params + 1))
 
@@ -236,7 +285,9 @@ class DecimatedWindows:
         self.n_samples += len(window.time)
         while self.n_samples > self.most and len(self._kept) > 1:
             self._stride *= 2
-            self._kept = [(number, window) for number, window in self._kept if number % self._stride == 0]
+            self._kept = [
+                (number, window) for number, window in self._kept if number % self._stride == 0
+            ]
             self.n_samples = sum(len(window.time) for _, window in self._kept)
 
     def copy(self) -> 'DecimatedWindows':
@@ -300,7 +351,9 @@ class SessionData:
 
     def anew(self, windows: Iterable[WindowStatistics], judged_from: float = 0.0) -> 'SessionData':
         """Return the same with the windows reduced again."""
-        fresh = replace(self, accumulator=Accumulator(), held_out=HeldOut(), judged_from=judged_from)
+        fresh = replace(
+            self, accumulator=Accumulator(), held_out=HeldOut(), judged_from=judged_from
+        )
         for window in windows:
             fresh.take(window)
         return fresh
@@ -308,12 +361,21 @@ class SessionData:
     @property
     def moving(self) -> list:
         """Moving windows with all their kept samples; live, the windows of the search of effects."""
-        return self.kept or [window for spread in self.spreads for window in spread.windows if window.kind != 'static']
+        return self.kept or [
+            window
+            for spread in self.spreads
+            for window in spread.windows
+            if window.kind != 'static'
+        ]
 
     @property
     def duration(self) -> float:
         """Seconds from the first to the last IMU stamp, recordings added."""
-        return 0.0 if self.first_stamp_ns is None or self.last_stamp_ns is None else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
+        return (
+            0.0
+            if self.first_stamp_ns is None or self.last_stamp_ns is None
+            else (self.last_stamp_ns - self.first_stamp_ns) * 1e-9
+        )
 
 
 def merge(parts: Iterable[SessionData]) -> SessionData:
@@ -323,25 +385,42 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
     for part in parts[1:]:
         total.accumulator.merge(part.accumulator)
         total.held_out.merge(part.held_out)
-        windows = total.kept + part.kept   # up to KEPT_SAMPLES samples
+        windows = total.kept + part.kept  # up to KEPT_SAMPLES samples
         ends = np.cumsum([len(window.time) for window in windows])
-        total.kept, total.poses = windows[:int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))], total.poses + part.poses
-        total.spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)[:MOST_ASKED]
-        total.counts = {key: total.counts.get(key, 0) + part.counts.get(key, 0) for key in {**total.counts, **part.counts}}
+        total.kept, total.poses = (
+            windows[: int(np.searchsorted(ends, KEPT_SAMPLES, side='right'))],
+            total.poses + part.poses,
+        )
+        total.spreads = sorted(total.spreads + part.spreads, key=lambda spread: -spread.n_samples)[
+            :MOST_ASKED
+        ]
+        total.counts = {
+            key: total.counts.get(key, 0) + part.counts.get(key, 0)
+            for key in {**total.counts, **part.counts}
+        }
         total.largest_rate = max(total.largest_rate, part.largest_rate)
         total.largest_force = max(total.largest_force, part.largest_force)
         total.frame_id = total.frame_id or part.frame_id
         total.findings += part.findings
         ranges = [r for r in (total.temperature_c, part.temperature_c) if r]
-        total.temperature_c = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else None
+        total.temperature_c = (
+            (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else None
+        )
         if part.first_stamp_ns is not None and part.last_stamp_ns is not None:
-            total.first_stamp_ns = part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
-            total.last_stamp_ns = (total.last_stamp_ns or total.first_stamp_ns) + part.last_stamp_ns - part.first_stamp_ns
+            total.first_stamp_ns = (
+                part.first_stamp_ns if total.first_stamp_ns is None else total.first_stamp_ns
+            )
+            total.last_stamp_ns = (
+                (total.last_stamp_ns or total.first_stamp_ns)
+                + part.last_stamp_ns
+                - part.first_stamp_ns
+            )
     return total
 
 
 def naming(names: Sequence[str], session: int) -> Callable:
     """Return a function that calls another one and, with several recordings, puts the recording's name before its error."""
+
     def call(function, *arguments, **options):
         try:
             return function(*arguments, **options)
@@ -349,10 +428,13 @@ def naming(names: Sequence[str], session: int) -> Callable:
             if len(names) < 2:
                 raise
             raise error.named(names[session]) from error
+
     return call
 
 
-def join(parts: Sequence[SessionData], names: Sequence[str], check: Callable[[SessionData], object]) -> SessionData:
+def join(
+    parts: Sequence[SessionData], names: Sequence[str], check: Callable[[SessionData], object]
+) -> SessionData:
     """
     Return the merged SessionData of several recordings.
 
@@ -381,8 +463,12 @@ def join(parts: Sequence[SessionData], names: Sequence[str], check: Callable[[Se
 
 def _require_like_the_first(first, part, first_name, name):
     if not part.accumulator.rows:
-        raise InputError(f'{name}: every recording must contain a static window, spin or dynamic segment, this one has none; omit it')
+        raise InputError(
+            f'{name}: every recording must contain a static window, spin or dynamic segment, this one has none; omit it'
+        )
     if part.frame_id != first.frame_id:
-        raise InputError(f"{name}: all recordings must be of one IMU, "
-                         f"the frame is '{part.frame_id}' here and '{first.frame_id}' in {first_name}; "
-                         'calibrate different IMUs one by one')
+        raise InputError(
+            f'{name}: all recordings must be of one IMU, '
+            f"the frame is '{part.frame_id}' here and '{first.frame_id}' in {first_name}; "
+            'calibrate different IMUs one by one'
+        )

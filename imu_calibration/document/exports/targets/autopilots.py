@@ -6,8 +6,24 @@ import numpy as np
 
 from imu_calibration.core.documents import plain
 from imu_calibration.core.errors import InputError
-from imu_calibration.document.exports.affine import OFFSETS, SCALES, THERMAL_OFFSETS, AffineImu, forward_right_down, of
-from imu_calibration.document.exports.target import AXIS_LETTERS, Page, Read, Target, commented, read_parameters, refuse_curved, vector_of
+from imu_calibration.document.exports.affine import (
+    OFFSETS,
+    SCALES,
+    THERMAL_OFFSETS,
+    AffineImu,
+    forward_right_down,
+    of,
+)
+from imu_calibration.document.exports.target import (
+    AXIS_LETTERS,
+    Page,
+    Read,
+    Target,
+    commented,
+    read_parameters,
+    refuse_curved,
+    vector_of,
+)
 from imu_calibration.effects.base import SENSORS
 
 
@@ -22,8 +38,11 @@ def _has(found, pattern):
 
 def _linear(imu, offset, scale):
     """Return the offsets of both sensors, and the scale factors of the accelerometer."""
-    return {name: value for sensor in SENSORS for name, value in _by_axis(offset[sensor], imu.bias[sensor]).items()} | \
-        _by_axis(scale, 1.0 / np.diag(imu.matrix['accelerometer']))
+    return {
+        name: value
+        for sensor in SENSORS
+        for name, value in _by_axis(offset[sensor], imu.bias[sensor]).items()
+    } | _by_axis(scale, 1.0 / np.diag(imu.matrix['accelerometer']))
 
 
 def _matrix(found, scale):
@@ -49,37 +68,69 @@ def numbers_ardupilot(imu: AffineImu) -> dict:
         found |= {f'{TCAL}_ENABLE': 1, f'{TCAL}_TMIN': low, f'{TCAL}_TMAX': high}
         for sensor in SENSORS:
             found[CALTEMP[sensor]] = imu.temperature_ref_c
-            found |= {f'{TCAL}_{TCAL_SENSORS[sensor]}{power}_{a}': float(value) / PER_PARAMETER if power == 1 else 0.0
-                      for power in (1, 2, 3) for a, value in zip(AXIS_LETTERS, imu.thermal[sensor])}
+            found |= {
+                f'{TCAL}_{TCAL_SENSORS[sensor]}{power}_{a}': float(value) / PER_PARAMETER
+                if power == 1
+                else 0.0
+                for power in (1, 2, 3)
+                for a, value in zip(AXIS_LETTERS, imu.thermal[sensor])
+            }
     return found
 
 
 def imu_ardupilot(found: dict) -> AffineImu:
     """Return the IMU of such parameters."""
     on = found.get(f'{TCAL}_ENABLE') == 1
-    limits = (found.get(f'{TCAL}_TMIN', ARDUPILOT_RANGE_C[0]), found.get(f'{TCAL}_TMAX', ARDUPILOT_RANGE_C[1])) if on else None
-    ref = float(np.clip(found.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits)) if limits else 25.0
-    thermal = {s: vector_of(found, f'{TCAL}_{TCAL_SENSORS[s]}1_*') * PER_PARAMETER * on for s in SENSORS}
+    limits = (
+        (
+            found.get(f'{TCAL}_TMIN', ARDUPILOT_RANGE_C[0]),
+            found.get(f'{TCAL}_TMAX', ARDUPILOT_RANGE_C[1]),
+        )
+        if on
+        else None
+    )
+    ref = (
+        float(np.clip(found.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits))
+        if limits
+        else 25.0
+    )
+    thermal = {
+        s: vector_of(found, f'{TCAL}_{TCAL_SENSORS[s]}1_*') * PER_PARAMETER * on for s in SENSORS
+    }
     bias = {s: vector_of(found, OFFSET[s]) for s in SENSORS}
-    if limits:   # both sensors may have been calibrated at temperatures of their own; the document has one
+    if (
+        limits
+    ):  # both sensors may have been calibrated at temperatures of their own; the document has one
         there = float(np.clip(found.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
         bias['gyroscope'] = bias['gyroscope'] + thermal['gyroscope'] * (ref - there)
-    return AffineImu(bias=bias, matrix=_matrix(found, SCALE), thermal=thermal, temperature_ref_c=ref, temperature_range_c=limits)
+    return AffineImu(
+        bias=bias,
+        matrix=_matrix(found, SCALE),
+        thermal=thermal,
+        temperature_ref_c=ref,
+        temperature_range_c=limits,
+    )
 
 
 def write_ardupilot(page: Page) -> str:
     """Return a parameter file, ``NAME,VALUE``."""
-    return commented(page.comments) + ''.join(f'{name},{value!r}\n' for name, value in plain(page.numbers).items())
+    return commented(page.comments) + ''.join(
+        f'{name},{value!r}\n' for name, value in plain(page.numbers).items()
+    )
 
 
 def read_ardupilot(content: bytes, _path: str | Path) -> Read:
     """Read the parameters of the first IMU."""
     found = read_parameters(content, 'ArduPilot parameter file')
     if not any(_has(found, pattern) for pattern in (*OFFSET.values(), SCALE)):
-        raise InputError('the ArduPilot parameter file must hold INS_ACCOFFS, INS_ACCSCAL or INS_GYROFFS, it holds none of them; '
-                         'give another file')
+        raise InputError(
+            'the ArduPilot parameter file must hold INS_ACCOFFS, INS_ACCSCAL or INS_GYROFFS, it holds none of them; '
+            'give another file'
+        )
     if found.get(f'{TCAL}_ENABLE') == 1:
-        refuse_curved(found, [f'{TCAL}_{short}{power}' for short in TCAL_SENSORS.values() for power in (2, 3)])
+        refuse_curved(
+            found, [f'{TCAL}_{short}{power}' for short in TCAL_SENSORS.values() for power in (2, 3)]
+        )
     lacks = tuple(h for s in SENSORS for h in of(s, OFFSETS) if not _has(found, OFFSET[s]))
     return Read(found, lacks if _has(found, SCALE) else lacks + of('accelerometer', SCALES))
 
@@ -89,21 +140,39 @@ def ignored_ardupilot(found: dict) -> list[str]:
     lines = []
     offset, scale = vector_of(found, OFFSET['accelerometer']), vector_of(found, SCALE, 1.0)
     if np.any(np.abs(offset) > LARGEST_OFFSET):
-        lines.append(f'ArduPilot accepts INS_ACCOFFS to {LARGEST_OFFSET:g} m/s^2, here {np.abs(offset).max():.3g}: arming will be refused')
+        lines.append(
+            f'ArduPilot accepts INS_ACCOFFS to {LARGEST_OFFSET:g} m/s^2, here {np.abs(offset).max():.3g}: arming will be refused'
+        )
     if np.any((scale < SCALES_ALLOWED[0]) | (scale > SCALES_ALLOWED[1])):
         low, high = SCALES_ALLOWED
-        lines.append(f'ArduPilot accepts INS_ACCSCAL from {low:g} to {high:g}, here {scale.min():.3g} to {scale.max():.3g}')
-    return [*lines, 'ArduPilot measures the offsets of gyroscopes at each start unless INS_GYR_CAL is 0']
+        lines.append(
+            f'ArduPilot accepts INS_ACCSCAL from {low:g} to {high:g}, here {scale.min():.3g} to {scale.max():.3g}'
+        )
+    return [
+        *lines,
+        'ArduPilot measures the offsets of gyroscopes at each start unless INS_GYR_CAL is 0',
+    ]
 
 
-ARDUPILOT = (Target(
-    name='ardupilot', title='ArduPilot parameters', suffix='.param',
-    formula='(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL in forward-right-down axes before the turn of the board; gyroscopes: no SCAL\n'
-            'poly(T) = 1e-6 (c1 dT + c2 dT^2 + c3 dT^3), dT = T - 35 C, T within TMIN..TMAX',
-    source='ArduPilot/ardupilot, libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp, AP_InertialSensor_tempcal.cpp',
-    holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers_ardupilot,
-    write=write_ardupilot, read=read_ardupilot, imu=imu_ardupilot, back=forward_right_down, ignored=ignored_ardupilot,
-    hint='of the first IMU; the readings must be uncalibrated, in the axes of the vehicle'),)
+ARDUPILOT = (
+    Target(
+        name='ardupilot',
+        title='ArduPilot parameters',
+        suffix='.param',
+        formula='(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL in forward-right-down axes before the turn of the board; gyroscopes: no SCAL\n'
+        'poly(T) = 1e-6 (c1 dT + c2 dT^2 + c3 dT^3), dT = T - 35 C, T within TMIN..TMAX',
+        source='ArduPilot/ardupilot, libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp, AP_InertialSensor_tempcal.cpp',
+        holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS,
+        placement=forward_right_down,
+        numbers=numbers_ardupilot,
+        write=write_ardupilot,
+        read=read_ardupilot,
+        imu=imu_ardupilot,
+        back=forward_right_down,
+        ignored=ignored_ardupilot,
+        hint='of the first IMU; the readings must be uncalibrated, in the axes of the vehicle',
+    ),
+)
 
 
 CAL_OFFSET = {'accelerometer': 'CAL_ACC0_*OFF', 'gyroscope': 'CAL_GYRO0_*OFF'}
@@ -124,9 +193,17 @@ def numbers_px4(imu: AffineImu) -> dict:
     for sensor in SENSORS:
         if np.any(imu.thermal[sensor]):
             short = TC[sensor]
-            found |= {f'{short}_ENABLE': 1, f'{short}0_TREF': imu.temperature_ref_c, f'{short}0_TMIN': low, f'{short}0_TMAX': high}
-            found |= {f'{short}0_X{power}_{axis}': float(value) if power == 1 else 0.0
-                      for power in range(4) for axis, value in enumerate(imu.thermal[sensor])}
+            found |= {
+                f'{short}_ENABLE': 1,
+                f'{short}0_TREF': imu.temperature_ref_c,
+                f'{short}0_TMIN': low,
+                f'{short}0_TMAX': high,
+            }
+            found |= {
+                f'{short}0_X{power}_{axis}': float(value) if power == 1 else 0.0
+                for power in range(4)
+                for axis, value in enumerate(imu.thermal[sensor])
+            }
     return found
 
 
@@ -137,17 +214,34 @@ def imu_px4(found: dict) -> AffineImu:
         short = f'{TC[sensor]}0'
         on = bool(found.get(f'{TC[sensor]}_ENABLE'))
         bias[sensor] = vector_of(found, CAL_OFFSET[sensor])
-        thermal[sensor] = np.array([found.get(f'{short}_X1_{axis}', 0.0) if on else 0.0 for axis in range(3)])
+        thermal[sensor] = np.array(
+            [found.get(f'{short}_X1_{axis}', 0.0) if on else 0.0 for axis in range(3)]
+        )
         if on:
-            bias[sensor] = bias[sensor] + [found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)]
+            bias[sensor] = bias[sensor] + [
+                found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)
+            ]
             ref, limits = found[f'{short}_TREF'], (found[f'{short}_TMIN'], found[f'{short}_TMAX'])
-    return AffineImu(bias=bias, matrix=_matrix(found, CAL_SCALE), thermal=thermal, temperature_ref_c=ref, temperature_range_c=limits)
+    return AffineImu(
+        bias=bias,
+        matrix=_matrix(found, CAL_SCALE),
+        thermal=thermal,
+        temperature_ref_c=ref,
+        temperature_range_c=limits,
+    )
 
 
 def write_px4(page: Page) -> str:
     """Return a parameter file: vehicle, component, name, value, type."""
-    lines = [f'1\t1\t{name}\t{value!r}\t{INTEGER if isinstance(value, int) else REAL}' for name, value in plain(page.numbers).items()]
-    return commented([*page.comments, '', 'Vehicle-Id Component-Id Name Value Type']) + '\n'.join(lines) + '\n'
+    lines = [
+        f'1\t1\t{name}\t{value!r}\t{INTEGER if isinstance(value, int) else REAL}'
+        for name, value in plain(page.numbers).items()
+    ]
+    return (
+        commented([*page.comments, '', 'Vehicle-Id Component-Id Name Value Type'])
+        + '\n'.join(lines)
+        + '\n'
+    )
 
 
 def read_px4(content: bytes, _path: str | Path) -> Read:
@@ -156,31 +250,58 @@ def read_px4(content: bytes, _path: str | Path) -> Read:
     present = {sensor: _has(found, CAL_OFFSET[sensor]) for sensor in SENSORS}
     present['accelerometer'] |= _has(found, CAL_SCALE)
     if not any(present.values()):
-        raise InputError('the PX4 parameter file must hold CAL_ACC0 or CAL_GYRO0, it holds none of them; give another file')
+        raise InputError(
+            'the PX4 parameter file must hold CAL_ACC0 or CAL_GYRO0, it holds none of them; give another file'
+        )
     refuse_curved(found, [f'{short}0_X{power}' for short in TC.values() for power in (2, 3)])
-    return Read(found, tuple(lacking for sensor in SENSORS if not present[sensor] for lacking in of(sensor, OFFSETS + SCALES)))
+    return Read(
+        found,
+        tuple(
+            lacking
+            for sensor in SENSORS
+            if not present[sensor]
+            for lacking in of(sensor, OFFSETS + SCALES)
+        ),
+    )
 
 
 def ignored_px4(found: dict) -> list[str]:
     """Return the changes that PX4 ignores."""
     lines = []
-    for pattern, nominal in ((CAL_OFFSET['accelerometer'], 0.0), (CAL_SCALE, 1.0), (CAL_OFFSET['gyroscope'], 0.0)):
+    for pattern, nominal in (
+        (CAL_OFFSET['accelerometer'], 0.0),
+        (CAL_SCALE, 1.0),
+        (CAL_OFFSET['gyroscope'], 0.0),
+    ):
         change = float(np.linalg.norm(vector_of(found, pattern, nominal) - nominal))
         if 0 < change <= UNNOTICED:
-            lines.append(f'PX4 ignores a change of {pattern} if the three together change by {UNNOTICED:g} or less (older '
-                         f'versions 0.001), here they change by {change:.2g} from {nominal:g}: check that your version accepts them')
+            lines.append(
+                f'PX4 ignores a change of {pattern} if the three together change by {UNNOTICED:g} or less (older '
+                f'versions 0.001), here they change by {change:.2g} from {nominal:g}: check that your version accepts them'
+            )
     return lines
 
 
-PX4 = (Target(
-    name='px4', title='PX4 parameters', suffix='.params',
-    formula='(raw - thermal - OFF) * SCALE in forward-right-down axes; gyroscopes: no SCALE\n'
-            'thermal = X0 + X1 (T - TREF) + ..., T within TMIN..TMAX',
-    source='PX4/PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.{hpp,cpp}, Gyroscope.hpp, temperature_compensation',
-    holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS, placement=forward_right_down, numbers=numbers_px4,
-    write=write_px4, read=read_px4, imu=imu_px4, back=forward_right_down, ignored=ignored_px4,
-    hint='set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these sensors, or PX4 ignores them;'
-         ' the readings must be uncalibrated'),)
+PX4 = (
+    Target(
+        name='px4',
+        title='PX4 parameters',
+        suffix='.params',
+        formula='(raw - thermal - OFF) * SCALE in forward-right-down axes; gyroscopes: no SCALE\n'
+        'thermal = X0 + X1 (T - TREF) + ..., T within TMIN..TMAX',
+        source='PX4/PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.{hpp,cpp}, Gyroscope.hpp, temperature_compensation',
+        holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS,
+        placement=forward_right_down,
+        numbers=numbers_px4,
+        write=write_px4,
+        read=read_px4,
+        imu=imu_px4,
+        back=forward_right_down,
+        ignored=ignored_px4,
+        hint='set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these sensors, or PX4 ignores them;'
+        ' the readings must be uncalibrated',
+    ),
+)
 
 
 TARGETS = ARDUPILOT + PX4

@@ -15,33 +15,58 @@ def _gravity(page: Page) -> float:
 def vins(found: Noise) -> dict:
     """Return the noise for the midpoint rule, which weights each of two samples with half a step and multiplies walks by a full one."""
     accel, gyro = found.accelerometer, found.gyroscope
-    return {'acc_n': accel.white * (2 * found.rate)**0.5, 'gyr_n': gyro.white * (2 * found.rate)**0.5,
-            'acc_w': accel.walk * found.rate**0.5, 'gyr_w': gyro.walk * found.rate**0.5}
+    return {
+        'acc_n': accel.white * (2 * found.rate) ** 0.5,
+        'gyr_n': gyro.white * (2 * found.rate) ** 0.5,
+        'acc_w': accel.walk * found.rate**0.5,
+        'gyr_w': gyro.walk * found.rate**0.5,
+    }
 
 
 def lio_sam(found: Noise) -> dict:
     """Return continuous densities, as used by gtsam's preintegration."""
     accel, gyro = found.accelerometer, found.gyroscope
-    return {'imuAccNoise': accel.white, 'imuGyrNoise': gyro.white, 'imuAccBiasN': accel.walk, 'imuGyrBiasN': gyro.walk}
+    return {
+        'imuAccNoise': accel.white,
+        'imuGyrNoise': gyro.white,
+        'imuAccBiasN': accel.walk,
+        'imuGyrBiasN': gyro.walk,
+    }
 
 
 def fast_lio(found: Noise) -> dict:
     """Return variances that the filter multiplies with the square of the step."""
     accel, gyro = found.accelerometer, found.gyroscope
-    return {'acc_cov': accel.white**2 * found.rate, 'gyr_cov': gyro.white**2 * found.rate,
-            'b_acc_cov': accel.walk**2 * found.rate, 'b_gyr_cov': gyro.walk**2 * found.rate}
+    return {
+        'acc_cov': accel.white**2 * found.rate,
+        'gyr_cov': gyro.white**2 * found.rate,
+        'b_acc_cov': accel.walk**2 * found.rate,
+        'b_gyr_cov': gyro.walk**2 * found.rate,
+    }
 
 
 def orb_slam3(found: Noise) -> dict:
     """Return continuous densities and the rate with which the program makes them discrete."""
-    return {'IMU.NoiseGyro': found.gyroscope.white, 'IMU.NoiseAcc': found.accelerometer.white, 'IMU.GyroWalk': found.gyroscope.walk,
-            'IMU.AccWalk': found.accelerometer.walk, 'IMU.Frequency': found.rate}
+    return {
+        'IMU.NoiseGyro': found.gyroscope.white,
+        'IMU.NoiseAcc': found.accelerometer.white,
+        'IMU.GyroWalk': found.gyroscope.walk,
+        'IMU.AccWalk': found.accelerometer.walk,
+        'IMU.Frequency': found.rate,
+    }
 
 
 def covariances(found: Noise) -> dict:
     """Return the covariances of messages, by rows."""
-    return {f'{name}_covariance': [densities.sample_sd(found.rate)**2 if k % 4 == 0 else 0.0 for k in range(9)]
-            for name, densities in (('angular_velocity', found.gyroscope), ('linear_acceleration', found.accelerometer))}
+    return {
+        f'{name}_covariance': [
+            densities.sample_sd(found.rate) ** 2 if k % 4 == 0 else 0.0 for k in range(9)
+        ]
+        for name, densities in (
+            ('angular_velocity', found.gyroscope),
+            ('linear_acceleration', found.accelerometer),
+        )
+    }
 
 
 def write(page: Page, inside: str = '', gravity: str = '', *, head: str = '') -> str:
@@ -51,27 +76,68 @@ def write(page: Page, inside: str = '', gravity: str = '', *, head: str = '') ->
 
 
 def _target(name, title, formula, source, noise, noise_is, writer, **more):
-    return Target(name=name, title=title, formula=formula, source=source, noise=noise, noise_is=noise_is, write=writer,
-                  **{'estimates': SLOW_OFFSETS, **more})
+    return Target(
+        name=name,
+        title=title,
+        formula=formula,
+        source=source,
+        noise=noise,
+        noise_is=noise_is,
+        write=writer,
+        **{'estimates': SLOW_OFFSETS, **more},
+    )
 
 
 TARGETS = (
-    _target('vins', 'VINS-Mono and VINS-Fusion noise',
-            'midpoint rule: angle variance of a step = 2 (dt/2)^2 gyr_n^2, of the bias (dt gyr_w)^2',
-            'HKUST-Aerial-Robotics/VINS-Mono, vins_estimator/src/factor/integration_base.h', vins,
-            'per sample of the midpoint rule: N sqrt(2 rate), K sqrt(rate)', partial(write, gravity='g_norm', head='%YAML:1.0\n'),
-            hint='put these lines into the configuration; they hold for this rate only'),
-    _target('lio-sam', 'LIO-SAM noise', "gtsam's preintegration: variance of a step = imuGyrNoise^2 dt, of the bias imuGyrBiasN^2 dt",
-            'TixiaoShan/LIO-SAM, src/imuPreintegration.cpp, config/params.yaml', lio_sam, 'continuous: N, K',
-            partial(write, inside='lio_sam', gravity='imuGravity')),
-    _target('fast-lio', 'FAST-LIO and FAST-LIO2 noise', 'filter: variance of a step = dt^2 gyr_cov, of the bias dt^2 b_gyr_cov; '
-            'acc is scaled by gravity over the mean at the start', 'hku-mars/FAST_LIO, src/IMU_Processing.hpp, IKFoM esekfom.hpp', fast_lio,
-            'per sample: N^2 rate, K^2 rate', partial(write, inside='mapping'), hint='they hold for this rate only'),
-    _target('orb-slam3', 'ORB-SLAM3 noise', 'discrete inside: Noise sqrt(Frequency), Walk / sqrt(Frequency)',
-            'UZ-SLAMLab/ORB_SLAM3, src/Tracking.cc', orb_slam3, 'continuous: N, K', partial(write, head='%YAML:1.0\n')),
-    _target('robot-localization', 'covariances for robot_localization and imu_tools',
-            'both use the covariances of the messages only',
-            'cra-ros-pkg/robot_localization, CCNYRoboticsLab/imu_tools', covariances, 'discrete: N^2 rate, as in the messages', write,
-            needs_walk=False, estimates=(),
-            hint='compensator_node fills them in by itself; these numbers are for drivers with such parameters'),
+    _target(
+        'vins',
+        'VINS-Mono and VINS-Fusion noise',
+        'midpoint rule: angle variance of a step = 2 (dt/2)^2 gyr_n^2, of the bias (dt gyr_w)^2',
+        'HKUST-Aerial-Robotics/VINS-Mono, vins_estimator/src/factor/integration_base.h',
+        vins,
+        'per sample of the midpoint rule: N sqrt(2 rate), K sqrt(rate)',
+        partial(write, gravity='g_norm', head='%YAML:1.0\n'),
+        hint='put these lines into the configuration; they hold for this rate only',
+    ),
+    _target(
+        'lio-sam',
+        'LIO-SAM noise',
+        "gtsam's preintegration: variance of a step = imuGyrNoise^2 dt, of the bias imuGyrBiasN^2 dt",
+        'TixiaoShan/LIO-SAM, src/imuPreintegration.cpp, config/params.yaml',
+        lio_sam,
+        'continuous: N, K',
+        partial(write, inside='lio_sam', gravity='imuGravity'),
+    ),
+    _target(
+        'fast-lio',
+        'FAST-LIO and FAST-LIO2 noise',
+        'filter: variance of a step = dt^2 gyr_cov, of the bias dt^2 b_gyr_cov; '
+        'acc is scaled by gravity over the mean at the start',
+        'hku-mars/FAST_LIO, src/IMU_Processing.hpp, IKFoM esekfom.hpp',
+        fast_lio,
+        'per sample: N^2 rate, K^2 rate',
+        partial(write, inside='mapping'),
+        hint='they hold for this rate only',
+    ),
+    _target(
+        'orb-slam3',
+        'ORB-SLAM3 noise',
+        'discrete inside: Noise sqrt(Frequency), Walk / sqrt(Frequency)',
+        'UZ-SLAMLab/ORB_SLAM3, src/Tracking.cc',
+        orb_slam3,
+        'continuous: N, K',
+        partial(write, head='%YAML:1.0\n'),
+    ),
+    _target(
+        'robot-localization',
+        'covariances for robot_localization and imu_tools',
+        'both use the covariances of the messages only',
+        'cra-ros-pkg/robot_localization, CCNYRoboticsLab/imu_tools',
+        covariances,
+        'discrete: N^2 rate, as in the messages',
+        write,
+        needs_walk=False,
+        estimates=(),
+        hint='compensator_node fills them in by itself; these numbers are for drivers with such parameters',
+    ),
 )

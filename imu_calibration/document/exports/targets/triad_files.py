@@ -7,7 +7,17 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.document.exports.affine import MATRICES, OFFSETS, SCALES, AffineImu, of, undone
-from imu_calibration.document.exports.target import Noise, Page, Read, Target, numbers_at, read_yaml, section, text_of, yaml_file
+from imu_calibration.document.exports.target import (
+    Noise,
+    Page,
+    Read,
+    Target,
+    numbers_at,
+    read_yaml,
+    section,
+    text_of,
+    yaml_file,
+)
 from imu_calibration.effects.base import AXES
 
 
@@ -31,15 +41,29 @@ def read_imu_calib(content: bytes, _path: str | Path) -> Read:
     """Read the YAML file."""
     what = 'imu_calib file'
     mapping = read_yaml(content, what)
-    return Read({'SM': numbers_at(mapping, 'SM', (9,), what=what), 'bias': numbers_at(mapping, 'bias', (3,), what=what)})
+    return Read(
+        {
+            'SM': numbers_at(mapping, 'SM', (9,), what=what),
+            'bias': numbers_at(mapping, 'bias', (3,), what=what),
+        }
+    )
 
 
-IMU_CALIB = (Target(
-    name='imu-calib', title='imu_calib YAML (ROS 1 and ROS 2)',
-    formula='corrected = SM raw - bias of the accelerometer, SM by rows; the gyroscopes lose the mean of their first readings',
-    source='dpkoch/imu_calib, src/accel_calib.cpp', holds=of('accelerometer', OFFSETS + MATRICES), estimates=of('gyroscope', OFFSETS),
-    numbers=numbers_imu_calib, write=write_imu_calib, read=read_imu_calib, imu=imu_imu_calib,
-    hint='set calibrate_gyros to true and keep the robot still at the start'),)
+IMU_CALIB = (
+    Target(
+        name='imu-calib',
+        title='imu_calib YAML (ROS 1 and ROS 2)',
+        formula='corrected = SM raw - bias of the accelerometer, SM by rows; the gyroscopes lose the mean of their first readings',
+        source='dpkoch/imu_calib, src/accel_calib.cpp',
+        holds=of('accelerometer', OFFSETS + MATRICES),
+        estimates=of('gyroscope', OFFSETS),
+        numbers=numbers_imu_calib,
+        write=write_imu_calib,
+        read=read_imu_calib,
+        imu=imu_imu_calib,
+        hint='set calibrate_gyros to true and keep the robot still at the start',
+    ),
+)
 
 
 ENDINGS = {'accelerometer': '.acc', 'gyroscope': '.gyro'}
@@ -50,20 +74,30 @@ COUNT = 21
 def imu_imu_tk(found: dict) -> AffineImu:
     """Return the IMU of such numbers; a sensor without a file is perfect."""
     parts = {sensor: np.asarray(values, float) for sensor, values in found.items()}
-    turns = {sensor: values[:9].reshape(3, 3) @ values[9:18].reshape(3, 3) for sensor, values in parts.items()}
+    turns = {
+        sensor: values[:9].reshape(3, 3) @ values[9:18].reshape(3, 3)
+        for sensor, values in parts.items()
+    }
     return undone({sensor: (turn, turn @ parts[sensor][18:]) for sensor, turn in turns.items()})
 
 
 def read_imu_tk(content: bytes, path: str | Path) -> Read:
     """Read the named file and, if present, that of the other sensor in the same folder."""
     path = Path(path)
-    own = next((sensor for sensor, ending in ENDINGS.items() if path.suffix == ending), 'accelerometer')
+    own = next(
+        (sensor for sensor, ending in ENDINGS.items() if path.suffix == ending), 'accelerometer'
+    )
     found = {own: _numbers(content)}
     for sensor, ending in ENDINGS.items():
         beside = path.with_suffix(ending)
         if sensor != own and beside.is_file():
             found[sensor] = _numbers(beside.read_bytes())
-    return Read(found, tuple(h for sensor in ENDINGS if sensor not in found for h in of(sensor, OFFSETS + MATRICES)))
+    return Read(
+        found,
+        tuple(
+            h for sensor in ENDINGS if sensor not in found for h in of(sensor, OFFSETS + MATRICES)
+        ),
+    )
 
 
 def _numbers(content):
@@ -72,17 +106,32 @@ def _numbers(content):
         values = [float(word) for word in words]
     except ValueError:
         values = []
-    if len(values) != COUNT or not np.all(np.isfinite(values)) or not all(
-            abs(np.linalg.det(np.reshape(part, (3, 3)))) > 0 for part in (values[:9], values[9:18])):
-        raise InputError(f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be inverted and a bias, got '
-                         f'{len(words)} entries; give a different file')
+    if (
+        len(values) != COUNT
+        or not np.all(np.isfinite(values))
+        or not all(
+            abs(np.linalg.det(np.reshape(part, (3, 3)))) > 0 for part in (values[:9], values[9:18])
+        )
+    ):
+        raise InputError(
+            f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be inverted and a bias, got '
+            f'{len(words)} entries; give a different file'
+        )
     return values
 
 
-IMU_TK = (Target(
-    name='imu-tk', title='imu_tk calibration', formula='calibrated = T K (raw - B)',
-    source='A. Pretto, imu_tk, include/imu_tk/calibration.h',
-    holds=OFFSETS + MATRICES, read=read_imu_tk, imu=imu_imu_tk, axes='accelerometer_upper_triangular'),)
+IMU_TK = (
+    Target(
+        name='imu-tk',
+        title='imu_tk calibration',
+        formula='calibrated = T K (raw - B)',
+        source='A. Pretto, imu_tk, include/imu_tk/calibration.h',
+        holds=OFFSETS + MATRICES,
+        read=read_imu_tk,
+        imu=imu_imu_tk,
+        axes='accelerometer_upper_triangular',
+    ),
+)
 
 
 SCALE_KEY = 'gyro_scale_input'
@@ -90,55 +139,90 @@ SCALE_KEY = 'gyro_scale_input'
 
 def numbers_autoware(imu: AffineImu) -> dict:
     """Return offsets and scale factors of the gyroscopes: the same model as ours on the diagonal."""
-    offsets = {f'angular_velocity_offset_{a}': value for a, value in zip(AXES, imu.bias['gyroscope'])}
+    offsets = {
+        f'angular_velocity_offset_{a}': value for a, value in zip(AXES, imu.bias['gyroscope'])
+    }
     return {**offsets, SCALE_KEY: np.diag(imu.matrix['gyroscope'])}
 
 
 def imu_autoware(found: dict) -> AffineImu:
     """Return the IMU of such numbers."""
     offset = np.array([found[f'angular_velocity_offset_{a}'] for a in AXES])
-    return AffineImu(bias={'accelerometer': np.zeros(3), 'gyroscope': offset},
-                     matrix={'accelerometer': np.eye(3), 'gyroscope': np.diag(found[SCALE_KEY])})
+    return AffineImu(
+        bias={'accelerometer': np.zeros(3), 'gyroscope': offset},
+        matrix={'accelerometer': np.eye(3), 'gyroscope': np.diag(found[SCALE_KEY])},
+    )
 
 
 def noise_autoware(found: Noise) -> dict:
     """Return standard deviations of samples, the square roots of the covariances in its messages."""
     rate = found.gyroscope.sample_sd(found.rate)
-    return {**{f'angular_velocity_stddev_{a}{a}': rate for a in AXES}, 'acceleration_stddev': found.accelerometer.sample_sd(found.rate)}
+    return {
+        **{f'angular_velocity_stddev_{a}{a}': rate for a in AXES},
+        'acceleration_stddev': found.accelerometer.sample_sd(found.rate),
+    }
 
 
 def write_autoware(page: Page) -> str:
     """Return a parameter file."""
     x, y, z = (float(value) for value in page.numbers[SCALE_KEY])
-    scale = [f'the file has no scale factors; the node reads them from the topic {SCALE_KEY}, published repeatedly:',
-             f'  ros2 topic pub -r 1 {SCALE_KEY} geometry_msgs/msg/Vector3Stamped "{{vector: {{x: {x!r}, y: {y!r}, z: {z!r}}}}}"']
-    parameters = {name: value for name, value in page.numbers.items() if name != SCALE_KEY} | (page.noise or {})
-    switches = {'correct_for_static_bias': True, 'correct_for_dynamic_bias': False, 'correct_for_scale': True}
-    return yaml_file([*page.comments, *scale], {'/**': {'ros__parameters': {**parameters, 'on_off_correction': switches}}})
+    scale = [
+        f'the file has no scale factors; the node reads them from the topic {SCALE_KEY}, published repeatedly:',
+        f'  ros2 topic pub -r 1 {SCALE_KEY} geometry_msgs/msg/Vector3Stamped "{{vector: {{x: {x!r}, y: {y!r}, z: {z!r}}}}}"',
+    ]
+    parameters = {name: value for name, value in page.numbers.items() if name != SCALE_KEY} | (
+        page.noise or {}
+    )
+    switches = {
+        'correct_for_static_bias': True,
+        'correct_for_dynamic_bias': False,
+        'correct_for_scale': True,
+    }
+    return yaml_file(
+        [*page.comments, *scale],
+        {'/**': {'ros__parameters': {**parameters, 'on_off_correction': switches}}},
+    )
 
 
 def read_autoware(content: bytes, _path: str | Path) -> Read:
     """Read a parameter file; scale factors only from the comment that `write_autoware` makes."""
     what = 'imu_corrector parameter file'
     found = section(section(read_yaml(content, what), '/**', what), 'ros__parameters', what)
-    offsets = {name: float(numbers_at(found, name, (), what=what)) for name in (f'angular_velocity_offset_{a}' for a in AXES)}
-    scale = re.search(rf'^#.*{SCALE_KEY} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M)
+    offsets = {
+        name: float(numbers_at(found, name, (), what=what))
+        for name in (f'angular_velocity_offset_{a}' for a in AXES)
+    }
+    scale = re.search(
+        rf'^#.*{SCALE_KEY} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M
+    )
     try:
         values = [float(part) for part in scale.groups()] if scale else [1.0] * 3
     except ValueError as error:
-        raise InputError(f'the {what} must repeat three numbers in its comment on {SCALE_KEY}: {shortened(str(error))}; '
-                         'correct it') from error
+        raise InputError(
+            f'the {what} must repeat three numbers in its comment on {SCALE_KEY}: {shortened(str(error))}; '
+            'correct it'
+        ) from error
     return Read({**offsets, SCALE_KEY: values}, () if scale else of('gyroscope', SCALES))
 
 
-AUTOWARE = (Target(
-    name='autoware', title='Autoware imu_corrector parameters',
-    formula='rate = (raw - angular_velocity_offset) / gyro_scale_input; specific force unchanged\n'
-            'covariances = stddev^2; after the rotation to base_link the largest of the three is used for all',
-    source='autowarefoundation/autoware_universe, sensing/autoware_imu_corrector/src/imu_corrector_core.cpp',
-    holds=of('gyroscope', OFFSETS + SCALES), numbers=numbers_autoware, noise=noise_autoware, needs_walk=False,
-    noise_is='discrete: standard deviation of a sample', write=write_autoware, read=read_autoware, imu=imu_autoware,
-    hint='older versions name the switches on_off_correction.correct_for_bias and have no scale'),)
+AUTOWARE = (
+    Target(
+        name='autoware',
+        title='Autoware imu_corrector parameters',
+        formula='rate = (raw - angular_velocity_offset) / gyro_scale_input; specific force unchanged\n'
+        'covariances = stddev^2; after the rotation to base_link the largest of the three is used for all',
+        source='autowarefoundation/autoware_universe, sensing/autoware_imu_corrector/src/imu_corrector_core.cpp',
+        holds=of('gyroscope', OFFSETS + SCALES),
+        numbers=numbers_autoware,
+        noise=noise_autoware,
+        needs_walk=False,
+        noise_is='discrete: standard deviation of a sample',
+        write=write_autoware,
+        read=read_autoware,
+        imu=imu_autoware,
+        hint='older versions name the switches on_off_correction.correct_for_bias and have no scale',
+    ),
+)
 
 
 TARGETS = IMU_CALIB + IMU_TK + AUTOWARE

@@ -31,13 +31,31 @@ def read_json_document(content: bytes, _path: str | Path) -> Read:
 def write_mat(page: Page) -> bytes:
     """Return a struct for each sensor, values with names and covariance, and the document as text."""
     from scipy.io import savemat
+
     calibration = page.calibration
-    sensors = {sensor: {effect.name: calibration.value(*effect.key) for effect in calibration.model.effects if effect.section == sensor}
-               for sensor in SENSORS}
+    sensors = {
+        sensor: {
+            effect.name: calibration.value(*effect.key)
+            for effect in calibration.model.effects
+            if effect.section == sensor
+        }
+        for sensor in SENSORS
+    }
     stream = io.BytesIO()
-    savemat(stream, {**sensors, 'param_names': np.array(calibration.param_names, dtype=object), 'values': calibration.values,
-                     'sd': calibration.sd, 'covariance': calibration.covariance, 'status': np.array(calibration.status, dtype=object),
-                     'comments': '\n'.join(page.comments), DOCUMENT: json.dumps(plain(page.numbers))}, long_field_names=True)
+    savemat(
+        stream,
+        {
+            **sensors,
+            'param_names': np.array(calibration.param_names, dtype=object),
+            'values': calibration.values,
+            'sd': calibration.sd,
+            'covariance': calibration.covariance,
+            'status': np.array(calibration.status, dtype=object),
+            'comments': '\n'.join(page.comments),
+            DOCUMENT: json.dumps(plain(page.numbers)),
+        },
+        long_field_names=True,
+    )
     return MAT_HEADER.ljust(MAT_TEXT_BYTES) + stream.getvalue()[MAT_TEXT_BYTES:]
 
 
@@ -45,18 +63,43 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
     """Read the document in a .mat file."""
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
+
     what = 'MATLAB calibration'
     try:
-        text = str(loadmat(io.BytesIO(content), variable_names=[DOCUMENT])[DOCUMENT][0])   # damaged structs crash scipy
-    except (MatReadError, ValueError, KeyError, IndexError, TypeError, NotImplementedError, OSError, MemoryError, zlib.error) as error:
-        raise InputError(f"the {what} must be a .mat file with '{DOCUMENT}', as an export writes it; give another file") from error
+        text = str(
+            loadmat(io.BytesIO(content), variable_names=[DOCUMENT])[DOCUMENT][0]
+        )  # damaged structs crash scipy
+    except (
+        MatReadError,
+        ValueError,
+        KeyError,
+        IndexError,
+        TypeError,
+        NotImplementedError,
+        OSError,
+        MemoryError,
+        zlib.error,
+    ) as error:
+        raise InputError(
+            f"the {what} must be a .mat file with '{DOCUMENT}', as an export writes it; give another file"
+        ) from error
     return Read(read_json(text.encode(), what))
 
 
 def _target(name, title, writer, reader, suffix):
-    return Target(name=name, title=title, formula='measured = bias + matrix @ (true + lever-arm terms) + further effects; values in SI',
-                  source='imu_calibration, calibration.yaml', whole=True, write=writer, read=reader, suffix=suffix)
+    return Target(
+        name=name,
+        title=title,
+        formula='measured = bias + matrix @ (true + lever-arm terms) + further effects; values in SI',
+        source='imu_calibration, calibration.yaml',
+        whole=True,
+        write=writer,
+        read=reader,
+        suffix=suffix,
+    )
 
 
-TARGETS = (_target('json', 'the whole document as JSON', write_json, read_json_document, '.json'),
-           _target('mat', 'the whole document as MATLAB .mat', write_mat, read_mat, '.mat'))
+TARGETS = (
+    _target('json', 'the whole document as JSON', write_json, read_json_document, '.json'),
+    _target('mat', 'the whole document as MATLAB .mat', write_mat, read_mat, '.mat'),
+)
