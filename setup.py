@@ -1,4 +1,8 @@
-"""Installation by colcon (ament_python) and by pip; docs/decisions/packaging.md has the places of the files."""
+"""
+Installation by colcon (ament_python) and by pip.
+
+Docs/decisions/packaging.md has the places of the files.
+"""
 
 from glob import glob
 from pathlib import Path
@@ -18,7 +22,11 @@ NODES = (
 
 
 class _OnPathToo:
-    """Write each console script to bin/ as well: `ros2 run` looks in lib/PACKAGE, a shell looks on PATH."""
+    """
+    Write each console script to bin/ as well.
+
+    `ros2 run` looks in lib/PACKAGE, a shell looks on PATH.
+    """
 
     def write_script(self, script_name, contents, *args):
         super().write_script(script_name, contents, *args)
@@ -41,7 +49,9 @@ class Develop(_OnPathToo, develop):
 setup(
     name=NAME,
     version='0.1.0',
-    description='Calibration and compensation of inertial measurement units, offline and live on ROS 2',
+    description=(
+        'Calibration and compensation of inertial measurement units, offline and live on ROS 2'
+    ),
     long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license='Apache-2.0',

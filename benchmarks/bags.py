@@ -1,4 +1,8 @@
-"""Bags for the benchmarks, a simulated session, repeated until the bag is long enough, and the cost of a command on them."""
+"""
+Bags for the benchmarks, and the cost of a command on them.
+
+Each bag is a simulated session, repeated until the bag is long enough.
+"""
 
 import subprocess
 import sys
@@ -17,7 +21,9 @@ from msg_adapters.write import write_session
 
 PIECE_MINUTES = 10.0
 PAUSE_NS = 2_000_000_000
-"""Hole between the repetitions, so that the jump of the joints back to the start lies in no window."""
+"""
+Hole between the repetitions, so that the jump of the joints back to the start lies in no window.
+"""
 ITERATED_SECONDS = 1.0
 """Processor time over which a bare iteration is averaged."""
 RUNNER = """
@@ -26,7 +32,9 @@ child = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subproc
 _, status, usage = os.wait4(child.pid, 0)
 print(usage.ru_utime + usage.ru_stime, usage.ru_maxrss, os.waitstatus_to_exitcode(status))
 """
-"""Runs a command from a small process: the peak memory of a child begins with that of its parent."""
+"""
+Runs a command from a small process: the peak memory of a child begins with that of its parent.
+"""
 
 
 def bench_table():
@@ -67,7 +75,11 @@ def long_session(minutes, imu_rate=1000.0, joint_rate=200.0):
 
 
 def hand_session():
-    """Return (ImuSamples, None) of ten minutes by hand at 200 Hz: 25 poses of 22 s, random turns of 2 s between them."""
+    """
+    Return (ImuSamples, None) of ten minutes by hand at 200 Hz.
+
+    25 poses of 22 s, random turns of 2 s between them.
+    """
     from worlds.hand_sessions import simulate as simulate_by_hand
 
     return simulate_by_hand(0, 25, period=0.005, still=22.0, duration=2.0)[0], None
@@ -87,7 +99,11 @@ def iterate(bag):
 
 
 def run_verb(command, codes=(0, 3, 4)):
-    """Return (processor seconds, peak memory in MB) of a command in a process of its own; RuntimeError unless it ends with one of `codes`."""
+    """
+    Return (processor seconds, peak memory in MB) of a command in a process of its own.
+
+    RuntimeError unless it ends with one of `codes`.
+    """
     found = subprocess.run(
         [sys.executable, '-c', RUNNER, *command],
         cwd=Path(__file__).parents[1],
@@ -98,13 +114,16 @@ def run_verb(command, codes=(0, 3, 4)):
     seconds, kilobytes, code = found.stdout.split()
     if int(code) not in codes:
         raise RuntimeError(
-            f'the command must end with one of {codes}, it ended with {code}; run it by hand: {" ".join(command)}'
+            f'the command must end with one of {codes}, it ended with {code}; run it by hand:'
+            f' {" ".join(command)}'
         )
     return float(seconds), float(kilobytes) / 1024
 
 
 def write_bench_bag(path, minutes=None, storage='sqlite3', with_joints=True, session=None):
-    """Write a bench bag and return its path; `session` (from `long_session`) saves making it again."""
+    """
+    Write a bench bag and return its path; `session` (from `long_session`) saves making it again.
+    """
     imu, joints = session or long_session(minutes)
     write_session(path, imu, joints if with_joints else None, storage=storage)
     return path

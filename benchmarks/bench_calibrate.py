@@ -1,9 +1,11 @@
 """
-Processor time and memory of ``imu_calibration calibrate`` on a long bag, relative to the iteration of rosbags over its raw messages.
+Processor time and memory of ``imu_calibration calibrate`` on a long bag.
 
-Every repetition times both on the same bag one after the other, so that a slow machine changes both; the ratio is the median over
-the repetitions. The time of the command includes its imports. Run it separately with
-``python benchmarks/bench_calibrate.py [--minutes M] [--repetitions N]``.
+Both are relative to the iteration of rosbags over the raw messages of the bag.
+
+Every repetition times both on the same bag one after the other, so that a slow machine changes
+both; the ratio is the median over the repetitions. The time of the command includes its imports.
+Run it separately with ``python benchmarks/bench_calibrate.py [--minutes M] [--repetitions N]``.
 """
 
 import argparse
@@ -45,7 +47,11 @@ class Row(NamedTuple):
 
 
 def bench_calibrate(minutes=MINUTES, repetitions=REPETITIONS):
-    """Return the rows: time against bare iteration, growth with the length, and peak memory, per storage."""
+    """
+    Return the rows.
+
+    Time against bare iteration, growth with the length, and peak memory, per storage.
+    """
     with TemporaryDirectory() as folder:
         session, rows = long_session(minutes), []
         short = tuple(
@@ -95,7 +101,11 @@ def _measure(long_bag, short_bag, storage, limit, repetitions):
 
 
 def calibrate(bag):
-    """Return (processor seconds, peak memory in MB) of calibrating a bag into a folder beside it, without a report."""
+    """
+    Return (processor seconds, peak memory in MB) of calibrating a bag into a folder beside it.
+
+    Without a report.
+    """
     return run_verb(
         [
             sys.executable,
@@ -123,7 +133,8 @@ def main():
     rows = bench_calibrate(options.minutes, options.repetitions)
     for row in rows:
         print(
-            f'{row.name:50s} {row.value:7.2f} {row.unit:2s} (at most {row.limit:g} {row.unit})  {row.note}'
+            f'{row.name:50s} {row.value:7.2f} {row.unit:2s} (at most {row.limit:g} {row.unit}) '
+            f' {row.note}'
         )
     return 1 if any(row.value > row.limit for row in rows) else 0
 

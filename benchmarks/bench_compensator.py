@@ -1,9 +1,12 @@
 """
-CPU time and latency of the compensator relative to an rclpy relay, both between a serialized source and sink, alternately in one run.
+CPU time and latency of the compensator relative to an rclpy relay.
 
-CPU time includes all DDS threads of the process while messages are sent. Latency is the time from publication by the source to reception
-by the sink; added latency is the latency minus that of a direct connection from source to sink. Run it separately with
-``python benchmarks/bench_compensator.py [--seconds S]``.
+Both run between a serialized source and sink, alternately in one run.
+
+CPU time includes all DDS threads of the process while messages are sent. Latency is the time from
+publication by the source to reception by the sink; added latency is the latency minus that of a
+direct connection from source to sink. Run it separately with ``python
+benchmarks/bench_compensator.py [--seconds S]``.
 """
 
 import argparse
@@ -86,7 +89,11 @@ class Process:
 
 
 def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0):
-    """Send messages to `raw` and receive them from `corrected`; return (report of the source, report of the sink, CPU seconds)."""
+    """
+    Send messages to `raw` and receive them from `corrected`.
+
+    Return (report of the source, report of the sink, CPU seconds).
+    """
     sink = subprocess.Popen(
         [sys.executable, ENDS, 'sink', corrected],
         env=environment,
@@ -110,7 +117,11 @@ def _source(topic, rate, seconds, environment):
 
 
 def compare(nodes, seconds, environment, rate=1000.0):
-    """Measure each node and the direct connection alternately for `TURN` s at `rate`; return the direct median latency, microseconds."""
+    """
+    Measure each node and the direct connection alternately for `TURN` s at `rate`.
+
+    Return the direct median latency, microseconds.
+    """
     direct = []
     for _ in range(max(1, round(seconds / TURN))):
         for node in nodes:
@@ -131,7 +142,9 @@ def compare(nodes, seconds, environment, rate=1000.0):
 
 
 def highest_rate(node, environment, seconds):
-    """Return [(requested rate, actual rate, lost messages)] with rising rates until messages are lost."""
+    """
+    Return [(requested rate, actual rate, lost messages)] with rising rates until messages are lost.
+    """
     rows = []
     for rate in RATES:
         sent, came, _ = run_once(*node.topics, rate, seconds, environment)
@@ -168,8 +181,10 @@ def bench_compensator(seconds=30.0):
             time.sleep(4.0)
             direct = compare(nodes, seconds, environment)
             figures = {
-                node.name: _figures(node, direct)
-                | {'rates': highest_rate(node, environment, min(5.0, seconds))}
+                node.name: (
+                    _figures(node, direct)
+                    | {'rates': highest_rate(node, environment, min(5.0, seconds))}
+                )
                 for node in nodes
             }
         finally:
@@ -207,7 +222,8 @@ def main():
     options = parser.parse_args()
     figures, ratios = bench_compensator(options.seconds)
     print(
-        f'at 1 kHz, reliable, depth 1000; direct connection from source to sink {figures["direct"]:.0f} us'
+        'at 1 kHz, reliable, depth 1000; direct connection from source to sink'
+        f' {figures["direct"]:.0f} us'
     )
     for name, text in MEANING.items():
         shown = ', '.join(f'{key} {figures[name][key]:.0f} us' for key in ratios)

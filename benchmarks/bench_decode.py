@@ -1,8 +1,11 @@
 """
-Speed of the conversion of Imu messages to arrays relative to rosbags, which converts one message at a time.
+Speed of the conversion of Imu messages to arrays relative to rosbags.
 
-Every repetition times rosbags and this package on the same bag one after the other, so that a busy machine slows both; the
-ratio is the median over the repetitions. Run it separately with ``python benchmarks/bench_decode.py [--minutes M]``.
+rosbags converts one message at a time.
+
+Every repetition times rosbags and this package on the same bag one after the other, so that a busy
+machine slows both; the ratio is the median over the repetitions. Run it separately with ``python
+benchmarks/bench_decode.py [--minutes M]``.
 """
 
 import argparse
@@ -40,7 +43,11 @@ class Row(NamedTuple):
 
 
 def bench_decode(minutes=3.0, repetitions=REPETITIONS):
-    """Return the rows: decoding of Imu per storage, and of all messages against the bare iteration of rosbags."""
+    """
+    Return the rows.
+
+    Decoding of Imu per storage, and of all messages against the bare iteration of rosbags.
+    """
     with TemporaryDirectory() as folder:
         session = long_session(minutes)
         bags = {
@@ -129,7 +136,8 @@ def main():
     for row in rows:
         target = f'  (at least {row.target:g})' if row.target else ''
         print(
-            f'{row.name:60s} {row.ours / 1e6:7.3f} M/s against {row.theirs / 1e6:7.3f} M/s: {row.ratio:6.1f} x{target}'
+            f'{row.name:60s} {row.ours / 1e6:7.3f} M/s against {row.theirs / 1e6:7.3f} M/s:'
+            f' {row.ratio:6.1f} x{target}'
         )
     return 1 if any(row.ratio < row.target for row in rows) else 0
 

@@ -1,11 +1,15 @@
 """
-Figures of the planner over random tables, tolerances and grades: ``python benchmarks/bench_plan.py [--tables N] [--seeds N]``.
+Figures of the planner over random tables, tolerances and grades.
 
-Each table has three axes in random directions, none closer than 60 degrees to parallel with its neighbour, 200 to 400 deg/s (the fixed profile spins at 200), and a random
-mount. Tolerances are drawn for each effect between one and three times the sd of the fixed profile `calibration` on that table, for
-biases between twice and four times, so that the profile has no time to spare on some effect; it is charged with the time after which its
-own motions, in its own order, meet the tolerances. Achieved: errors of calibrations of simulated sessions over predicted sd, root mean square
-over all parameters and seeds.
+``python benchmarks/bench_plan.py [--tables N] [--seeds N]``.
+
+Each table has three axes in random directions, none closer than 60 degrees to parallel with its
+neighbour, 200 to 400 deg/s (the fixed profile spins at 200), and a random mount. Tolerances are
+drawn for each effect between one and three times the sd of the fixed profile `calibration` on that
+table, for biases between twice and four times, so that the profile has no time to spare on some
+effect; it is charged with the time after which its own motions, in its own order, meet the
+tolerances. Achieved: errors of calibrations of simulated sessions over predicted sd, root mean
+square over all parameters and seeds.
 """
 
 import argparse
@@ -43,7 +47,11 @@ from imu_calibration.references.options import CalibrationOptions, choose_model 
 from imu_calibration.simulation.motion_builder import Profile  # noqa: E402
 from imu_calibration.simulation.profiles import make_profile  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate  # noqa: E402
+from imu_calibration.simulation.session import (
+    SimulationOptions,
+    random_values,
+    simulate,
+)  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
 
 from worlds.random_tables import random_table  # noqa: E402
@@ -107,7 +115,11 @@ def followed(plan, table, grade, seed):
 
 
 def achieved(plan, table, grade, seed):
-    """Return (errors, reported standard deviations), both over predicted ones, of one simulated session that follows the plan."""
+    """
+    Return (errors, reported standard deviations) of one simulated session.
+
+    Both are divided by the predicted standard deviations. The session follows the plan.
+    """
     found, truth = followed(plan, table, grade, seed)
     rows = [
         (found.values[k] - truth[name], found.sd[k], plan.sd[plan.model.param_names.index(name)])
@@ -159,7 +171,11 @@ def one_table(number, seeds):
 
 
 def planned_session(plan, table, seed):
-    """Return the parameters that are not determined and the sensors that do not help in a simulated session that follows the plan."""
+    """
+    Return the undetermined parameters and the sensors that do not help.
+
+    The result is for a simulated session that follows the plan.
+    """
     found, _ = followed(plan, table, 'industrial', seed)
     wanted = {name for name, flag in zip(plan.model.param_names, plan.wanted, strict=True) if flag}
     weak = [
@@ -171,7 +187,11 @@ def planned_session(plan, table, seed):
 
 
 def stands(sessions, first, names):
-    """Print the targets of the six stands: time over the bound at a quarter of the default tolerances, memory, and planned sessions."""
+    """
+    Print the targets of the six stands.
+
+    Time over the bound at a quarter of the default tolerances, memory, and planned sessions.
+    """
     noise, passed = noise_of_grade(GRADES['industrial'].noise, RATE), 0
     print(
         'stand                 plan s  bound s  ratio  planning s  most MB  default plan s  bound s'
@@ -187,8 +207,9 @@ def stands(sessions, first, names):
         )
         plans[name] = make_planner(table, noise=noise).plan()
         print(
-            f'{name:<21} {plan.seconds:6.1f}  {plan.lower_bound_seconds:7.1f}  {plan.seconds / plan.lower_bound_seconds:5.2f}  {taken:10.1f}  '
-            f'{memory:7.0f}  {plans[name].seconds:14.1f}  {plans[name].lower_bound_seconds:7.1f}',
+            f'{name:<21} {plan.seconds:6.1f}  {plan.lower_bound_seconds:7.1f} '
+            f' {plan.seconds / plan.lower_bound_seconds:5.2f}  {taken:10.1f}  {memory:7.0f} '
+            f' {plans[name].seconds:14.1f}  {plans[name].lower_bound_seconds:7.1f}',
             flush=True,
         )
     for number in range(sessions):
@@ -198,8 +219,8 @@ def stands(sessions, first, names):
         if weak:
             print(f'session {first + number} on {name}: {", ".join(weak)}', flush=True)
     print(
-        f'{passed} of {sessions} planned sessions with every parameter determined and both sensors of help (target 35 of 40); ratio at most 1.25; '
-        'seven joints at most 500 MB and 10 s'
+        f'{passed} of {sessions} planned sessions with every parameter determined and both sensors'
+        ' of help (target 35 of 40); ratio at most 1.25; seven joints at most 500 MB and 10 s'
     )
 
 
@@ -221,15 +242,17 @@ def main():
         return stands(options.sessions, options.first, options.stands)
     rows = []
     print(
-        'table grade       met  plan s  bound s  ratio  fixed s  share  achieved/predicted  reported/predicted  planning s'
+        'table grade       met  plan s  bound s  ratio  fixed s  share  achieved/predicted '
+        ' reported/predicted  planning s'
     )
     for number in range(options.first, options.first + options.tables):
         row = one_table(number, options.seeds)
         rows.append(row)
         print(
-            f'{number:5d} {row["grade"]:<11} {"yes" if row["met"] else "NO ":<4}{row["plan"]:7.1f}  {row["bound"]:7.1f}  '
-            f'{row["plan"] / row["bound"]:5.2f}  {row["fixed"]:7.1f}  {row["plan"] / row["fixed"]:5.2f}  {row["rms"]:18.2f}  '
-            f'{row["reported"]:18.2f}  {row["planning"]:10.1f}',
+            f'{number:5d} {row["grade"]:<11} {"yes" if row["met"] else "NO ":<4}{row["plan"]:7.1f} '
+            f' {row["bound"]:7.1f}  {row["plan"] / row["bound"]:5.2f}  {row["fixed"]:7.1f} '
+            f' {row["plan"] / row["fixed"]:5.2f}  {row["rms"]:18.2f}  {row["reported"]:18.2f} '
+            f' {row["planning"]:10.1f}',
             flush=True,
         )
     ratio, share = (
@@ -237,10 +260,11 @@ def main():
     )
     rms = np.array([row['rms'] for row in rows])
     print(
-        f'tolerances met on {sum(row["met"] for row in rows)} of {len(rows)}; plan over bound: median {np.median(ratio):.2f}, '
-        f'largest {ratio.max():.2f}; plan over fixed profile: median {np.median(share):.2f}, largest {share.max():.2f}; achieved over '
-        f'predicted: median {np.nanmedian(rms):.2f}, {np.nanmin(rms):.2f} to {np.nanmax(rms):.2f}; processor time: largest '
-        f'{max(row["planning"] for row in rows):.1f} s'
+        f'tolerances met on {sum(row["met"] for row in rows)} of {len(rows)}; plan over bound:'
+        f' median {np.median(ratio):.2f}, largest {ratio.max():.2f}; plan over fixed profile:'
+        f' median {np.median(share):.2f}, largest {share.max():.2f}; achieved over predicted:'
+        f' median {np.nanmedian(rms):.2f}, {np.nanmin(rms):.2f} to {np.nanmax(rms):.2f}; processor'
+        f' time: largest {max(row["planning"] for row in rows):.1f} s'
     )
 
 

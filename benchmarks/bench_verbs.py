@@ -1,11 +1,15 @@
 """
-Processor time and peak memory of the verbs, relative to a bare iteration of rosbags over the same bag.
+Processor time and peak memory of the verbs.
 
-The limits were stated in seconds on one machine, where `calibrate` of an hour at 1 kHz needed 19.4 s of processor time, 2.7 times a bare
-iteration over the raw messages of its sqlite3 bag. One iteration therefore needed 7.2 s, 1.67 us per message: a limit of S seconds for a
-bag of N messages is S / (1.67e-6 N) iterations. The iteration and the verb run one after the other, and the ratio is the median over
-the repetitions, so that a slow or busy machine changes both. The processor time of a verb includes its imports and its report.
-Run it separately with ``python benchmarks/bench_verbs.py [--repetitions N] [--only TEXT]``.
+Both are relative to a bare iteration of rosbags over the same bag.
+
+The limits were stated in seconds on one machine, where `calibrate` of an hour at 1 kHz needed 19.4
+s of processor time, 2.7 times a bare iteration over the raw messages of its sqlite3 bag. One
+iteration therefore needed 7.2 s, 1.67 us per message: a limit of S seconds for a bag of N messages
+is S / (1.67e-6 N) iterations. The iteration and the verb run one after the other, and the ratio is
+the median over the repetitions, so that a slow or busy machine changes both. The processor time of
+a verb includes its imports and its report. Run it separately with ``python
+benchmarks/bench_verbs.py [--repetitions N] [--only TEXT]``.
 """
 
 import argparse
@@ -20,12 +24,21 @@ ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
     sys.path[:0] = [str(ROOT), str(ROOT / 'test')]  # simulated worlds of the tests
 
-from benchmarks.bags import hand_session, iterate, long_session, run_verb, write_bench_bag  # noqa: E402
+from benchmarks.bags import (
+    hand_session,
+    iterate,
+    long_session,
+    run_verb,
+    write_bench_bag,
+)  # noqa: E402
 from imu_calibration.use_cases.resources import config_file  # noqa: E402
 
 REPETITIONS = 3
 SECONDS_PER_MESSAGE = 19.4 / 2.7 / (3600 * 1200)
-"""Bare iteration on the machine on which the limits were stated: an hour with Imu at 1 kHz and JointState at 200 Hz."""
+"""
+Bare iteration on the machine on which the limits were stated: an hour with Imu at 1 kHz and
+JointState at 200 Hz.
+"""
 
 
 class Session(NamedTuple):
@@ -76,7 +89,11 @@ CASES = (
 
 
 def bench_verbs(repetitions=REPETITIONS, only=''):
-    """Yield (case, multiples of a bare iteration, seconds, MB, limit as multiple); multiples, seconds and MB of each repetition."""
+    """
+    Yield (case, multiples of a bare iteration, seconds, MB, limit as multiple).
+
+    Multiples, seconds and MB of each repetition.
+    """
     with TemporaryDirectory() as folder:
         for number, (name, session) in enumerate(SESSIONS.items()):
             cases = [
@@ -101,7 +118,9 @@ def bench_verbs(repetitions=REPETITIONS, only=''):
 
 
 def _measure(case, bag, output):
-    """Return (processor seconds of a bare iteration, processor seconds of the verb, its peak MB)."""
+    """
+    Return (processor seconds of a bare iteration, processor seconds of the verb, its peak MB).
+    """
     iteration, table = iterate(bag), config_file('table_simulated.yaml')
     calibration = bag.parent / f'calibration_{bag.name}'
     if case.verb == 'compensate' and not calibration.exists():
@@ -132,8 +151,9 @@ def main():
         multiple = median(multiples)
         missed |= multiple > limit or max(memory) > case.memory_mb
         print(
-            f'{case.verb + ", " + case.session:40s} {multiple:6.1f} iterations (at most {limit:.1f}: {case.seconds:g} s)  '
-            f'{median(seconds):5.1f} s  {max(memory):4.0f} MB (at most {case.memory_mb:g})',
+            f'{case.verb + ", " + case.session:40s} {multiple:6.1f} iterations (at most'
+            f' {limit:.1f}: {case.seconds:g} s)  {median(seconds):5.1f} s  {max(memory):4.0f} MB'
+            f' (at most {case.memory_mb:g})',
             flush=True,
         )
     return 1 if missed else 0

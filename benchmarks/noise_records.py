@@ -1,11 +1,13 @@
 """
-Coverage and efficiency of identified noise: simulated records of four grades and three lengths, intervals and errors against the bound.
+Coverage and efficiency of identified noise.
+
+Simulated records of four grades and three lengths, intervals and errors against the bound.
 
     make noise-coverage       # fresh seeds; writes the tables of docs/noise.md
 
-Every axis draws its own densities and one of four forms of slow noise. Intervals include the choice of the form. Errors
-are from the fit of the true form, relative to the Cramer-Rao bound for a given form: exact Fisher information of block means, and of the
-spectrum within blocks.
+Every axis draws its own densities and one of four forms of slow noise. Intervals include the choice
+of the form. Errors are from the fit of the true form, relative to the Cramer-Rao bound for a given
+form: exact Fisher information of block means, and of the spectrum within blocks.
 """
 
 import argparse
@@ -26,7 +28,12 @@ from imu_calibration.allan.processes import (  # noqa: E402
     gauss_markov,
     mean_covariance,
 )
-from imu_calibration.allan.terms import PROCESSES, TIME_KEY, fit_form, identify_axis  # noqa: E402  # noqa: E402
+from imu_calibration.allan.terms import (
+    PROCESSES,
+    TIME_KEY,
+    fit_form,
+    identify_axis,
+)  # noqa: E402  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
 
@@ -46,7 +53,10 @@ BLOCKS = 500
 BEGIN, END = '<!-- records: begin -->', '<!-- records: end -->'
 """Marks around the tables in the document."""
 INFORMED = 0.3
-"""Errors are compared with the bound where the bound is below this share of the coefficient; elsewhere the record does not determine it."""
+"""
+Errors are compared with the bound where the bound is below this share of the coefficient; elsewhere
+the record does not determine it.
+"""
 
 
 def record_axes(length, grade, number, seed):
@@ -73,7 +83,11 @@ def scales_of(n, period):
 
 
 def judged(truth, moments):
-    """Return the result of one axis: (name, truth, lower, upper, status) of every figure, and the errors of the fit of the true form."""
+    """
+    Return the result of one axis.
+
+    (name, truth, lower, upper, status) of every figure, and the errors of the fit of the true form.
+    """
     found = identify_axis(moments)
     figures = []
     for name, value in truth.figures.items():
@@ -142,7 +156,11 @@ def bound(moments, truth, names):
 
 
 def moment_bound(moments, truth, names):
-    """Return the relative bounds of the optimally weighted estimator from Allan variances (GMWM's bound)."""
+    """
+    Return the relative bounds of the optimally weighted Allan variance estimator.
+
+    The estimator works from Allan variances, weighted optimally (GMWM's bound).
+    """
     design = np.column_stack(_derivatives(truth, names, moments.scales.expectation))
     processes = tuple(
         gauss_markov(truth.figures[TIME_KEY]) if name == 'gauss_markov' else PROCESSES[name]
@@ -160,7 +178,11 @@ def moment_bound(moments, truth, names):
 
 
 def _derivatives(truth, names, of):
-    """Return the contribution of each process, and the change with the logarithm of the correlation time."""
+    """
+    Return the contribution of each process, and its change with correlation time.
+
+    The change is the one with the logarithm of the correlation time.
+    """
     parts = []
     for name in names:
         process = (
@@ -178,7 +200,11 @@ def _derivatives(truth, names, of):
 
 
 def _spectrum(process, frequency, period):
-    """Return the two-sided density of a process of unit coefficient, well above the corner frequency of slow processes."""
+    """
+    Return the two-sided density of a process of unit coefficient.
+
+    For slow processes, it is the density well above the corner frequency.
+    """
     angular = 2 * np.pi * frequency
     return {
         'white_noise': np.ones_like(frequency),
@@ -190,7 +216,9 @@ def _spectrum(process, frequency, period):
 
 
 def run(records, seed, progress=print):
-    """Return the results of all axes: length -> list of `judged`; `records` for each grade and length."""
+    """
+    Return the results of all axes: length -> list of `judged`; `records` for each grade and length.
+    """
     found = {}
     for label, length in LENGTHS.items():
         start = time.monotonic()
@@ -205,7 +233,11 @@ def run(records, seed, progress=print):
 
 
 def coverage(axes):
-    """Return {name: (number, share of intervals that hold the truth, share below, share above)} of the figures in `NAMES`."""
+    """
+    Return {name: (number, three shares of intervals)} of the figures in `NAMES`.
+
+    The values are (number, share of intervals that hold the truth, share below, share above).
+    """
     table = {}
     for name in NAMES:
         rows = [
@@ -226,7 +258,12 @@ def coverage(axes):
 
 
 def sharpness(axes):
-    """Return {name: (number, rms error over the Cramer-Rao bound, over that of the moments)} where the bound is below `INFORMED`."""
+    """
+    Return {name: (number, two ratios of rms errors)} of informed coefficients.
+
+    The values are (number, rms error over the Cramer-Rao bound, over that of the moments). Only
+    cases where the bound is below `INFORMED` count.
+    """
     table = {}
     for name in NAMES:
         rows = [
@@ -263,7 +300,11 @@ def tables(found):
     """Return the tables of docs/noise.md."""
     every = [axis for axes in found.values() for axis in axes]
     lines = [
-        f'{len(every) // 6} records of six axes ({", ".join(f"{len(axes) // 6} of {label}" for label, axes in found.items())}; {RATE:g} Hz).',
+        (
+            f'{len(every) // 6} records of six axes'
+            f' ({", ".join(f"{len(axes) // 6} of {label}" for label, axes in found.items())};'
+            f' {RATE:g} Hz).'
+        ),
         '',
         '| figure | axes that have it | interval holds the truth | too low | too high | '
         + ' | '.join(found)
@@ -285,7 +326,10 @@ def tables(found):
         )
     lines += [
         '',
-        '| figure | axes with a bound below 30 % | rms error over the Cramér–Rao bound | over the bound of the moments |',
+        (
+            '| figure | axes with a bound below 30 % | rms error over the Cramér–Rao bound | over'
+            ' the bound of the moments |'
+        ),
         '| --- | ---: | ---: | ---: |',
     ]
     lines += [
@@ -302,8 +346,11 @@ def tables(found):
     rival = sum(axis['true'] in axis['rivals'] for axis in every)
     lines += [
         '',
-        f'The form of the slow noise: found as it was in {right} axes, a part or a limiting case of it in {part}, named as explaining the curve as '
-        f'well in {rival}, of {len(every)}.',
+        (
+            f'The form of the slow noise: found as it was in {right} axes, a part or a limiting'
+            f' case of it in {part}, named as explaining the curve as well in {rival}, of'
+            f' {len(every)}.'
+        ),
     ]
     return '\n'.join(lines)
 

@@ -1,4 +1,8 @@
-"""Processes of the relay benchmark: a source and a sink of serialized messages, and the rclpy relay for comparison."""
+"""
+Processes of the relay benchmark.
+
+A source and a sink of serialized messages, and the rclpy relay for comparison.
+"""
 
 import json
 import struct
@@ -26,7 +30,11 @@ END = 2.0**40
 
 
 def template():
-    """Return one serialized message of an IMU in motion, and the offset of the number that identifies each message."""
+    """
+    Return one serialized message of an IMU in motion, and the offset of its number.
+
+    The number identifies each message.
+    """
     imu = ImuSamples(
         np.zeros(1, np.int64),
         np.array([[0.3, -0.2, 9.8]]),
@@ -38,7 +46,11 @@ def template():
 
 
 def source(topic, rate, seconds):
-    """Publish with the send time as stamp and a running number as orientation.x; late messages are sent immediately."""
+    """
+    Publish with the send time as stamp and a running number as orientation.x.
+
+    Late messages are sent immediately.
+    """
     node = rclpy.create_node('bench_source')
     publisher = node.create_publisher(Imu, topic, output_qos())
     data, number_at = template()
@@ -105,9 +117,11 @@ def sink(topic):
             {
                 'came': len(set(numbers)),
                 'doubled': len(numbers) - len(set(numbers)),
-                'late_us': np.round(np.percentile(late, np.arange(0, 101)), 1).tolist()
-                if len(late)
-                else [],
+                'late_us': (
+                    np.round(np.percentile(late, np.arange(0, 101)), 1).tolist()
+                    if len(late)
+                    else []
+                ),
             }
         ),
         flush=True,

@@ -1,4 +1,8 @@
-"""Run every benchmark of this folder, one after the other; exit code 1 when one of them misses a target."""
+"""
+Run every benchmark of this folder, one after the other.
+
+Exit code 1 when one of them misses a target.
+"""
 
 import subprocess
 import sys

@@ -1,4 +1,8 @@
-"""Figures of the pages in docs/answers, drawn from the files that their commands wrote into the current folder."""
+"""
+Figures of the pages in docs/answers.
+
+They are drawn from the files that the commands of the pages wrote into the current folder.
+"""
 
 from pathlib import Path
 

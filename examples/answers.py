@@ -1,8 +1,11 @@
 """
-The pages in docs/answers: run each of their commands and write its output below it (``make answers``).
+The pages in docs/answers.
 
-A page is its own source. Blocks that begin with ``console`` contain lines ``$ command``; the lines below a command are replaced by its
-output. The pages are processed in alphabetical order in one folder, so that later pages use the files of earlier pages.
+Run each of their commands and write its output below it (``make answers``).
+
+A page is its own source. Blocks that begin with ``console`` contain lines ``$ command``; the lines
+below a command are replaced by its output. The pages are processed in alphabetical order in one
+folder, so that later pages use the files of earlier pages.
 """
 
 import argparse
@@ -25,7 +28,11 @@ FILTERS = ('grep', 'head', 'tail', 'cat', 'printf')
 
 
 def run(command: str) -> str:
-    """Run a command in the current folder and return both of its outputs; ``|`` joins stages, ``>`` writes a file."""
+    """
+    Run a command in the current folder and return both of its outputs.
+
+    ``|`` joins stages, ``>`` writes a file.
+    """
     command, _, target = command.partition(' > ')
     output = ''
     for stage in command.split(' | '):

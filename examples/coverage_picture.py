@@ -1,4 +1,8 @@
-"""Draw docs/coverage.png: the markers of imu/coverage at the beginning, in the middle and at the end of a calibration by hand."""
+"""
+Draw docs/coverage.png.
+
+The markers of imu/coverage at the beginning, in the middle and at the end of a calibration by hand.
+"""
 
 import textwrap
 from pathlib import Path
@@ -20,7 +24,12 @@ MINIMUM = 8.0
 
 
 def states():
-    """Yield a Coverage at the beginning, after six poses and at the end of a session that follows the recommended motions."""
+    """
+    Yield a Coverage at three times of a session of recommended motions.
+
+    The times are the beginning, after six poses, and the end of the session, which follows the
+    recommended motions.
+    """
     up = np.array([0.0, 0.0, 1.0])
     knowledge, seen = (
         knowledge_of(EMPTY_SCAN, None, HandOptions(gravity=9.81)).then(HandStep(up)),

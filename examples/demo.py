@@ -91,7 +91,8 @@ if __name__ == '__main__':
         strangers = sorted(p.name for p in target.iterdir() if p.name not in known)
         if strangers:
             raise SystemExit(
-                f'{target} must be empty or contain an earlier demonstration, it contains {strangers[0]}; choose another --output'
+                f'{target} must be empty or contain an earlier demonstration, it contains'
+                f' {strangers[0]}; choose another --output'
             )
         shutil.rmtree(target)
     target.mkdir(parents=True)

@@ -1,8 +1,11 @@
 """
-Effect of a calibration on navigation: dead reckoning from /imu/data_raw and from /imu/data, over DDS from a bag.
+Effect of a calibration on navigation.
 
-The node integrates the rate and the specific force and sets its velocity to zero at rest (zero-velocity update); it publishes nav_msgs/Odometry.
-The remaining nodes are those of a robot: bag_player_node plays a drive, compensator_node corrects it with a calibration.
+Dead reckoning from /imu/data_raw and from /imu/data, over DDS from a bag.
+
+The node integrates the rate and the specific force and sets its velocity to zero at rest
+(zero-velocity update); it publishes nav_msgs/Odometry. The remaining nodes are those of a robot:
+bag_player_node plays a drive, compensator_node corrects it with a calibration.
 
 Run: ``python examples/downstream_nav.py [--picture FILE]``; it needs about half a minute.
 """
@@ -35,7 +38,9 @@ GRAVITY, RATE, LEG, STOP = 9.81, 100.0, 20.0, 4.0
 FACTOR = 5.0
 """Simulated seconds per second."""
 DEPTH = 20_000
-"""Queue length: larger than the number of messages of the drive, so that a busy machine loses none."""
+"""
+Queue length: larger than the number of messages of the drive, so that a busy machine loses none.
+"""
 MOST_LOST = 250
 """Of 12000; before levelling, one second after the start, no position is published."""
 NOISE = {'accelerometer': 0.01, 'gyroscope': 0.001}
@@ -44,7 +49,11 @@ PATIENCE = 120.0
 
 
 def drive(seed, seconds):
-    """Return (time, true rate, true force, path) of a robot that drives curves on a floor and stops before each leg."""
+    """
+    Return (time, true rate, true force, path) of a robot that drives on a floor.
+
+    The robot drives curves and stops before each leg.
+    """
     rng, time_ = np.random.default_rng(seed), np.arange(0, seconds, 1 / RATE)
     phase, leg = time_ % LEG, (time_ // LEG).astype(int)
     moving = np.clip(np.minimum(phase - STOP, LEG - phase), 0, 1)  # each leg begins at rest
@@ -79,8 +88,10 @@ def measured(time_, rate, force, seed):
         temperature,
     )
     read = {
-        sensor: sensor_output(truth.model, sensor, truth.values, ref=ref)
-        + rng.normal(0, sd, (len(time_), 3))
+        sensor: (
+            sensor_output(truth.model, sensor, truth.values, ref=ref)
+            + rng.normal(0, sd, (len(time_), 3))
+        )
         for sensor, sd in NOISE.items()
     }
     stamps = 1_800_000_000 * 10**9 + np.round(time_ * 1e9).astype(np.int64)
@@ -88,7 +99,11 @@ def measured(time_, rate, force, seed):
 
 
 class DeadReckoning:
-    """Attitude, velocity and position from specific force and rate; levelled at the first stop, velocity zero at every stop."""
+    """
+    Attitude, velocity and position from specific force and rate.
+
+    Levelled at the first stop, velocity zero at every stop.
+    """
 
     def __init__(self):
         self._stops = StopDetector(np.repeat(list(NOISE.values()), 3))
@@ -154,7 +169,11 @@ class Navigator:
 
 
 def navigate(bag, calibration, domain_id):
-    """Play the bag through a compensator and two navigators; return {topic: path, rows of stamp and position}."""
+    """
+    Play the bag through a compensator and two navigators.
+
+    Return {topic: path, rows of stamp and position}.
+    """
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
@@ -178,7 +197,8 @@ def navigate(bag, calibration, domain_id):
             while not corrected.node.count_publishers(corrected.input.topic_name):
                 if time.monotonic() > end:
                     raise SystemExit(
-                        'the compensator did not start within the time limit; run it again on an idle machine'
+                        'the compensator did not start within the time limit; run it again on an'
+                        ' idle machine'
                     )
                 executor.spin_once(
                     timeout_sec=0.1
@@ -192,7 +212,8 @@ def navigate(bag, calibration, domain_id):
             ):
                 if time.monotonic() > end:
                     raise SystemExit(
-                        'the drive did not end within the time limit; run it again on an idle machine'
+                        'the drive did not end within the time limit; run it again on an idle'
+                        ' machine'
                     )
                 executor.spin_once(timeout_sec=0.1)
             return {
@@ -204,7 +225,11 @@ def navigate(bag, calibration, domain_id):
 
 
 def errors_of(paths, stamps, path):
-    """Return {topic: (largest error, error at the end, m; path in the plane)}, with the true heading at the start."""
+    """
+    Return {topic: (largest error, error at the end, m; path in the plane)}.
+
+    With the true heading at the start.
+    """
     found = {}
     for topic, rows in paths.items():
         index = np.searchsorted(stamps, rows[:, 0].astype(np.int64))
@@ -254,7 +279,8 @@ def run(domain_id, picture, seconds, folder):
         print(f'/{topic}: error {last:.2f} m at the end, largest {most:.2f} m')
     (_, raw, _), (_, corrected, _) = found.values()
     print(
-        f'the calibration reduces the position error after {seconds:.0f} s by {raw - corrected:.2f} m'
+        f'the calibration reduces the position error after {seconds:.0f} s by'
+        f' {raw - corrected:.2f} m'
     )
     if picture:
         draw(found, path, picture)

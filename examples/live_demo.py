@@ -1,10 +1,14 @@
 """
-The closed loop as processes over real DDS: a simulated table, calibration_node, planner_node, then compensator_node.
+The closed loop as processes over real DDS.
 
-An uncalibrated IMU with a fault outside its model is turned through its six faces. This motion determines every parameter of the model, but at +-1 g a
-quadratic term and an asymmetry of the scale factor are collinear, so the diagnosis reports a class of effects. The planner drives the motion that separates
-them until one effect remains. The live calibration then includes this effect, and the compensator corrects another motion with it. Run:
-``python examples/live_demo.py`` (or ``make live-demo``); it needs two to three minutes and no ``ros2 launch``, and writes ``live_demo.png``.
+A simulated table, calibration_node, planner_node, then compensator_node.
+
+An uncalibrated IMU with a fault outside its model is turned through its six faces. This motion
+determines every parameter of the model, but at +-1 g a quadratic term and an asymmetry of the scale
+factor are collinear, so the diagnosis reports a class of effects. The planner drives the motion
+that separates them until one effect remains. The live calibration then includes this effect, and
+the compensator corrects another motion with it. Run: ``python examples/live_demo.py`` (or ``make
+live-demo``); it needs two to three minutes and no ``ros2 launch``, and writes ``live_demo.png``.
 """
 
 import argparse
@@ -101,11 +105,13 @@ class Watcher:
             for process in self._processes.running:
                 if process.poll():
                     raise SystemExit(
-                        f'a node ended with exit code {process.returncode}: {" ".join(process.args[1:4])}'
+                        f'a node ended with exit code {process.returncode}:'
+                        f' {" ".join(process.args[1:4])}'
                     )
             if time.monotonic() > deadline:
                 raise SystemExit(
-                    'the demonstration did not end within its time limit; run it again on an idle machine'
+                    'the demonstration did not end within its time limit; run it again on an idle'
+                    ' machine'
                 )
             self._rclpy.spin_once(self.node, timeout_sec=0.1)
 
@@ -135,7 +141,11 @@ def once(samples):
 
 
 def differences(samples, truth):
-    """Return time (s) and one-second means of measured minus true force and rate at the same stamps, each of shape (n, 3)."""
+    """
+    Return time (s) and one-second means of measured minus true force and rate.
+
+    Measured and true values are at the same stamps. The means have shape (n, 3) each.
+    """
     _, here, there = np.intersect1d(samples.stamp_ns, truth.stamp_ns, return_indices=True)
     rate = int(SIMULATOR['imu_rate'])
     count = len(here) // rate * rate
@@ -155,7 +165,8 @@ def run(domain_id, folder, output):
     os.environ |= {'ROS_DOMAIN_ID': str(domain_id), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
     with NodeProcesses(domain_id) as processes:
         print(
-            f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and planner_node; hidden effect of the IMU: {HIDDEN}',
+            f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and'
+            f' planner_node; hidden effect of the IMU: {HIDDEN}',
             flush=True,
         )
         calibration_node = processes.start(
@@ -228,7 +239,11 @@ def drive(watcher, deadline):
 
 
 def compare(watcher, processes, deadline):
-    """Compensate another motion of the same IMU; return time and differences before and after, None without corrected messages."""
+    """
+    Compensate another motion of the same IMU.
+
+    Return time and differences before and after, None without corrected messages.
+    """
     for topic in watcher.streams:
         watcher.take(topic)
     print('compensating another motion of the same IMU', flush=True)
@@ -256,7 +271,8 @@ def compare(watcher, processes, deadline):
     )
     for name, (_, force, rate) in (('before', before), ('after', after)):
         print(
-            f'  {name:7} accelerometer {np.sqrt((force**2).mean()) / (G * 1e-3):9.4f} mg    gyroscope {np.sqrt((rate**2).mean()) / DEG:9.5f} deg/s'
+            f'  {name:7} accelerometer {np.sqrt((force**2).mean()) / (G * 1e-3):9.4f} mg   '
+            f' gyroscope {np.sqrt((rate**2).mean()) / DEG:9.5f} deg/s'
         )
     return before, after
 
@@ -271,11 +287,13 @@ def events(drive):
         event = (
             'waits for the diagnosis'
             if text == 'diagnosing'
-            else f'separates {candidates}'
-            if values.get('separating') == 'True'
-            else f'found: {found}'
-            if values['state'] == 'done' and found
-            else ''
+            else (
+                f'separates {candidates}'
+                if values.get('separating') == 'True'
+                else f'found: {found}'
+                if values['state'] == 'done' and found
+                else ''
+            )
         )
         if event and event != previous:
             yield at, event
@@ -283,7 +301,11 @@ def events(drive):
 
 
 def picture(path, watcher, calibration, errors):
-    """Draw standard deviations over time, the actions of the planner, and the errors before and after compensation."""
+    """
+    Draw standard deviations over time, the planner's actions, and the errors.
+
+    The errors are drawn before and after compensation.
+    """
     import matplotlib
 
     matplotlib.use('Agg')
@@ -329,7 +351,10 @@ def picture(path, watcher, calibration, errors):
     known.set(
         xlabel='s since the planner started',
         ylabel='standard deviation / tolerance',
-        title=f'{PROFILE}, then {watcher.drive[-1][2]["motion"]} planned motions: parameters of accelerometer (blue) and gyroscope (orange)',
+        title=(
+            f'{PROFILE}, then {watcher.drive[-1][2]["motion"]} planned motions: parameters of'
+            ' accelerometer (blue) and gyroscope (orange)'
+        ),
     )
     found = [
         effect.name

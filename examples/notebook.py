@@ -1,8 +1,9 @@
 # %% [markdown]
 # # An IMU on a turntable, in a notebook
 #
-# Every cell runs unchanged, in Jupyter, VS Code or Spyder (percent format) and as a script: `python examples/notebook.py`.
-# Two lines calibrate a bag: the import, and `imu.calibrate('session.bag', 'table.yaml')`.
+# Every cell runs unchanged, in Jupyter, VS Code or Spyder (percent format) and as a script: `python
+# examples/notebook.py`. Two lines calibrate a bag: the import, and `imu.calibrate('session.bag',
+# 'table.yaml')`.
 
 # %%
 from pathlib import Path
@@ -18,7 +19,8 @@ found = imu.calibrate(SESSION, SESSION / 'table.yaml')
 found
 
 # %% [markdown]
-# Every parameter has a standard deviation and a status; the verdict contains the next step. The residual of each window, with its expectation from noise:
+# Every parameter has a standard deviation and a status; the verdict contains the next step. The
+# residual of each window, with its expectation from noise:
 
 # %%
 found.plot('accelerometer')
@@ -27,8 +29,8 @@ found.plot('accelerometer')
 found.plot('gyroscope')
 
 # %% [markdown]
-# A calibration is an object that compensates arrays. The sample session was simulated, so that the truth is available: the error of each parameter,
-# divided by its reported standard deviation:
+# A calibration is an object that compensates arrays. The sample session was simulated, so that the
+# truth is available: the error of each parameter, divided by its reported standard deviation:
 
 # %%
 truth = imu.load(SESSION / 'truth.yaml')
@@ -42,7 +44,8 @@ error = {
     if name in names and sd > 0
 }
 print(
-    f'{len(error)} parameters, largest error {max(map(abs, error.values())):.1f} sd, rms {np.sqrt(np.mean(np.square(list(error.values())))):.2f} sd'
+    f'{len(error)} parameters, largest error {max(map(abs, error.values())):.1f} sd, rms'
+    f' {np.sqrt(np.mean(np.square(list(error.values())))):.2f} sd'
 )
 
 # %%
@@ -54,7 +57,8 @@ force[-1], rate[-1]
 # %% [markdown]
 # ## Errors of the sensor model
 #
-# The simulated session has an effect outside the model, a g-sensitivity of the gyroscopes; the diagnosis finds it. Samples in memory replace the bag.
+# The simulated session has an effect outside the model, a g-sensitivity of the gyroscopes; the
+# diagnosis finds it. Samples in memory replace the bag.
 
 # %%
 session = imu.simulate('short', effects=['gyro_g_sensitivity'], seed=11)
@@ -75,5 +79,5 @@ corrected = imu.compensate(session.samples, diagnosis.calibration)
 corrected
 
 # %% [markdown]
-# Files: `found.save('result')` writes calibration.yaml and report.html, `diagnosis.save('finding')` also diagnosis.json, and
-# `session.save('session_bag')` a bag.
+# Files: `found.save('result')` writes calibration.yaml and report.html, `diagnosis.save('finding')`
+# also diagnosis.json, and `session.save('session_bag')` a bag.

@@ -1,4 +1,8 @@
-"""Nodes as processes of their own, without `ros2 run`: for demonstrations, measurements and tests on one host."""
+"""
+Nodes as processes of their own, without `ros2 run`.
+
+For demonstrations, measurements and tests on one host.
+"""
 
 import os
 import signal
@@ -79,7 +83,9 @@ class NodeProcesses:
     def start(
         self, name: str, parameters: Mapping | None = None, output: Any = None, **options: Any
     ) -> subprocess.Popen:
-        """Start a node (see `node_command`) and return its Popen; `output` is a file for its output."""
+        """
+        Start a node (see `node_command`) and return its Popen; `output` is a file for its output.
+        """
         process = subprocess.Popen(
             node_command(name, parameters, **options),
             env=self.environment,

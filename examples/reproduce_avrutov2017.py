@@ -1,5 +1,10 @@
 #!/usr/bin/env python3
-"""Rerun the four samples of Avrutov et al., "3D-Calibration of the IMU" (ELNANO 2017), and compare the results with the published claims."""
+"""
+Rerun the four samples of Avrutov et al. and compare with the published claims.
+
+The paper is Avrutov et al., "3D-Calibration of the IMU" (ELNANO 2017). The results of the rerun are
+compared with its claims.
+"""
 
 import itertools
 
@@ -43,7 +48,11 @@ def readings(order='ZYX', axis='z', angles=ANGLES):
 
 
 def samples():
-    """Return number, title, model, inputs and nominal coefficients of the four samples; n11 = 0.01 as printed for the gyroscopes."""
+    """
+    Return number, title, model, inputs and nominal coefficients of the four samples.
+
+    N11 = 0.01 as printed for the gyroscopes.
+    """
     return [
         (
             1,
@@ -87,10 +96,12 @@ def print_samples():
         solution = avrutov.calibrate(inputs, outputs, model)
         normal = np.max(np.abs(avrutov.calibrate_as_printed(inputs, outputs, model) - truth))
         print(
-            f'\nSample {number}: {title}, {len(inputs)} runs, cond {solution.cond:.6g}, eqcond {solution.eqcond:.5g}'
+            f'\nSample {number}: {title}, {len(inputs)} runs, cond {solution.cond:.6g}, eqcond'
+            f' {solution.eqcond:.5g}'
         )
         print(
-            f'  largest error: ours {np.max(np.abs(solution.values - truth)):.1e}, printed normal equations {normal:.1e}'
+            f'  largest error: ours {np.max(np.abs(solution.values - truth)):.1e}, printed normal'
+            f' equations {normal:.1e}'
         )
         print(f'  {"":5s}{"printed":>27s}{"ours":>32s}{"nominal":>29s}')
         for k, name in enumerate(avrutov.MODEL_COLUMNS[model]):
@@ -100,7 +111,8 @@ def print_samples():
                 else f'{"(not in the text)":>30s}'
             )
             print(
-                f'  {name:5s}{printed}  {"".join(f"{v:10.6f}" for v in solution.values[k])} {"".join(f"{v:9.4f}" for v in truth[k])}'
+                f'  {name:5s}{printed}  {"".join(f"{v:10.6f}" for v in solution.values[k])}'
+                f' {"".join(f"{v:9.4f}" for v in truth[k])}'
             )
 
 
@@ -109,7 +121,8 @@ def print_gimbal_orders():
         'Every gimbal order (first letter turns first) and gravity direction, equal angles 0:10:400'
     )
     print(
-        'order  gravity   n x 4: rank   cond    n x 7: rank   cond  eqcond   sd at 1 mV: k mV/g   l mV/g^2'
+        'order  gravity   n x 4: rank   cond    n x 7: rank   cond  eqcond   sd at 1 mV: k mV/g   l'
+        ' mV/g^2'
     )
     for order, axis in itertools.product(avrutov.GIMBAL_ORDERS, 'xyz'):
         designs = [
@@ -120,8 +133,9 @@ def print_gimbal_orders():
             readings(order, axis), np.zeros((len(ANGLES), 3)), 'products'
         ).unit_sd
         print(
-            f'{order}    {axis}     {numerical_rank(designs[0]):10d} {cond4:9.3f} {numerical_rank(designs[1]):13d} {cond7:8.2f} '
-            f'{eqcond7:7.1f} {max(sd[1:4]):18.2f} {max(sd[4:]):10.2f}'
+            f'{order}    {axis}     {numerical_rank(designs[0]):10d} {cond4:9.3f}'
+            f' {numerical_rank(designs[1]):13d} {cond7:8.2f} {eqcond7:7.1f} {max(sd[1:4]):18.2f}'
+            f' {max(sd[4:]):10.2f}'
         )
 
 
@@ -151,7 +165,8 @@ def print_refusals():
         except NotObservableError:
             lost = sorted(set().union(*null_directions(design, avrutov.MODEL_COLUMNS[model])))
             print(
-                f'{name:40s} rank {numerical_rank(design)} of {design.shape[1]}; not determined: {", ".join(lost)}'
+                f'{name:40s} rank {numerical_rank(design)} of {design.shape[1]}; not determined:'
+                f' {", ".join(lost)}'
             )
 
 
@@ -179,7 +194,8 @@ def print_gyro_series():
 
 def print_budget():
     heading(
-        'Error budget of sample 1 (section V): 0.1 mV, level 2 arcmin, encoder 1.5 arcsec; worst sensor, mV and mV/g'
+        'Error budget of sample 1 (section V): 0.1 mV, level 2 arcmin, encoder 1.5 arcsec; worst'
+        ' sensor, mV and mV/g'
     )
     truth, mat_bn = avrutov.nominal_accelerometers('linear'), avrutov.turn('ZYX', [ANGLES] * 3)
     budget = avrutov.error_budget(
@@ -205,15 +221,18 @@ def print_budget():
     tilted = avrutov.design_matrix(avrutov.gravity_readings(mat_bn, 'z', (TILT, 0))) @ truth
     solution = avrutov.calibrate_with_tilt(mat_bn, tilted, 'z')
     print(
-        f'levelling estimated with the three sensors jointly: rank {len(solution.linear.param_names)} of 14, '
-        f'largest error {np.max(np.abs(solution.coefficients - truth)):.1e} V/g, tilt {60 * np.rad2deg(solution.tilt_rad[0]):.6f} arcmin'
+        'levelling estimated with the three sensors jointly: rank'
+        f' {len(solution.linear.param_names)} of 14, largest error'
+        f' {np.max(np.abs(solution.coefficients - truth)):.1e} V/g, tilt'
+        f' {60 * np.rad2deg(solution.tilt_rad[0]):.6f} arcmin'
     )
 
 
 def print_section_5():
     tests, noise_sd, truth = 2000, 1e-3, avrutov.nominal_accelerometers('linear')
     heading(
-        f'Section V as printed: X = B U (eq. 13), {tests} tests of sample 1 with 1 mV of output noise; sd in mV and mV/g'
+        f'Section V as printed: X = B U (eq. 13), {tests} tests of sample 1 with 1 mV of output'
+        ' noise; sd in mV and mV/g'
     )
     operator, design = avrutov.estimation_operator(readings()), avrutov.design_matrix(readings())
     outputs = design @ truth + noise_sd * np.random.default_rng(3).normal(
@@ -237,8 +256,9 @@ def print_section_5():
         )
     few = avrutov.m_test_sd(errors[:5]) / avrutov.m_test_sd(errors[:5], as_printed=False)
     print(
-        f'B is {operator.shape[0]} x {operator.shape[1]}, not n x 4; with five tests 1/(m-1) is {100 * (few.mean() - 1):.0f} % too large, for the truth is '
-        'known and no mean was estimated'
+        f'B is {operator.shape[0]} x {operator.shape[1]}, not n x 4; with five tests 1/(m-1) is'
+        f' {100 * (few.mean() - 1):.0f} % too large, for the truth is known and no mean was'
+        ' estimated'
     )
 
 
@@ -253,10 +273,11 @@ def findings():
     literal = avrutov.gravity_readings(avrutov.simultaneous_turn(ANGLES), 'z')
     total = np.sum(literal, axis=1)
     yield (
-        '"Without any limitations for accelerometers" fails: one turn about (1,1,1), "three axes simultaneously" taken literally, keeps '
-        f'ax+ay+az at {total.mean():.3f} g (scatter {np.ptp(total):.0e}); rank '
-        f'{numerical_rank(avrutov.design_matrix(literal))} of 4 and '
-        f'{numerical_rank(avrutov.design_matrix(literal, "products"))} of 7. With gimbals the rank is full in every order.'
+        '"Without any limitations for accelerometers" fails: one turn about (1,1,1), "three axes'
+        f' simultaneously" taken literally, keeps ax+ay+az at {total.mean():.3f} g (scatter'
+        f' {np.ptp(total):.0e}); rank {numerical_rank(avrutov.design_matrix(literal))} of 4 and'
+        f' {numerical_rank(avrutov.design_matrix(literal, "products"))} of 7. With gimbals the rank'
+        ' is full in every order.'
     )
     conds = [
         condition_numbers(avrutov.design_matrix(readings(o, a), 'products'))[0]
@@ -264,8 +285,8 @@ def findings():
         for a in 'xyz'
     ]
     yield (
-        f'Neither order nor gravity direction is given, yet cond of the n x 7 design runs from {min(conds):.1f} to {max(conds):.1f}; '
-        'noise-free recovery does not separate them.'
+        'Neither order nor gravity direction is given, yet cond of the n x 7 design runs from'
+        f' {min(conds):.1f} to {max(conds):.1f}; noise-free recovery does not separate them.'
     )
     products_sd = [
         max(avrutov.calibrate(readings(o, a), np.zeros((41, 3)), 'products').unit_sd[4:])
@@ -273,30 +294,38 @@ def findings():
         for a in 'xyz'
     ]
     yield (
-        f'At 1 mV the product terms of sample 2 (nominal 1 mV/g^2) have sd up to {min(products_sd):.2f} mV/g^2 in the best order and '
-        f'{max(products_sd):.1f} in the worst.'
+        'At 1 mV the product terms of sample 2 (nominal 1 mV/g^2) have sd up to'
+        f' {min(products_sd):.2f} mV/g^2 in the best order and {max(products_sd):.1f} in the worst.'
     )
     series, truth = avrutov.series_4(), avrutov.nominal_gyroscopes()
     unit_sd = avrutov.calibrate(series, np.zeros((11, 3)), 'products').unit_sd
     good_sd = avrutov.calibrate(avrutov.factorial_rates(), np.zeros((11, 3)), 'products').unit_sd
     yield (
-        f'Full rank is not enough: sample 4 has rank {numerical_rank(avrutov.design_matrix(series, "products"))}, and 1 mV makes '
-        f'{100e-3 * unit_sd[4] / K:.0f} % of p11; 1 % needs {1e6 * 0.01 * K / unit_sd[4]:.2f} uV. Eleven runs of a factorial design are '
-        f'{unit_sd[4] / good_sd[4]:.0f} times better on the same term.'
+        'Full rank is not enough: sample 4 has rank'
+        f' {numerical_rank(avrutov.design_matrix(series, "products"))}, and 1 mV makes'
+        f' {100e-3 * unit_sd[4] / K:.0f} % of p11; 1 % needs {1e6 * 0.01 * K / unit_sd[4]:.2f} uV.'
+        f' Eleven runs of a factorial design are {unit_sd[4] / good_sd[4]:.0f} times better on the'
+        ' same term.'
     )
     as_rad = np.column_stack([np.deg2rad(avrutov.series_3()[:, 0]) ** p for p in (1, 1 / 2, 1 / 3)])
     in_rad = avrutov.calibrate(np.rad2deg(as_rad), np.zeros((11, 3))).unit_sd
     in_deg = avrutov.calibrate(avrutov.series_3(), np.zeros((11, 3))).unit_sd
     yield (
-        f'w, w^(1/2), w^(1/3) depends on the unit: formed in deg/s the sd of n.2 is {in_deg[2]:.2f} per unit of noise, formed in rad/s '
-        f'{in_rad[2]:.2f}: different experiments.'
+        f'w, w^(1/2), w^(1/3) depends on the unit: formed in deg/s the sd of n.2 is {in_deg[2]:.2f}'
+        f' per unit of noise, formed in rad/s {in_rad[2]:.2f}: different experiments.'
     )
     quiet = int(np.sum(series[:, 1] < EARTH_RATE))
-    yield f'Sample 4 turns the y axis at {series[:, 1].max():.0f} deg/s at most, and below Earth rate in {quiet} of {len(series)} runs.'
+    yield (
+        f'Sample 4 turns the y axis at {series[:, 1].max():.0f} deg/s at most, and below Earth rate'
+        f' in {quiet} of {len(series)} runs.'
+    )
     linear = avrutov.nominal_gyroscopes('linear')
     sensed = avrutov.add_earth_rate(avrutov.series_3(), EARTH_RATE)
     ignored = avrutov.reference_error(avrutov.series_3(), sensed - avrutov.series_3(), linear)
-    yield f'Earth rate is not in the model: in Kyiv it puts {np.max(np.abs(ignored[1:])):.2e} V/(deg/s) into sample 3.'
+    yield (
+        f'Earth rate is not in the model: in Kyiv it puts {np.max(np.abs(ignored[1:])):.2e}'
+        ' V/(deg/s) into sample 3.'
+    )
     mat_bn = avrutov.turn('ZYX', [ANGLES] * 3)
     nominal = avrutov.nominal_accelerometers()
     tilted = avrutov.gravity_readings(mat_bn, 'z', (TILT, 0))
@@ -304,9 +333,10 @@ def findings():
         readings(), avrutov.design_matrix(tilted, 'products') @ nominal, 'products'
     )
     yield (
-        f"Levelling to 2 arcmin (the paper's own figure) costs {1e3 * np.max(np.abs(solution.values - nominal)):.2f} mV/g and leaves "
-        f'{1e6 * np.sqrt(np.mean(solution.residuals**2)):.2f} uV of residual: it cannot be seen there. Section V sums errors as if '
-        'they were independent from row to row.'
+        "Levelling to 2 arcmin (the paper's own figure) costs"
+        f' {1e3 * np.max(np.abs(solution.values - nominal)):.2f} mV/g and leaves'
+        f' {1e6 * np.sqrt(np.mean(solution.residuals**2)):.2f} uV of residual: it cannot be seen'
+        ' there. Section V sums errors as if they were independent from row to row.'
     )
     fitted = avrutov.calibrate(
         series, avrutov.design_matrix(series, 'products') @ truth, 'products'
@@ -315,20 +345,24 @@ def findings():
         np.max(np.abs(fitted[order] - np.array(PRINTED[4][4:]))) for order in ([0, 1, 2], [0, 2, 1])
     )
     yield (
-        f'Rows 6 and 7 of the printed result of sample 4 are exchanged: it differs from the nominal values by {straight:.0e}, '
-        f'by {exchanged:.0e} once they are swapped.'
+        'Rows 6 and 7 of the printed result of sample 4 are exchanged: it differs from the nominal'
+        f' values by {straight:.0e}, by {exchanged:.0e} once they are swapped.'
     )
     yield (
-        f'Sample 3 prints n11 = {PRINTED[3][1][0]:g} and n22 = {PRINTED[3][2][1]:g} where the nominal values are '
-        f'{avrutov.nominal_gyroscopes("linear", MATRIX)[1, 0]:g} and {linear[2, 1]:g}; 0.1 is meant for n11, it seems.'
+        f'Sample 3 prints n11 = {PRINTED[3][1][0]:g} and n22 = {PRINTED[3][2][1]:g} where the'
+        f' nominal values are {avrutov.nominal_gyroscopes("linear", MATRIX)[1, 0]:g} and'
+        f' {linear[2, 1]:g}; 0.1 is meant for n11, it seems.'
     )
     yield (
-        f'0 to 400 deg by 10 is {len(ANGLES)} positions, not 40, and repeats {int(np.sum(np.rad2deg(ANGLES) >= 359.9))} of them; '
-        f'both gyroscope series have {len(series)} runs, not 10. Biases are volts, not V/g.'
+        f'0 to 400 deg by 10 is {len(ANGLES)} positions, not 40, and repeats'
+        f' {int(np.sum(np.rad2deg(ANGLES) >= 359.9))} of them; both gyroscope series have'
+        f' {len(series)} runs, not 10. Biases are volts, not V/g.'
     )
     yield (
-        f'A 1 g test cannot see squares: rank {numerical_rank(avrutov.design_matrix(readings(), "quadratic"))} of 10 here, 9 at best. '
-        'Kronecker-Capelli is about existence; uniqueness needs full column rank, for accelerometers too.'
+        'A 1 g test cannot see squares: rank'
+        f' {numerical_rank(avrutov.design_matrix(readings(), "quadratic"))} of 10 here, 9 at best.'
+        ' Kronecker-Capelli is about existence; uniqueness needs full column rank, for'
+        ' accelerometers too.'
     )
 
 

@@ -1,5 +1,10 @@
 #!/usr/bin/env python3
-"""Rerun Zhang et al., "Comprehensive Calibration of Strap-Down Tri-Axis Accelerometer Unit" (Sensors 2017), and compare the results with the published claims."""
+"""
+Rerun the calibration of Zhang et al. and compare with the published claims.
+
+The paper is Zhang et al., "Comprehensive Calibration of Strap-Down Tri-Axis Accelerometer Unit"
+(Sensors 2017). The results of the rerun are compared with its claims.
+"""
 
 import numpy as np
 from papers import zhang2017 as zhang
@@ -51,22 +56,27 @@ def row(values, form='10.4f'):
 
 def print_table_1():
     heading(
-        'Table 1, static calibration: printed numbers | six positions simulated from them and refitted with unit rows'
+        'Table 1, static calibration: printed numbers | six positions simulated from them and'
+        ' refitted with unit rows'
     )
     force = zhang.six_positions()
     fitted, _ = zhang.fit_static(force, TABLE.predict(force))
     for i, axis in enumerate('xyz'):
         print(
-            f'{axis}  bias {TABLE.bias[i]:.6f} V  k {TABLE.scale[i]:.6f} V/g  angles{row(zhang.TABLE_1_ANGLES_DEG[i], "10.5f")} deg | '
-            f'{fitted.bias[i]:.6f}  {fitted.scale[i]:.6f} {row(fitted.angles_deg[i], "10.5f")}'
+            f'{axis}  bias {TABLE.bias[i]:.6f} V  k {TABLE.scale[i]:.6f} V/g '
+            f' angles{row(zhang.TABLE_1_ANGLES_DEG[i], "10.5f")} deg | {fitted.bias[i]:.6f} '
+            f' {fitted.scale[i]:.6f} {row(fitted.angles_deg[i], "10.5f")}'
         )
 
 
 def simulated_readings(rng, rate_deg_s):
     """
-    Return window means (measured, compensated, reference) with x up and down, from Table 1 and Table 3, 0.1 mg of noise.
+    Return window means (measured, compensated, reference) with x up and down.
 
-    They are compensated with the estimates of the paper's method from other readings: six positions, and arms by eq. 24.
+    From Table 1 and Table 3, 0.1 mg of noise.
+
+    They are compensated with the estimates of the paper's method from other readings: six
+    positions, and arms by eq. 24.
     """
     calibration, arms = six_position_calibration(rng), mean_of_rates(rng, 0.1 * MG)
     runs = [spin((sign, 0, 0), rate_deg_s, 1.0) for sign in (1, -1)]
@@ -108,8 +118,9 @@ def print_tables_2_and_4(rng):
             shown = printed[sensor, column : column + 2]
             ratio = abs(shown[0] - line.theoretical_g) / abs(shown[1] - line.theoretical_g)
             print(
-                f'{line.position} up, {line.sensor}: {shown[0]:10.6f} -> {shown[1]:10.6f} ({ratio:5.2f}) | '
-                f'{line.before_g:10.6f} -> {line.after_g:10.6f} ({line.improvement:6.1f})'
+                f'{line.position} up, {line.sensor}: {shown[0]:10.6f} -> {shown[1]:10.6f}'
+                f' ({ratio:5.2f}) | {line.before_g:10.6f} -> {line.after_g:10.6f}'
+                f' ({line.improvement:6.1f})'
             )
 
 
@@ -123,7 +134,11 @@ def closed_form_means(rng, rate, noise_sd, axes=None):
 
 
 def mean_of_rates(rng, noise_sd, weighted=False):
-    """Return the arms by eq. 24 averaged over 100, 150 and 200 deg/s: plainly as in the paper, or by their inverse variances."""
+    """
+    Return the arms by eq. 24 averaged over 100, 150 and 200 deg/s.
+
+    Plainly as in the paper, or by their inverse variances.
+    """
     rates = np.deg2rad(RATES_DEG_S)
     arms = [
         zhang.closed_form(*closed_form_means(rng, rate, noise_sd), rate, directions=SENSOR.cosines)
@@ -175,15 +190,17 @@ def print_table_3(rng):
 
 def print_designs():
     heading(
-        'Parameters that a design determines: 6 faces + 9 runs, 0.1 mg per mean; arms in mm, tolerance 0.1 mm'
+        'Parameters that a design determines: 6 faces + 9 runs, 0.1 mg per mean; arms in mm,'
+        ' tolerance 0.1 mm'
     )
     for design in DESIGNS:
         judged = judge_design(design_runs(design), SENSOR.cosines, ARMS)
         sd = 0.1 * np.array([one.sd_over_tolerance[4:] for one in judged])
         weak = weak_arms(judged)
         print(
-            f'{design:4s}{NAMES[design]:32s} sd on axis {np.diag(sd).max():.4f}, off axis {sd[OFF_AXIS].max():8.4f}; '
-            f'cond in tolerances {max(one.cond for one in judged):6.1f}; not determined: {", ".join(weak) or "none"}'
+            f'{design:4s}{NAMES[design]:32s} sd on axis {np.diag(sd).max():.4f}, off axis'
+            f' {sd[OFF_AXIS].max():8.4f}; cond in tolerances'
+            f' {max(one.cond for one in judged):6.1f}; not determined: {", ".join(weak) or "none"}'
         )
     runs = design_runs('Z0')[:6] + [oscillation((1, 1, 1), 10, 1.0, noise_sd=MG)]
     try:
@@ -195,19 +212,21 @@ def print_designs():
 
 def print_static_navigation(rng):
     heading(
-        'Figures 6 and 7, 50 s at rest after six-position calibration (printed: 4 -> 0.02 m/s, 100 -> 0.3 m)'
+        'Figures 6 and 7, 50 s at rest after six-position calibration (printed: 4 -> 0.02 m/s, 100'
+        ' -> 0.3 m)'
     )
     for drift in (0.0, 0.02, 0.05, 0.1, 0.75):
         v0, p0, v1, p1 = zhang.static_navigation(TABLE, 1e-3 * drift, rng, n_draws=200)
         print(
-            f'bias drift between runs {drift:4.2f} mg: {v0:.2f} -> {v1:.3f} m/s ({v0 / v1:5.1f}x), {p0:.0f} -> {p1:.2f} m '
-            f'({p0 / p1:5.1f}x)'
+            f'bias drift between runs {drift:4.2f} mg: {v0:.2f} -> {v1:.3f} m/s ({v0 / v1:5.1f}x),'
+            f' {p0:.0f} -> {p1:.2f} m ({p0 / p1:5.1f}x)'
         )
 
 
 def print_spins():
     heading(
-        'Constant spins at 100 deg/s with Table 3 uncompensated: summed in the body frame | navigated in the level frame'
+        'Constant spins at 100 deg/s with Table 3 uncompensated: summed in the body frame |'
+        ' navigated in the level frame'
     )
     for axis, seconds in (
         ((1, 0, 0), 100),
@@ -222,14 +241,15 @@ def print_spins():
             [strapdown.largest(part) for part in growth[key]] for key in ('body', 'level')
         )
         print(
-            f'axis {axis!s:11s} {seconds:3d} s: {body_v:5.2f} m/s {body_p:6.1f} m | {level_v:6.3f} m/s {level_p:6.2f} m, '
-            f'steady along the axis {growth["axial_mg"]:+.3f} mg'
+            f'axis {axis!s:11s} {seconds:3d} s: {body_v:5.2f} m/s {body_p:6.1f} m | {level_v:6.3f}'
+            f' m/s {level_p:6.2f} m, steady along the axis {growth["axial_mg"]:+.3f} mg'
         )
 
 
 def print_tumbling(rng):
     heading(
-        'Figures 9 and 10, 60 s of three-axis sinusoids: peak errors and median improvement over 300 estimates of the arms'
+        'Figures 9 and 10, 60 s of three-axis sinusoids: peak errors and median improvement over'
+        ' 300 estimates of the arms'
     )
     motions = (
         ((60, 45, 30), (0.7, 0.9, 1.1)),
@@ -258,8 +278,8 @@ def print_tumbling(rng):
             for design, wrong in errors.items()
         }
         print(
-            f'{amplitude} deg, {frequency} Hz: {plain[0, 0]:.2f} m/s {plain[1, 0]:.0f} m; on-axis arms only '
-            f'{plain[0, 0] / diagonal[0, 0]:.1f}x; '
+            f'{amplitude} deg, {frequency} Hz: {plain[0, 0]:.2f} m/s {plain[1, 0]:.0f} m; on-axis'
+            f' arms only {plain[0, 0] / diagonal[0, 0]:.1f}x; '
             + ', '.join(f'{design} {gain:.2f}x' for design, gain in gains.items())
         )
 
@@ -274,16 +294,21 @@ def findings():
     """Yield sentences whose numbers are computed here."""
     norms = 1e6 * (np.linalg.norm(TABLE.cosines, axis=1) - 1)
     yield (
-        f'Row y of Table 1 is no unit vector (norm off by {norms[1]:.1f} ppm; x {norms[0]:.3f}, z {norms[2]:.3f}): theta_yy would '
-        f'have to be {SENSOR.angles_deg[1, 1]:.5f} deg instead of {zhang.TABLE_1_ANGLES_DEG[1, 1]:.5f}.'
+        f'Row y of Table 1 is no unit vector (norm off by {norms[1]:.1f} ppm; x {norms[0]:.3f}, z'
+        f' {norms[2]:.3f}): theta_yy would have to be {SENSOR.angles_deg[1, 1]:.5f} deg instead of'
+        f' {zhang.TABLE_1_ANGLES_DEG[1, 1]:.5f}.'
     )
     force = zhang.six_positions()
     worst = np.max(np.abs(TABLE.invert_as_printed(TABLE.predict(force)) - force))
-    yield f'C is called orthogonal (eq. 3, 4), but its nine angles are free: the transpose is wrong by {1e3 * worst:.2f} mg per g.'
+    yield (
+        'C is called orthogonal (eq. 3, 4), but its nine angles are free: the transpose is wrong'
+        f' by {1e3 * worst:.2f} mg per g.'
+    )
     plus, minus = zhang.TABLE_2_G[1, [0, 2]]
     yield (
-        f'Table 1 uses the +1 g reading of Table 2 alone: {1e3 * plus:.2f} mg is {np.rad2deg(np.arccos(plus)):.5f} deg; the half '
-        f'difference, which a bias requires, is {np.rad2deg(np.arccos((plus - minus) / 2)):.4f} deg.'
+        f'Table 1 uses the +1 g reading of Table 2 alone: {1e3 * plus:.2f} mg is'
+        f' {np.rad2deg(np.arccos(plus)):.5f} deg; the half difference, which a bias requires, is'
+        f' {np.rad2deg(np.arccos((plus - minus) / 2)):.4f} deg.'
     )
     ratios = [
         (abs(t[i, c] - s) / abs(t[i, c + 1] - s))
@@ -294,60 +319,74 @@ def findings():
     ]
     after = 1e3 * np.abs(zhang.TABLE_4_G[:, 1] - [1, 0, 0])
     yield (
-        f'"Less than 1 mg" is false for Table 4: x {after[0]:.2f}, z {after[2]:.2f} mg remain; improvements in both tables run from '
-        f'{min(ratios):.2f}x to {max(ratios):.1f}x, where "one or two orders" is claimed.'
+        f'"Less than 1 mg" is false for Table 4: x {after[0]:.2f}, z {after[2]:.2f} mg remain;'
+        f' improvements in both tables run from {min(ratios):.2f}x to {max(ratios):.1f}x, where'
+        ' "one or two orders" is claimed.'
     )
     move = 1e3 * (np.mean(zhang.TABLE_4_G[0, [0, 2]]) - np.mean(zhang.TABLE_2_G[0, [0, 2]]))
-    yield f'The x bias moves by {move:.2f} mg between Tables 2 and 4, which no lever arm explains: another mounting or drift.'
+    yield (
+        f'The x bias moves by {move:.2f} mg between Tables 2 and 4, which no lever arm explains:'
+        ' another mounting or drift.'
+    )
     shift = 1e3 * np.mean(zhang.TABLE_4_G[1:, [0, 2]] - zhang.TABLE_2_G[1:, [0, 2]], axis=1)
     implied = -shift * MG / np.deg2rad(100) ** 2
     yield (
-        f'Table 3 has the sign of the text ("from A to the origin"), not that of eq. 11 and 21: the spin moves y and z by '
-        f'{shift[0]:.2f} and {shift[1]:.2f} mg, hence arms of {1e3 * implied[0]:+.2f} and {1e3 * implied[1]:+.2f} mm where '
-        f'{-1e3 * ARMS[1, 1]:.2f} and {-1e3 * ARMS[2, 2]:.2f} are printed.'
+        'Table 3 has the sign of the text ("from A to the origin"), not that of eq. 11 and 21: the'
+        f' spin moves y and z by {shift[0]:.2f} and {shift[1]:.2f} mg, hence arms of'
+        f' {1e3 * implied[0]:+.2f} and {1e3 * implied[1]:+.2f} mm where {-1e3 * ARMS[1, 1]:.2f} and'
+        f' {-1e3 * ARMS[2, 2]:.2f} are printed.'
     )
     rate = np.deg2rad(200)
     static, spinning = closed_form_means(np.random.default_rng(0), rate, 0.0)
     wrong = zhang.closed_form(static, spinning, rate, directions=SENSOR.cosines, as_printed=True)
     yield (
-        f'The fourth term of r_jx in eq. 24 lacks a 0: as printed r_jx comes out as {row(wrong[:, 0], " .3f")} m instead of '
-        f'{row(ARMS[:, 0], " .4f")}.'
+        'The fourth term of r_jx in eq. 24 lacks a 0: as printed r_jx comes out as'
+        f' {row(wrong[:, 0], " .3f")} m instead of {row(ARMS[:, 0], " .4f")}.'
     )
     sd = 1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines)
     yield (
-        f"Only r_xx, r_yy, r_zz can be seen: at 200 deg/s and the sensor's 0.75 mg the off-axis arms have sd "
-        f'{sd[OFF_AXIS].min():.0f} to {sd[OFF_AXIS].max():.0f} mm, the printed values are {1e3 * np.abs(ARMS[OFF_AXIS]).min():.2f} to '
-        f'{1e3 * np.abs(ARMS[OFF_AXIS]).max():.2f} mm. Averaging over rates adds no information; a skewed fixture '
-        f'({1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines, spin_axes=skewed_axes(60)).max():.1f} mm) or oscillations do.'
+        "Only r_xx, r_yy, r_zz can be seen: at 200 deg/s and the sensor's 0.75 mg the off-axis"
+        f' arms have sd {sd[OFF_AXIS].min():.0f} to {sd[OFF_AXIS].max():.0f} mm, the printed values'
+        f' are {1e3 * np.abs(ARMS[OFF_AXIS]).min():.2f} to {1e3 * np.abs(ARMS[OFF_AXIS]).max():.2f}'
+        ' mm. Averaging over rates adds no information; a skewed fixture'
+        f' ({1e3 * zhang.closed_form_sd(0.75 * MG, rate, SENSOR.cosines, spin_axes=skewed_axes(60)).max():.1f}'
+        ' mm) or oscillations do.'
     )
     equilibrated = np.linalg.cond(
         jacobian(design_runs('Z0'), TRUTH[0])
         / np.linalg.norm(jacobian(design_runs('Z0'), TRUTH[0]), axis=0)
     )
-    yield f"An equilibrated condition number does not see this ({equilibrated:.1f} for Zhang's design); tolerances do."
+    yield (
+        f"An equilibrated condition number does not see this ({equilibrated:.1f} for Zhang's"
+        ' design); tolerances do.'
+    )
     acceleration = np.deg2rad(100) ** 2 * 0.01
     growth = zhang.spin_growth(SENSOR.cosines, ARMS, (1, 0, 0))
     yield (
-        f'"3 m/s and 150 m in 100 s" is {100 * acceleration:.2f} m/s and {5000 * acceleration:.0f} m by arithmetic, but the error turns '
-        f'with the body: with Table 3 it stays below {strapdown.largest(growth["level"][0]):.3f} m/s and '
-        f'{strapdown.largest(growth["level"][1]):.1f} m.'
+        f'"3 m/s and 150 m in 100 s" is {100 * acceleration:.2f} m/s and {5000 * acceleration:.0f}'
+        ' m by arithmetic, but the error turns with the body: with Table 3 it stays below'
+        f' {strapdown.largest(growth["level"][0]):.3f} m/s and'
+        f' {strapdown.largest(growth["level"][1]):.1f} m.'
     )
     constant = 4.0**2 / (2 * 100.0)
     yield (
-        f'4 m/s and 100 m belong to a constant {1e3 * constant / G:.2f} mg over {4.0 / constant:.0f} s; 0.02 m/s and 0.3 m to another '
-        f'length, {2 * 0.3 / 0.02:.0f} s. z of Table 2 gives {zhang.TABLE_2_G[2, 0] * -G * 47.4:.2f} m/s and '
-        f'{zhang.TABLE_2_G[2, 0] * -G * 47.4**2 / 2:.1f} m at 47.4 s.'
+        f'4 m/s and 100 m belong to a constant {1e3 * constant / G:.2f} mg over'
+        f' {4.0 / constant:.0f} s; 0.02 m/s and 0.3 m to another length, {2 * 0.3 / 0.02:.0f} s. z'
+        f' of Table 2 gives {zhang.TABLE_2_G[2, 0] * -G * 47.4:.2f} m/s and'
+        f' {zhang.TABLE_2_G[2, 0] * -G * 47.4**2 / 2:.1f} m at 47.4 s.'
     )
     left = zhang.TABLE_2_G[1, 1] * G
     yield (
-        f'y of Table 2 after compensation ({1e3 * zhang.TABLE_2_G[1, 1]:.2f} mg) alone gives {left * 50:.2f} m/s, {left * 1250:.0f} m '
-        f'in 50 s: {left * 50 / 0.02:.0f} and {left * 1250 / 0.3:.0f} times the claimed value.'
+        f'y of Table 2 after compensation ({1e3 * zhang.TABLE_2_G[1, 1]:.2f} mg) alone gives'
+        f' {left * 50:.2f} m/s, {left * 1250:.0f} m in 50 s: {left * 50 / 0.02:.0f} and'
+        f' {left * 1250 / 0.3:.0f} times the claimed value.'
     )
     tilt = np.sin(np.deg2rad(2 / 60)) * G
     yield f'Levelling to 2 arcmin alone gives {tilt * 50:.2f} m/s and {tilt * 1250:.1f} m in 50 s.'
     yield (
-        '"15 parameters" are 3 + 9 + 3, of which 12 are independent (unit rows); the nine arms are not counted: 21. Eq. 11 lost the dot '
-        'on the tangential term, eq. 20 and 21 carry wrong indices, Table 3 has no unit.'
+        '"15 parameters" are 3 + 9 + 3, of which 12 are independent (unit rows); the nine arms are'
+        ' not counted: 21. Eq. 11 lost the dot on the tangential term, eq. 20 and 21 carry wrong'
+        ' indices, Table 3 has no unit.'
     )
 
 

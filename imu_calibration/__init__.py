@@ -35,35 +35,36 @@ In a notebook
     import imu_calibration as imu
     found = imu.calibrate('session.bag', 'table.yaml')      # without a table: by hand
 
-`load`, `calibrate`, `check`, `compensate`, `diagnose` and `simulate` suffice; their results print, draw and
-saves itself.
+`load`, `calibrate`, `check`, `compensate`, `diagnose` and `simulate` suffice; their results print,
+draw and saves itself.
 
 Contents
 --------
 From the lowest layer; each package imports only packages above it in this list. docs/glossary.md explains the terms.
 
-================  ======================================================================================================
-`core`            samples, units, settings, errors, documents, probabilities
-`kinematics`      table and joints become attitude, rate, angular acceleration, specific force; strapdown integration
-`effects`         the catalogue of physical effects, and the sensor model made of it
-`preprocessing`   a stream becomes windows: static poses, spins, dynamic stretches; checks of a recording
-`estimation`      windows become a solution: noise, likelihood, least squares, observability
-`simulation`      the model run: profiles of motion, noise, sessions
-`compensation`    the model inverted: corrected samples with their covariance
-`selection`       choice of the effects that the data support, tested on held-out windows; analysis of the residual
-`allan`           the noise of an IMU at rest: Allan curves, their fit with intervals, noise.yaml
-`document`        the calibration file, its verdict, comparison, and conversion to formats of other programs
-`references`      turntable and gravity: gathered data and the equations of calibration by hand
-`calibration`     from recordings to a judged document; live sessions, fleets, diagnosis
-`between_imus`    the arm between two IMUs
-`planning`        choice of motions, a lower bound on the time of all plans, execution with stops and their reason
-`report`          HTML reports
-`use_cases`       from files to files: functions of the command line and of notebooks
-`cli`, `nodes`    the command line and the ROS 2 nodes; the package `msg_adapters` handles messages and bags
-================  ======================================================================================================
+================
+======================================================================================================
+`core`            samples, units, settings, errors, documents, probabilities `kinematics`      table
+and joints become attitude, rate, angular acceleration, specific force; strapdown integration
+`effects`         the catalogue of physical effects, and the sensor model made of it `preprocessing`
+a stream becomes windows: static poses, spins, dynamic stretches; checks of a recording `estimation`
+windows become a solution: noise, likelihood, least squares, observability `simulation`      the
+model run: profiles of motion, noise, sessions `compensation`    the model inverted: corrected
+samples with their covariance `selection`       choice of the effects that the data support, tested
+on held-out windows; analysis of the residual `allan`           the noise of an IMU at rest: Allan
+curves, their fit with intervals, noise.yaml `document`        the calibration file, its verdict,
+comparison, and conversion to formats of other programs `references`      turntable and gravity:
+gathered data and the equations of calibration by hand `calibration`     from recordings to a judged
+document; live sessions, fleets, diagnosis `between_imus`    the arm between two IMUs `planning`
+choice of motions, a lower bound on the time of all plans, execution with stops and their reason
+`report`          HTML reports `use_cases`       from files to files: functions of the command line
+and of notebooks `cli`, `nodes`    the command line and the ROS 2 nodes; the package `msg_adapters`
+handles messages and bags ================
+======================================================================================================
 """
 
-TYPE_CHECKING = False  # the name that type checkers take for true; `typing` would take most of the time of this import
+# The name that type checkers take for true; `typing` would take most of the time of this import
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from imu_calibration.use_cases.notebook import (
         calibrate,
@@ -79,7 +80,11 @@ __version__ = '0.1.0'
 
 
 def __getattr__(name: str) -> object:
-    """Import the names of `__all__` at their first use (PEP 562): the package itself is quick to import and free of ROS."""
+    """
+    Import the names of `__all__` at their first use (PEP 562).
+
+    The package itself is quick to import and free of ROS.
+    """
     if name not in __all__:
         raise AttributeError(f"module 'imu_calibration' has no attribute '{name}'")
     from imu_calibration.use_cases import notebook

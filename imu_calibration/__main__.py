@@ -1,4 +1,8 @@
-"""Entry of the command line, also as ``python -m imu_calibration VERB``; an interruption ends it with 130 from here on."""
+"""
+Entry of the command line, also as ``python -m imu_calibration VERB``.
+
+An interruption ends it with 130 from here on.
+"""
 
 import signal
 import sys
@@ -6,15 +10,18 @@ from types import FrameType
 
 NUMERICAL = ('numpy', 'scipy')
 RETRY_SECONDS, MOST_RETRIES = 0.02, 100
-"""A postponed interruption is tried again after this time; in numerical packages at most so often."""
+"""
+A postponed interruption is tried again after this time; in numerical packages at most so often.
+"""
 
 
 class Interruption:
     """
     Handler of signals: raises KeyboardInterrupt as soon as the running code passes it on.
 
-    It is postponed within an import, where numpy reports a broken installation instead, and, at most `MOST_RETRIES` times, within numpy
-    and scipy, where finalizers and compiled functions print the exception and continue.
+    It is postponed within an import, where numpy reports a broken installation instead, and, at
+    most `MOST_RETRIES` times, within numpy and scipy, where finalizers and compiled functions print
+    the exception and continue.
     """
 
     def __init__(self) -> None:
@@ -38,7 +45,11 @@ class Interruption:
 
 
 def main() -> int:
-    """Run the command line; return its exit code. Partial results are removed after SIGTERM as after Ctrl+C."""
+    """
+    Run the command line; return its exit code.
+
+    Partial results are removed after SIGTERM as after Ctrl+C.
+    """
     handler = Interruption()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
         if signal.getsignal(number) != signal.SIG_IGN:  # a background job ignores SIGINT

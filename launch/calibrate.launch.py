@@ -3,9 +3,11 @@ Calibrate an IMU on a table, live.
 
     ros2 launch imu_calibration calibrate.launch.py table:=/path/to/table.yaml imu:=/imu/data_raw
 
-    ros2 launch imu_calibration calibrate.launch.py table:=none urdf:=topic imu:=/imu/data_raw      # on the arm of robot_description
+    ros2 launch imu_calibration calibrate.launch.py table:=none urdf:=topic imu:=/imu/data_raw
+    # on the arm of robot_description
 
-    ros2 launch imu_calibration calibrate.launch.py table:=none imu:=/imu/data_raw      # by hand, without a table
+    ros2 launch imu_calibration calibrate.launch.py table:=none imu:=/imu/data_raw      # by hand,
+    without a table
 
 Several IMUs: one launch each with its own `namespace` and `save_file`.
 """
@@ -28,14 +30,18 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'table',
                 default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
-                description='table description, YAML; the template is refused; none: no table, by hand',
+                description=(
+                    'table description, YAML; the template is refused; none: no table, by hand'
+                ),
             ),
             DeclareLaunchArgument(
                 'urdf',
                 default_value='',
-                description='robot description, path (.urdf, or .xacro with '
-                'allow_xacro: true in params); or topic: '
-                'robot_description; with table:=none, or a table with the site of the arm',
+                description=(
+                    'robot description, path (.urdf, or .xacro with '
+                    'allow_xacro: true in params); or topic: '
+                    'robot_description; with table:=none, or a table with the site of the arm'
+                ),
             ),
             DeclareLaunchArgument(
                 'imu_link',
@@ -50,7 +56,10 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'save_file',
                 default_value='',
-                description='file of ~/save; empty: calibration.yaml in the working directory, by ~/save only',
+                description=(
+                    'file of ~/save; empty: calibration.yaml in the working directory, by ~/save'
+                    ' only'
+                ),
             ),
             DeclareLaunchArgument(
                 'resume',

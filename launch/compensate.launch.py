@@ -1,10 +1,14 @@
 """
-Correct an IMU's messages with a calibration, live, and optionally feed robot_localization with them.
+Correct an IMU's messages with a calibration, live.
 
-    ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml imu:=/imu/data_raw
-    ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml corrected:=imu/data ekf:=true
+Optionally feed robot_localization with the corrected messages.
 
-Subscribers of imu/data, the usual topic, receive corrected readings with corrected:=imu/data and a driver on imu/data_raw.
+    ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml
+    imu:=/imu/data_raw ros2 launch imu_calibration compensate.launch.py
+    calibration:=/path/to/calibration.yaml corrected:=imu/data ekf:=true
+
+Subscribers of imu/data, the usual topic, receive corrected readings with corrected:=imu/data and a
+driver on imu/data_raw.
 """
 
 from launch.actions import DeclareLaunchArgument
@@ -34,12 +38,18 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'adopt',
                 default_value='file_then_topic',
-                description='source of calibrations: file (in the field), topic (replaces the file), file_then_topic',
+                description=(
+                    'source of calibrations: file (in the field), topic (replaces the file),'
+                    ' file_then_topic'
+                ),
             ),
             DeclareLaunchArgument(
                 'target_frame',
                 default_value='',
-                description='frame to move the readings to, by the transforms on /tf_static; empty: that of the sensor',
+                description=(
+                    'frame to move the readings to, by the transforms on /tf_static; empty: that of'
+                    ' the sensor'
+                ),
             ),
             DeclareLaunchArgument(
                 'params',

@@ -1,9 +1,13 @@
 """
-Move a table or an arm automatically until the IMU on it is calibrated; there is no motion before ~/start.
+Move a table or an arm automatically until the IMU on it is calibrated.
 
-    ros2 launch imu_calibration drive.launch.py table:=/path/to/table.yaml joint_trajectory:=/joint_trajectory_controller/joint_trajectory
+There is no motion before ~/start.
 
-    ros2 launch imu_calibration drive.launch.py table:=none urdf:=topic joint_trajectory:=/joint_trajectory_controller/joint_trajectory
+    ros2 launch imu_calibration drive.launch.py table:=/path/to/table.yaml
+    joint_trajectory:=/joint_trajectory_controller/joint_trajectory
+
+    ros2 launch imu_calibration drive.launch.py table:=none urdf:=topic
+    joint_trajectory:=/joint_trajectory_controller/joint_trajectory
 
     ros2 service call /planner_node/start std_srvs/srv/Trigger
 """
@@ -38,13 +42,17 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'table',
                 default_value=PathJoinSubstitution([CONFIG, 'table_template.yaml']),
-                description='table description with the limits of its joints, YAML; the template is refused',
+                description=(
+                    'table description with the limits of its joints, YAML; the template is refused'
+                ),
             ),
             DeclareLaunchArgument(
                 'urdf',
                 default_value='',
-                description='robot description (.urdf), path; or topic: '
-                'robot_description; with table:=none, or a table with the site of the arm',
+                description=(
+                    'robot description (.urdf), path; or topic: '
+                    'robot_description; with table:=none, or a table with the site of the arm'
+                ),
             ),
             DeclareLaunchArgument(
                 'imu_link',
@@ -54,7 +62,10 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'save_file',
                 default_value='',
-                description='where ~/save of calibration_node writes; empty: calibration.yaml in the working directory',
+                description=(
+                    'where ~/save of calibration_node writes; empty: calibration.yaml in the'
+                    ' working directory'
+                ),
             ),
             DeclareLaunchArgument(
                 'imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'

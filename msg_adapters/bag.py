@@ -57,8 +57,8 @@ def description_in(path: str, imu_topic: str | None = None) -> str:
     )
     if not texts:
         raise InputError(
-            f'{path} must hold the robot description on {DESCRIPTION_TOPIC} ({STRING_TYPE}), it holds none; record that '
-            'topic, or give the file',
+            f'{path} must hold the robot description on {DESCRIPTION_TOPIC} ({STRING_TYPE}), it'
+            ' holds none; record that topic, or give the file',
             key='urdf',
             code='description_missing',
         )
@@ -66,7 +66,11 @@ def description_in(path: str, imu_topic: str | None = None) -> str:
 
 
 def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str, str, np.ndarray]]:
-    """Return (parent, child, quaternion x y z w of the child in the parent) of every static transform of a recording."""
+    """
+    Return (parent, child, quaternion) of every static transform of a recording.
+
+    The quaternion is x y z w of the child in the parent.
+    """
     return [
         row
         for rows in _messages(path, imu_topic, STATIC_TOPIC, TF_TYPE, transform_rows)
@@ -75,7 +79,11 @@ def static_transforms(path: str, imu_topic: str | None = None) -> list[tuple[str
 
 
 def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
-    """Return (parent, child, quaternion) of each transform of a TFMessage, as an object of rclpy or rosbags."""
+    """
+    Return (parent, child, quaternion) of each transform of a TFMessage.
+
+    As an object of rclpy or rosbags.
+    """
     return [
         (
             clean_name(t.header.frame_id).lstrip('/'),
@@ -89,7 +97,11 @@ def transform_rows(message: Any) -> list[tuple[str, str, np.ndarray]]:
 def _messages(
     path, imu_topic, topic, message_type, read: Callable[[Any], Sample]
 ) -> Iterator[Sample]:
-    """Yield the result of `read` for each decodable message of a topic; no results when the recording lacks it."""
+    """
+    Yield the result of `read` for each decodable message of a topic.
+
+    No results when the recording lacks it.
+    """
     with open_recording(path, imu_topic, want_joints=False, want_temperature=False) as recording:
         if recording.source.types.get(topic) == message_type:
             deserialize = recording.deserializer(message_type)
@@ -133,18 +145,23 @@ def open_recording(
     frame_id: str | None = None,
 ) -> 'Recording':
     """
-    Open a bag and choose its topics: by the given name, the default name, or the only one of the type, in this order.
+    Open a bag and choose its topics.
+
+    By the given name, the default name, or the only one of the type, in this order.
 
     Parameters
     ----------
     path : path-like
-        A rosbag2 folder, a bare .db3 or .mcap file, a ROS 1 .bag file, or a text log (.csv) whose columns and units are unambiguous.
+        A rosbag2 folder, a bare .db3 or .mcap file, a ROS 1 .bag file, or a text log (.csv) whose
+        columns and units are unambiguous.
     imu_topic, joint_topic, temperature_topic : str, optional
         Names of topics.
     want_joints : bool or 'optional'
-        True: refuse a recording without JointState; 'optional': read none where the topic is missing or ambiguous.
+        True: refuse a recording without JointState; 'optional': read none where the topic is
+        missing or ambiguous.
     want_temperature : bool or 'optional'
-        Whether to read temperatures when the recording has them; 'optional': read none where the topic is ambiguous.
+        Whether to read temperatures when the recording has them; 'optional': read none where the
+        topic is ambiguous.
     frame_id : str, optional
         Frame of the Imu messages that are read; needed for a topic with messages of several frames.
 
@@ -250,7 +267,8 @@ class Recording:
         Yields
         ------
         block : SampleBlock
-            IMU, joints and temperature of one stretch of the file; `dropped` counts the messages of the stretch that are unusable.
+            IMU, joints and temperature of one stretch of the file; `dropped` counts the messages of
+            the stretch that are unusable.
 
         Raises
         ------
@@ -295,7 +313,11 @@ class Recording:
         return decoders
 
     def frames(self) -> list[str]:
-        """Return the frames of the first stretch of the Imu topic, in order of name; [] without messages."""
+        """
+        Return the frames of the first stretch of the Imu topic, in order of name.
+
+        [] without messages.
+        """
         decoder = self._decoders(None, '')[
             self.imu_topic
         ]  # with a chosen frame, several frames are no error
@@ -306,13 +328,18 @@ class Recording:
         )
 
     def deserializer(self, message_type: str) -> Callable:
-        """Return a function from message bytes to a message object (raises InputError for a definition that cannot be used)."""
+        """
+        Return a function from message bytes to a message object.
+
+        It raises InputError for a definition that cannot be used.
+        """
         try:
             return deserializer(message_type, self.source.definitions, self.source.ros1)
         except Exception as error:  # rosbags' parser raises many kinds
             raise InputError(
-                f'the definition of {message_type} in {self.path} must be one that rosbags understands, got: '
-                f'{shortened(str(error), 200)}; record again with standard messages',
+                f'the definition of {message_type} in {self.path} must be one that rosbags'
+                f' understands, got: {shortened(str(error), 200)}; record again with standard'
+                ' messages',
                 code='definition_damaged',
             ) from error
 
@@ -328,7 +355,11 @@ class Recording:
 
 
 def _block(parts, decoders):
-    """Join the parts of a block and add the counts of messages dropped by the decoders since the last one."""
+    """
+    Join the parts of a block and add the counts of dropped messages.
+
+    These are the messages dropped by the decoders since the last block.
+    """
     dropped, notes = taken_counts(decoders.values())
     joined = {kind: kind.concatenate(samples) for kind, samples in parts.items()}
     return SampleBlock(
@@ -343,12 +374,13 @@ def _block(parts, decoders):
 def _open_source(path):
     if not path.exists():
         raise InputError(
-            f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file, got {path}, which does not '
-            'exist; check the path'
+            f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file,'
+            f' got {path}, which does not exist; check the path'
         )
     if not (path.is_dir() or path.is_file()):
         raise InputError(
-            f'a recording must be a folder or a regular file, got {path}, which is a pipe or a device; give a file'
+            f'a recording must be a folder or a regular file, got {path}, which is a pipe or a'
+            ' device; give a file'
         )
     try:
         if path.suffix.lower() in SUFFIXES:
@@ -359,9 +391,9 @@ def _open_source(path):
     except Exception as error:  # rosbags, sqlite3 and the system raise many kinds
         came = shortened(str(error), 300)
         raise InputError(
-            f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file) or a text log '
-            f'({", ".join(SUFFIXES)}), got: {came}; check the path, record again, or write the data as CSV and use the verb '
-            'convert'
+            f'{path} must be a readable bag (rosbag2 folder, {", ".join(suffixes())} or .bag file)'
+            f' or a text log ({", ".join(SUFFIXES)}), got: {came}; check the path, record again, or'
+            ' write the data as CSV and use the verb convert'
         ) from error
 
 
@@ -381,7 +413,11 @@ def _listed(source):
 
 
 def _choose(path, topics, message_type, asked, required, lenient=False):
-    """Return the topic of a type by the rule of `open_recording`, or None: where there is none, or, when `lenient`, no telling which."""
+    """
+    Return the topic of a type by the rule of `open_recording`, or None.
+
+    Where there is none, or, when `lenient`, no telling which.
+    """
     key = TOPIC_KEYS[message_type]
     fitting = [topic.name for topic in topics if topic.type == message_type]
     if asked is not None:
@@ -400,15 +436,16 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
         return fitting[0]
     if fitting and not lenient:
         raise InputError(
-            f'{path} must have one {message_type} topic or one named {DEFAULT_TOPICS[message_type]}, '
-            f'got {", ".join(fitting)}; choose one',
+            f'{path} must have one {message_type} topic or one named'
+            f' {DEFAULT_TOPICS[message_type]}, got {", ".join(fitting)}; choose one',
             key=key,
             code='topic_ambiguous',
         )
     if required:
         raise InputError(
-            f'{path} must have a {message_type} topic, got none: {_listing(topics, fitting)}; record it'
-            f'{", or calibrate by hand, without a table" * (message_type == JOINT_STATE_TYPE)}',
+            f'{path} must have a {message_type} topic, got none: {_listing(topics, fitting)};'
+            ' record'
+            f' it{", or calibrate by hand, without a table" * (message_type == JOINT_STATE_TYPE)}',
             code='no_topic_of_type',
         )
     return None
@@ -459,7 +496,11 @@ class Ros1File:
         )
 
     def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
-        """Yield RawMessages of the topics in file order; lost messages of the file are counted in `lost`."""
+        """
+        Yield RawMessages of the topics in file order.
+
+        Lost messages of the file are counted in `lost`.
+        """
         connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
         pending, n_read = [], 0
         expected = sum(c.msgcount for c in connections)

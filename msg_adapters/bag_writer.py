@@ -39,7 +39,8 @@ class BagWriter:
     def __init__(self, path: str | PathLike[str], storage: str = 'sqlite3', **options: str):
         if storage not in identifiers():
             raise InputError(
-                f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r}; choose one of these',
+                f'the storage of a bag must be {" or ".join(identifiers())}, got {storage!r};'
+                ' choose one of these',
                 code='storage_unknown',
             )
         self.path = Path(path)
@@ -52,7 +53,11 @@ class BagWriter:
         self.storage = self.kind.writer(self.partial / self.file_name, ROS_DISTRO, **options)
 
     def add_topic(self, name: str, definition: TypeDefinition, qos: Sequence[Any] = ()) -> int:
-        """Declare a topic (`definition` is a TypeDefinition, `qos` a list of rosbag2 QoS mappings); return its id."""
+        """
+        Declare a topic (`definition` is a TypeDefinition, `qos` a list of rosbag2 QoS mappings).
+
+        Return its id.
+        """
         topic_id = len(self.topics) + 1
         self.topics[topic_id] = (name, definition, list(qos))
         self.storage.add_topic(
@@ -61,7 +66,11 @@ class BagWriter:
         return topic_id
 
     def write(self, topic_ids: np.ndarray, received_ns: np.ndarray, messages: Packed) -> None:
-        """Append messages in the order of the file: arrays of topic ids and receive times, and the messages."""
+        """
+        Append messages in the order of the file.
+
+        Arrays of topic ids and receive times, and the messages.
+        """
         if not len(messages):
             return
         self.storage.write(topic_ids, received_ns, messages)
@@ -132,12 +141,17 @@ class BagWriter:
         self.abort()
         if isinstance(error, (OSError, sqlite3.Error)):
             raise InputError(
-                f'{self.path} must be writable to its end, got: {error}; free space or choose another output'
+                f'{self.path} must be writable to its end, got: {error}; free space or choose'
+                ' another output'
             ) from error
 
 
 def make_partial_folder(path: Path) -> Path:
-    """Make the temporary folder next to `path` (raises InputError when `path` exists or cannot be written)."""
+    """
+    Make the temporary folder next to `path`.
+
+    It raises InputError when `path` exists or cannot be written.
+    """
     path = Path(path)
     if path.exists():
         raise InputError(
@@ -149,7 +163,8 @@ def make_partial_folder(path: Path) -> Path:
         partial.mkdir()
     except OSError as error:
         raise InputError(
-            f'{path.parent} must be a folder that can be written: {error.strerror}; choose another output'
+            f'{path.parent} must be a folder that can be written: {error.strerror}; choose another'
+            ' output'
         ) from error
     return partial
 

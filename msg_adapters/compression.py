@@ -11,18 +11,33 @@ from typing import Any
 
 PACKED_PIECE_BYTES = 1 << 20
 LARGEST_CHUNK, LARGEST_MESSAGE = 64 << 20, 32 << 20
-"""Bytes of a chunk and of a message when decompressed; recorders write chunks of a few megabytes."""
+"""
+Bytes of a chunk and of a message when decompressed; recorders write chunks of a few megabytes.
+"""
 MESSAGE_BASE = 4 << 20
-"""A message may grow to this many bytes, plus `FILE_RATIO` times its compressed size; each of many may be a bomb."""
+"""
+A message may grow to this many bytes, plus `FILE_RATIO` times its compressed size; each of many may
+be a bomb.
+"""
 MOST_FRAMES = 10_000
-"""Frames of one stream; each costs time and gives at least a megabyte in files that compress in parallel."""
+"""
+Frames of one stream; each costs time and gives at least a megabyte in files that compress in
+parallel.
+"""
 FILE_BASE, FILE_RATIO = 256 << 20, 100
-"""A file may grow to this many bytes, plus this many times its compressed size; recordings of sensors shrink by a factor of ten at most."""
+"""
+A file may grow to this many bytes, plus this many times its compressed size; recordings of sensors
+shrink by a factor of ten at most.
+"""
 
 
 @cache
 def zstd() -> ModuleType:
-    """Return the zstd module: of the standard library where available, otherwise of the package that rosbags requires."""
+    """
+    Return the zstd module.
+
+    Of the standard library where available, otherwise of the package that rosbags requires.
+    """
     if sys.version_info >= (3, 14):
         from compression import zstd as module
     else:
@@ -65,7 +80,11 @@ def decompression_errors() -> tuple[type[Exception], ...]:
 
 
 def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:
-    """Return the content of a chunk, at most the `size` bytes that its header declares, or its readable part (raises ValueError)."""
+    """
+    Return the content of a chunk, or its readable part (raises ValueError).
+
+    At most the `size` bytes that the chunk's header declares are returned.
+    """
     if size > LARGEST_CHUNK:
         raise ValueError(
             f'a chunk of {size} bytes, more than the {LARGEST_CHUNK} that are accepted'
@@ -79,7 +98,11 @@ def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:
 
 
 def decompress_message(data: bytes) -> bytes:
-    """Return one message of a bag that is compressed by message (raises ValueError for one that expands too much)."""
+    """
+    Return one message of a bag that is compressed by message.
+
+    It raises ValueError for a message that expands too much.
+    """
     limit = min(LARGEST_MESSAGE, MESSAGE_BASE + FILE_RATIO * len(data))
     plain = decompress('zstd', data, limit)
     if len(plain) == limit:
@@ -123,7 +146,8 @@ def decompress_file(source: Path, target: Path) -> str | None:
                     started = bool(data)
                 if plain.tell() > limit or n_frames > MOST_FRAMES:
                     raise ValueError(
-                        f'it expands beyond the {limit} bytes or {MOST_FRAMES} frames that are accepted'
+                        f'it expands beyond the {limit} bytes or {MOST_FRAMES} frames that are'
+                        ' accepted'
                     )
         except module.ZstdError as error:
             return str(error)

@@ -1,4 +1,6 @@
-"""A copy of a recording with an additional corrected Imu topic; all other data are copied bit by bit."""
+"""
+A copy of a recording with an additional corrected Imu topic; all other data are copied bit by bit.
+"""
 
 from collections import Counter
 from collections.abc import Callable
@@ -31,10 +33,13 @@ def copy_with_corrected(
     source_frame_id: str | None = None,
 ) -> dict[str, int]:
     """
-    Write a bag with all topics of another one and each corrected Imu message after the measured one.
+    Write a bag with all topics of another one, and the corrected Imu messages.
 
-    Stamps and uncorrected fields are copied from the measured message. Its covariances follow the message definition: an
-    absent quantity (first element -1) is unchanged, `propagate` is applied to the present ones.
+    Each corrected message is written after the measured one.
+
+    Stamps and uncorrected fields are copied from the measured message. Its covariances follow the
+    message definition: an absent quantity (first element -1) is unchanged, `propagate` is applied
+    to the present ones.
 
     Parameters
     ----------
@@ -43,13 +48,15 @@ def copy_with_corrected(
     imu_topic, corrected_topic : str
         Topic to correct, and name of the new one.
     correct : callable
-        ImuSamples -> object with `force` and `rate`, each (n, 3), for one block after the other in the order of the file; and
-        with `marks` (n, 2), variances that replace the covariances of (force, rate) where they are not zero.
+        ImuSamples -> object with `force` and `rate`, each (n, 3), for one block after the other in
+        the order of the file; and with `marks` (n, 2), variances that replace the covariances of
+        (force, rate) where they are not zero.
     propagate : callable, optional
-        Called after each block for each distinct pair of covariances: measured (force, rate), each (3, 3) or None when unknown ->
-        corrected (force, rate).
+        Called after each block for each distinct pair of covariances: measured (force, rate), each
+        (3, 3) or None when unknown -> corrected (force, rate).
     frame_id : str, optional
-        New frame of the corrected messages; `mat_ts` (target from sensor) then turns the orientation.
+        New frame of the corrected messages; `mat_ts` (target from sensor) then turns the
+        orientation.
     late_ns : int
         Subtracted from the stamps of the corrected messages.
     source_frame_id : str, optional
@@ -63,7 +70,8 @@ def copy_with_corrected(
     Raises
     ------
     InputError
-        When the source is unsuitable or the destination cannot be written; all partial output is removed.
+        When the source is unsuitable or the destination cannot be written; all partial output is
+        removed.
 
     """
     with open_recording(source, imu_topic, want_joints=False, want_temperature=False) as recording:
@@ -88,23 +96,25 @@ def _check(recording, corrected_topic):
     bag, name = recording.source, recording.imu_topic
     if bag.ros1:
         raise InputError(
-            f'{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with the command '
-            "'rosbags-convert' (pip install rosbags)",
+            f'{recording.path} must be a rosbag2 recording, it is of ROS 1; convert it with the'
+            " command 'rosbags-convert' (pip install rosbags)",
             code='ros1_bag',
         )
     if not is_standard(IMU_TYPE, *bag.definitions.get(IMU_TYPE, ('', ''))):
         raise InputError(
-            f'{recording.path} must be a rosbag2 recording with the standard Imu definition; convert it first'
+            f'{recording.path} must be a rosbag2 recording with the standard Imu definition;'
+            ' convert it first'
         )
     foreign = [topic.name for topic in recording.topics if ' ' in topic.type]
     if foreign:
         raise InputError(
-            f'every topic of {recording.path} must be CDR to be copied, got {", ".join(foreign)}; record without them'
+            f'every topic of {recording.path} must be CDR to be copied, got {", ".join(foreign)};'
+            ' record without them'
         )
     if corrected_topic in recording.message_counts:
         raise InputError(
-            f'the corrected topic must be new, {recording.path} has {corrected_topic} already in addition to {name}; '
-            'choose another name',
+            f'the corrected topic must be new, {recording.path} has {corrected_topic} already in'
+            f' addition to {name}; choose another name',
             code='topic_taken',
         )
 
@@ -140,7 +150,11 @@ class _Patch:
         self.dropped = Counter()
 
     def __call__(self, packed, received_ns):
-        """Return (index of the messages that could be corrected, their corrected messages); a zero stamp counts as the time of arrival."""
+        """
+        Return (index of the messages that could be corrected, their corrected messages).
+
+        A zero stamp counts as the time of arrival.
+        """
         groups, n_broken = group_by_layout(packed, find_imu_layout)
         if n_broken:
             self.dropped['Imu message that cannot be decoded'] += n_broken
@@ -224,7 +238,11 @@ class _Patch:
 
 
 def _propagated(propagate, pairs):
-    """Return the corrected covariances of measured ones, both (n, 18): nine numbers of force, nine of rate."""
+    """
+    Return the corrected covariances of measured ones, both (n, 18).
+
+    Nine numbers of force, nine of rate.
+    """
     distinct, which = (
         (pairs[:1], np.zeros(len(pairs), int))
         if (pairs == pairs[0]).all()

@@ -83,26 +83,37 @@ COLUMN_PATTERNS = (
     ),
     (
         'force',
-        r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
+        r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs'
+        r' s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
         r'(.* )?linear acceleration)',
     ),
     (
         'rate',
-        r'(g|w|gyr|gyro|gyroscope|omega|rate|w rs s|(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
+        r'(g|w|gyr|gyro|gyroscope|omega|rate|w rs s|(angular|rotation|gyro|gyroscope|imu|raw)'
+        r' ?(rate|rotation|gyro\w*)|'
         r'(.* )?angular velocity)',
     ),
     ('temperature', r'temp|temperature|(imu|sensor|chip|die) temp(erature)?'),
 )
-"""Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force and rate."""
+"""
+Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force
+and rate.
+"""
 PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns', 1.2e5, 1.1e8))
-"""Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within the usual rates."""
+"""
+Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within
+the usual rates.
+"""
 MAX_TIME_SECONDS = 4e9
 """s; stamps in ns and their differences fit into 64 bits."""
 GRAVITY_BAND = 1.15
 """The median of the specific force may differ from gravity by this factor."""
 RATE_BAND = 1.6
 """The rate that turns gravity may differ from the measured one by this factor."""
-REMEDY = 'convert it with the columns stated: time=NAME:UNIT force=X,Y,Z:UNIT rate=X,Y,Z:UNIT [temperature=NAME:C] [joint.JOINT=NAME:UNIT]'
+REMEDY = (
+    'convert it with the columns stated: time=NAME:UNIT force=X,Y,Z:UNIT rate=X,Y,Z:UNIT'
+    ' [temperature=NAME:C] [joint.JOINT=NAME:UNIT]'
+)
 
 
 @dataclass(frozen=True)
@@ -153,13 +164,15 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
     path : path-like
         Text with columns separated by comma, semicolon, tab or spaces.
     columns : sequence of str
-        Assignments ``quantity=NAME[,NAME,NAME][:UNIT]`` that replace the guess; the quantity is time, force, rate, temperature or
-        joint.JOINT. A name may be the number of a column (1 is the first).
+        Assignments ``quantity=NAME[,NAME,NAME][:UNIT]`` that replace the guess; the quantity is
+        time, force, rate, temperature or joint.JOINT. A name may be the number of a column (1 is
+        the first).
 
     Raises
     ------
     InputError
-        When a needed column or unit is neither given, nor in the header, nor determined by the values.
+        When a needed column or unit is neither given, nor in the header, nor determined by the
+        values.
 
     """
     path = Path(path)
@@ -173,8 +186,9 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
     for quantity in ('time', 'force', 'rate'):
         if quantity not in by_quantity:
             raise InputError(
-                f'{path} must have a column of {quantity}{"" if quantity == "time" else " per axis"}, got the columns '
-                f'{shortened(", ".join(table.names), 300)}; {REMEDY}',
+                f'{path} must have a column of'
+                f' {quantity}{"" if quantity == "time" else " per axis"}, got the columns'
+                f' {shortened(", ".join(table.names), 300)}; {REMEDY}',
                 key='columns',
             )
     table.load([name for each in found for name in each.names])
@@ -223,8 +237,8 @@ def _with_unit(columns, guess, path):
     unit = guess()
     if unit is None:
         raise InputError(
-            f'the unit of {columns.quantity} in {path} must be stated by the header or follow from the values, got columns '
-            f'{", ".join(columns.names)} without one; {REMEDY}',
+            f'the unit of {columns.quantity} in {path} must be stated by the header or follow from'
+            f' the values, got columns {", ".join(columns.names)} without one; {REMEDY}',
             key='columns',
         )
     return replace(columns, unit=unit, origin='values')
@@ -246,13 +260,14 @@ def _parse(text):
         or len(names) != (3 if quantity in ('force', 'rate') else 1)
     ):
         raise InputError(
-            f'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and rate, got {text!r}; '
-            f'{REMEDY}',
+            'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and'
+            f' rate, got {text!r}; {REMEDY}',
             key='columns',
         )
     if unit is not None and unit not in units:
         raise InputError(
-            f'the unit of {quantity} must be one of {", ".join(units)}, got {unit!r}; correct {text!r}'
+            f'the unit of {quantity} must be one of {", ".join(units)}, got {unit!r}; correct'
+            f' {text!r}'
         )
     return Columns(quantity, names, unit, joint, 'given')
 
@@ -271,7 +286,8 @@ class _Table:
         lines = head.splitlines()
         if not lines or '\0' in head:
             raise InputError(
-                f'{path} must be a text log, got {"an empty file" if not lines else "binary data"}; check the path'
+                f'{path} must be a text log, got {"an empty file" if not lines else "binary data"};'
+                ' check the path'
             )
         self.delimiter = _delimiter(lines)
         rows = [self._cells(line) for line in lines[: None if len(head) < HEAD_BYTES else -1]]
@@ -285,7 +301,8 @@ class _Table:
         )
         if first is None:
             raise InputError(
-                f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces, got none; check the file'
+                f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces,'
+                ' got none; check the file'
             )
         self.first, self.decimal_comma = (
             first,
@@ -330,7 +347,8 @@ class _Table:
         if name.isdigit() and 1 <= int(name) <= len(self.names):
             return int(name) - 1
         raise InputError(
-            f'a column must be in {self.path}, got {name!r}; it has {shortened(", ".join(self.names), 300)}'
+            f'a column must be in {self.path}, got {name!r}; it has'
+            f' {shortened(", ".join(self.names), 300)}'
         )
 
     def load(self, names):
@@ -356,9 +374,11 @@ class _Table:
         for k in set(wanted) & self.dates:
             cells = [self._cells(line) for line in lines if line.strip()]
             dates = [
-                re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', row[k].strip()).replace(' ', 'T')
-                if k < len(row)
-                else 'NaT'
+                (
+                    re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', row[k].strip()).replace(' ', 'T')
+                    if k < len(row)
+                    else 'NaT'
+                )
                 for row in cells
             ]
             self._values[k] = np.array(dates, 'datetime64[ns]')
@@ -390,15 +410,19 @@ class _Table:
         bad = np.count_nonzero(~(np.abs(values * unit) < MAX_TIME_SECONDS))
         if bad:
             raise InputError(
-                f'the time of every row of {self.path} must be a number below {MAX_TIME_SECONDS:g} s, got {bad} without one; '
-                'remove these rows',
+                f'the time of every row of {self.path} must be a number below {MAX_TIME_SECONDS:g}'
+                f' s, got {bad} without one; remove these rows',
                 code='csv_time',
             )
         return stamps_of(values, unit)
 
 
 def _delimiter(lines):
-    """Return the delimiter that gives the same number of columns, at least four, in most lines; None for white space."""
+    """
+    Return the delimiter that gives the same number of columns, at least four, in most lines.
+
+    None for white space.
+    """
 
     def agreement(delimiter):
         counts = Counter(len(line.split(delimiter)) for line in lines[:50] if line.strip())
@@ -433,8 +457,10 @@ def _guess(table):
         complete = [group for group in groups.values() if set(group) == set('xyz')]
         if len(complete) > 1:
             raise InputError(
-                f'{table.path} must have one column of {quantity} per axis, got {len(complete)} sets: '
-                f'{"; ".join(", ".join(group[axis][0] for axis in "xyz") for group in complete)}; {REMEDY}',
+                f'{table.path} must have one column of {quantity} per axis, got {len(complete)}'
+                ' sets:'
+                f' {"; ".join(", ".join(group[axis][0] for axis in "xyz") for group in complete)};'
+                f' {REMEDY}',
                 key='columns',
             )
         if complete:
@@ -521,7 +547,8 @@ class CsvBag(Rosbag2):
     Raises
     ------
     InputError
-        When columns or units are ambiguous; `csv_log.read_csv` with explicit columns reads such a log.
+        When columns or units are ambiguous; `csv_log.read_csv` with explicit columns reads such a
+        log.
 
     """
 
@@ -533,7 +560,9 @@ class CsvBag(Rosbag2):
 
 
 class ConvertedLog:
-    """The temporary bag of a text log; its folder is removed with the last reference, or at exit."""
+    """
+    The temporary bag of a text log; its folder is removed with the last reference, or at exit.
+    """
 
     def __init__(self, path: Path):
         log, folder = read_csv(path), mkdtemp(prefix='imu_calibration_')
@@ -544,5 +573,9 @@ class ConvertedLog:
 
 @lru_cache(maxsize=1)
 def _converted(path, _modified_ns, _size):
-    """Return the ConvertedLog: a verb opens a recording several times, and converts an unchanged file once."""
+    """
+    Return the ConvertedLog.
+
+    A verb opens a recording several times, and converts an unchanged file once.
+    """
     return ConvertedLog(path)

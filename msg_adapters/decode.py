@@ -37,7 +37,8 @@ class Decoder:
     message_type : str
         Imu or Temperature; JointState has its own class.
     deserialize : callable, optional
-        Message bytes -> message object, for messages that are not standard CDR; each is then converted to it.
+        Message bytes -> message object, for messages that are not standard CDR; each is then
+        converted to it.
     choice : object, optional
         Its `wants` returns whether messages of a frame_id are used, as that of a FrameChoice.
 
@@ -54,13 +55,16 @@ class Decoder:
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
         """
-        Return the samples of a Packed in its order, or None when there are none; counts unusable messages in `dropped`.
+        Return the samples of a Packed in its order, or None when there are none.
+
+        Counts unusable messages in `dropped`.
 
         Parameters
         ----------
         packed : Packed
         arrived_ns : callable, optional
-            Returns the times of sending or reception, int64, shape (n,): used for messages whose stamp is zero, counted in `notes`.
+            Returns the times of sending or reception, int64, shape (n,): used for messages whose
+            stamp is zero, counted in `notes`.
 
         """
         if self.deserialize is not None:
@@ -78,7 +82,11 @@ class Decoder:
         )
 
     def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
-        """Return the samples of messages of one layout, None for messages that are not wanted (raises UnusableMessage)."""
+        """
+        Return the samples of messages of one layout.
+
+        None for messages that are not wanted (raises UnusableMessage).
+        """
         if self.choice is not None and not self.choice.wants(layout.names[0], len(packed)):
             return None
         return (decode_imu if self.message_type == IMU_TYPE else decode_temperature)(layout, packed)
@@ -102,7 +110,9 @@ class Decoder:
         """Return a message as standard CDR; no bytes for one that cannot be read."""
         try:
             return standard_bytes(self.deserialize(data), self.message_type)
-        except Exception:  # rosbags' generated readers raise many kinds on broken bytes, and fields of other definitions differ
+        # Rosbags' generated readers raise many kinds on broken bytes, and fields of other
+        # definitions differ
+        except Exception:
             return b''
 
 
@@ -115,7 +125,8 @@ class FrameChoice:
     topic : str
         Its name for errors.
     frame_id : str, optional
-        Frame of the messages to read; default: all messages; a second frame with OTHER_FRAME messages is refused.
+        Frame of the messages to read; default: all messages; a second frame with OTHER_FRAME
+        messages is refused.
 
     """
 
@@ -123,14 +134,17 @@ class FrameChoice:
         self.topic, self.frame_id, self.counts = topic, frame_id, Counter()
 
     def wants(self, frame_id: str, n_messages: int = 1) -> bool:
-        """Return whether messages of a frame are used; raises InputError if the choice is ambiguous."""
+        """
+        Return whether messages of a frame are used; raises InputError if the choice is ambiguous.
+        """
         self.counts[frame_id] += n_messages
         if (
             self.frame_id is None
             and sum(count >= OTHER_FRAME for count in self.counts.values()) > 1
         ):
             raise InputError(
-                f'{self.topic} must have messages of one frame_id, got {self._listed()}; choose one',
+                f'{self.topic} must have messages of one frame_id, got {self._listed()};'
+                ' choose one',
                 key='frame_id',
                 code='frame_ambiguous',
             )
@@ -140,7 +154,8 @@ class FrameChoice:
         """Raise InputError if no message has the frame_id that was chosen."""
         if self.frame_id is not None and self.counts and self.frame_id not in self.counts:
             raise InputError(
-                f"the frame_id must be one of {self.topic}, got '{self.frame_id}'; choose one of {self._listed()}",
+                f"the frame_id must be one of {self.topic}, got '{self.frame_id}'; choose one of"
+                f' {self._listed()}',
                 key='frame_id',
                 code='frame_unknown',
             )
@@ -172,7 +187,11 @@ class JointDecoder(Decoder):
         self.n_messages, self.n_fitting = 0, 0
 
     def decode(self, packed: Packed, arrived_ns: Callable[[], np.ndarray] | None = None) -> Any:
-        """As for Decoder; raises InputError when the names have not matched the table's for a number of messages."""
+        """
+        As for Decoder.
+
+        Raises InputError when the names have not matched the table's for a number of messages.
+        """
         samples = super().decode(packed, arrived_ns)
         self.n_messages += len(packed)
         self.n_fitting += 0 if samples is None else len(samples)
@@ -181,7 +200,11 @@ class JointDecoder(Decoder):
         return samples
 
     def decode_group(self, layout: MessageLayout, packed: Packed) -> Any:
-        """Return the JointSamples in the order of the table; its joints are those of the first message where none were given."""
+        """
+        Return the JointSamples in the order of the table.
+
+        Its joints are those of the first message where none were given.
+        """
         if layout.names not in self.seen and len(self.seen) < KEPT_NAMES:
             self.seen.append(layout.names)
         if not self.asked and not self.names:
@@ -193,8 +216,8 @@ class JointDecoder(Decoder):
         if self.asked and self.seen and not self.n_fitting:
             if any(set(self.names) <= set(names) for names in self.seen):
                 raise InputError(
-                    'JointState must have one position for each named joint, the messages so far do not; correct the '
-                    'driver, or choose a different topic',
+                    'JointState must have one position for each named joint, the messages so far do'
+                    ' not; correct the driver, or choose a different topic',
                     key='joint_topic',
                 )
             came = '; '.join(', '.join(names) or 'no names' for names in self.seen)
@@ -202,15 +225,20 @@ class JointDecoder(Decoder):
                 ([name for name in self.names if name not in names] for names in self.seen), key=len
             )
             raise InputError(
-                f'JointState must name the joints of the table ({", ".join(self.names)}), got {came}, which lacks '
-                f'{", ".join(missing)}; correct the names in the table description, or choose another topic',
+                f'JointState must name the joints of the table ({", ".join(self.names)}), got'
+                f' {came}, which lacks {", ".join(missing)}; correct the names in the table'
+                ' description, or choose another topic',
                 key='joint_topic',
                 code='joint_names',
             )
 
 
 def taken_counts(decoders: Iterable[Decoder]) -> tuple[dict[str, int] | None, ...]:
-    """Return ({reason: messages dropped}, {reason: messages used with a change}) since the last call; None for none."""
+    """
+    Return ({reason: messages dropped}, {reason: messages used with a change}) since the last call.
+
+    None for none.
+    """
     totals: tuple[Counter[str], ...] = Counter(), Counter()
     for decoder in decoders:
         for total, own in zip(totals, (decoder.dropped, decoder.notes), strict=True):

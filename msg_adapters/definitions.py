@@ -1,4 +1,6 @@
-"""Message definitions: the standard ones, and whether a bag's own definition is the standard one."""
+"""
+Message definitions: the standard ones, and whether a bag's own definition is the standard one.
+"""
 
 from collections.abc import Callable
 from functools import cache
@@ -11,7 +13,9 @@ from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, st
 
 SEPARATOR = '=' * 80
 MAX_DEFINITION_CHARACTERS, MAX_ELEMENTS = 100_000, 10_000
-"""Characters of a definition and elements of a message at most, an array counted by its elements."""
+"""
+Characters of a definition and elements of a message at most, an array counted by its elements.
+"""
 DEFAULT_TOPICS = {
     IMU_TYPE: '/imu/data_raw',
     JOINT_STATE_TYPE: '/joint_states',
@@ -47,7 +51,11 @@ def standard_definition(message_type: str) -> TypeDefinition:
 
 
 def is_standard(message_type: str, encoding: str, text: str) -> bool:
-    """Return whether a definition has the fields of the standard one; without a text the standard is assumed."""
+    """
+    Return whether a definition has the fields of the standard one.
+
+    Without a text the standard is assumed.
+    """
     if not text:
         return True
     if encoding != 'ros2msg' or len(text) > MAX_DEFINITION_CHARACTERS:
@@ -61,7 +69,11 @@ def is_standard(message_type: str, encoding: str, text: str) -> bool:
 
 
 def _fields(text, message_type):
-    """Return the types of a ros2msg definition with their fields, without constants and default values."""
+    """
+    Return the types of a ros2msg definition with their fields.
+
+    Without constants and default values.
+    """
     from rosbags.typesys import get_types_from_msg
 
     return {name: fields for name, (_, fields) in get_types_from_msg(text, message_type).items()}
@@ -89,7 +101,8 @@ def deserializer(
     encoding, text = definitions.get(message_type, ('', ''))
     if len(text) > MAX_DEFINITION_CHARACTERS:
         raise ValueError(
-            f'a definition of {len(text)} characters, at most {MAX_DEFINITION_CHARACTERS} are accepted'
+            f'a definition of {len(text)} characters, at most {MAX_DEFINITION_CHARACTERS} are'
+            ' accepted'
         )
     if text and encoding == 'ros2msg':
         types.update(get_types_from_msg(text, message_type))
@@ -109,7 +122,11 @@ def deserializer(
 
 
 def standard_bytes(message: Any, message_type: str) -> bytes:
-    """Return a message object of any definition as plain CDR of the standard one; fields are found by their names."""
+    """
+    Return a message object of any definition as plain CDR of the standard one.
+
+    Fields are found by their names.
+    """
     return bytes(standard_store().serialize_cdr(_standard(message, message_type), message_type))
 
 
@@ -126,7 +143,11 @@ def _standard(message, message_type):
 
 
 def _require_size(types, message_type):
-    """Refuse a type with too many elements, recursion, or sequences of an empty type: a message of few bytes would fill the memory."""
+    """
+    Refuse a type with too many elements, recursion, or sequences of an empty type.
+
+    A message of few bytes would fill the memory.
+    """
     known = {}
 
     def elements(name):

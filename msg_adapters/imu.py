@@ -39,12 +39,17 @@ def find_imu_layout(data: bytes) -> MessageLayout:
 
 
 def _layout(data, kind, n_doubles, fields):
-    """Return the MessageLayout of a message with doubles after its header; `fields` are name -> (index of the first, number)."""
+    """
+    Return the MessageLayout of a message with doubles after its header.
+
+    `fields` are name -> (index of the first, number).
+    """
     header = open_header(data)
     body = aligned(header.end, 8)
     if len(data) < body + 8 * n_doubles:
         raise MessageError(
-            f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles} bytes, got {len(data)}'
+            f'a message of type {kind} with its doubles at byte {body} has {body + 8 * n_doubles}'
+            f' bytes, got {len(data)}'
         )
     offsets = {name: (body + 8 * first, count) for name, (first, count) in fields.items()}
     return MessageLayout(
@@ -58,7 +63,11 @@ def _layout(data, kind, n_doubles, fields):
 
 
 def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
-    """Return the ImuSamples of messages of one layout; a quantity declared absent (covariance -1) is NaN."""
+    """
+    Return the ImuSamples of messages of one layout.
+
+    A quantity declared absent (covariance -1) is NaN.
+    """
     readings = {}
     for name, cov in (('force_s', 'force_cov'), ('rate_s', 'rate_cov')):
         values = layout.column(packed, name)

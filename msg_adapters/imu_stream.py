@@ -1,4 +1,8 @@
-"""Parse and rewrite serialized Imu messages of one stream; repeated parts are parsed only when their bytes change."""
+"""
+Parse and rewrite serialized Imu messages of one stream.
+
+Repeated parts are parsed only when their bytes change.
+"""
 
 import struct
 from collections import Counter
@@ -73,7 +77,11 @@ class ImuStream:
         return layout.names[0]
 
     def take(self, data: bytes) -> tuple[int, tuple[float, ...]] | None:
-        """Return (stamp in ns, readings: rate x, y, z, force x, y, z), or None where head or covariances differ from the last."""
+        """
+        Return (stamp in ns, readings: rate x, y, z, force x, y, z).
+
+        Or None where head or covariances differ from the last.
+        """
         if (
             len(data) != self._size
             or data[HEAD_AT : self._head_end] != self._head
@@ -90,7 +98,11 @@ class ImuStream:
         return seconds * NS + nanoseconds, self._readings.unpack_from(data, self._rate_at)
 
     def heads(self, data: bytes) -> bool:
-        """Return whether a message has the head of the last opened one, so that all positions are equal."""
+        """
+        Return whether a message has the head of the last opened one.
+
+        So that all positions are equal.
+        """
         return (
             len(data) == self._size
             and data[HEAD_AT : self._head_end] == self._head
@@ -159,7 +171,9 @@ class ImuStream:
 
 
 class ImuHeads:
-    """Gathers the `MessageEvidence` of serialized Imu messages; memory grows by a number for each."""
+    """
+    Gathers the `MessageEvidence` of serialized Imu messages; memory grows by a number for each.
+    """
 
     def __init__(self) -> None:
         self._stream, self._frame_ids = ImuStream(), Counter[str]()
@@ -167,7 +181,11 @@ class ImuHeads:
         self._age: list[float] = []
 
     def add(self, data: bytes, received_ns: int) -> None:
-        """Add a message and its time of reception, ns since the epoch, 0 if meaningless; invalid Imu messages are skipped."""
+        """
+        Add a message and its time of reception, ns since the epoch, 0 if meaningless.
+
+        Invalid Imu messages are skipped.
+        """
         if not self._stream.heads(data):
             try:
                 self._frame_id = self._stream.open(data)

@@ -25,7 +25,10 @@ from msg_adapters.layout import (
 JOINT_STATE_TYPE = 'sensor_msgs/msg/JointState'
 
 MAX_MESSAGE_JOINTS, MAX_NAME_BYTES = 1000, 1 << 16
-"""Joints of a message and bytes of their names; the time to compare names grows with the square of either."""
+"""
+Joints of a message and bytes of their names; the time to compare names grows with the square of
+either.
+"""
 MISSING_JOINT = 'JointState without every joint of the table'
 NO_POSITION = 'JointState without a position for every name'
 
@@ -47,7 +50,8 @@ def find_joint_layout(data: bytes) -> MessageLayout:
         names = tuple(walk.string() for _ in range(min(n_names, MAX_MESSAGE_JOINTS)))
         if n_names > MAX_MESSAGE_JOINTS or walk.position > MAX_NAME_BYTES:
             raise MessageError(
-                f'a JointState must have at most {MAX_MESSAGE_JOINTS} joints and {MAX_NAME_BYTES} bytes of names'
+                f'a JointState must have at most {MAX_MESSAGE_JOINTS} joints and {MAX_NAME_BYTES}'
+                ' bytes of names'
             )
         offsets = {field: walk.doubles() for field in ('position', 'velocity', 'effort')}
     except struct.error:
@@ -132,7 +136,9 @@ def standard_store() -> Any:
 
 
 def encode_trajectory(points: TrajectoryPoints) -> bytes:
-    """Return TrajectoryPoints as plain little-endian CDR, without a frame, to begin at their arrival."""
+    """
+    Return TrajectoryPoints as plain little-endian CDR, without a frame, to begin at their arrival.
+    """
     types, none = standard_store().types, np.zeros(0)
     columns = {
         name: np.ascontiguousarray(values) for name, values in points.columns().items()
@@ -155,7 +161,8 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
     """
     Return the TrajectoryPoints of a message object of rclpy or rosbags.
 
-    Velocities or accelerations that not every point has count as not given, as in the controller's spline.
+    Velocities or accelerations that not every point has count as not given, as in the controller's
+    spline.
 
     Raises
     ------
@@ -178,8 +185,8 @@ def trajectory_from_message(message: Any) -> TrajectoryPoints:
     }
     if 'position' not in complete:
         raise InputError(
-            f'each point of a trajectory must have {len(names)} positions, one for each joint, some have not; '
-            'give them all',
+            f'each point of a trajectory must have {len(names)} positions, one for each joint, some'
+            ' have not; give them all',
             code='position_count',
         )
     return TrajectoryPoints(names, time, **complete)

@@ -10,7 +10,10 @@ import numpy as np
 from imu_calibration.core.errors import printable
 
 MAX_LAYOUTS = 16
-"""A stretch with more layouts than this is not worth grouping; its further messages are decoded one by one."""
+"""
+A stretch with more layouts than this is not worth grouping; its further messages are decoded one by
+one.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,11 @@ class Packed:
         return list(self._parts(self.buffer.data))
 
     def copies(self) -> Iterator[bytearray]:
-        """Yield copies of the messages; SQLite binds a bytearray in half the time of bytes, for which Python looks for an adapter."""
+        """
+        Yield copies of the messages.
+
+        SQLite binds a bytearray in half the time of bytes, for which Python looks for an adapter.
+        """
         return self._parts(bytearray(self.buffer))
 
     def _parts(self, data):
@@ -49,7 +56,9 @@ class Packed:
         )
 
     def copy_to(self, target: np.ndarray, place: np.ndarray) -> None:
-        """Copy each message into the bytes `target`, from its `place` on: one gather for each size."""
+        """
+        Copy each message into the bytes `target`, from its `place` on: one gather for each size.
+        """
         order = np.argsort(self.size, kind='stable')
         for some in np.split(order, np.flatnonzero(np.diff(self.size[order])) + 1):
             if len(some) and self.size[some[0]]:
@@ -91,7 +100,11 @@ class Packed:
 
 @dataclass(frozen=True, eq=False)
 class MessageLayout:
-    """Where the numbers of a message lie, and which bytes must be equal for another message to share it."""
+    """
+    Where the numbers of a message lie, and which bytes must be equal in another one.
+
+    These bytes must be equal for another message to share this layout.
+    """
 
     order: str
     """Byte order, '<' or '>'."""
@@ -100,7 +113,10 @@ class MessageLayout:
     sample: bytes
     """The message that the layout was found from."""
     fixed: tuple
-    """Ranges (first, last + 1) of bytes that must equal the bytes of `sample`; padding and numbers are outside."""
+    """
+    Ranges (first, last + 1) of bytes that must equal the bytes of `sample`; padding and numbers are
+    outside.
+    """
     offsets: dict
     """Field name -> (offset of its first double, number of doubles)."""
     names: tuple = ()
@@ -126,7 +142,11 @@ class MessageLayout:
         return sec.astype(np.int64) * NS_PER_S + nanosec
 
     def column(self, packed: Packed, name: str, count: int | None = None) -> np.ndarray:
-        """Return the doubles of field `name`, or its first `count`, of messages that have this layout, shape (n, count)."""
+        """
+        Return the doubles of field `name`, or its first `count`, of messages that have this layout.
+
+        Shape (n, count).
+        """
         offset, length = self.offsets[name]
         count = length if count is None else count
         if not count:
@@ -180,7 +200,9 @@ def overlapping(buffer: np.ndarray, dtype: str) -> np.ndarray:
 
 
 def _checks(fixed, sample):
-    """Cover the fixed bytes by few 8-byte words inside the message: (offset, mask, expected value)."""
+    """
+    Cover the fixed bytes by few 8-byte words inside the message: (offset, mask, expected value).
+    """
     left = np.zeros(len(sample), dtype=bool)
     for first, last in fixed:
         left[first:last] = True
@@ -208,7 +230,10 @@ FRAME_OFFSET = ENCAPSULATION_SIZE + 8
 LONGEST_NAME = 256
 """Bytes of a name; ROS 2 itself allows 255 for a topic."""
 LONGEST_FRAME = 4096
-"""Bytes of a frame_id in a message that is used; the time to compare frames grows with the square of their length."""
+"""
+Bytes of a frame_id in a message that is used; the time to compare frames grows with the square of
+their length.
+"""
 
 _STARTS = {order: struct.Struct(order + 'iII') for order in '<>'}
 _BYTE_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
@@ -223,7 +248,11 @@ class UnusableMessage(MessageError):
 
 
 def clean_name(name: str | bytes) -> str:
-    """Return a frame, topic, type or joint name without control characters, at most `LONGEST_NAME` bytes; a recording may contain any."""
+    """
+    Return a frame, topic, type or joint name without control characters.
+
+    It has at most `LONGEST_NAME` bytes, because a recording may contain any name.
+    """
     raw = name.encode(errors='replace') if isinstance(name, str) else bytes(name)
     return printable(raw[:LONGEST_NAME].decode(errors='replace'))
 
@@ -247,7 +276,11 @@ class Header(NamedTuple):
 
 
 def open_header(data: bytes) -> Header:
-    """Return the Header of a serialized message (raises MessageError); plain CDR (XCDR1) is the only representation in ROS 2."""
+    """
+    Return the Header of a serialized message (raises MessageError).
+
+    Plain CDR (XCDR1) is the only representation in ROS 2.
+    """
     order = _BYTE_ORDERS.get(bytes(data[:2]))
     if order is None:
         raise MessageError(
@@ -274,11 +307,19 @@ def open_header(data: bytes) -> Header:
 
 
 def frame_head(frame_id: str, order: str = '<') -> bytes:
-    """Return the bytes of a frame_id after the stamp: its length, text and padding to the doubles that follow."""
+    """
+    Return the bytes of a frame_id after the stamp.
+
+    Its length, text and padding to the doubles that follow.
+    """
     text = frame_id.encode() + b'\0'
     return struct.pack(order + 'I', len(text)) + text + bytes(-(4 + len(text)) % 8)
 
 
 def aligned(position: int, size: int) -> int:
-    """Return the first position from `position` on that CDR aligns to `size`; positions count from the start of the message."""
+    """
+    Return the first position from `position` on that CDR aligns to `size`.
+
+    Positions count from the start of the message.
+    """
     return position + (ENCAPSULATION_SIZE - position) % size

@@ -17,17 +17,19 @@ class LiveGatherer:
     """
     Keep messages until `flush` turns them into a SampleBlock.
 
-    Adding is cheap and may happen in another thread than `flush`. Every topic gives serialized messages (a subscription with
-    ``raw=True``), which are decoded many at once.
+    Adding is cheap and may happen in another thread than `flush`. Every topic gives serialized
+    messages (a subscription with ``raw=True``), which are decoded many at once.
 
     Parameters
     ----------
     joint_names : sequence of str, optional
         Joints of the table, in its order; default: the joints of the first message.
     max_messages : int
-        Largest number of stored messages of one kind; the oldest are discarded first and counted as dropped.
+        Largest number of stored messages of one kind; the oldest are discarded first and counted as
+        dropped.
     frame_id : str, optional
-        Imu messages of another frame are counted as dropped; '' selects the frame of the first message, None any frame.
+        Imu messages of another frame are counted as dropped; '' selects the frame of the first
+        message, None any frame.
 
     """
 

@@ -28,7 +28,9 @@ PREFIX = struct.Struct('<BQ')
 MESSAGE_PREFIX = PREFIX.size + 22
 """Bytes of a Message record in front of its data: prefix, channel, sequence, two times."""
 MOST_OTHERS = 1 << 17
-"""Records that are not messages in one buffer; there are at most 65,536 schemas and as many channels."""
+"""
+Records that are not messages in one buffer; there are at most 65,536 schemas and as many channels.
+"""
 RUN = 8
 """After so many records of one size, the next ones are searched by stride."""
 
@@ -74,7 +76,9 @@ def parse_channel(content: bytes | memoryview) -> tuple[int, Channel]:
 
 
 def parse_message_index(content: bytes) -> tuple[int, np.ndarray]:
-    """Return (channel id, offsets of its Message records in the chunk) from a MessageIndex record."""
+    """
+    Return (channel id, offsets of its Message records in the chunk) from a MessageIndex record.
+    """
     channel, length = struct.unpack_from('<HI', content)
     entries = np.frombuffer(content, dtype='<u8', count=length // 8, offset=6)
     return channel, entries[1::2].astype(np.int64)
@@ -135,8 +139,8 @@ def indexed_messages(
     Returns
     -------
     (channel, messages) : (ndarray, Packed) or None
-        Channel ids, int64, shape (n,), and the messages in file order; None when the indexes do not account for every byte of the chunk
-        (definitions in between, or a wrong index).
+        Channel ids, int64, shape (n,), and the messages in file order; None when the indexes do not
+        account for every byte of the chunk (definitions in between, or a wrong index).
 
     """
     if not indexes or len(buffer) < MESSAGE_PREFIX:
@@ -162,7 +166,9 @@ def indexed_messages(
 
 def walk(buffer: np.ndarray) -> tuple[tuple[np.ndarray, Packed], list[tuple[int, bytes]], int]:
     """
-    Step through records until a chunk, the end, or an incomplete or impossible one; runs of one size are parsed at once.
+    Step through records until a chunk, the end, or an incomplete or impossible one.
+
+    Runs of one size are parsed at once.
 
     Returns
     -------
@@ -224,7 +230,11 @@ def is_record(opcode: int) -> bool:
 
 
 def _run(buffer, position, stride, reach):
-    """Return offsets of up to `reach` records from `position` on that follow each other with the same opcode and length."""
+    """
+    Return offsets of up to `reach` records from `position` on.
+
+    The records follow each other with the same opcode and length.
+    """
     offset = position + stride * np.arange(min((len(buffer) - position) // stride, reach))
     same = (buffer[offset] == MESSAGE) & (
         overlapping(buffer, '<u8')[offset + 1] == stride - PREFIX.size
@@ -242,7 +252,10 @@ def _strings(content, position, count):
 
 
 FIRST_BYTES = 1 << 16
-"""Bytes read at once of messages outside of chunks; doubled up to `STRETCH_BYTES` while no other record is between them."""
+"""
+Bytes read at once of messages outside of chunks; doubled up to `STRETCH_BYTES` while no other
+record is between them.
+"""
 STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
 FOOTER_SIZE = PREFIX.size + 20
@@ -346,7 +359,11 @@ class McapFile(StorageFile):
             yield _join(waiting)
 
     def _pieces(self, wanted):
-        """Yield (channel ids, Packed) for each chunk with wanted channels and each run of messages outside of chunks."""
+        """
+        Yield (channel ids, Packed) for chunks and for runs of messages outside of chunks.
+
+        Each chunk with wanted channels and each such run gives one pair.
+        """
         for opcode, position, length, walked in self._records():
             if opcode == CHUNK:
                 indexes = self._indexes_behind(position + length)
@@ -379,9 +396,12 @@ class McapFile(StorageFile):
 
     def _records(self):
         """
-        Yield (opcode, position, length, None) of the records of the data section; a truncated chunk is yielded with its remaining bytes.
+        Yield (opcode, position, length, None) of the records of the data section.
 
-        Messages outside of chunks are yielded in groups, with ((channel ids, Packed), other records) in place of None.
+        A truncated chunk is yielded with its remaining bytes.
+
+        Messages outside of chunks are yielded in groups, with ((channel ids, Packed), other
+        records) in place of None.
         """
         position = len(MAGIC)
         self.n_unpacked = 0
@@ -415,7 +435,11 @@ class McapFile(StorageFile):
                 position = behind
 
     def _resume(self, position):
-        """Count the damage at `position` and return the start of the next chunk in the summary, or None."""
+        """
+        Count the damage at `position` and return the start of the next chunk in the summary.
+
+        Or None.
+        """
         following = self._following(position)
         self._lose('bytes that are no whole record', max((following or self.size) - position, 1))
         return following
@@ -461,7 +485,9 @@ class McapFile(StorageFile):
         self.chunk_starts.sort()
 
     def _scan(self):
-        """Find channels and counts without a summary, by the message indexes where there are any."""
+        """
+        Find channels and counts without a summary, by the message indexes where there are any.
+        """
         counts = Counter()
         for opcode, position, length, walked in self._records():
             indexes = self._indexes_behind(position + length) if opcode == CHUNK else []

@@ -1,4 +1,6 @@
-"""rosbag2 recordings: a folder with its metadata, a folder without them, or a single storage file."""
+"""
+rosbag2 recordings: a folder with its metadata, a folder without them, or a single storage file.
+"""
 
 import re
 import shutil
@@ -27,7 +29,11 @@ QOS_POLICIES = ('history', 'reliability', 'durability', 'liveliness')
 
 
 def spelled_out(profiles: Sequence) -> list:
-    """Return offered_qos_profiles as a list of mappings with names in place of numbers; empty when they make no sense."""
+    """
+    Return offered_qos_profiles as a list of mappings with names in place of numbers.
+
+    Empty when they make no sense.
+    """
     if isinstance(profiles, str):
         try:
             profiles = parsed(profiles, 'QoS profile')
@@ -135,7 +141,11 @@ class Rosbag2:
         return spelled_out(self._entry(topic).get('offered_qos_profiles', []))
 
     def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
-        """Yield RawMessages of the topics, file by file; count the messages in the metadata that damaged files lack."""
+        """
+        Yield RawMessages of the topics, file by file.
+
+        Count the messages in the metadata that damaged files lack.
+        """
         n_read = 0
         for file in self.files:
             file.lost.clear()
@@ -145,7 +155,8 @@ class Rosbag2:
                     yield raw
             except Exception as error:  # readers raise various errors on hostile or damaged files
                 file.lost[
-                    f'rest of {file.path.name} after damage ({shortened(f"{type(error).__name__}: {error}", 100)})'
+                    f'rest of {file.path.name} after damage'
+                    f' ({shortened(f"{type(error).__name__}: {error}", 100)})'
                 ] = 1
         announced = sum(self._announced().get(topic, 0) for topic in topics)
         if self.lost and announced > n_read:
@@ -190,15 +201,17 @@ class Rosbag2:
             )
             if reader is None:
                 raise ValueError(
-                    f'a storage file must end in {", ".join(suffixes())}, with {" or ".join(COMPRESSED)} behind it when '
-                    'compressed'
+                    f'a storage file must end in {", ".join(suffixes())}, with'
+                    f' {" or ".join(COMPRESSED)} behind it when compressed'
                 )
             if path.exists() and not path.is_file():
                 raise ValueError('it is not a regular file')
             plain = self._decompressed(path) if path.suffix in COMPRESSED else path
             self.files.append(reader(plain, unpack))
             self._lost.update(self.files[-1].lost)
-        except Exception as error:  # sqlite3, struct, OS and decompression errors: a damaged file must not prevent reading of intact ones
+        # Sqlite3, struct, OS and decompression errors: a damaged file must not prevent reading of
+        # intact ones
+        except Exception as error:
             self._lost[f'file {path.name} that cannot be read ({error})'] = 1
             return f'{path.name}: {error}'
         return None
@@ -223,7 +236,11 @@ class Rosbag2:
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
-    """Return the content of metadata.yaml; empty when there is none or it is damaged, as after a crash of the recorder."""
+    """
+    Return the content of metadata.yaml.
+
+    Empty when there is none or it is damaged, as after a crash of the recorder.
+    """
     try:
         with open_regular(folder / 'metadata.yaml') as file:
             text = file.read(documents.MAX_DOCUMENT_CHARACTERS + 1).decode()

@@ -1,4 +1,8 @@
-"""rosbag2 sqlite3 storage, read (topics by SQL, messages from the pages or row by row) and written (schema version 4)."""
+"""
+rosbag2 sqlite3 storage, read and written (schema version 4).
+
+Topics are read by SQL, and messages from the pages or row by row.
+"""
 
 import os
 import sqlite3
@@ -85,7 +89,11 @@ class SqliteFile(StorageFile):
             }
 
     def _require_tables(self):
-        """Refuse views, virtual tables and generated columns: they are programs that can give rows without end."""
+        """
+        Refuse views, virtual tables and generated columns.
+
+        They are programs that can give rows without end.
+        """
         for kind, name, text in self.connection.execute(
             'SELECT type, name, sql FROM sqlite_master'
         ).fetchmany(MOST_TABLES):
@@ -112,7 +120,11 @@ class SqliteFile(StorageFile):
         return {name: sum(by_id[k] for k in ids) for name, ids in self.topic_ids.items()}
 
     def time_range(self) -> tuple[int, int] | None:
-        """Return (first, last) receive time in ns, or None when there are no messages or they cannot be read."""
+        """
+        Return (first, last) receive time in ns.
+
+        Or None when there are no messages or they cannot be read.
+        """
         with suppress(sqlite3.Error):
             (first,) = self.connection.execute('SELECT min(timestamp) FROM messages').fetchone()
             (last,) = self.connection.execute('SELECT max(timestamp) FROM messages').fetchone()
@@ -143,7 +155,11 @@ class SqliteFile(StorageFile):
                     self.lost[f'unreadable {name} of {self.path.name}'] = count
 
     def _root(self):
-        """Return the root page of the table of messages, or None when only SQL can read it (write-ahead log, other columns)."""
+        """
+        Return the root page of the table of messages.
+
+        Or None when only SQL can read it (write-ahead log, other columns).
+        """
         columns = [row[1] for row in self.connection.execute('PRAGMA table_info(messages)')]
         found = self.connection.execute(
             "SELECT rootpage, sql FROM sqlite_master WHERE type = 'table' AND name = 'messages'"
@@ -158,7 +174,11 @@ class SqliteFile(StorageFile):
         return found[0]
 
     def _pack(self, rows, index):
-        """Return the data of some rows; data that continue in overflow pages are read by SQL and appended to the pages."""
+        """
+        Return the data of some rows.
+
+        Data that continue in overflow pages are read by SQL and appended to the pages.
+        """
         start, size = rows.start[index], rows.size[index]
         outside = np.flatnonzero(~rows.inside[index])
         if not len(outside):
@@ -209,7 +229,9 @@ class SqliteFile(StorageFile):
 
 
 def _connect(path, logged):
-    """Open read-only; `immutable` keeps SQLite from looking for locks, but hides a write-ahead log."""
+    """
+    Open read-only; `immutable` keeps SQLite from looking for locks, but hides a write-ahead log.
+    """
     if os.path.getsize(path) < 512:
         raise sqlite3.DatabaseError('the file is shorter than one page')
     address = f'file:{quote(str(path))}?mode=ro' + ('' if logged else '&immutable=1')
@@ -222,19 +244,34 @@ def _connect(path, logged):
 
 SCHEMA_STATEMENTS = (
     'CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL)',
-    'CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata TEXT NOT NULL)',
-    'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL, '
-    'offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL)',
-    'CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL, encoding TEXT NOT NULL, '
-    'encoded_message_definition TEXT NOT NULL, type_description_hash TEXT NOT NULL)',
-    'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL)',
+    (
+        'CREATE TABLE metadata(id INTEGER PRIMARY KEY, metadata_version INTEGER NOT NULL, metadata'
+        ' TEXT NOT NULL)'
+    ),
+    (
+        'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,'
+        ' serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL,'
+        ' type_description_hash TEXT NOT NULL)'
+    ),
+    (
+        'CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT NOT NULL,'
+        ' encoding TEXT NOT NULL, encoded_message_definition TEXT NOT NULL, type_description_hash'
+        ' TEXT NOT NULL)'
+    ),
+    (
+        'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER'
+        ' NOT NULL, data BLOB NOT NULL)'
+    ),
 )
 
 
 PAGE_SIZE = 16384
 """Bytes; SQLite writes and balances fewer pages than with its default of 4096."""
 INSERTED_ROWS = 256
-"""Rows per statement; SQLite finds the end of the table once for all of them. Older versions allow 999 values."""
+"""
+Rows per statement; SQLite finds the end of the table once for all of them. Older versions allow 999
+values.
+"""
 
 
 class SqliteWriter:
@@ -242,7 +279,8 @@ class SqliteWriter:
 
     def __init__(self, path: Path, ros_distro: str):
         self.connection = sqlite3.connect(path, isolation_level=None)
-        # The file is made under another name and deleted on failure: a journal would have no benefit.
+        # The file is made under another name and deleted on failure: a journal would have no
+        # benefit.
         for pragma in (
             f'page_size = {PAGE_SIZE}',
             'journal_mode = OFF',
@@ -267,8 +305,8 @@ class SqliteWriter:
         ).fetchone()
         if not known and definition.text:
             self.connection.execute(
-                'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition, type_description_hash) '
-                'VALUES (?, ?, ?, ?)',
+                'INSERT INTO message_definitions (topic_type, encoding, encoded_message_definition,'
+                ' type_description_hash) VALUES (?, ?, ?, ?)',
                 (definition.type, definition.encoding, definition.text, definition.digest),
             )
 

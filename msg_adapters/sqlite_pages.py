@@ -1,8 +1,8 @@
 """
 Table leaves of an SQLite file, many pages at once.
 
-Only the file format's documented table b-tree is used (sqlite.org/fileformat2.html, sections 1.3 to 2.1). Rows that do not fit
-into one page are read by SQL; a damaged page costs its own rows only.
+Only the file format's documented table b-tree is used (sqlite.org/fileformat2.html, sections 1.3 to
+2.1). Rows that do not fit into one page are read by SQL; a damaged page costs its own rows only.
 """
 
 import os
@@ -57,8 +57,8 @@ class PageReader:
     """
     Reads the leaves below one root page in the order of the row ids.
 
-    When inner pages are damaged or the file is truncated, all leaves of the file are read in their order instead: the inner page
-    above the first rows of a table is often much later in the file.
+    When inner pages are damaged or the file is truncated, all leaves of the file are read in their
+    order instead: the inner page above the first rows of a table is often much later in the file.
     """
 
     def __init__(self, path: Path, root: int):
@@ -142,7 +142,11 @@ class PageReader:
         yield from self._leaf_groups(np.array([self.root]), 0)
 
     def _leaf_groups(self, pages, depth):
-        """Yield arrays of leaf page numbers below `pages`, all of one level; a page listed several times, or by itself, counts once."""
+        """
+        Yield arrays of leaf page numbers below `pages`, all of one level.
+
+        A page listed several times, or by itself, counts once.
+        """
         inside = pages[(pages >= 1) & (pages <= self.n_pages)]
         inside = inside[~self.is_seen[inside]]
         inside = inside[np.sort(np.unique(inside, return_index=True)[1])]
@@ -216,7 +220,11 @@ def _read_into(descriptor, target, offset):
 
 
 def _parse_cells(buffer, cell, page_end, largest):
-    """Return (MessageRows, mask of the sensible ones) for the table cells at `cell`, which must end before `page_end`."""
+    """
+    Return (MessageRows, mask of the sensible ones) for the table cells at `cell`.
+
+    The cells must end before `page_end`.
+    """
     payload_size, position = _varint(buffer, cell)
     row_id, position = _varint(buffer, position)
     header_size, field = _varint(buffer, position)
@@ -239,9 +247,10 @@ def _parse_cells(buffer, cell, page_end, largest):
         & (value <= page_end)
     )
     sensible &= (start - position + size == payload_size) & (~inside | (start + size <= page_end))
-    return MessageRows(
-        buffer, row_id, topic_id, start, size, inside, received_at, types[2]
-    ), sensible
+    return (
+        MessageRows(buffer, row_id, topic_id, start, size, inside, received_at, types[2]),
+        sensible,
+    )
 
 
 def _varint(buffer, position):

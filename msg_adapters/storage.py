@@ -37,7 +37,11 @@ class RawMessages(NamedTuple):
     """The messages."""
 
     def of(self, number: int) -> tuple[Packed, Callable[[], np.ndarray]]:
-        """Return the messages of one of the requested topics, and a function that returns their receive times."""
+        """
+        Return the messages of one of the requested topics.
+
+        A function that returns their receive times is returned too.
+        """
         mine = np.flatnonzero(self.topic == number)
         return self.packed.select(mine), lambda: self.received_ns()[mine]
 
@@ -46,8 +50,9 @@ class StorageFile:
     """
     Base of the readers of one file.
 
-    They provide `topic_ids` (topic -> numbers), `_stretches` and `unpack`, count in `lost`, and have `types`, `definitions`, `count`,
-    `time_range` and `close`. Writers have `add_topic`, `write`, `close` (finishes the file) and `abort`.
+    They provide `topic_ids` (topic -> numbers), `_stretches` and `unpack`, count in `lost`, and
+    have `types`, `definitions`, `count`, `time_range` and `close`. Writers have `add_topic`,
+    `write`, `close` (finishes the file) and `abort`.
     """
 
     topic_ids: dict[str, list[int]]
@@ -64,7 +69,11 @@ class StorageFile:
         raise NotImplementedError
 
     def stretches(self, topics: Sequence[str]) -> Iterator[RawMessages]:
-        """Yield RawMessages of the topics in file order; lost messages of the file are counted in `lost`."""
+        """
+        Yield RawMessages of the topics in file order.
+
+        Lost messages of the file are counted in `lost`.
+        """
         for stretch in self._stretches(topics):
             code = np.full(len(stretch.topic_ids), -1)
             for number, topic in enumerate(topics):
@@ -88,7 +97,11 @@ class StorageFile:
         return mine[kept], Packed.join(messages)
 
     def _unpacked(self, data, n_before):
-        """Return a decompressed message of a stretch that has `n_before` bytes already; None when it is lost."""
+        """
+        Return a decompressed message of a stretch that has `n_before` bytes already.
+
+        None when it is lost.
+        """
         if n_before >= LARGEST_STRETCH:
             return self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
         try:

@@ -19,7 +19,9 @@ from msg_adapters.layout import NS_PER_S, Packed, frame_head
 NO_ORIENTATION = (0.0, 0.0, 0.0, 1.0)
 UNKNOWN_COVARIANCE = (0.0,) * 9
 ABSENT_COVARIANCE = (-1.0,) + (0.0,) * 8
-"""Covariances: all zeros means unknown, -1 first means that the message does not hold the quantity."""
+"""
+Covariances: all zeros means unknown, -1 first means that the message does not hold the quantity.
+"""
 
 
 def encode_imu(
@@ -52,7 +54,11 @@ def encode_imu(
 
 
 def encode_joints(joints: JointSamples, with_velocity: bool = True) -> np.ndarray:
-    """Serialize JointSamples (see `encode_imu`), with an empty sequence of velocities when these are left out."""
+    """
+    Serialize JointSamples (see `encode_imu`).
+
+    With an empty sequence of velocities when these are left out.
+    """
     count = struct.pack('<I', len(joints.names))
     head = _padded(_string(''), 4) + count
     for name in joints.names:
@@ -83,7 +89,11 @@ def _padded(data, size):
 
 
 def _table(stamp_ns, head, pieces):
-    """Lay encapsulation, stamp, `head` and the pieces (constant bytes, or doubles per row) side by side."""
+    """
+    Lay encapsulation, stamp, `head` and the pieces side by side.
+
+    The pieces are constant bytes, or doubles per row.
+    """
     n = len(stamp_ns)
     stamps = np.empty((n, 2), dtype='<i4')
     stamps[:, 0], stamps[:, 1] = np.divmod(np.asarray(stamp_ns, dtype=np.int64), NS_PER_S)
@@ -184,7 +194,9 @@ def write_trajectories(
     storage: str = 'sqlite3',
 ) -> None:
     """
-    Write joint trajectories into a new bag, each at the time (ns) at which it shall begin: played back, it drives the joints.
+    Write joint trajectories into a new bag, each at the time (ns) at which it shall begin.
+
+    Played back, it drives the joints.
 
     Raises
     ------

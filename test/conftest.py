@@ -44,7 +44,12 @@ FEW = (
 
 @pytest.fixture(scope='module')
 def few_candidates(request):
-    """Restrict the candidates of each search on a table to effects of users and `FEW` of the module or of this file: it takes a third of the time."""
+    """
+    Restrict the candidates of each search on a table to a few effects.
+
+    These are effects of users and `FEW` of the module or of this file, and this needs a third of
+    the time.
+    """
     from imu_calibration.effects.catalogue import CATALOGUE
     from imu_calibration.selection import investigation
 
@@ -61,13 +66,21 @@ def few_candidates(request):
 
 
 def pytest_configure(config):
-    """Keep the order of the files that `pytest_collection_modifyitems` gives; earlier versions of xdist, as in Ubuntu 24.04, know no other."""
+    """
+    Keep the order of the files that `pytest_collection_modifyitems` gives.
+
+    Earlier versions of xdist, as in Ubuntu 24.04, know no other.
+    """
     if hasattr(config.option, 'loadscopereorder'):
         config.option.loadscopereorder = False
 
 
 def pytest_collection_modifyitems(items):
-    """Let the files with the most long tests begin first: one that begins last keeps the other processes waiting for it."""
+    """
+    Let the files with the most long tests begin first.
+
+    One that begins last keeps the other processes waiting for it.
+    """
     long = Counter(
         item.path for item in items if any(map(item.get_closest_marker, ('slow', 'long', 'live')))
     )

@@ -1,4 +1,8 @@
-"""Pytest plugin: keeps processes and DDS out of the core lane and reports the processor time of the slowest tests."""
+"""
+Pytest plugin.
+
+Keeps processes and DDS out of the core lane and reports the processor time of the slowest tests.
+"""
 
 import functools
 import multiprocessing.util
@@ -19,13 +23,18 @@ _start = pytest.StashKey()
 
 
 def _kept_out(function, action):
-    """Return a function that fails a core test before it acts; a failure is no Exception, so that code under test cannot catch it."""
+    """
+    Return a function that fails a core test before it acts.
+
+    A failure is no Exception, so that code under test cannot catch it.
+    """
 
     @functools.wraps(function)
     def guarded(*arguments, **options):
         if _core_test and not _library_calls():
             pytest.fail(
-                f'A core test must not {action}; {_core_test} did: mark it with pytest.mark.live, or test without it.'
+                f'A core test must not {action}; {_core_test} did: mark it with pytest.mark.live,'
+                ' or test without it.'
             )
         return function(*arguments, **options)
 
@@ -33,7 +42,11 @@ def _kept_out(function, action):
 
 
 def _library_calls():
-    """Return whether an installed library acts by itself, as matplotlib, which runs fc-list when it has no list of fonts yet."""
+    """
+    Return whether an installed library acts by itself.
+
+    As matplotlib, which runs fc-list when it has no list of fonts yet.
+    """
     frame = sys._getframe(2)
     while (
         frame
@@ -59,7 +72,11 @@ def pytest_configure():
 
 
 def _processor_time():
-    """Return seconds of this process and of its ended children; those do not depend on other work of the machine."""
+    """
+    Return seconds of this process and of its ended children.
+
+    Those do not depend on other work of the machine.
+    """
     return sum(os.times()[:4])
 
 
@@ -77,7 +94,9 @@ def pytest_runtest_protocol(item):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
-    """Attach the processor time to the last report of a test, which also arrives from other processes."""
+    """
+    Attach the processor time to the last report of a test, which also arrives from other processes.
+    """
     report = yield
     if call.when == 'teardown':
         report.user_properties.append(('processor_seconds', _processor_time() - item.stash[_start]))
@@ -105,7 +124,8 @@ def pytest_terminal_summary(terminalreporter):
     if not slowest:
         return
     terminalreporter.section(
-        f'slowest {len(slowest)} of {len(_seconds)} tests, {sum(_seconds.values()):.0f} s of processor time in total'
+        f'slowest {len(slowest)} of {len(_seconds)} tests, {sum(_seconds.values()):.0f} s of'
+        ' processor time in total'
     )
     for name, seconds in slowest:
         terminalreporter.write_line(f'{seconds:6.1f} s {name}')

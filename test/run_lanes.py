@@ -1,8 +1,10 @@
 """
-Run lanes of the suite: `run_lanes.py LANE [LANE ...] [-- PYTEST OPTIONS]`; lanes are core, live and long.
+Run lanes of the suite: `run_lanes.py LANE [LANE ...] [-- PYTEST OPTIONS]`.
 
-Live tests that fail run once more after all others, in one process. The run passes if all of them pass then; each is listed as
-`unstable: NAME` with its first failure. A core test is never repeated.
+Lanes are core, live and long.
+
+Live tests that fail run once more after all others, in one process. The run passes if all of them
+pass then; each is listed as `unstable: NAME` with its first failure. A core test is never repeated.
 """
 
 import argparse
@@ -53,7 +55,8 @@ def run(lanes, options):
     if again.returncode == 0:
         for name, report in failures.reports.items():
             print(
-                f'unstable: {name} failed once and passed when repeated; first failure:\n{report.longreprtext}\n'
+                f'unstable: {name} failed once and passed when repeated; first'
+                f' failure:\n{report.longreprtext}\n'
             )
     print(again.stdout, again.stderr, sep='', end='', flush=True)  # ends with pytest's closing line
     return again.returncode

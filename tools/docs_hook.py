@@ -1,4 +1,8 @@
-"""Pages that `make docs` makes: the README as first page, other pages of the root, and one page of the Python interface per package."""
+"""
+Pages that `make docs` makes.
+
+The README as first page, other pages of the root, and one page of the Python interface per package.
+"""
 
 import ast
 import re
@@ -29,7 +33,9 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, **_):
-    """Lead links to the page in the site; a link to another file of the repository becomes its name."""
+    """
+    Lead links to the page in the site; a link to another file of the repository becomes its name.
+    """
     here = (
         ROOT / PAGES[page.file.src_uri]
         if page.file.src_uri in PAGES
@@ -52,7 +58,11 @@ def on_page_markdown(markdown, page, **_):
 
 
 def on_post_page(output, page, **_):
-    """Replace the script that the theme would load from another host, for search in pages opened from files."""
+    """
+    Replace the script that the theme would load from another host.
+
+    For search in pages opened from files.
+    """
     up = '../' * page.file.src_uri.count('/')
     return re.sub(
         r'<script src="?https://unpkg.com/iframe-worker/shim"?>',
@@ -72,7 +82,9 @@ def on_post_build(config):
 
 
 def interface():
-    """Return {page: text} with one page per package and one section per module that has public names."""
+    """
+    Return {page: text} with one page per package and one section per module that has public names.
+    """
     pages = {}
     packages = sorted(path.parent for path in (ROOT / 'imu_calibration').glob('*/__init__.py'))
     for folder in [ROOT / 'imu_calibration', ROOT / 'msg_adapters', *packages]:
@@ -94,8 +106,10 @@ def interface():
             )
     links = '\n'.join(f'- [{Path(page).stem}]({Path(page).name})' for page in pages)
     return {
-        'api/index.md': f'# Python interface\n\nPublic functions and classes, from their docstrings. Start with '
-        f'[use_cases](imu_calibration.use_cases.md).\n\n{links}\n'
+        'api/index.md': (
+            '# Python interface\n\nPublic functions and classes, from their docstrings. Start with'
+            f' [use_cases](imu_calibration.use_cases.md).\n\n{links}\n'
+        )
     } | pages
 
 

@@ -1,4 +1,6 @@
-"""The parameter files of the nodes, written from the declarations of their settings: ``make config``."""
+"""
+The parameter files of the nodes, written from the declarations of their settings: ``make config``.
+"""
 
 import textwrap
 from pathlib import Path
@@ -21,7 +23,10 @@ def main(folder: Path = Path(__file__).resolve().parents[1] / 'config') -> None:
 def rendered(node: str) -> str:
     """Return the text of the parameter file of `node`."""
     lines = [
-        f'# Parameters of {node} with their defaults: meaning [unit], range, and symptoms of a wrong value.',
+        (
+            f'# Parameters of {node} with their defaults: meaning [unit], range, and symptoms of a'
+            ' wrong value.'
+        ),
         '/**:',
         '  ros__parameters:',
     ]

@@ -1,10 +1,13 @@
 #!/usr/bin/env python3
 """
-Count marker words in docstrings, comments, messages and pages: words that technical English rarely needs; fail above a limit.
+Count marker words in docstrings, comments, messages and pages.
 
-Usage: `plain.py [ROOT] [--folders] [--worst N]`; ROOT is a folder or one file. A marker is frequent in sentences with one of four habits:
-a clause in place of a noun ("what is left" for "the residual"), data that speak ("the windows say"), a common verb in place of the
-technical one ("goes with" for "correlates with"), and a vague pronoun. Good packages have 0.5 to 5 per 1,000 words.
+Words that technical English rarely needs; fail above a limit.
+
+Usage: `plain.py [ROOT] [--folders] [--worst N]`; ROOT is a folder or one file. A marker is frequent
+in sentences with one of four habits: a clause in place of a noun ("what is left" for "the
+residual"), data that speak ("the windows say"), a common verb in place of the technical one ("goes
+with" for "correlates with"), and a vague pronoun. Good packages have 0.5 to 5 per 1,000 words.
 """
 
 import argparse
@@ -16,7 +19,10 @@ import sys
 import tokenize
 
 MOST = {'docstring': 6.0, 'comment': 6.0, 'message': 8.0, 'page': 10.0}
-"""Largest number of markers per 1,000 words of each kind of text; lower it when the rate has fallen, never raise it."""
+"""
+Largest number of markers per 1,000 words of each kind of text; lower it when the rate has fallen,
+never raise it.
+"""
 MOST_WORDS = {
     'README.md': 900,
     'docs/turntable.md': 900,
@@ -117,7 +123,10 @@ def main():
 
     def row(name, numbers):
         words, hits, long = numbers
-        return f'{name:34s} {words:7d} words {1000 * hits / max(words, 1):6.1f} markers per 1,000  {long:4d} sentences above 30 words'
+        return (
+            f'{name:34s} {words:7d} words {1000 * hits / max(words, 1):6.1f} markers per 1,000 '
+            f' {long:4d} sentences above 30 words'
+        )
 
     for (group, name), numbers in sorted(
         count.items(), key=lambda item: (item[0][0] != 'place', -item[1][1])
@@ -139,8 +148,8 @@ def main():
     if not arguments.root.is_dir():
         return
     faults = [
-        f'marker words per 1,000 words in {kind}s must be at most {MOST[kind]:g}, got {rate:.2f}; rewrite the sentences that '
-        '`tools/plain.py --worst 20` prints'
+        f'marker words per 1,000 words in {kind}s must be at most {MOST[kind]:g}, got {rate:.2f};'
+        ' rewrite the sentences that `tools/plain.py --worst 20` prints'
         for kind, rate in rates.items()
         if rate > MOST[kind]
     ]
@@ -149,7 +158,8 @@ def main():
             words = len(path.read_text().split())
             if words > most:
                 faults.append(
-                    f'{path.relative_to(arguments.root)} must have at most {most} words, got {words}; shorten it'
+                    f'{path.relative_to(arguments.root)} must have at most {most} words, got'
+                    f' {words}; shorten it'
                 )
     if faults:
         sys.exit('\n'.join(faults))

@@ -1,4 +1,6 @@
-"""The file of tolerances that users copy and change, written from the catalogue: ``make config``."""
+"""
+The file of tolerances that users copy and change, written from the catalogue: ``make config``.
+"""
 
 from pathlib import Path
 
@@ -16,14 +18,19 @@ COMMENT_AT = 35
 
 
 def rendered(catalogue: Catalogue = CATALOGUE) -> str:
-    """Return the text of the file: every effect's tolerance as it is declared, with its unit and reason."""
+    """
+    Return the text of the file.
+
+    Every effect's tolerance as it is declared, with its unit and reason.
+    """
     lines = [HEAD]
     for section in SECTIONS:
         effects = [effect for effect in catalogue.effects().values() if effect.sensor == section]
         lines += [
             f'{section}:',
             *(
-                f'{f"  {e.name}: {_number(e.tolerance)}":{COMMENT_AT - 1}} # {e.unit_of(0)}: {e.tolerance_reason}'
+                f'{f"  {e.name}: {_number(e.tolerance)}":{COMMENT_AT - 1}} # {e.unit_of(0)}:'
+                f' {e.tolerance_reason}'
                 for e in effects
             ),
             '',

@@ -1,10 +1,13 @@
 #!/usr/bin/env python3
 """
-Print tokens, statements, files and import cycles of imu_calibration and msg_adapters; fail if there is a cycle.
+Print tokens, statements, files and import cycles of imu_calibration and msg_adapters.
 
-Usage: `weigh.py [ROOT] [--packages]`. Tokens and statements are counted without comments and docstrings (strings under fields and
-constants count as docstrings); lines do not count, because a limit on them rewards packing. A cycle is a set of modules that import each
-other by any import statement at any depth, under TYPE_CHECKING too.
+Fail if there is a cycle.
+
+Usage: `weigh.py [ROOT] [--packages]`. Tokens and statements are counted without comments and
+docstrings (strings under fields and constants count as docstrings); lines do not count, because a
+limit on them rewards packing. A cycle is a set of modules that import each other by any import
+statement at any depth, under TYPE_CHECKING too.
 """
 
 import argparse

@@ -1,4 +1,8 @@
-"""The claims, measured on real recordings: `make validate` runs every section and writes docs/validation.md."""
+"""
+The claims, measured on real recordings.
+
+`make validate` runs every section and writes docs/validation.md.
+"""
 
 import os
 

@@ -1,4 +1,8 @@
-"""Prediction of the readings of another IMU on the same board by compensator_node with a known arm: live, over real DDS."""
+"""
+Prediction of the readings of another IMU on the same board by compensator_node with a known arm.
+
+Live, over real DDS.
+"""
 
 import importlib.util
 import os
@@ -64,7 +68,11 @@ class Case:
 
 
 def prepare(folder, name, arm_from, pair=PAIR, seconds=STRETCH_S):
-    """Return the Case of the last `seconds` of a recording: calibrations from its poses, the arm from the recording `arm_from`."""
+    """
+    Return the Case of the last `seconds` of a recording.
+
+    Calibrations from its poses, the arm from the recording `arm_from`.
+    """
     topics = [f'/imu_{k}/data_raw' for k in pair]
     imus = [load(folder, name, topic) for topic in topics]
     found = []
@@ -97,7 +105,10 @@ def _after(bad):
 
 def play(case, speed=SPEED, domain_id=DOMAIN):
     """
-    Send A's messages to two compensator nodes, one with the rotation to B's frame, one with the arm to B too; return the published messages of each.
+    Send A's messages to two compensator nodes and return their published messages.
+
+    One has the rotation to B's frame, and the other one has the arm to B too; the messages of each
+    are returned.
 
     Returns
     -------
@@ -188,7 +199,11 @@ def _spin_until(executor, condition, seconds, what=None):
 
 
 def residuals(case, came):
-    """Return {'turned', 'moved': B's force minus the published force, for usable samples, shape (m, 3)}, and the numbers of messages."""
+    """
+    Return {'turned', 'moved': force differences}, and the numbers of messages.
+
+    A difference is B's force minus the published force, for usable samples, shape (m, 3).
+    """
     stamps = case.imu_a.stamp_ns.tolist()
     both = np.array([all(stamp in messages for messages in came.values()) for stamp in stamps])
     keep = case.usable & both
@@ -207,10 +222,13 @@ def rms(values):
 
 def looking_ahead(case):
     """
-    Return the residuals of two predictions with future samples, which a live node does not have, (m, 3) each, on the usable samples.
+    Return the residuals of two predictions with future samples, (m, 3) each.
 
-    'central': the angular acceleration from the samples before and after. 'filter': from nine samples, with the weights that
-    fit B's readings in this stretch best; its residual is not determined by the samples of the rate.
+    A live node does not have these samples, and the residuals are on the usable samples.
+
+    'central': the angular acceleration from the samples before and after. 'filter': from nine
+    samples, with the weights that fit B's readings in this stretch best; its residual is not
+    determined by the samples of the rate.
     """
     calibration, (xyz, rpy), imu = (
         calibration_from_text(case.calibration),

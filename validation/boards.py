@@ -55,7 +55,8 @@ def run(folder, plots):
     section.claim(
         'arm of a pair from the two recordings, difference per axis',
         'within three of its sds (0.3 mm until 0.30 mm was seen)',
-        f'at most {in_sd.max():.1f} sd, rms {_rms(in_sd):.2f} sd; at most {np.abs(apart).max():.2f} mm, sds {expected.min():.2f} to {expected.max():.2f} mm',
+        f'at most {in_sd.max():.1f} sd, rms {_rms(in_sd):.2f} sd; at most {np.abs(apart).max():.2f}'
+        f' mm, sds {expected.min():.2f} to {expected.max():.2f} mm',
         in_sd.max() < 3.0,
     )
     ratios = np.array(

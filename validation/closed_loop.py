@@ -1,10 +1,14 @@
 """
-Closed loop: diagnose a session with a hidden cause, simulate the finding on the same motion, diagnose the simulation, compare.
+Closed loop: diagnose a session, simulate the finding, diagnose it, compare.
 
-Usage: `python -m validation.closed_loop [--seed N] [--only NAME ...]` prints one line for each loop and the table. Causes: each effect of the
-catalogue with a known size, one formula per template of the grammar, and, for each pair in `indistinguishable_from`, the other member at the
-size that the diagnosis estimated for it. In the second diagnosis the true size is that of the first finding, so that
-z = (second size - first size) / (sd of the second) has a standard deviation of 1 where the reported sds are correct.
+The session has a hidden cause, and the simulation is on the same motion.
+
+Usage: `python -m validation.closed_loop [--seed N] [--only NAME ...]` prints one line for each loop
+and the table. Causes: each effect of the catalogue with a known size, one formula per template of
+the grammar, and, for each pair in `indistinguishable_from`, the other member at the size that the
+diagnosis estimated for it. In the second diagnosis the true size is that of the first finding, so
+that z = (second size - first size) / (sd of the second) has a standard deviation of 1 where the
+reported sds are correct.
 """
 
 import argparse
@@ -94,7 +98,11 @@ def measured_sessions(names):
 
 
 def sizes_of(found):
-    """Return {name: {parameter: (value, sd)}} of the findings and formulas, implausible findings excepted."""
+    """
+    Return {name: {parameter: (value, sd)}} of the findings and formulas.
+
+    Implausible findings are excepted.
+    """
     sizes = {
         finding.effect: {name: (value, sd) for name, (value, sd, _) in finding.parameters.items()}
         for finding in found.findings
@@ -121,7 +129,9 @@ def values_of(calibration):
 
 
 def same_formula(column, known):
-    """Return whether two columns differ in their estimated phases only, by less than `SAME_PHASE`."""
+    """
+    Return whether two columns differ in their estimated phases only, by less than `SAME_PHASE`.
+    """
     one, other = (
         np.array([float(sign + phase) for sign, phase in PHASE.findall(text)])
         for text in (column, known)
@@ -135,7 +145,11 @@ def same_formula(column, known):
 
 
 def compared(expected, calibration, measured, seed):
-    """Simulate a calibration on the motion of a session, diagnose the simulation and compare with {name: {parameter: value}}."""
+    """
+    Simulate a calibration on the motion of a session, and diagnose the simulation.
+
+    The result is compared with {name: {parameter: value}}.
+    """
     second = diagnose(
         replay(measured.samples, calibration, measured.table, seed=seed).samples, measured.table
     )
@@ -171,7 +185,9 @@ def compared(expected, calibration, measured, seed):
 
 def exchanged(calibration, finding, mate, measured):
     """
-    Return the calibration of a session with `mate` in the place of a finding, or None where it is not determined.
+    Return the calibration of a session with `mate` in the place of a finding.
+
+    Or None where it is not determined.
 
     All parameters are estimated with it: a drift in place of a thermal bias needs another bias.
     """
@@ -236,9 +252,10 @@ def run(names, seed):
             )
         for row in found:
             print(
-                f'{row["cause"]}: found {", ".join(row["found"]) or "-"}; again {", ".join(row["again"]) or "-"}; new '
-                f'{", ".join(row["new"]) or "-"}; z {" ".join(f"{z:.1f}" for z in row["z"])} {row.get("why", "")} '
-                f'({time.process_time() - start:.0f} s)',
+                f'{row["cause"]}: found {", ".join(row["found"]) or "-"}; again'
+                f' {", ".join(row["again"]) or "-"}; new {", ".join(row["new"]) or "-"}; z'
+                f' {" ".join(f"{z:.1f}" for z in row["z"])} {row.get("why", "")}'
+                f' ({time.process_time() - start:.0f} s)',
                 flush=True,
             )
         rows += found

@@ -1,4 +1,8 @@
-"""Tests of one recording of hardware against another: halves, two parts of one trial, and recordings that are refused."""
+"""
+Tests of one recording of hardware against another.
+
+Halves, two parts of one trial, and recordings that are refused.
+"""
 
 from dataclasses import replace
 from functools import cache
@@ -58,7 +62,11 @@ def _calibrated(folder, name, part):
 
 
 def transfer(folder, made, used, parts=(None, None)):
-    """Return (Calibrated or the refusal, CheckResult or None): calibrated on one recording or half, checked on another."""
+    """
+    Return (Calibrated or the refusal, CheckResult or None).
+
+    Calibrated on one recording or half, checked on another.
+    """
     table, block = recording(folder, used)
     try:
         found = _calibrated(folder, made, parts[0])
@@ -70,7 +78,11 @@ def transfer(folder, made, used, parts=(None, None)):
 
 
 def outcome(found, checked):
-    """Return (outcome as text, whether it is correct): each sensor helps without harm in a motion, or the recording is refused."""
+    """
+    Return (outcome as text, whether it is correct).
+
+    Each sensor helps without harm in a motion, or the recording is refused.
+    """
     if checked is None:
         return f'refused: {found}', True
     words, claimed = [], []
@@ -80,7 +92,8 @@ def outcome(found, checked):
             max(part['after'] / part['before'] for part in entry['regimes'].values()),
         )
         words.append(
-            f'{sensor} {found.verdict.decisions[sensor]}: {ratio:.2f}, at most {worst:.2f} in any motion'
+            f'{sensor} {found.verdict.decisions[sensor]}: {ratio:.2f}, at most {worst:.2f} in any'
+            ' motion'
         )
         claimed.append(
             found.verdict.decisions[sensor] is not HELPS or ratio < 1.0 and worst <= WORSE
@@ -92,7 +105,8 @@ def spread(first, second):
     """
     Return the differences over combined standard deviations of the common parameters, by group.
 
-    Delays and filters of a sensor are one group, because they are alternative descriptions of one cause; their sum is a separate group.
+    Delays and filters of a sensor are one group, because they are alternative descriptions of one
+    cause; their sum is a separate group.
     """
     groups = {}
     theirs = dict(zip(second.param_names, zip(second.values, second.sd, second.status)))
@@ -167,9 +181,10 @@ def _attempt(source, table: Table, **choices):
         for item in found.calibration.statistics['preflight']
         if 'frozen' in item['text'] or 'stay' in item['text']
     ]
-    return found.verdict.text + ''.join(f'; {text}' for text in warned[:1]), bool(
-        warned
-    ) or HELPS not in found.verdict.decisions.values()
+    return (
+        found.verdict.text + ''.join(f'; {text}' for text in warned[:1]),
+        bool(warned) or HELPS not in found.verdict.decisions.values(),
+    )
 
 
 def run(folder, plots):
@@ -196,7 +211,8 @@ def run(folder, plots):
     for name in RECORDINGS:
         for made, used in ((0, 1), (1, 0)):
             section.claim(
-                f'{name}: half {made + 1} calibrates, half {used + 1} is compensated: error after / before',
+                f'{name}: half {made + 1} calibrates, half {used + 1} is compensated: error after /'
+                ' before',
                 'below 1, in no motion above 1.05, or refused',
                 *outcome(*transfer(folder, name, name, (made, used))),
                 made == 0,

@@ -1,4 +1,8 @@
-"""Decision and truth: sensors that are calibrated on one session and judged on a second session of the same unit."""
+"""
+Decision and truth.
+
+Sensors that are calibrated on one session and judged on a second session of the same unit.
+"""
 
 import argparse
 import sys
@@ -52,7 +56,9 @@ class Outcome:
 
 
 def judged(case, first, second, table=None, **choices) -> Iterator[Outcome]:
-    """Yield the Outcome of each sensor: calibrated on the first session, with the error on the second."""
+    """
+    Yield the Outcome of each sensor: calibrated on the first session, with the error on the second.
+    """
     try:
         found = calibrate(first, table, **choices)
         proof = check(second, found.calibration, table, **choices).proof
@@ -69,7 +75,11 @@ def judged(case, first, second, table=None, **choices) -> Iterator[Outcome]:
 
 
 def real(folder) -> Iterator[Outcome]:
-    """Yield the outcomes of the recordings: two parts of one trial, and halves, each calibrated on the one and judged on the other."""
+    """
+    Yield the outcomes of the recordings.
+
+    Two parts of one trial, and halves, each calibrated on the one and judged on the other.
+    """
     from validation.cross import ONE_UNIT, RECORDINGS, halves, recording
 
     for first, second in ONE_UNIT:
@@ -151,17 +161,20 @@ def _moved(block, force, rate):
 def _coarse(seed):
     """Both sensors have steps far above their noise."""
     first, second, table = _on_table(seed)
-    return *(
-        replace(
-            block,
-            imu=replace(
-                block.imu,
-                force_s=0.08 * np.round(block.imu.force_s / 0.08),
-                rate_s=0.02 * np.round(block.imu.rate_s / 0.02),
-            ),
-        )
-        for block in (first, second)
-    ), table
+    return (
+        *(
+            replace(
+                block,
+                imu=replace(
+                    block.imu,
+                    force_s=0.08 * np.round(block.imu.force_s / 0.08),
+                    rate_s=0.02 * np.round(block.imu.rate_s / 0.02),
+                ),
+            )
+            for block in (first, second)
+        ),
+        table,
+    )
 
 
 def _by_hand(seed, *, poses, faces=False):
@@ -288,8 +301,9 @@ def run(folder, plots):
     """Return the section."""
     section = Section('Decision and truth')
     section.say(
-        'Each sensor is calibrated on one session and judged on a second session, or the other half, of the same unit. Both halves of a recording and both '
-        'sensors of an IMU are counted, which are not independent.'
+        'Each sensor is calibrated on one session and judged on a second session, or the other'
+        ' half, of the same unit. Both halves of a recording and both sensors of an IMU are'
+        ' counted, which are not independent.'
     )
     add_claims(section, SESSIONS['real'], list(real(folder)))
     add_claims(section, SESSIONS['simulated'], list(simulated()))

@@ -1,4 +1,8 @@
-"""Diagnosis on every recording: whatever is found must lower the error on data held out; what is not explained is said with its size."""
+"""
+Diagnosis on every recording: whatever is found must lower the error on data held out.
+
+What is not explained is said with its size.
+"""
 
 import json
 from pathlib import Path
@@ -35,7 +39,10 @@ def found_text(finding):
     name, largest = max(finding['parameters'].items(), key=_clearness)
     factor, unit = for_people(largest['unit'])
     mates = finding.get('indistinguishable_from') or []
-    size = f'{significant(largest["value"] * factor)} ± {significant(largest["sd"] * factor, 2)} {unit}'
+    size = (
+        f'{significant(largest["value"] * factor)} ± {significant(largest["sd"] * factor, 2)}'
+        f' {unit}'
+    )
     return f'{finding["effect"]}: {name.split(".", 1)[1]} {size}' + (
         f' (or {", ".join(mates)})' if mates else ''
     )
@@ -61,7 +68,10 @@ def unexplained_text(document, sensor):
         return 'not tested'
     factor, unit = for_people(rest['unit'])
     along = f', with {rest["correlates_with"]}' if rest.get('correlates_with') else ''
-    return f'{"**significant**" if rest.get("significant") else "no"}, {significant(rest["rms"] * factor)} {unit}{along}'
+    return (
+        f'{"**significant**" if rest.get("significant") else "no"},'
+        f' {significant(rest["rms"] * factor)} {unit}{along}'
+    )
 
 
 def run(folder, plots):
@@ -83,7 +93,8 @@ def run(folder, plots):
     )
     good = sum(lowers(finding) for finding in findings)
     section.claim(
-        'every finding lowers the error on data held out, with its whole interval (what does not is withdrawn beforehand: this counts, it is no test)',
+        'every finding lowers the error on data held out, with its whole interval (what does not is'
+        ' withdrawn beforehand: this counts, it is no test)',
         f'all {len(findings)} findings',
         f'{good} of {len(findings)}',
         good == len(findings),
@@ -163,7 +174,10 @@ LAGS = ('time_offset', 'gyro_bandwidth', 'gyro_delay', 'gyro_filter')
 def _shaft(section, name, document):
     claim, wanted = (
         f'{name}: the lag is found by itself',
-        'a lag of the gyroscope, of whichever kind, together 12 to 14 in whole ms (12.0 to 14.0 until 11.97 was seen; time_offset or gyro_bandwidth while there were no others)',
+        (
+            'a lag of the gyroscope, of whichever kind, together 12 to 14 in whole ms (12.0 to 14.0'
+            ' until 11.97 was seen; time_offset or gyro_bandwidth while there were no others)'
+        ),
     )
     if isinstance(document, str):
         section.claim(claim, wanted, document, False)

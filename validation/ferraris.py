@@ -1,4 +1,6 @@
-"""Six faces and three full turns by hand: this project compared with imucal on the same sections."""
+"""
+Six faces and three full turns by hand: this project compared with imucal on the same sections.
+"""
 
 import numpy as np
 
@@ -27,12 +29,15 @@ def calibrate_sections(imu, sections, angle):
     """Return our calibration from the six faces, the way between them, and the full turns."""
     faces = [slice(*sections[name]) for name in FACES]
     order = np.argsort([face.start for face in faces])
-    return calibrate_by_hand(
-        imu,
-        HandOptions(GRAVITY),
-        [faces[k] for k in order],
-        known_turns=known_turns(imu, sections, angle),
-    ), order
+    return (
+        calibrate_by_hand(
+            imu,
+            HandOptions(GRAVITY),
+            [faces[k] for k in order],
+            known_turns=known_turns(imu, sections, angle),
+        ),
+        order,
+    )
 
 
 def angles_between(matrix):
@@ -42,7 +47,11 @@ def angles_between(matrix):
 
 
 def comparable(found, info):
-    """Return [(parameter, unit, ours, imucal's, our sd or None)]: the quantities that are independent of the choice of axes."""
+    """
+    Return [(parameter, unit, ours, imucal's, our sd or None)].
+
+    The quantities that are independent of the choice of axes.
+    """
     (bias_f, matrix_f), (bias_w, matrix_w, _) = found.accelerometer, found.gyroscope
     theirs_f, theirs_w = accelerometer_of(info), info.K_g @ info.R_g
     rows = []
@@ -94,12 +103,20 @@ def _matrix_rows(sensor, ours, theirs, found):
 
 
 def faces_as_they_lay(found, order):
-    """Return the directions of gravity in x_p, x_a, ... as our calibration sees them, unit vectors in our axes, shape (6, 3)."""
+    """
+    Return the directions of gravity in x_p, x_a, ... as our calibration sees them.
+
+    They are unit vectors in our axes, shape (6, 3).
+    """
     return found.state.up[np.argsort(order)]
 
 
 def imucal_from_ours(found, up):
-    """Return (bias, matrix) that imucal's formulas give for our sensor with the faces as they lay, without noise."""
+    """
+    Return (bias, matrix) that imucal's formulas give for our sensor with the faces as they lay.
+
+    Without noise.
+    """
     bias, matrix = found.accelerometer
     readings = bias + GRAVITY * up @ matrix.T
     plus, minus = readings[0::2].T, readings[1::2].T
@@ -107,7 +124,11 @@ def imucal_from_ours(found, up):
 
 
 def tilts(up):
-    """Return the angle between each face and the axis of our frame that it represents, deg, shape (6,)."""
+    """
+    Return the angle between each face and the axis of our frame that it represents, deg.
+
+    Shape (6,).
+    """
     wanted = np.repeat(np.eye(3), 2, axis=0) * np.tile([1, -1], 3)[:, None]
     return np.degrees(np.arccos(np.clip(np.sum(up * wanted, axis=1), -1, 1)))
 
@@ -152,7 +173,8 @@ def run(folder, plots):
         headline=True,
     )
     section.claim(
-        "differences of the accelerometer explained: imucal's formulas on our sensor and the faces as they lay give its result",
+        "differences of the accelerometer explained: imucal's formulas on our sensor and the faces"
+        ' as they lay give its result',
         'bias within 1 mm/s², matrix within 0.0001',
         f'{1e3 * left[0]:.3f} mm/s², {left[1]:.6f}',
         left[0] < 1e-3 and left[1] < 1e-4,
@@ -165,9 +187,11 @@ def run(folder, plots):
             gravity=GRAVITY,
             turn_deg=known['turn_deg'],
             tilts=', '.join(f'{t:.1f}' for t in tilts(up)),
-            sensitivity='estimates it'
-            if sensitivity
-            else 'leaves it out, since six attitudes do not show it',
+            sensitivity=(
+                'estimates it'
+                if sensitivity
+                else 'leaves it out, since six attitudes do not show it'
+            ),
             weak=', '.join(weak) or 'nothing',
         )
     )

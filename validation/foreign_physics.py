@@ -1,8 +1,11 @@
 """
-Causes outside the package: twenty recordings with a place, twenty without one, forty without a cause (validation/foreign_worlds.py).
+Causes outside the package.
 
-Usage: `python -m validation.foreign_physics --seed N [--kinds NAME ...] [--empty N]` prints one line for each recording and the table.
-Reserved seeds: draw them once, after the search is frozen.
+Twenty recordings with a place, twenty without one, forty without a cause
+(validation/foreign_worlds.py).
+
+Usage: `python -m validation.foreign_physics --seed N [--kinds NAME ...] [--empty N]` prints one
+line for each recording and the table. Reserved seeds: draw them once, after the search is frozen.
 """
 
 import argparse
@@ -24,7 +27,9 @@ from validation.section import markdown_table
 SAME_PLACE = 0.7
 """F1 score of the reported and the true samples from which a place counts as correct."""
 WORSE = 1.05
-"""Largest allowed ratio of the rms errors on a second session, chosen model over bias and matrix only."""
+"""
+Largest allowed ratio of the rms errors on a second session, chosen model over bias and matrix only.
+"""
 SENSORS = ('accelerometer', 'gyroscope')
 KINDS = [
     'clock_stepped' if kind == 'accel_offset_in_outer_arc' else kind for kind in PLACED
@@ -102,7 +107,11 @@ def outcome(kind, unit, motion, *, second=True):
 
 
 def _place(world, regimes, onset=None):
-    """Return 'correct', 'false', 'missed' or 'none' for the reported places; an onset is the place after a time."""
+    """
+    Return 'correct', 'false', 'missed' or 'none' for the reported places.
+
+    An onset is the place after a time.
+    """
     if not regimes and onset is None:
         return 'missed' if world.place else 'none'
     if not world.place:
@@ -126,7 +135,11 @@ def _f1(time, options, world):
 
 
 def _second_session(block, table, kind, unit, motion):
-    """Return sensor -> rms error of a second session corrected by the chosen model over that by bias and matrix only."""
+    """
+    Return sensor -> ratio of the rms errors of a second session.
+
+    It is the rms error when corrected by the chosen model over that by bias and matrix only.
+    """
     plain = {
         'accelerometer_model': 'bias+matrix',
         'gyroscope_model': 'bias+matrix',
@@ -204,7 +217,10 @@ def table_of(rows):
             (
                 'refused with a reason',
                 '',
-                f'{count(hidden, lambda row: row["refused"])}, the second session {len(hidden) - len(worst)}',
+                (
+                    f'{count(hidden, lambda row: row["refused"])}, the second session'
+                    f' {len(hidden) - len(worst)}'
+                ),
             ),
             (
                 'processor time, median, 95 %, largest, s',

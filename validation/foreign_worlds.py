@@ -1,9 +1,12 @@
 """
-Recordings of a three-axis table whose physics is written here alone: rotations, filters, play operators and clocks are its own.
+Recordings of a three-axis table whose physics is written here alone.
 
-Nothing of the package is imported. `make_world` returns stamps, readings, joint angles and the truth about one hidden cause: its sensor,
-its axis, its place (a variable of the recording and a mask) or the fact that it has none, and the names that describe it correctly.
-Twenty kinds of worlds act at a place, twenty do not; a world without a cause is made with the kind 'nothing'.
+Rotations, filters, play operators and clocks are its own.
+
+Nothing of the package is imported. `make_world` returns stamps, readings, joint angles and the
+truth about one hidden cause: its sensor, its axis, its place (a variable of the recording and a
+mask) or the fact that it has none, and the names that describe it correctly. Twenty kinds of worlds
+act at a place, twenty do not; a world without a cause is made with the kind 'nothing'.
 """
 
 from dataclasses import dataclass, field
@@ -91,7 +94,11 @@ def _blend(start, end, duration, step):
 
 
 def _motion(rng, step):
-    """Return joint angles, rad, shape (n, 3): 26 poses of 4 s, two spins of each joint, swings of two joints at a time."""
+    """
+    Return joint angles, rad, shape (n, 3).
+
+    26 poses of 4 s, two spins of each joint, swings of two joints at a time.
+    """
     here, parts = np.zeros(3), []
     poses = rng.permutation(
         [[o, m, i] for o in (0, 90) for m in (-90, -45, 0, 45, 90) for i in (0, 90, 180)]
@@ -142,7 +149,11 @@ def _about(axis, angle):
 
 
 def _kinematics(angle, step):
-    """Return (joint rates, n-to-s matrices, specific force in s, rate in s) at the intersection of the axes."""
+    """
+    Return (joint rates, n-to-s matrices, specific force in s, rate in s).
+
+    They are at the intersection of the axes.
+    """
     turn = np.gradient(angle, step, axis=0)
     outer, middle, inner = (_about(axis, angle[:, k]) for k, axis in enumerate((2, 1, 0)))
     mat_ns = outer @ middle @ inner
@@ -160,7 +171,11 @@ def _kinematics(angle, step):
 
 
 def make_world(kind: str, unit: int, motion: int) -> World:
-    """Return a recording of a unit (which fixes instrument and cause) with a motion and noise of their own."""
+    """
+    Return a recording of a unit with a motion and noise of their own.
+
+    The unit fixes instrument and cause.
+    """
     own, rng = np.random.default_rng([unit, 1]), np.random.default_rng([motion, 2])
     step = 1.0 / RATE / FINE
     angle = _motion(rng, step)
@@ -242,7 +257,7 @@ def make_world(kind: str, unit: int, motion: int) -> World:
     )
 
 
-# --- causes at a place ---------------------------------------------------------------------------------------------------------------------
+# --- causes at a place ----------------------------------------------------------------------------
 
 
 def _mark(scene, sensor, inside, *place, names=(), axes=None):
@@ -451,7 +466,7 @@ PLACED = {
 """Kinds that act at a place."""
 
 
-# --- causes without a place ------------------------------------------------------------------------------------------------------------------
+# --- causes without a place -----------------------------------------------------------------------
 
 
 def _add(scene, sensor, signal, *, names=(), axes=None, size=1.0):
@@ -475,7 +490,11 @@ def _hysteretic_gyro(scene):
 
 
 def _resonator(values, hertz, damping, step):
-    """Return the deflection of a damped spring that is driven by values, divided by its static deflection (trapezoidal rule)."""
+    """
+    Return the deflection of a damped spring that is driven by values.
+
+    It is divided by its static deflection (trapezoidal rule).
+    """
     omega = 2 * np.pi * hertz
     above, below = bilinear([omega**2], [1.0, 2 * damping * omega, omega**2], 1.0 / step)
     return lfilter(above, below, values, zi=lfilter_zi(above, below) * values[0])[0]

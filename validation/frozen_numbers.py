@@ -1,11 +1,15 @@
 """
-Write every document of the verbs for the sample session, recordings and simulated sessions, and compare two such folders numerically.
+Write every document of the verbs, and compare two such folders numerically.
 
-A change that must keep all numbers is checked by one folder written before it and one written after it: numbers are the same if their
-bytes are, or if they differ by at most 1e-9 relative. Texts, names of software versions and hashes are not compared.
+The documents are for the sample session, recordings and simulated sessions.
 
-Run: ``python validation/frozen_numbers.py write FOLDER [--data DATA] [--recordings NAME ...] [--sessions N] [--without-plan]``
-and ``python validation/frozen_numbers.py compare FOLDER_A FOLDER_B``; exit code 1 when a number or an exit code differs.
+A change that must keep all numbers is checked by one folder written before it and one written after
+it: numbers are the same if their bytes are, or if they differ by at most 1e-9 relative. Texts,
+names of software versions and hashes are not compared.
+
+Run: ``python validation/frozen_numbers.py write FOLDER [--data DATA] [--recordings NAME ...]
+[--sessions N] [--without-plan]`` and ``python validation/frozen_numbers.py compare FOLDER_A
+FOLDER_B``; exit code 1 when a number or an exit code differs.
 """
 
 import argparse
@@ -42,7 +46,11 @@ class Writer:
         self.folder, self.codes = folder, {}
 
     def run(self, name, verb, *arguments):
-        """Run a verb with its result in `folder/name`, keep its printed document, and return whether it wrote a result."""
+        """
+        Run a verb with its result in `folder/name`, keep its printed document.
+
+        It returns whether the verb wrote a result.
+        """
         place = self.folder / name
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO()):
@@ -197,7 +205,9 @@ def compare(before, after):
 
 
 def differences(first, second):
-    """Return a line for the places in one document only, and one for each pair of numbers that differ."""
+    """
+    Return a line for the places in one document only, and one for each pair of numbers that differ.
+    """
     lonely = sorted(first.keys() ^ second.keys())
     found = [f'{len(lonely)} places in one document only, first {lonely[0]}'] if lonely else []
     for place in first.keys() & second.keys():

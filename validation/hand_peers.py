@@ -1,4 +1,8 @@
-"""Published programs for a calibration by hand, written again from their descriptions: what people would use instead."""
+"""
+Published programs for a calibration by hand, written again from their descriptions.
+
+What people would use instead.
+"""
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -9,15 +13,20 @@ from validation.second_opinions import Forward, fit_norm
 GUARD, QUIET_RATE = 60, 0.13
 """imu-calib: samples kept out on both sides of a motion, and the rate that is one, rad/s."""
 HALF_WINDOW, PER_REST, MULTIPLIERS, LEAST_RESTS = 50, 100, range(2, 11), 12
-"""imu_tk: half of the window of the variance, samples that are used of a rest, factors of the threshold, least number of rests."""
+"""
+imu_tk: half of the window of the variance, samples that are used of a rest, factors of the
+threshold, least number of rests.
+"""
 
 
 def imu_tk(imu, ranges, gravity, without=None):
     """
-    Return (accelerometer, gyroscope) as imu_tk (Tedaldi et al., ICRA 2014) does with the means of rests and the gyroscope's bias free.
+    Return (accelerometer, gyroscope) as imu_tk does (Tedaldi et al., ICRA 2014).
 
-    The rest at the beginning, `ranges[0]`, sets the threshold of the variance; the others it finds itself. None: it finds too few. Turns
-    that overlap the slice `without` are not used.
+    It uses the means of rests, and the gyroscope's bias is free.
+
+    The rest at the beginning, `ranges[0]`, sets the threshold of the variance; the others it finds
+    itself. None: it finds too few. Turns that overlap the slice `without` are not used.
     """
     first, time, best = ranges[0], 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), None
     variance, threshold = (
@@ -57,7 +66,11 @@ def imu_tk(imu, ranges, gravity, without=None):
 
 
 def imu_calib(imu, ranges, gravity, without=None):
-    """Return (accelerometer, gyroscope) as imu-calib (M. Mikov) does: a fixed threshold of the rate, even times, a soft loss."""
+    """
+    Return (accelerometer, gyroscope) as imu-calib (M. Mikov) does.
+
+    A fixed threshold of the rate, even times, a soft loss.
+    """
     first, rests = ranges[0], _resting(imu, ranges[0])
     step = 1e-9 * (imu.stamp_ns[-1] - imu.stamp_ns[0]) / (len(imu) - 1)
     samples = imu.force_s[np.concatenate([np.arange(rest.start, rest.stop) for rest in rests])]
@@ -74,12 +87,20 @@ def imu_calib(imu, ranges, gravity, without=None):
 
 
 def norm_fit(imu, ranges, gravity):
-    """Return (accelerometer, None): scipy's fit of the length of gravity to the means of the rests that imu-calib finds."""
+    """
+    Return (accelerometer, None).
+
+    Scipy's fit of the length of gravity to the means of the rests that imu-calib finds.
+    """
     return fit_norm(_means(imu, _resting(imu, ranges[0])), gravity), None
 
 
 def six_faces(imu, ranges, gravity):
-    """Return (accelerometer, None): bias and matrix by least squares from the rests nearest to the six faces, taken as exact."""
+    """
+    Return (accelerometer, None).
+
+    Bias and matrix by least squares from the rests nearest to the six faces, taken as exact.
+    """
     force = _means(imu, ranges)
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     near = force[np.argmax(faces @ force.T, axis=1)]
@@ -88,7 +109,11 @@ def six_faces(imu, ranges, gravity):
 
 
 def _variance(values):
-    """Return the norm of the variances of the axes in the window about each sample, infinite at the ends, shape (n,)."""
+    """
+    Return the norm of the variances of the axes in the window about each sample.
+
+    It is infinite at the ends, shape (n,).
+    """
     sums = np.pad(
         np.cumsum(
             np.stack([values - values.mean(axis=0), (values - values.mean(axis=0)) ** 2]), axis=1
@@ -104,7 +129,11 @@ def _variance(values):
 
 
 def _resting(imu, first):
-    """Return the rests of imu-calib: the rate, less its mean in the first rest, below a threshold, and no motion close by."""
+    """
+    Return the rests of imu-calib.
+
+    The rate, less its mean in the first rest, below a threshold, and no motion close by.
+    """
     busy = np.linalg.norm(imu.rate_s - imu.rate_s[first].mean(axis=0), axis=1) >= QUIET_RATE
     return _runs(np.convolve(busy, np.ones(2 * GUARD + 1), 'same') < 0.5)
 
@@ -120,7 +149,11 @@ def _means(imu, rests):
 
 
 def _other_turns(turns, up, rests, without):
-    """Return (turns, gravity before them, gravity after them) of the turns between rests that do not overlap the slice `without`."""
+    """
+    Return (turns, gravity before them, gravity after them) of the usable turns.
+
+    These are the turns between rests that do not overlap the slice `without`.
+    """
     used = np.array(
         [
             k
@@ -133,7 +166,11 @@ def _other_turns(turns, up, rests, without):
 
 
 def _gyroscope(turns, first, last, bias, loss):
-    """Return the gyroscope, bias and matrix, that turns gravity from rest to rest, directions `first` and `last` of each turn."""
+    """
+    Return the gyroscope, bias and matrix, that turns gravity from rest to rest.
+
+    Each turn has the directions `first` and `last`.
+    """
 
     def misses(values):
         inverse = np.linalg.inv(values[3:].reshape(3, 3))
@@ -151,7 +188,11 @@ def _gyroscope(turns, first, last, bias, loss):
 
 
 def turned(rate, step):
-    """Return the rotation matrix, end to start, of rates with `step` s (one or n - 1) between them (trapezoids, commutator of neighbours)."""
+    """
+    Return the rotation matrix, end to start, of rates with `step` s between them.
+
+    `step` is one or n - 1 (trapezoids, commutator of neighbours).
+    """
     step = np.broadcast_to(step, len(rate) - 1)[:, None]
     mats = Rotation.from_rotvec(
         0.5 * step * (rate[1:] + rate[:-1]) + step**2 / 12 * np.cross(rate[:-1], rate[1:])

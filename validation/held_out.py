@@ -1,4 +1,6 @@
-"""Prediction errors of this project, a plain gravity-norm fit and imucal on the same held-out poses."""
+"""
+Prediction errors of this project, a plain gravity-norm fit and imucal on the same held-out poses.
+"""
 
 import numpy as np
 from scipy.stats import t
@@ -52,7 +54,11 @@ def ours(imu, ranges, left_out, gravity):
 
 
 def errors_of_splits(imu, ranges, gravity, splits):
-    """Return {'ours', 'norm fit', 'uncalibrated': list of arrays}: ``|force| - g`` of the held-out poses of each split."""
+    """
+    Return {'ours', 'norm fit', 'uncalibrated': list of arrays}.
+
+    ``|force| - g`` of the held-out poses of each split.
+    """
     force, result = mean_forces(imu, ranges), {'ours': [], 'norm fit': [], 'uncalibrated': []}
     for left_out in splits:
         rest = np.setdiff1d(np.arange(len(ranges)), left_out)
@@ -72,7 +78,9 @@ def rms(errors):
 
 
 def bootstrap_difference(first, second, rng):
-    """Return the 95 % interval of rms(second) - rms(first) over the same poses, drawn again together."""
+    """
+    Return the 95 % interval of rms(second) - rms(first) over the same poses, drawn again together.
+    """
     picks = rng.integers(len(first), size=(DRAWS, len(first)))
     drawn = [np.sqrt(np.mean(np.square(errors)[picks], axis=1)) for errors in (first, second)]
     return np.quantile(drawn[1] - drawn[0], [0.025, 0.975])
@@ -80,9 +88,12 @@ def bootstrap_difference(first, second, rng):
 
 def resampled_ratio(first, second, share):
     """
-    Return (geometric mean of rms(second) / rms(first) over repeated splits of the same poses, its 95 % interval).
+    Return (geometric mean of rms(second) / rms(first), its 95 % interval).
 
-    Splits share poses, so that the variance of the mean is ``(1/J + n_test/n_train) var`` (Nadeau and Bengio 2003).
+    The mean is over repeated splits of the same poses.
+
+    Splits share poses, so that the variance of the mean is ``(1/J + n_test/n_train) var`` (Nadeau
+    and Bengio 2003).
     """
     ratios = np.log([rms(b) / rms(a) for a, b in zip(first, second)])
     half = t.ppf(0.975, len(ratios) - 1) * np.sqrt((1 / len(ratios) + share) * ratios.var(ddof=1))
@@ -90,7 +101,9 @@ def resampled_ratio(first, second, share):
 
 
 def leave_one_out(imu, ranges, gravity, rng):
-    """Return ({method: rms}, interval of norm fit minus ours, errors) with every pose left out once."""
+    """
+    Return ({method: rms}, interval of norm fit minus ours, errors) with every pose left out once.
+    """
     found = errors_of_splits(imu, ranges, gravity, [np.array([k]) for k in range(len(ranges))])
     errors = {name: np.concatenate(parts) for name, parts in found.items()}
     return (
@@ -101,7 +114,11 @@ def leave_one_out(imu, ranges, gravity, rng):
 
 
 def few_poses(imu, ranges, gravity, rng):
-    """Return ({method: median rms}, (ratio of norm fit to ours, interval)) with FEW poses for the fit and the remaining ones held out."""
+    """
+    Return ({method: median rms}, (ratio of norm fit to ours, interval)).
+
+    The fit uses FEW poses, and the remaining ones are held out.
+    """
     splits = [np.sort(rng.permutation(len(ranges))[FEW:]) for _ in range(SPLITS)]
     found = errors_of_splits(imu, ranges, gravity, splits)
     ratio = resampled_ratio(found['ours'], found['norm fit'], (len(ranges) - FEW) / FEW)
@@ -112,9 +129,12 @@ def few_poses(imu, ranges, gravity, rng):
 
 def faces_and_the_rest(folder):
     """
-    Return {method: errors on the rests outside the sections} for the ferraris recording, six faces and three turns for all.
+    Return {method: errors on the rests outside the sections} for ferraris.
 
-    Nine parameters cannot be fitted to the norm in six poses: the plain fit has biases and scale factors only.
+    It is the ferraris recording, with six faces and three turns for all.
+
+    Nine parameters cannot be fitted to the norm in six poses: the plain fit has biases and scale
+    factors only.
     """
     imu, known = load(folder, FERRARIS), reference(folder, FERRARIS)
     sections, angle = known['sections'], np.radians(known['turn_deg'])
@@ -235,8 +255,8 @@ def _count(section, rows, few):
         section.claim(
             f'poses that took no part, norm fit beside ours, {what}',
             'whoever predicts better',
-            f'ours better in {better.count("ours")}, norm fit in {better.count("norm fit")}, no difference seen in '
-            f'{better.count("no difference seen")} of {len(better)}',
+            f'ours better in {better.count("ours")}, norm fit in {better.count("norm fit")}, no'
+            f' difference seen in {better.count("no difference seen")} of {len(better)}',
             headline=table is rows,
         )
 

@@ -1,10 +1,12 @@
 """
 Hide and seek: effects are hidden in sessions made by physics, and `diagnose` has to find them.
 
-Run as ``python validation/hide_and_seek.py`` (or ``make hide-and-seek``): two hours of processor time. Prints a confusion matrix and the
-figures, draws them into docs/, and lists the sessions of which the record in the repository tells another thing. ``--seeds``, ``--minutes 20``,
-``--pairs 100`` and ``--parts effects,none`` run less, and draw beside the record; what was run stands beside every figure. Rows are written as they
-come, so that ``--from-record`` counts what there is of a run that was stopped, or of several that ran apart.
+Run as ``python validation/hide_and_seek.py`` (or ``make hide-and-seek``): two hours of processor
+time. Prints a confusion matrix and the figures, draws them into docs/, and lists the sessions of
+which the record in the repository tells another thing. ``--seeds``, ``--minutes 20``, ``--pairs
+100`` and ``--parts effects,none`` run less, and draw beside the record; what was run stands beside
+every figure. Rows are written as they come, so that ``--from-record`` counts what there is of a run
+that was stopped, or of several that ran apart.
 """
 
 import argparse
@@ -25,7 +27,10 @@ from worlds import hide_and_seek_record as record_kept  # noqa: E402
 from worlds.hide_and_seek_worlds import GRADES, PARTS, failed, run, tasks_of  # noqa: E402
 
 FIRST_SEED = 277000
-"""Seeds from here on were never used while the search was developed; those of earlier runs were 7000 on, 8000 to 8019."""
+"""
+Seeds from here on were never used while the search was developed; those of earlier runs were 7000
+on, 8000 to 8019.
+"""
 
 
 def main(arguments=None):
@@ -39,7 +44,10 @@ def main(arguments=None):
         '--seeds',
         type=int,
         default=1,
-        help='times that every effect is hidden at each grade in white and in realistic noise; other parts grow alike',
+        help=(
+            'times that every effect is hidden at each grade in white and in realistic noise; other'
+            ' parts grow alike'
+        ),
     )
     parser.add_argument('--first-seed', type=int, default=FIRST_SEED)
     parser.add_argument('--effects', help='names joined by commas; default all')
@@ -48,7 +56,10 @@ def main(arguments=None):
     parser.add_argument(
         '--noise',
         type=names,
-        help='white, realistic and names of worlds.wanders, joined by commas; default white, and realistic kinds dealt to the effects',
+        help=(
+            'white, realistic and names of worlds.wanders, joined by commas; default white, and'
+            ' realistic kinds dealt to the effects'
+        ),
     )
     parser.add_argument('--pairs', type=int, help='so many pairs, drawn by chance; default all')
     parser.add_argument('--processes', type=int, default=2)
@@ -59,7 +70,9 @@ def main(arguments=None):
     parser.add_argument(
         '--docs',
         type=Path,
-        help='where pictures and figures go; default docs/ for a run in full, else beside the record',
+        help=(
+            'where pictures and figures go; default docs/ for a run in full, else beside the record'
+        ),
     )
     parser.add_argument(
         '--from-record', nargs='+', type=Path, help='only print and draw what these records hold'
@@ -88,7 +101,8 @@ def main(arguments=None):
     kept = record_kept.read()
     changed = record_kept.differences(rows, kept)
     print(
-        f'\nbeside the record in the repository ({len(kept)} sessions), of {len(rows)} sessions another thing is told of {len(changed)}',
+        f'\nbeside the record in the repository ({len(kept)} sessions), of {len(rows)} sessions'
+        f' another thing is told of {len(changed)}',
         *changed,
         sep='\n  ',
     )
@@ -120,7 +134,8 @@ def _work(tasks, options):
                         pool = ProcessPoolExecutor(options.processes)
                 record_file.flush()
                 print(
-                    f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions, {(time.time() - start) / 60:.1f} min',
+                    f'\r{done}/{len(tasks)} tasks, {len(rows)} sessions,'
+                    f' {(time.time() - start) / 60:.1f} min',
                     end='',
                     file=sys.stderr,
                     flush=True,

@@ -1,4 +1,8 @@
-"""The figures of hide and seek as text: the table in docs/hide-and-seek.md and the sentence in docs/evidence.md, written from the record."""
+"""
+The figures of hide and seek as text.
+
+The table in docs/hide-and-seek.md and the sentence in docs/evidence.md, written from the record.
+"""
 
 import re
 from datetime import date
@@ -19,7 +23,11 @@ MARKS = ('<!-- {}: begin -->', '<!-- {}: end -->')
 
 
 def write_figures(rows, docs):
-    """Put the figures of a record between the marks in docs/hide-and-seek.md and docs/evidence.md; other text stays."""
+    """
+    Put the figures of a record between the marks in docs/hide-and-seek.md and docs/evidence.md.
+
+    Other text stays.
+    """
     parts = {}
     for row in rows:
         parts.setdefault(row['part'], []).append(row)
@@ -49,8 +57,12 @@ def beyond_table(rows):
     """Return the table of the worlds beyond the catalogue."""
     seeds = sorted({row['seed'] for row in rows})
     lines = [
-        f'{len(rows)} worlds of {len({row["kind"] for row in rows} - {beyond_catalogue.NOTHING})} kinds, {", ".join(sorted({row["noise"] for row in rows}))} noise, '
-        f'seeds {seeds[0]} to {seeds[-1]}, {date.today().isoformat()}:',
+        (
+            f'{len(rows)} worlds of'
+            f' {len({row["kind"] for row in rows} - {beyond_catalogue.NOTHING})} kinds,'
+            f' {", ".join(sorted({row["noise"] for row in rows}))} noise, seeds {seeds[0]} to'
+            f' {seeds[-1]}, {date.today().isoformat()}:'
+        ),
         '',
         '| what | required | measured |',
         '| --- | --- | --- |',
@@ -78,15 +90,20 @@ def _table(rows, parts):
     effects = parts.get('effects', [])
     seeds = [row['seed'] for row in rows if 'seed' in row]
     lines = [
-        f'{len(seeds)} sessions, seeds {min(seeds, default=0)} to {max(seeds, default=0)}, {date.today().isoformat()}, made and counted by `make hide-and-seek`:',
+        (
+            f'{len(seeds)} sessions, seeds {min(seeds, default=0)} to {max(seeds, default=0)},'
+            f' {date.today().isoformat()}, made and counted by `make hide-and-seek`:'
+        ),
         '',
         '| what | required | measured |',
         '| --- | --- | --- |',
     ]
     for grade, noise, some in by_grade(effects):
         lines.append(
-            f'| hidden effect first, or in the class of the first finding, {grade} grade, {noise} noise | {BARS[noise]} | {_percent(map(first_is_right, some))} '
-            f'(strictly first {_count(map(strictly_first, some))}; nothing else named {_count(len(row["found"]) == 1 for row in some)}) |'
+            f'| hidden effect first, or in the class of the first finding, {grade} grade, {noise}'
+            f' noise | {BARS[noise]} | {_percent(map(first_is_right, some))} (strictly first'
+            f' {_count(map(strictly_first, some))}; nothing else named'
+            f' {_count(len(row["found"]) == 1 for row in some)}) |'
         )
     for noise in BARS:
         some = [row for _, kind, part in by_grade(effects) for row in part if kind == noise]
@@ -101,12 +118,14 @@ def _table(rows, parts):
                 else ''
             )
             lines.append(
-                f'| the same, all grades, {noise} noise | {BARS[noise]} | {_percent(map(first_is_right, some))}{": " + each if each else ""} |'
+                f'| the same, all grades, {noise} noise | {BARS[noise]} |'
+                f' {_percent(map(first_is_right, some))}{": " + each if each else ""} |'
             )
     if effects:
         sizes = class_sizes(effects)
         lines.append(
-            f'| of the right ones, told with mates that the recording cannot tell apart |  | {_count(sizes > 1)} |'
+            '| of the right ones, told with mates that the recording cannot tell apart |  |'
+            f' {_count(sizes > 1)} |'
         )
         names = sorted({row['hidden'][0] for row in effects})
         shares = {
@@ -115,7 +134,8 @@ def _table(rows, parts):
         }
         low = [name for name in sorted(names, key=shares.get) if shares[name] < LEAST]
         lines.append(
-            f'| the same for each of the {len(names)} effects, all grades and noises together, the worst | 85 % | {100 * min(shares.values()):.0f} %'
+            f'| the same for each of the {len(names)} effects, all grades and noises together, the'
+            f' worst | 85 % | {100 * min(shares.values()):.0f} %'
             + (
                 f'; below 85 %: {", ".join(f"{name} {100 * shares[name]:.0f} %" for name in low)}'
                 if low
@@ -126,7 +146,8 @@ def _table(rows, parts):
     separating = parts.get('separating', [])
     if separating:
         lines.append(
-            f'| sessions made to separate a class: strictly first | as often | {_count(map(strictly_first, separating))} |'
+            '| sessions made to separate a class: strictly first | as often |'
+            f' {_count(map(strictly_first, separating))} |'
         )
     errors = np.abs(
         [
@@ -138,8 +159,8 @@ def _table(rows, parts):
     )
     if len(errors):
         lines.append(
-            f'| parameters within three sd of the truth | 97 % | {100 * np.mean(errors < 3):.1f} % of {len(errors)}; '
-            f'rms error {np.sqrt(np.mean(np.minimum(errors, 10) ** 2)):.2f} sd |'
+            f'| parameters within three sd of the truth | 97 % | {100 * np.mean(errors < 3):.1f} %'
+            f' of {len(errors)}; rms error {np.sqrt(np.mean(np.minimum(errors, 10) ** 2)):.2f} sd |'
         )
     levels = [row['level_error'] for row in effects if 'level_error' in row]
     if levels:
@@ -157,48 +178,59 @@ def _table(rows, parts):
         ]
         if each:
             lines.append(
-                f'| nothing hidden: {what} | at most 2 % | {_percent(value for *_, some in each for value in some)} '
+                f'| nothing hidden: {what} | at most 2 % |'
+                f' {_percent(value for *_, some in each for value in some)} '
                 f'({"; ".join(f"{grade} {noise} {_count(some)}" for grade, noise, some in each)}) |'
             )
     outside = parts.get('outside', [])
     if outside:
         lines.append(
-            f'| cause outside the catalogue: the rest is significant | 95 % | {_count(row["unexplained"] for row in outside)} |'
+            '| cause outside the catalogue: the rest is significant | 95 % |'
+            f' {_count(row["unexplained"] for row in outside)} |'
         )
         lines.append(
-            f'| cause outside the catalogue: nothing named | 80 % | {_count(not row["found"] for row in outside)} |'
+            '| cause outside the catalogue: nothing named | 80 % |'
+            f' {_count(not row["found"] for row in outside)} |'
         )
     pairs = [row for row in parts.get('pairs', []) if separable(row)]
     if pairs:
         lines.append(
-            f'| two effects at once, all pairs but {len(parts["pairs"]) - len(pairs)} that these sessions cannot separate: both named | 90 % | {_percent(map(both_found, pairs))} |'
+            f'| two effects at once, all pairs but {len(parts["pairs"]) - len(pairs)} that these'
+            f' sessions cannot separate: both named | 90 % | {_percent(map(both_found, pairs))} |'
         )
         lines.append(
-            f'| the same: a wrong name | at most 2 % | {_percent(bool(wrong_names(row)) for row in pairs)} |'
+            '| the same: a wrong name | at most 2 % |'
+            f' {_percent(bool(wrong_names(row)) for row in pairs)} |'
         )
     for factor in sorted({row['factor'] for row in parts.get('sizes', [])}):
         some = [row for row in parts['sizes'] if row['factor'] == factor]
         marked = sum(first_is_right(row) and row['implausible'][0] for row in some)
         lines.append(
-            f'| {factor:g} times the smallest detectable size: first right | {"95 %" if factor > 5 else ""} | {_percent(map(first_is_right, some))}, {marked} of them with the mark |'
+            f'| {factor:g} times the smallest detectable size: first right |'
+            f' {"95 %" if factor > 5 else ""} | {_percent(map(first_is_right, some))}, {marked} of'
+            ' them with the mark |'
         )
     if 'traps' in parts:
         lines.append(
-            f'| traps that give a finding | none | {_count(bool(row["found"]) for row in parts["traps"])} |'
+            '| traps that give a finding | none |'
+            f' {_count(bool(row["found"]) for row in parts["traps"])} |'
         )
     ratios = [row['oracle_ratio'] for row in effects if row.get('oracle_ratio') is not None]
     if ratios:
         lines.append(
-            f'| held-out rms over that of a fit with the right effect alone, median (1 where nothing else is named) | 1.02 | {np.median(ratios):.4f} ({len(ratios)} sessions) |'
+            '| held-out rms over that of a fit with the right effect alone, median (1 where'
+            f' nothing else is named) | 1.02 | {np.median(ratios):.4f} ({len(ratios)} sessions) |'
         )
     if 'failed' in parts:
         lines.append(
-            f'| tasks or worlds that failed and are counted nowhere | none | {len(parts["failed"])} |'
+            '| tasks or worlds that failed and are counted nowhere | none |'
+            f' {len(parts["failed"])} |'
         )
     seconds = [row['seconds'] for row in rows if 'seconds' in row] or [np.nan]
     lines.append(
-        f'| processor time per diagnosis, five minutes at 100 Hz | 5 s, 95 % 10 s | median {np.median(seconds):.1f} s, 95 % below '
-        f'{np.quantile(seconds, 0.95):.1f} s, largest {np.max(seconds):.1f} s |'
+        '| processor time per diagnosis, five minutes at 100 Hz | 5 s, 95 % 10 s | median'
+        f' {np.median(seconds):.1f} s, 95 % below {np.quantile(seconds, 0.95):.1f} s, largest'
+        f' {np.max(seconds):.1f} s |'
     )
     return '\n'.join(lines)
 
@@ -210,13 +242,20 @@ def _sentence(rows, parts):
     told = [
         (
             effects,
-            f'each cause at five times its smallest detectable size and at four grades the hidden effect is named first, or in the class of the first finding, in {_count(map(first_is_right, effects))}',
+            (
+                'each cause at five times its smallest detectable size and at four grades the'
+                ' hidden effect is named first, or in the class of the first finding, in'
+                f' {_count(map(first_is_right, effects))}'
+            ),
         ),
         (none, f'nothing hidden gave a finding in {_count(bool(row["found"]) for row in none)}'),
         (
             hidden,
-            f'a cause that no catalogue holds was reported as unexplained in {_count(row["flagged"] for row in hidden)} and given a name in '
-            f'{_count(bool(row["found"]) for row in hidden)}',
+            (
+                'a cause that no catalogue holds was reported as unexplained in'
+                f' {_count(row["flagged"] for row in hidden)} and given a name in'
+                f' {_count(bool(row["found"]) for row in hidden)}'
+            ),
         ),
         (pairs, f'two effects at once were both found in {_count(map(both_found, pairs))}'),
     ]
@@ -228,7 +267,11 @@ def _sentence(rows, parts):
 
 
 def missed(parts):
-    """Return the list of failures: single effects, sessions without an effect, pairs, and the excepted pairs."""
+    """
+    Return the list of failures.
+
+    Single effects, sessions without an effect, pairs, and the excepted pairs.
+    """
     lines = ['Single effects that were not named first:', '']
     lines += [
         f'- {row["hidden"][0]}, {row["noise"]}, seed {row["seed"]}: {_outcome(row)}'

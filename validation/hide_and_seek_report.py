@@ -59,15 +59,18 @@ def _effects(rows, what):
         return
     for grade, noise, some in by_grade(rows):
         print(
-            f'\nfirst finding right or in its class, {what}, {grade} grade, {noise} noise: {_share(map(first_is_right, some))}; strictly first '
-            f'{_share(map(strictly_first, some))}; nothing else named {_share(len(row["found"]) == 1 for row in some)}'
+            f'\nfirst finding right or in its class, {what}, {grade} grade, {noise} noise:'
+            f' {_share(map(first_is_right, some))}; strictly first'
+            f' {_share(map(strictly_first, some))}; nothing else named'
+            f' {_share(len(row["found"]) == 1 for row in some)}'
         )
     for kind in sorted(set(map(kind_of, rows))):
         print(f'  {kind}: {_share(first_is_right(row) for row in rows if kind_of(row) == kind)}')
     for row in rows:
         if not first_is_right(row):
             print(
-                f'  {row["hidden"][0]} seed {row["seed"]} {row["noise"]}: {row["found"]} {row["classes"]}, rest significant: {row["unexplained"]}'
+                f'  {row["hidden"][0]} seed {row["seed"]} {row["noise"]}: {row["found"]}'
+                f' {row["classes"]}, rest significant: {row["unexplained"]}'
             )
     names = sorted({row['hidden'][0] for row in rows})
     weak = [
@@ -103,7 +106,8 @@ def _parameters(rows):
         errors = np.abs(errors)
         rms = np.sqrt(np.mean(np.minimum(errors, 10) ** 2))
         print(
-            f'\nparameters within 3 sd: {100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms error in sd {rms:.2f}'
+            f'\nparameters within 3 sd: {100 * np.mean(errors < 3):.1f} % of {len(errors)}; rms'
+            f' error in sd {rms:.2f}'
         )
     levels = [row['level_error'] for row in rows if 'level_error' in row]
     if levels:
@@ -121,13 +125,16 @@ def _separating(rows):
 def _nothing(rows, what):
     for grade, noise, some in by_grade(rows):
         print(
-            f'\n{what}, {grade} grade, {noise} noise: a finding in {_share(bool(row["found"]) for row in some)}; '
-            f'significant rest in {_share(row["unexplained"] for row in some)}; a formula in {_share(bool(row["formulas"]) for row in some)}'
+            f'\n{what}, {grade} grade, {noise} noise: a finding in'
+            f' {_share(bool(row["found"]) for row in some)}; significant rest in'
+            f' {_share(row["unexplained"] for row in some)}; a formula in'
+            f' {_share(bool(row["formulas"]) for row in some)}'
         )
         for row in some:
             if row['found'] or row['unexplained'] or row['formulas']:
                 print(
-                    f'  seed {row["seed"]} {row["noise"]}: {row["found"]}, rest significant: {row["unexplained"]}, {row["formulas"]}'
+                    f'  seed {row["seed"]} {row["noise"]}: {row["found"]}, rest significant:'
+                    f' {row["unexplained"]}, {row["formulas"]}'
                 )
 
 
@@ -135,14 +142,16 @@ def _outside(rows):
     if not rows:
         return
     print(
-        f'\ncauses outside the catalogue: unexplained significant in {_share(row["unexplained"] for row in rows)}, nothing named in '
-        f'{_share(not row["found"] for row in rows)}'
+        '\ncauses outside the catalogue: unexplained significant in'
+        f' {_share(row["unexplained"] for row in rows)}, nothing named in'
+        f' {_share(not row["found"] for row in rows)}'
     )
     for name in sorted({row['hidden'][0] for row in rows}):
         some = [row for row in rows if row['hidden'][0] == name]
         print(
-            f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named '
-            f'{_share(not row["found"] for row in some)} {[row["found"] for row in some if row["found"]]}'
+            f'  {name}: unexplained {_share(row["unexplained"] for row in some)}, nothing named'
+            f' {_share(not row["found"] for row in some)}'
+            f' {[row["found"] for row in some if row["found"]]}'
         )
 
 
@@ -163,14 +172,16 @@ def _classes(rows):
     sizes = class_sizes(rows)
     if len(sizes):
         print(
-            f'\nright first findings told with mates: {_share(sizes > 1)}, of these with two: {_share(sizes[sizes > 1] > 2)}'
+            f'\nright first findings told with mates: {_share(sizes > 1)}, of these with two:'
+            f' {_share(sizes[sizes > 1] > 2)}'
         )
 
 
 def _beyond(rows):
     if rows:
         print(
-            f'\ncauses outside the catalogue, {len({row["kind"] for row in rows}) - 1} kinds, {len(rows)} worlds'
+            f'\ncauses outside the catalogue, {len({row["kind"] for row in rows}) - 1} kinds,'
+            f' {len(rows)} worlds'
         )
         for what, required, measured in beyond_catalogue.figures(rows):
             print(f'  {what}: {measured} (required: {required})')
@@ -181,8 +192,8 @@ def _oracle(rows):
     ratios = [row['oracle_ratio'] for row in rows if row.get('oracle_ratio') is not None]
     if ratios:
         print(
-            f'\nheld-out rms over that of an oracle: median {np.median(ratios):.4f}, largest {np.max(ratios):.4f} '
-            f'({len(ratios)} sessions)'
+            f'\nheld-out rms over that of an oracle: median {np.median(ratios):.4f}, largest'
+            f' {np.max(ratios):.4f} ({len(ratios)} sessions)'
         )
 
 
@@ -190,7 +201,8 @@ def _seconds(rows):
     seconds = [row['seconds'] for row in rows if 'seconds' in row]
     if seconds:
         print(
-            f'\nprocessor time per diagnosis: median {np.median(seconds):.1f} s, largest {np.max(seconds):.1f} s'
+            f'\nprocessor time per diagnosis: median {np.median(seconds):.1f} s, largest'
+            f' {np.max(seconds):.1f} s'
         )
 
 
@@ -223,8 +235,8 @@ def draw_confusion(rows, path):
     axes.set_ylabel('hidden')
     right = np.mean([first_is_right(row) for row in rows])
     axes.set_title(
-        f'Hide and seek at five times the smallest detectable size: {100 * right:.1f} % of {len(rows)} sessions right '
-        'or in the declared class',
+        f'Hide and seek at five times the smallest detectable size: {100 * right:.1f} % of'
+        f' {len(rows)} sessions right or in the declared class',
         fontsize=10,
     )
     figure.savefig(path, dpi=110)

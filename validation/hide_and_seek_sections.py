@@ -1,4 +1,9 @@
-"""Sections of hide and seek: grades and kinds of noise, all pairs of effects at once, and effects from the smallest detectable size to a hundred times it."""
+"""
+Sections of hide and seek.
+
+Grades and kinds of noise, all pairs of effects at once, and effects from the smallest detectable
+size to a hundred times it.
+"""
 
 import numpy as np
 
@@ -20,7 +25,11 @@ def kind_of(row):
 
 
 def by_grade(rows):
-    """Yield (grade, 'white' or 'realistic', rows), the largest noise first; every kind but white is realistic."""
+    """
+    Yield (grade, 'white' or 'realistic', rows), the largest noise first.
+
+    Every kind but white is realistic.
+    """
     order = ('consumer', 'industrial', 'tactical', 'navigation')
     for white in (True, False):
         for grade in order:
@@ -37,7 +46,11 @@ def both_found(row):
 
 
 def wrong_names(row):
-    """Return the findings that are no hidden effect, and whose class holds none that has no finding of its own."""
+    """
+    Return the findings that are no hidden effect, and stand for none by their class.
+
+    The class of each holds no hidden effect that lacks a finding of its own.
+    """
     owned = set(_owners(row).values())
     return [
         name for k, name in enumerate(row['found']) if k not in owned and name not in row['hidden']
@@ -45,7 +58,11 @@ def wrong_names(row):
 
 
 def _owners(row):
-    """Return hidden effect -> number of its finding, as many as can be had with one each: by name first, then by class."""
+    """
+    Return hidden effect -> number of its finding, as many as can be had with one each.
+
+    By name first, then by class.
+    """
     owners = {name: row['found'].index(name) for name in row['hidden'] if name in row['found']}
     for name in row['hidden']:
         free = [
@@ -59,12 +76,18 @@ def _owners(row):
 
 
 def separable(row):
-    """Return whether the session shows each of the two where the other one may take any value: at least its smallest detectable size is left."""
+    """
+    Return whether the session shows each of the two where the other one may take any value.
+
+    At least its smallest detectable size is left.
+    """
     return min(row.get('beside', {}).values(), default=np.inf) >= 1.0
 
 
 def print_pairs(rows):
-    """Print how many pairs were found, which not, and which no search can find in these sessions."""
+    """
+    Print how many pairs were found, which not, and which no search can find in these sessions.
+    """
     if not rows:
         return
     asked, excepted = (
@@ -72,16 +95,18 @@ def print_pairs(rows):
         [row for row in rows if not separable(row)],
     )
     print(
-        f'\nall pairs at five times the smallest detectable size: both named {share_of(map(both_found, asked))}; '
-        f'a wrong name {share_of(bool(wrong_names(row)) for row in asked)}'
+        '\nall pairs at five times the smallest detectable size: both named'
+        f' {share_of(map(both_found, asked))}; a wrong name'
+        f' {share_of(bool(wrong_names(row)) for row in asked)}'
     )
     for row in asked:
         if not both_found(row) or wrong_names(row):
             print(f'  {row["hidden"]} seed {row["seed"]}: {row["found"]} {row["classes"]}')
     if excepted:
         print(
-            f'excepted, for less than the smallest detectable size of a member is left beside the other: {len(excepted)}, of which both named '
-            f'{share_of(map(both_found, excepted))}; a wrong name {share_of(bool(wrong_names(row)) for row in excepted)}'
+            'excepted, for less than the smallest detectable size of a member is left beside the'
+            f' other: {len(excepted)}, of which both named {share_of(map(both_found, excepted))}; a'
+            f' wrong name {share_of(bool(wrong_names(row)) for row in excepted)}'
         )
         for row in excepted:
             print(
@@ -95,11 +120,16 @@ def print_pairs(rows):
 
 
 def print_sizes(rows):
-    """Print by size how often the first finding is right, and how often it carries the mark of an implausible size."""
+    """
+    Print by size how often the first finding is right.
+
+    Also print how often it carries the mark of an implausible size.
+    """
     if not rows:
         return
     print(
-        '\nsize (in smallest detectable sizes): first finding right or in its class, of these with the mark, a wrong name'
+        '\nsize (in smallest detectable sizes): first finding right or in its class, of these with'
+        ' the mark, a wrong name'
     )
     for factor in sorted({row['factor'] for row in rows}):
         some = [row for row in rows if row['factor'] == factor]
@@ -109,7 +139,8 @@ def print_sizes(rows):
         ]
         marked = sum(good and row['implausible'][0] for good, row in zip(right, some))
         print(
-            f'  {factor:5g}: {share_of(right)}, {marked} marked, {share_of(bool(wrong_names(row)) for row in some)}'
+            f'  {factor:5g}: {share_of(right)}, {marked} marked,'
+            f' {share_of(bool(wrong_names(row)) for row in some)}'
         )
         for row, good in zip(some, right):
             if not good and factor > 1:

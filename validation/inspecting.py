@@ -9,7 +9,9 @@ from validation.section import Section, text
 
 
 def remarks(lines):
-    """Return what was printed below the list of topics; checks that found all well are counted only."""
+    """
+    Return what was printed below the list of topics; checks that found all well are counted only.
+    """
     below = [
         line for line in (lines[lines.index('') + 1 :] if '' in lines else lines) if line.strip()
     ]

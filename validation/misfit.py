@@ -1,4 +1,9 @@
-"""Worlds with causes outside the catalogue: a sensor with the decision `helps` improves in a second session, and warnings name the regimes that do not."""
+"""
+Worlds with causes outside the catalogue.
+
+A sensor with the decision `helps` improves in a second session, and warnings name the regimes that
+do not.
+"""
 
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.decision import HARM, HELPS, harmed
@@ -21,7 +26,11 @@ def worlds():
 
 
 def outcome(cause, options):
-    """Return ([cells of the row: decisions, error after / before, the largest of a motion], [whether each sensor with `helps` improves as stated])."""
+    """
+    Return ([cells of the row], [whether each sensor with `helps` improves as stated]).
+
+    The cells are decisions, error after / before, and the largest of a motion.
+    """
     from worlds.misfit_worlds import make_pair
 
     pair = make_pair(cause, SEED, **options)
@@ -62,7 +71,8 @@ def run(folder, plots):
         improved += helps
         rows.append(((cause or 'none').replace('_', ' '), table, *cells))
     section.claim(
-        'worlds of misfit: sensors with the decision "helps" improve in a second session; regimes that are worse by 5 % are named',
+        'worlds of misfit: sensors with the decision "helps" improve in a second session; regimes'
+        ' that are worse by 5 % are named',
         'all of them',
         f'{sum(improved)} of {len(improved)}',
         all(improved),

@@ -1,4 +1,8 @@
-"""MPU-9150 by hand against published biases, and the angles of turns that were not used against two peers."""
+"""
+MPU-9150 by hand against published biases, and turn angles against two peers.
+
+The angles are of turns that were not used.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -27,13 +31,18 @@ def figures(folder):
     """Return (HandCalibration, bias difference from the published ones in m/s^2)."""
     imu = load(folder, NAME)
     found = calibrate_by_hand(imu, HandOptions(gravity_sd=0.02), find_still(imu))
-    return found, found.accelerometer[0] - reference(folder, NAME)['published'][
-        'accelerometer_bias'
-    ]
+    return (
+        found,
+        found.accelerometer[0] - reference(folder, NAME)['published']['accelerometer_bias'],
+    )
 
 
 def ours_without(data, imu, ranges, gravity, without):
-    """Return (accelerometer, gyroscope) of a calibration by hand from `HandData` without the turns that overlap the slice `without`."""
+    """
+    Return (accelerometer, gyroscope) of a calibration by hand from `HandData`.
+
+    It omits the turns that overlap the slice `without`.
+    """
     turns = [
         turn
         for turn in data.turns
@@ -46,10 +55,13 @@ def ours_without(data, imu, ranges, gravity, without):
 
 def left_out_turns(imu, gravity):
     """
-    Return {method: rms angle in degrees} of all turns, each with the gyroscope from the other turns.
+    Return {method: rms angle in degrees} of all turns.
 
-    The angle is that between gravity after a turn and gravity before it, rotated by the corrected rates from the middle of one rest to
-    the middle of the next. The directions of gravity are the same for all methods: those of the norm fit to all poses.
+    Each turn has the gyroscope from the other turns.
+
+    The angle is that between gravity after a turn and gravity before it, rotated by the corrected
+    rates from the middle of one rest to the middle of the next. The directions of gravity are the
+    same for all methods: those of the norm fit to all poses.
     """
     ranges = find_still(imu)
     methods = {
@@ -88,7 +100,8 @@ def run(folder, plots):
         angles = left_out_turns(load(folder, name), gravity_of(folder, name))
         best = min(value for method, value in angles.items() if method != 'ours')
         section.claim(
-            f'{name}: angles of turns that were left out, first or within {WITHIN - 1:.0%} of the better peer',
+            f'{name}: angles of turns that were left out, first or within {WITHIN - 1:.0%} of the'
+            ' better peer',
             f'at most {WITHIN * best:.3f}°',
             ', '.join(f'{method} {value:.3f}°' for method, value in angles.items()),
             angles['ours'] <= WITHIN * best,

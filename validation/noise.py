@@ -19,9 +19,15 @@ RESTING = (
     ('mpu9150_3', None),
     *((name, f'/imu_{k}/data_raw') for name in ('array_2', 'array_5') for k in BOARD),
 )
-"""Recordings with rest in both halves; the fixed unit stands on the bench of a running motor, the others are held or laid down by hand between turns."""
+"""
+Recordings with rest in both halves; the fixed unit stands on the bench of a running motor, the
+others are held or laid down by hand between turns.
+"""
 INSIDE = 0.90
-"""Share of the averaging times that must lie within their 95 % bands; neighbours on a curve go together, so that few independent ones count."""
+"""
+Share of the averaging times that must lie within their 95 % bands; neighbours on a curve go
+together, so that few independent ones count.
+"""
 DRAWS = 2000
 """Times that the recordings are drawn anew for the interval of the share."""
 
@@ -37,7 +43,9 @@ def halves(imu):
 
 def predicted_band(first, second, axis):
     """
-    Return the 95 % band of an axis' Allan variances in `second` by the noise identified in `first`, shape (2, n_scales).
+    Return the 95 % band of an axis' Allan variances in `second` by the noise identified in `first`.
+
+    Shape (2, n_scales).
 
     The scatter of the measured variance and the uncertainty of the fit together, as a chi-square.
     """
@@ -60,7 +68,12 @@ def predicted_band(first, second, axis):
 
 
 def compare(imu):
-    """Return, for each of the six axes, whether each fitted averaging time of the second half lies inside, and whether a model explains the first."""
+    """
+    Return whether the second half's averaging times lie inside, and a model test.
+
+    Both are given for each of the six axes: whether each fitted averaging time of the second half
+    lies inside, and whether a model explains the first half.
+    """
     before, after = (SampleBlock(half) for half in halves(imu))
     first, second = identify_noise(lambda: iter([before])), read_rest(lambda: iter([after]))
     found = []
@@ -73,7 +86,11 @@ def compare(imu):
 
 
 def interval_of_share(counts, seed=0):
-    """Return the 95 % interval of the share inside when the recordings are drawn anew, counts of (inside, all) of shape (n_recordings, 2)."""
+    """
+    Return the 95 % interval of the share inside when the recordings are drawn again.
+
+    The counts of (inside, all) have shape (n_recordings, 2).
+    """
     drawn = counts[
         np.random.default_rng(seed).integers(len(counts), size=(DRAWS, len(counts)))
     ].sum(axis=1)
@@ -108,7 +125,8 @@ def run(folder, plots):
     section.claim(
         'noise fitted to the first half: Allan variances of the second inside their 95 % bands',
         f'at least {INSIDE:.0%}',
-        f'{inside} of {every} ({inside / every:.1%}; {least:.0%} to {most:.0%} with other such recordings)',
+        f'{inside} of {every} ({inside / every:.1%}; {least:.0%} to {most:.0%} with other such'
+        ' recordings)',
         inside >= INSIDE * every,
         headline=True,
     )

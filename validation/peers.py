@@ -1,4 +1,8 @@
-"""Beside plain peers on the same simulated data, where the truth is known: by hand in six kinds of session, on a table with nothing to find but bias and matrix."""
+"""
+Beside plain peers on the same simulated data, where the truth is known.
+
+By hand in six kinds of session, on a table with nothing to find but bias and matrix.
+"""
 
 import sys
 from pathlib import Path
@@ -56,9 +60,12 @@ def kinds():
 
 def plain(imu, ranges, average):
     """
-    Return (accelerometer, gyroscope) as somebody writes it in an afternoon, who knows when the sensor was held still.
+    Return (accelerometer, gyroscope) as somebody writes it in an afternoon.
 
-    The norm fit for the accelerometer; the gyroscope's bias is the average over the poses, its matrix turns gravity from pose to pose.
+    The person knows when the sensor was held still.
+
+    The norm fit for the accelerometer; the gyroscope's bias is the average over the poses, its
+    matrix turns gravity from pose to pose.
     """
     force = np.array([average(imu.force_s[held], axis=0) for held in ranges])
     accelerometer = fit_norm(force, GRAVITY)
@@ -84,7 +91,11 @@ def plain(imu, ranges, average):
 
 
 def plain_on_a_table(block, table):
-    """Return (accelerometer, gyroscope): bias and matrix by least squares over all samples beside what the joints say."""
+    """
+    Return (accelerometer, gyroscope).
+
+    Bias and matrix by least squares over all samples beside what the joints say.
+    """
     gatherer, model = (
         MotionGatherer(table),
         SensorModel(
@@ -110,7 +121,11 @@ def plain_on_a_table(block, table):
 
 
 def errors(found, truth):
-    """Return rms errors of the compensated accelerometer (m/s^2, at 1 g) and gyroscope (rad/s, at 1 rad/s rms per axis), over the same directions for all."""
+    """
+    Return rms errors of the compensated accelerometer and gyroscope.
+
+    The units are m/s^2 at 1 g, and rad/s at 1 rad/s rms per axis, over the same directions for all.
+    """
     rng, rms = np.random.default_rng(1), []
     force = rng.normal(size=(500, 3))
     for sensor, true, motion in zip(
@@ -138,7 +153,11 @@ def ours(calibration):
 
 
 def by_hand(make):
-    """Return rms errors over the seeds of ours, the plain fit on means and on medians, shape (3, 2); inf where we refuse."""
+    """
+    Return rms errors over the seeds of ours, the plain fit on means and on medians, shape (3, 2).
+
+    Inf where we refuse.
+    """
     from worlds.hand_sessions import unpack
 
     rows = []
@@ -160,7 +179,11 @@ def by_hand(make):
 
 
 def trial(make):
-    """Return {method: median errors over the sessions of a trial}; None for a sensor that a method does not calibrate."""
+    """
+    Return {method: median errors over the sessions of a trial}.
+
+    None for a sensor that a method does not calibrate.
+    """
     from worlds.hand_sessions import unpack
 
     found = {}
@@ -198,7 +221,8 @@ def trials(section):
             np.nanmin([errors for name, errors in found.items() if name != 'ours'], axis=0),
         )
         section.claim(
-            f'{kind}: median error of {len(TRIAL_SEEDS)} sessions, accelerometer and gyroscope, against the best peer',
+            f'{kind}: median error of {len(TRIAL_SEEDS)} sessions, accelerometer and gyroscope,'
+            ' against the best peer',
             f'at most {WITHIN} of it',
             '; '.join(
                 f'{1e3 * a:.2f} against {1e3 * b:.2f} {unit}'
@@ -222,7 +246,11 @@ def trials(section):
 
 
 def on_a_table():
-    """Return rms errors of ours and of plain least squares over all samples, shape (2, 2), where both know all there is."""
+    """
+    Return rms errors of ours and of plain least squares over all samples, shape (2, 2).
+
+    Where both know all there is.
+    """
     from worlds.physics import make_session
 
     rows = []
@@ -254,7 +282,8 @@ def run(folder, plots):
         rows.append((kind, *(f'{1e3 * value:.2f}' for value in found.T.ravel())))
     first, of = sum(ratio <= 1.0 for _, *both in ratios for ratio in both), 2 * len(ratios)
     section.claim(
-        f'{len(SEEDS) * len(rows)} sessions by hand, {len(rows)} kinds, two sensors: closer to the truth than either peer',
+        f'{len(SEEDS) * len(rows)} sessions by hand, {len(rows)} kinds, two sensors: closer to the'
+        ' truth than either peer',
         'in most',
         f'{first} of {of}',
         first > of / 2,
@@ -270,7 +299,8 @@ def run(folder, plots):
     trials(section)
     mine, plainly = on_a_table()
     section.claim(
-        'a table, bias and matrix are all there is: our error over that of plain least squares over all samples',
+        'a table, bias and matrix are all there is: our error over that of plain least squares over'
+        ' all samples',
         f'at most {BEHIND}',
         f'{mine[0] / plainly[0]:.2f} ({1e3 * mine[0]:.3f} and {1e3 * plainly[0]:.3f} mm/s²), '
         f'gyroscope {mine[1] / plainly[1]:.2f}',

@@ -1,4 +1,8 @@
-"""Run every section on the recordings and write docs/validation.md with its plots; exit code 1 if a section failed."""
+"""
+Run every section on the recordings and write docs/validation.md with its plots.
+
+Exit code 1 if a section failed.
+"""
 
 import argparse
 import importlib
@@ -70,7 +74,8 @@ def run_section(name, folder, plots):
     print(f'{time.monotonic() - start:.0f} s', flush=True)
     for row in section.rows:
         print(
-            f'    {row.claim}: {row.found} (wanted {row.target}){"" if row.holds in (None, True) else "  NO"}'
+            f'    {row.claim}: {row.found} (wanted'
+            f' {row.target}){"" if row.holds in (None, True) else "  NO"}'
         )
     return section, whole
 
@@ -127,7 +132,8 @@ def main():
     folder = data_folder()
     if folder is None:
         print(
-            f'the recordings must be in ../shared/data or where {VARIABLE} says, there is no such folder; set {VARIABLE}',
+            f'the recordings must be in ../shared/data or where {VARIABLE} says, there is no such'
+            f' folder; set {VARIABLE}',
             file=sys.stderr,
         )
         return 1

@@ -1,4 +1,8 @@
-"""Two other ways to calibrate by hand: a plain fit of the gravity norm, and the Ferraris method of the PyPI package imucal."""
+"""
+Two other ways to calibrate by hand.
+
+A plain fit of the gravity norm, and the Ferraris method of the PyPI package imucal.
+"""
 
 import importlib.util
 from dataclasses import dataclass
@@ -11,7 +15,9 @@ TURNS = ('x_rot', 'y_rot', 'z_rot')
 
 
 def installed(name):
-    """Return whether a package that only this comparison needs is there; `make validate` installs it."""
+    """
+    Return whether a package that only this comparison needs is there; `make validate` installs it.
+    """
     return importlib.util.find_spec(name) is not None
 
 
@@ -40,9 +46,12 @@ class Forward:
 
 def fit_norm(force, gravity, cross_axis=True, loss='linear'):
     """
-    Fit biases and a lower triangular matrix so that the mean readings `force` (n, 3) get the length `gravity`.
+    Fit biases and a lower triangular matrix to readings.
 
-    Nine parameters; without `cross_axis` six, which is what six faces can tell. `loss` is that of `scipy.optimize.least_squares`.
+    The mean readings `force` (n, 3) get the length `gravity`.
+
+    Nine parameters; without `cross_axis` six, which is what six faces can tell. `loss` is that of
+    `scipy.optimize.least_squares`.
     """
     lower = np.tril_indices(3) if cross_axis else np.diag_indices(3)
 
@@ -77,7 +86,8 @@ def ferraris(imu, sections, rate_hz, gravity, angle):
     """
     Return imucal's calibration of the sections in SI.
 
-    `angle` (rad) is the signed angle of all three turns. imucal's gyroscope works in deg/s by convention; given radians it stays in rad/s.
+    `angle` (rad) is the signed angle of all three turns. imucal's gyroscope works in deg/s by
+    convention; given radians it stays in rad/s.
     """
     from imucal import FerrarisCalibration, FerrarisSignalRegions
 
@@ -88,5 +98,9 @@ def ferraris(imu, sections, rate_hz, gravity, angle):
 
 
 def accelerometer_of(info):
-    """Return imucal's accelerometer as a forward model: its ``true = R^-1 K^-1 (measured - b)`` turned round."""
+    """
+    Return imucal's accelerometer as a forward model.
+
+    Its ``true = R^-1 K^-1 (measured - b)`` turned round.
+    """
     return Forward(info.b_a, info.K_a @ info.R_a)

@@ -1,11 +1,16 @@
 """
-Does a motion planned to separate causes leave the correct name? ``PYTHONPATH=test python -m validation.separating_worlds``.
+Check whether a motion planned to separate causes yields the correct name.
 
-A physical cause is hidden in a unit on a table, and a short recording is made with the usual motions: the faces, one spin about each axis, a swing. If
-its diagnosis names a class of confounded effects, the planner makes at most three minutes of motion for the same unit, and both recordings are diagnosed
-together; if a class remains, the planner makes another motion in the remaining time. The result is correct if the hidden effect is then named, without
-alternatives. Effects that the plan reports as confounded in any motion of that table of three minutes, mainly lags of one sensor within a tenth of a
-millisecond, are one cause: a class of these with the hidden effect is counted separately.
+Run ``PYTHONPATH=test python -m validation.separating_worlds``.
+
+A physical cause is hidden in a unit on a table, and a short recording is made with the usual
+motions: the faces, one spin about each axis, a swing. If its diagnosis names a class of confounded
+effects, the planner makes at most three minutes of motion for the same unit, and both recordings
+are diagnosed together; if a class remains, the planner makes another motion in the remaining time.
+The result is correct if the hidden effect is then named, without alternatives. Effects that the
+plan reports as confounded in any motion of that table of three minutes, mainly lags of one sensor
+within a tenth of a millisecond, are one cause: a class of these with the hidden effect is counted
+separately.
 """
 
 from __future__ import annotations
@@ -44,7 +49,10 @@ HIDDEN = (
 )
 """Effects that depend on motion and are often confounded with others in a short recording."""
 FACTORS = (2.5, 4.0)
-"""Sizes, as multiples of the smallest detectable size in the first recording; a larger one is less often in a class."""
+"""
+Sizes, as multiples of the smallest detectable size in the first recording; a larger one is less
+often in a class.
+"""
 PAUSE = 30.0
 """Seconds between one recording and the next."""
 SEPARATIONS = 2
@@ -61,7 +69,11 @@ class World:
     noise: str = 'realistic'
 
     def round(self) -> Profile:
-        """Return the first motion: the six faces, a spin in one sense and at one speed about each axis, a swing."""
+        """
+        Return the first motion.
+
+        The six faces, a spin in one sense and at one speed about each axis, a swing.
+        """
         rng, builder = generator(self.seed, 'round'), MotionBuilder(3)
         builder.rest(5.0)
         tasks = [pose(up + rng.normal(0.0, 0.03, 3), rng.uniform(-180, 180), 2.6) for up in FACES]
@@ -155,7 +167,12 @@ def is_class(found: list) -> bool:
 
 
 def judged(found: list, hidden: str, done: Sequence[Plan]) -> dict:
-    """Return the predictions of the plans, and whether the finding is the hidden effect alone, or a class that the first plan reported as one cause."""
+    """
+    Return the predictions of the plans, and whether the finding is correct.
+
+    It is correct when it is only the hidden effect, or a class that the first plan reported as one
+    cause.
+    """
     missing = done[0].missing  # of all three minutes
     alike = {
         hidden,
@@ -213,15 +230,18 @@ def main() -> None:
             continue
         rows.append(row)
         print(
-            f'{row["seed"]:6d} {row["hidden"]:<24} x{row["factor"]:<4g} {row["before"]} -> {row.get("after", row.get("refused"))} '
-            f'{row.get("seconds", 0.0):.0f} s {"right" if row["right"] else "one cause" if row.get("one_cause") else "WRONG"} {row.get("missing") or ""}',
+            f'{row["seed"]:6d} {row["hidden"]:<24} x{row["factor"]:<4g} {row["before"]} ->'
+            f' {row.get("after", row.get("refused"))} {row.get("seconds", 0.0):.0f} s'
+            f' {"right" if row["right"] else "one cause" if row.get("one_cause") else "WRONG"}'
+            f' {row.get("missing") or ""}',
             flush=True,
         )
         if len(rows) == options.worlds:
             break
     seconds = [row['seconds'] for row in rows if 'seconds' in row]
     print(
-        f"{tried} worlds, {len(rows)} with a class; a single, right name in {sum(row['right'] for row in rows)}, one cause by the plan's own word in "
+        f'{tried} worlds, {len(rows)} with a class; a single, right name in'
+        f" {sum(row['right'] for row in rows)}, one cause by the plan's own word in "
         f'{sum(row.get("one_cause", False) and not row["right"] for row in rows)}; '
         f'motion median {np.median(seconds):.0f} s, largest {max(seconds):.0f} s'
     )

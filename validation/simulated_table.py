@@ -1,4 +1,8 @@
-"""The PyPI package python-ins simulates an IMU on a two-axis table; our calibration must give its truth back."""
+"""
+The PyPI package python-ins simulates an IMU on a two-axis table.
+
+Our calibration must give its truth back.
+"""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -43,7 +47,11 @@ NOISE = {'accelerometer': 1.2e-3, 'gyroscope': 1.2e-4}
 
 
 def record():
-    """Return (ImuSamples, JointSamples): poses, then spins both ways about each axis, with python-ins' own motion, Earth and errors."""
+    """
+    Return (ImuSamples, JointSamples).
+
+    Poses, then spins both ways about each axis, with python-ins' own motion, Earth and errors.
+    """
     from pyins import inertial_sensor, sim, transform
 
     table = sim.Turntable(LLA, (*TILT_DEG, 0.0), angular_rate=60, angular_acceleration=60)
@@ -61,7 +69,8 @@ def record():
             for sign in (1, -1):
                 table.rotate(axis, sign * SPIN_DEG, angular_rate=rate, angular_acceleration=180)
                 table.rest(3.0)
-    # python-ins 1.0.1 gives the angles of one axis as (n,), which the Rotation of SciPy 1.17 takes only as (n, 1)
+    # python-ins 1.0.1 gives the angles of one axis as (n,), which the Rotation of SciPy 1.17 takes
+    # only as (n, 1)
     with mock.patch.object(
         sim, 'Rotation', SimpleNamespace(from_euler=_from_euler, from_matrix=Rotation.from_matrix)
     ):
@@ -77,7 +86,8 @@ def record():
     )
     mat_table = Rotation.from_euler('xyz', (*TILT_DEG, 0.0), True).as_matrix()
     mat = mat_table.T @ transform.mat_from_rph(trajectory[['roll', 'pitch', 'heading']].to_numpy())
-    # outer about x, then inner about z: third column (0, -sin outer, cos outer), first row (cos inner, -sin inner, 0)
+    # outer about x, then inner about z: third column (0, -sin outer, cos outer), first row (cos
+    # inner, -sin inner, 0)
     position = np.unwrap(
         np.column_stack(
             [np.arctan2(-mat[:, 1, 2], mat[:, 2, 2]), np.arctan2(-mat[:, 0, 1], mat[:, 0, 0])]
@@ -122,7 +132,11 @@ def calibrate_through_a_bag(imu, joints):
 
 
 def compare(calibration):
-    """Return [(parameter, value, truth, sd, status)] of everything that python-ins knows the truth of; its lever arms are zero."""
+    """
+    Return [(parameter, value, truth, sd, status)] of everything that python-ins knows the truth of.
+
+    Its lever arms are zero.
+    """
     truth = {
         f'{sensor}.{effect}.{name}': value
         for sensor, effects in TRUTH.items()

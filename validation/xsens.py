@@ -12,14 +12,20 @@ NAME = 'xsens_counts'
 
 
 def in_counts(found, nominal, sensor):
-    """Return (offsets, scale factors) of one sensor in counts and counts per SI unit; lengths of matrix rows need no choice of axes."""
+    """
+    Return (offsets, scale factors) of one sensor in counts and counts per SI unit.
+
+    Lengths of matrix rows need no choice of axes.
+    """
     bias, matrix = found.accelerometer if sensor == 'accelerometer' else found.gyroscope[:2]
     offset, scale = getattr(nominal, f'{sensor}_offset'), getattr(nominal, f'{sensor}_scale')
     return offset + scale * bias, scale * np.linalg.norm(matrix, axis=1)
 
 
 def figures(folder):
-    """Return (HandCalibration, {sensor: (offset difference in counts, relative scale difference)})."""
+    """
+    Return (HandCalibration, {sensor: (offset difference in counts, relative scale difference)}).
+    """
     nominal, factory = nominal_of(folder, NAME), reference(folder, NAME)['factory']
     imu = load(folder, NAME)
     found = calibrate_by_hand(imu, HandOptions(gravity_of(folder, NAME)), find_still(imu))

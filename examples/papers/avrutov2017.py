@@ -1,4 +1,8 @@
-"""Avrutov's 3D calibration (ELNANO 2017) as named methods, in the paper's units (V, g, deg/s), and the effect of the references."""
+"""
+Avrutov's 3D calibration (ELNANO 2017) as named methods.
+
+The methods use the paper's units (V, g, deg/s). The effect of the references is included.
+"""
 
 import itertools
 from collections.abc import Sequence
@@ -15,7 +19,10 @@ MODEL_COLUMNS = {
     'products': ('bias', 'x', 'y', 'z', 'xy', 'yz', 'xz'),
     'quadratic': ('bias', 'x', 'y', 'z', 'xy', 'yz', 'xz', 'xx', 'yy', 'zz'),
 }
-"""Design columns of the axial model (eq. 2, 8), the pendulous or extended model (eq. 5, 11) and the full quadratic."""
+"""
+Design columns of the axial model (eq. 2, 8), the pendulous or extended model (eq. 5, 11) and the
+full quadratic.
+"""
 
 GIMBAL_ORDERS = tuple(
     ''.join(order)
@@ -26,13 +33,21 @@ GIMBAL_ORDERS = tuple(
 
 
 def nominal_accelerometers(model: str = 'products') -> np.ndarray:
-    """Return the coefficients of samples 1 ('linear', V and V/g) and 2 ('products', also V/g^2), shape (n_params, 3)."""
+    """
+    Return the coefficients of samples 1 ('linear', V and V/g) and 2 ('products', also V/g^2).
+
+    Shape (n_params, 3).
+    """
     matrix = np.array([[1.0, 0.01, -0.01], [-0.01, 1.0, 0.01], [0.01, -0.01, 1.0]])
     return _stacked(2.5, matrix, model)
 
 
 def nominal_gyroscopes(model: str = 'products', n11: float = 0.1) -> np.ndarray:
-    """Return the coefficients of samples 3 and 4, V, V/(deg/s), V/(deg/s)^2; the paper prints 0.01 for n11 and means 0.1, it seems."""
+    """
+    Return the coefficients of samples 3 and 4, V, V/(deg/s), V/(deg/s)^2.
+
+    The paper prints 0.01 for n11 and means 0.1, it seems.
+    """
     matrix = np.array([[n11, 0.01, -0.02], [-0.01, 0.1, 0.01], [0.03, -0.01, 0.1]])
     return _stacked(2.0, matrix, model)
 
@@ -60,12 +75,20 @@ def turn(order: str, angles: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
 def simultaneous_turn(
     angle: np.ndarray, axis: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> np.ndarray:
-    """Return body-from-base matrices of one turn by `angle` (rad, shape (n,)) about `axis`: "three axes simultaneously", literally."""
+    """
+    Return body-from-base matrices of one turn by `angle` (rad, shape (n,)) about `axis`.
+
+    "three axes simultaneously", literally.
+    """
     return Rotation.from_rotvec(np.outer(angle, axis) / np.linalg.norm(axis)).inv().as_matrix()
 
 
 def equal_angles(step_deg: float = 10.0, stop_deg: float = 400.0) -> np.ndarray:
-    """Return the paper's turn angles in rad: 0 to `stop_deg` with the end, 41 positions (40 in the paper)."""
+    """
+    Return the paper's turn angles in rad.
+
+    0 to `stop_deg` with the end, 41 positions (40 in the paper).
+    """
     return np.deg2rad(np.arange(0.0, stop_deg + step_deg / 2, step_deg))
 
 
@@ -73,7 +96,9 @@ def gravity_readings(
     mat_bn: np.ndarray, gravity_axis: str, tilt_rad: Sequence[float] | np.ndarray = (0.0, 0.0)
 ) -> np.ndarray:
     """
-    Return the specific force in g in the body frame, shape (n, 3), for gravity along one axis of the table's base.
+    Return the specific force in g in the body frame, shape (n, 3).
+
+    For gravity along one axis of the table's base.
 
     Parameters
     ----------
@@ -90,7 +115,11 @@ def gravity_readings(
 
 
 def series_3() -> np.ndarray:
-    """Return the rates of sample 3, deg/s, shape (n, 3): w, w^(1/2), w^(1/3) for w = 0, 10 ... 100 (11 runs, 10 in the paper)."""
+    """
+    Return the rates of sample 3, deg/s, shape (n, 3).
+
+    W, w^(1/2), w^(1/3) for w = 0, 10 ... 100 (11 runs, 10 in the paper).
+    """
     rate = np.arange(0.0, 101.0, 10.0)
     return np.column_stack([rate, np.sqrt(rate), np.cbrt(rate)])
 
@@ -102,20 +131,30 @@ def series_4() -> np.ndarray:
 
 
 def factorial_rates(rate_deg_s: float = 10.0, n_static: int = 3) -> np.ndarray:
-    """Return all eight sign combinations of one rate on each axis and `n_static` runs at rest, deg/s: the orthogonal design."""
+    """
+    Return all eight sign combinations of one rate on each axis and `n_static` runs at rest, deg/s.
+
+    The orthogonal design.
+    """
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
     return np.vstack([rate_deg_s * corners, np.zeros((n_static, 3))])
 
 
 def add_earth_rate(rate_deg_s: np.ndarray, along_spin_axis_deg_s: float) -> np.ndarray:
-    """Return body rates that include Earth rate's component along the spin axis; the rest averages out over full turns."""
+    """
+    Return body rates that include Earth rate's component along the spin axis.
+
+    The rest averages out over full turns.
+    """
     size = np.linalg.norm(rate_deg_s, axis=1, keepdims=True)
     axis = np.where(size > 0, rate_deg_s / np.where(size > 0, size, 1.0), (1.0, 0.0, 0.0))
     return rate_deg_s + along_spin_axis_deg_s * axis
 
 
 def design_matrix(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
-    """Return G (eq. 2, 5) or omega (eq. 8, 11), shape (n, n_params), columns as in `MODEL_COLUMNS`."""
+    """
+    Return G (eq. 2, 5) or omega (eq. 8, 11), shape (n, n_params), columns as in `MODEL_COLUMNS`.
+    """
     if model not in MODEL_COLUMNS:
         raise InputError(
             f"model must be one of {', '.join(MODEL_COLUMNS)}, got '{model}'; choose one of them",
@@ -145,7 +184,9 @@ def calibrate(
     weights: np.ndarray | None = None,
 ) -> LinearSolution:
     """
-    Estimate bias, matrix and products of three sensors (eq. 3, 6, 9, 12), by orthogonal factors instead of normal equations.
+    Estimate bias, matrix and products of three sensors (eq. 3, 6, 9, 12).
+
+    By orthogonal factors instead of normal equations.
 
     Parameters
     ----------
@@ -175,7 +216,9 @@ def calibrate(
 def calibrate_as_printed(
     inputs: np.ndarray, outputs: np.ndarray, model: str = 'linear'
 ) -> np.ndarray:
-    """Return X by the printed normal equations ``inv(G'G) G'U``, for a comparison of their accuracy."""
+    """
+    Return X by the printed normal equations ``inv(G'G) G'U``, for a comparison of their accuracy.
+    """
     design = design_matrix(inputs, model)
     return np.linalg.inv(design.T @ design) @ design.T @ outputs
 
@@ -196,7 +239,10 @@ def calibrate_with_tilt(
     mat_bn: np.ndarray, outputs: np.ndarray, gravity_axis: str, *, iterations: int = 8
 ) -> TiltedSolution:
     """
-    Estimate bias, matrix (n x 4 model) and two tilt parameters from all three accelerometers jointly, by Gauss-Newton steps.
+    Estimate the parameters of all three accelerometers jointly.
+
+    The parameters are bias, matrix (n x 4 model) and two tilt parameters, estimated by Gauss-Newton
+    steps.
 
     Raises
     ------
@@ -232,10 +278,12 @@ def reference_error(
     model: str = 'linear',
 ) -> np.ndarray:
     """
-    Return the errors of the coefficients from errors of the reference inputs: ``G^+ dG X``, shape (n_params, 3).
+    Return the errors of the coefficients from errors of the reference inputs.
 
-    The true inputs are ``inputs + input_changes``, the fit uses `inputs`. Exact, and rows may err together (tilt, Earth rate),
-    which the paper's section V cannot express.
+    ``G^+ dG X``, shape (n_params, 3).
+
+    The true inputs are ``inputs + input_changes``, the fit uses `inputs`. Exact, and rows may err
+    together (tilt, Earth rate), which the paper's section V cannot express.
 
     """
     true_outputs = design_matrix(np.asarray(inputs) + input_changes, model) @ coefficients
@@ -243,7 +291,11 @@ def reference_error(
 
 
 def estimation_operator(inputs: np.ndarray, model: str = 'linear') -> np.ndarray:
-    """Return B with ``X = B @ U``, eq. 13: ``inv(G'G) G'``, by orthogonal factors, shape (n_params, n)."""
+    """
+    Return B with ``X = B @ U``, eq. 13.
+
+    ``inv(G'G) G'``, by orthogonal factors, shape (n_params, n).
+    """
     return (
         calibrate(inputs, np.zeros((len(inputs), 3)), model).unit_covariance
         @ design_matrix(inputs, model).T
@@ -252,10 +304,12 @@ def estimation_operator(inputs: np.ndarray, model: str = 'linear') -> np.ndarray
 
 def m_test_sd(errors: np.ndarray, as_printed: bool = True) -> np.ndarray:
     """
-    Return the root-mean-square error over m tests, as at the end of section V: ``sqrt(sum(error^2) / (m - 1))``, shape (...).
+    Return the root-mean-square error over m tests, as at the end of section V.
 
-    The errors are against known truth, without an estimate from them, so that m is right (`as_printed` False); m - 1 belongs to
-    differences from their own mean.
+    ``sqrt(sum(error^2) / (m - 1))``, shape (...).
+
+    The errors are against known truth, without an estimate from them, so that m is right
+    (`as_printed` False); m - 1 belongs to differences from their own mean.
 
     Parameters
     ----------
@@ -287,9 +341,11 @@ def error_budget(
     noise_sd : float
         Sd of the mean outputs, V: contributes ``noise_sd^2 inv(G'G)``.
     common : dict of str to array, shape (n, 3) or (k, n, 3)
-        Change of the inputs by one sd of a cause that all runs share (tilt: k = 2 directions, gravity, Earth rate).
+        Change of the inputs by one sd of a cause that all runs share (tilt: k = 2 directions,
+        gravity, Earth rate).
     scattered : dict of str to array, shape (n, 3) or (k, n, 3)
-        Change of the inputs by one sd of a cause that is drawn independently in every run (encoder, rate resolution).
+        Change of the inputs by one sd of a cause that is drawn independently in every run (encoder,
+        rate resolution).
 
     Returns
     -------
@@ -316,14 +372,22 @@ def error_budget(
 
 
 def tilt_changes(mat_bn: np.ndarray, gravity_axis: str, tilt_sd_rad: float) -> np.ndarray:
-    """Return the change of the readings by one sd of each tilt component, g, shape (2, n, 3), for `error_budget`."""
+    """
+    Return the change of the readings by one sd of each tilt component, g, shape (2, n, 3).
+
+    For `error_budget`.
+    """
     return tilt_sd_rad * np.moveaxis(mat_bn @ _tilt_derivative(gravity_axis, np.zeros(2)), 2, 0)
 
 
 def encoder_changes(
     order: str, angles: np.ndarray, gravity_axis: str, *, encoder_sd_rad: float
 ) -> np.ndarray:
-    """Return the change of the readings by one sd of each gimbal angle, g, shape (3, n, 3), for `error_budget`."""
+    """
+    Return the change of the readings by one sd of each gimbal angle, g, shape (3, n, 3).
+
+    For `error_budget`.
+    """
     changes = []
     for gimbal in range(3):
         shift = np.pi / 2 * np.eye(3)[gimbal][:, None]
@@ -343,7 +407,11 @@ def _tilt_derivative(gravity_axis, tilt_rad):
 
 
 def _design_slope(inputs, model):
-    """Return the derivative of the design by the inputs, shape (n, n_params, 3); exact, as the columns are quadratic at most."""
+    """
+    Return the derivative of the design by the inputs, shape (n, n_params, 3).
+
+    Exact, as the columns are quadratic at most.
+    """
     inputs = np.asarray(inputs, float)
     steps = np.eye(3)
     return np.stack(

@@ -1,4 +1,6 @@
-"""Accurate linear least squares: orthogonal factors of scaled columns instead of normal equations."""
+"""
+Accurate linear least squares: orthogonal factors of scaled columns instead of normal equations.
+"""
 
 from dataclasses import dataclass
 
@@ -8,21 +10,32 @@ import scipy.linalg
 from imu_calibration.core.errors import InputError, NotObservableError
 
 RANK_TOLERANCE = 1e-10
-"""A singular value of the unit-column design below this times the largest counts as zero; rounding errors are about 1e-15."""
+"""
+A singular value of the unit-column design below this times the largest counts as zero; rounding
+errors are about 1e-15.
+"""
 COLUMN_TOLERANCE = 1e-14
-"""A column shorter than this times the longest is rounding of zero (the sine of pi), not a column to be scaled up."""
+"""
+A column shorter than this times the longest is rounding of zero (the sine of pi), not a column to
+be scaled up.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearSolution:
-    """Least-squares solution of ``outputs = design @ values`` for one or several columns of outputs."""
+    """
+    Least-squares solution of ``outputs = design @ values`` for one or several columns of outputs.
+    """
 
     values: np.ndarray
     """Parameters in `param_names` order, shape (n_params,) or (n_params, n_outputs)."""
     param_names: tuple
     """Names of the parameters."""
     unit_covariance: np.ndarray
-    """Covariance for output noise of sd 1 (of sd 1/sqrt(weight) with weights), shape (n_params, n_params)."""
+    """
+    Covariance for output noise of sd 1 (of sd 1/sqrt(weight) with weights), shape (n_params,
+    n_params).
+    """
     residuals: np.ndarray
     """Outputs minus prediction, not weighted, shape of the outputs."""
     cond: float
@@ -89,13 +102,21 @@ def solve_linear(
 
 
 def numerical_rank(design: np.ndarray) -> int:
-    """Return the rank of `design` after its columns are scaled to unit norm; zero columns count as zero."""
+    """
+    Return the rank of `design` after its columns are scaled to unit norm.
+
+    Zero columns count as zero.
+    """
     singular = _scaled_svd(np.asarray(design, float))[2]
     return int(np.sum(~_negligible(singular)))
 
 
 def condition_numbers(design: np.ndarray) -> tuple[float, float]:
-    """Return (condition number as it is, condition number with unit-norm columns); infinite when a column is zero."""
+    """
+    Return (condition number as it is, condition number with unit-norm columns).
+
+    Infinite when a column is zero.
+    """
     design = np.asarray(design, float)
     return _ratio(np.linalg.svd(design, compute_uv=False)), _ratio(_scaled_svd(design)[2])
 
@@ -104,8 +125,8 @@ def null_directions(design: np.ndarray, param_names: tuple[str, ...]) -> list[di
     """
     Return the combinations of parameters that change no output, as a list of {name: weight}.
 
-    Weights are changes of the parameters in their own units, the leading one being 1; combinations are made as short as an echelon
-    form can. A column of zeros gives a direction of its own.
+    Weights are changes of the parameters in their own units, the leading one being 1; combinations
+    are made as short as an echelon form can. A column of zeros gives a direction of its own.
 
     """
     norms, _, singular, right = _scaled_svd(np.asarray(design, float))
@@ -117,7 +138,9 @@ def predicted_sd(
     design: np.ndarray, weights: np.ndarray | None = None, sigma: float = 1.0
 ) -> np.ndarray:
     """
-    Return the sd that each parameter will have, before any data exist; infinite where the design does not reach it.
+    Return the sd that each parameter will have, before any data exist.
+
+    Infinite where the design does not reach it.
 
     Parameters
     ----------
@@ -140,14 +163,23 @@ def predicted_sd(
 
 @dataclass(frozen=True, eq=False)
 class ToleranceScaled:
-    """Standard deviations along directions of the parameter space, each parameter in units of its tolerance."""
+    """
+    Standard deviations along directions of the parameter space.
+
+    Each parameter is in units of its tolerance.
+    """
 
     singular_values: np.ndarray
-    """One over the sd of each direction in tolerances, descending, shape (n_params,); below 1 the direction is too weak."""
+    """
+    One over the sd of each direction in tolerances, descending, shape (n_params,); below 1 the
+    direction is too weak.
+    """
     directions: np.ndarray
     """Unit vectors in tolerance units, one per row, shape (n_params, n_params)."""
     sd_over_tolerance: np.ndarray
-    """Predicted sd over tolerance of each parameter, shape (n_params,); infinite when not reached."""
+    """
+    Predicted sd over tolerance of each parameter, shape (n_params,); infinite when not reached.
+    """
 
     @property
     def cond(self) -> float:
@@ -157,7 +189,9 @@ class ToleranceScaled:
     def weak_directions(
         self, param_names: tuple[str, ...], share: float = 0.1
     ) -> list[dict[str, float]]:
-        """Return [{name: weight}] for directions whose sd exceeds the tolerance, the weakest first."""
+        """
+        Return [{name: weight}] for directions whose sd exceeds the tolerance, the weakest first.
+        """
         rows = self.directions[self.singular_values < 1.0][::-1]
         return [
             {
@@ -200,16 +234,19 @@ def _checked(design, outputs, param_names, weights):
     )
     if design.ndim != 2 or design.shape[1] != len(names):
         raise InputError(
-            f'the design must have one column per parameter ({len(names)}), got shape {design.shape}; correct one of them'
+            f'the design must have one column per parameter ({len(names)}), got shape'
+            f' {design.shape}; correct one of them'
         )
     if outputs.shape[:1] != design.shape[:1] or outputs.ndim > 2:
         raise InputError(
-            f'outputs must have {len(design)} rows like the design, got shape {outputs.shape}; correct one of them'
+            f'outputs must have {len(design)} rows like the design, got shape {outputs.shape};'
+            ' correct one of them'
         )
     weights = np.ones(len(design)) if weights is None else np.asarray(weights, float)
     if weights.shape != (len(design),) or not np.all(weights >= 0):
         raise InputError(
-            f'weights must be {len(design)} numbers >= 0, got shape {weights.shape}; give inverse variances'
+            f'weights must be {len(design)} numbers >= 0, got shape {weights.shape}; give inverse'
+            ' variances'
         )
     if not (
         np.all(np.isfinite(design))
@@ -223,7 +260,11 @@ def _checked(design, outputs, param_names, weights):
 
 
 def _scaled_svd(design):
-    """Return (column norms with 1 for empty columns, U, singular values, V') of the unit-column design, all n_params of them."""
+    """
+    Return (column norms, U, singular values, V') of the unit-column design.
+
+    The norms are 1 for empty columns. There are n_params singular values, that is, all of them.
+    """
     norms = np.linalg.norm(design, axis=0)
     empty = norms <= COLUMN_TOLERANCE * np.max(norms)
     norms = np.where(empty, 1.0, norms)
@@ -251,8 +292,9 @@ def _require_full_rank(design, norms, singular, right, names):
     if np.any(weak):
         directions = _echelon(right[weak], norms, names)
         raise NotObservableError(
-            f'the design must determine {len(names)} parameters, got rank {int(np.sum(~weak))} from {len(design)} rows; not determined: '
-            f'{"; ".join(map(_as_text, directions))}. Record motion that changes these columns independently, or hold a parameter.',
+            f'the design must determine {len(names)} parameters, got rank {int(np.sum(~weak))} from'
+            f' {len(design)} rows; not determined: {"; ".join(map(_as_text, directions))}. Record'
+            ' motion that changes these columns independently, or hold a parameter.',
             code='rank',
         )
 

@@ -27,7 +27,10 @@ TABLE_2_G = np.array(
         [-0.00911, 0.00023, 0.00953, 0.00020],
     ]
 )
-"""Readings at rest as printed, g, rows x, y, z; columns: x up before and after compensation, x down before and after."""
+"""
+Readings at rest as printed, g, rows x, y, z; columns: x up before and after compensation, x down
+before and after.
+"""
 TABLE_3_ARMS = -np.array(
     [[-0.00834, -0.00042, -0.00132], [-0.00256, -0.00893, -0.00026], [-0.00060, -0.00050, -0.00824]]
 )
@@ -72,7 +75,11 @@ class StaticModel:
         return np.linalg.solve(self.matrix, (np.asarray(outputs) - self.bias).T).T
 
     def invert_as_printed(self, outputs: np.ndarray) -> np.ndarray:
-        """Return specific forces with the transpose taken for the inverse of the cosines, as eq. 3 and 4 claim."""
+        """
+        Return specific forces with the transpose taken for the inverse of the cosines.
+
+        As eq. 3 and 4 claim.
+        """
         return (np.asarray(outputs) - self.bias) / self.scale @ self.cosines
 
 
@@ -94,7 +101,9 @@ def six_positions() -> np.ndarray:
 
 def fit_static(force_b: np.ndarray, outputs: np.ndarray) -> tuple[StaticModel, LinearSolution]:
     """
-    Estimate scale factors, nine installation angles and zero biases from means at rest (section 3.1, step 4).
+    Estimate scale factors, nine installation angles and zero biases.
+
+    The estimates are from means at rest (section 3.1, step 4).
 
     Parameters
     ----------
@@ -124,10 +133,12 @@ def closed_form(
     as_printed: bool = False,
 ) -> np.ndarray | None:
     """
-    Return the lever arms by eq. 24 from three spins about orthonormal axes that point up, shape (..., 3, 3), one sensor per row.
+    Return the lever arms by eq. 24 from three spins about orthonormal axes that point up.
 
-    ``r_ik = (d_ik - d_il - d_im) / (2 rate^2 cos(axis_i, spin axis k))`` with ``d = spin mean - static mean`` of sensor i; the
-    sensors' biases drop out.
+    Shape (..., 3, 3), one sensor per row.
+
+    ``r_ik = (d_ik - d_il - d_im) / (2 rate^2 cos(axis_i, spin axis k))`` with ``d = spin mean -
+    static mean`` of sensor i; the sensors' biases drop out.
 
     Parameters
     ----------
@@ -138,7 +149,8 @@ def closed_form(
     directions : array, shape (3, 3)
         Direction cosines, row i; a full sensor matrix does as well when the means are raw.
     spin_axes : array, shape (3, 3), optional
-        Spin axes in the body frame, one per row; the body axes if not given. The arms are in the body frame.
+        Spin axes in the body frame, one per row; the body axes if not given. The arms are in the
+        body frame.
     as_printed : bool
         Use the printed fourth term of r_jx (spin instead of static reading), to show its effect.
 
@@ -151,15 +163,16 @@ def closed_form(
     axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
     if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
         raise InputError(
-            'the three spin axes must be orthonormal for the closed form, got others; use the joint fit',
+            'the three spin axes must be orthonormal for the closed form, got others; use the'
+            ' joint fit',
             code='not_orthonormal',
         )
     cosines = np.asarray(directions, float) @ axes.T
     if np.any(np.abs(cosines) < 1e-12):
         sensor, spin = np.argwhere(np.abs(cosines) < 1e-12)[0]
         raise NotObservableError(
-            f'sensor axis {"xyz"[sensor]} must not be square to spin axis {spin + 1} for the closed form; '
-            'skew the fixture, add oscillations, or use the joint fit',
+            f'sensor axis {"xyz"[sensor]} must not be square to spin axis {spin + 1} for the closed'
+            ' form; skew the fixture, add oscillations, or use the joint fit',
             code='square_axes',
         )
     means_static, means_spin = np.asarray(means_static, float), np.asarray(means_spin, float)
@@ -173,13 +186,21 @@ def closed_form(
 def closed_form_sd(
     noise_sd: float, rate: float, directions: np.ndarray, *, spin_axes: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the sd of each arm along the spin axes, ``sqrt(6) noise_sd / (2 rate^2 |cos|)``, shape (3, 3), one sensor per row."""
+    """
+    Return the sd of each arm along the spin axes, ``sqrt(6) noise_sd / (2 rate^2 |cos|)``.
+
+    Shape (3, 3), one sensor per row.
+    """
     axes = np.eye(3) if spin_axes is None else np.asarray(spin_axes, float)
     return np.sqrt(6) * noise_sd / (2 * rate**2 * np.abs(np.asarray(directions, float) @ axes.T))
 
 
 def average_rates(arms: np.ndarray, rates: np.ndarray, weighted: bool = True) -> np.ndarray:
-    """Average closed-form arms of several spin rates, shape (n_rates, 3, 3), with weights rate^4 (their inverse variances) or plainly."""
+    """
+    Average closed-form arms of several spin rates, shape (n_rates, 3, 3).
+
+    With weights rate^4 (their inverse variances) or plainly.
+    """
     rates = np.asarray(rates, float)
     return np.average(arms, axis=0, weights=rates**4 if weighted else None)
 
@@ -196,9 +217,12 @@ def static_navigation(
     calibration_seconds: float = 60.0,
 ) -> np.ndarray:
     """
-    Return errors of navigation at rest with x up, attitude known: medians of velocity (m/s) and position (m), before and after calibration.
+    Return errors of navigation at rest with x up, attitude known.
 
-    Before, the installation angles are ignored; after, the six-position calibration is used. Shape (4,).
+    Medians of velocity (m/s) and position (m), before and after calibration.
+
+    Before, the installation angles are ignored; after, the six-position calibration is used. Shape
+    (4,).
 
     Parameters
     ----------
@@ -249,7 +273,11 @@ def _noise_at_end(rng, noise_sd, seconds, sample_rate):
 def size_effect_error(
     cosines: np.ndarray, arms: np.ndarray, rate: np.ndarray, *, alpha: np.ndarray
 ) -> np.ndarray:
-    """Return the error in the body frame, m/s^2, shape (n, 3), of accelerometers that are taken to sit in one point (eq. 17)."""
+    """
+    Return the error in the body frame, m/s^2.
+
+    Shape (n, 3), of accelerometers that are taken to sit in one point (eq. 17).
+    """
     along_axes = np.einsum('ij,njk,ik->ni', cosines, lever_matrix(rate, alpha), arms)
     return np.linalg.solve(cosines, along_axes.T).T
 
@@ -264,9 +292,12 @@ def spin_growth(
     sample_rate: float = 100.0,
 ) -> dict[str, Any]:
     """
-    Return errors of an uncompensated size effect in a constant spin: (velocity, position) in n, the same summed in the body frame.
+    Return errors of an uncompensated size effect in a constant spin.
 
-    The result is a dict with 'time', 'level' and 'body' (each a pair of (n, 3) arrays) and 'axial_mg', the steady part along the axis.
+    (velocity, position) in n, the same summed in the body frame.
+
+    The result is a dict with 'time', 'level' and 'body' (each a pair of (n, 3) arrays) and
+    'axial_mg', the steady part along the axis.
 
     """
     axis = np.asarray(axis, float) / np.linalg.norm(axis)
@@ -284,7 +315,11 @@ def spin_growth(
 
 @dataclass(frozen=True, eq=False)
 class Tumbling:
-    """Sinusoidal body rates about three axes: amplitude * 2 pi f * cos(2 pi f t + phase), attitude integrated from them."""
+    """
+    Sinusoidal body rates about three axes.
+
+    Amplitude * 2 pi f * cos(2 pi f t + phase), attitude integrated from them.
+    """
 
     time: np.ndarray
     """s, shape (n,)."""
@@ -314,7 +349,11 @@ def tumble(
 
 
 def arm_responses(motion: Tumbling, cosines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return velocity and position histories per metre of each arm component (sensor, component), shape (9, n, 3) each."""
+    """
+    Return velocity and position histories per metre of each arm component (sensor, component).
+
+    Shape (9, n, 3) each.
+    """
     unit_arms = np.eye(9).reshape(9, 3, 3)
     errors = np.array(
         [size_effect_error(cosines, arms, motion.rate, alpha=motion.alpha) for arms in unit_arms]
@@ -323,7 +362,11 @@ def arm_responses(motion: Tumbling, cosines: np.ndarray) -> tuple[np.ndarray, np
 
 
 def peaks(responses: tuple[np.ndarray, np.ndarray], arms: np.ndarray, every: int = 5) -> np.ndarray:
-    """Return the largest velocity and position error for arm errors of shape (n_draws, 3, 3), shape (2, n_draws)."""
+    """
+    Return the largest velocity and position error for arm errors of shape (n_draws, 3, 3).
+
+    Shape (2, n_draws).
+    """
     flat = np.asarray(arms, float).reshape(-1, 9)
     out = []
     for response in responses:

@@ -1,4 +1,8 @@
-"""Static and dynamic runs of a turntable in one least-squares system for bias, matrix and lever arms; designs of runs."""
+"""
+Static and dynamic runs of a turntable in one least-squares system for bias, matrix and lever arms.
+
+Designs of runs.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +21,10 @@ from papers.linear_least_squares import (
 )
 
 DESIGNS = ('Z0', 'Z60', 'O', 'M')
-"""Zhang's own runs, the same with the fixture skewed by 60 deg, oscillations, and a mixture with two-axis turns."""
+"""
+Zhang's own runs, the same with the fixture skewed by 60 deg, oscillations, and a mixture with
+two-axis turns.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +44,11 @@ class Run:
 
 
 def face(up: np.ndarray, noise_sd: float, tilt: float = 0.0, *, azimuth: float = 0.0) -> Run:
-    """Return one position at rest; the table is off level by `tilt` (rad) towards `azimuth` about the body's up axis."""
+    """
+    Return one position at rest.
+
+    The table is off level by `tilt` (rad) towards `azimuth` about the body's up axis.
+    """
     up = _unit(up)
     level = _square_to(up)
     force = np.cos(tilt) * up + np.sin(tilt) * (
@@ -47,7 +58,9 @@ def face(up: np.ndarray, noise_sd: float, tilt: float = 0.0, *, azimuth: float =
 
 
 def spin(axis: np.ndarray, rate_deg_s: float, noise_sd: float) -> Run:
-    """Return a spin at constant rate about a vertical axis; gravity and arms give constant readings."""
+    """
+    Return a spin at constant rate about a vertical axis; gravity and arms give constant readings.
+    """
     axis = _unit(axis)[None]
     return Run(
         'spin', STANDARD_GRAVITY * axis, np.deg2rad(rate_deg_s) * axis, np.zeros((1, 3)), noise_sd
@@ -63,7 +76,11 @@ def oscillation(
     n_samples: int = 100,
     delay: float = 0.0,
 ) -> Run:
-    """Return one period of ``amplitude sin(2 pi f t)`` about a vertical axis; `delay` (s) is how late the samples are stamped."""
+    """
+    Return one period of ``amplitude sin(2 pi f t)`` about a vertical axis.
+
+    `delay` (s) is how late the samples are stamped.
+    """
     axis, angular = _unit(axis), 2 * np.pi * frequency_hz
     phase = angular * (np.arange(n_samples) / n_samples / frequency_hz - delay)
     amplitude = np.deg2rad(amplitude_deg)
@@ -85,7 +102,11 @@ def two_axis(
     n_samples: int = 100,
     delay: float = 0.0,
 ) -> Run:
-    """Return one turn of a horizontal body axis `inner` at constant rate while the vertical outer axis turns as well."""
+    """
+    Return one turn of a horizontal body axis `inner` at constant rate.
+
+    The vertical outer axis turns as well at the same time.
+    """
     inner, (inner_rate, outer_rate) = _unit(inner), np.deg2rad([inner_deg_s, outer_deg_s])
     turned = inner_rate * (np.arange(n_samples) / n_samples * 2 * np.pi / abs(inner_rate) - delay)
     start = _square_to(inner)
@@ -108,7 +129,8 @@ def design_runs(
     name : str
         One of `DESIGNS`.
     sample_sd : float
-        White noise of one sample, m/s^2; runs with constant readings carry ``sample_sd / sqrt(n_samples)``.
+        White noise of one sample, m/s^2; runs with constant readings carry ``sample_sd /
+        sqrt(n_samples)``.
 
     """
     if name not in DESIGNS:
@@ -138,12 +160,20 @@ def design_runs(
 
 
 def skewed_axes(skew_deg: float) -> np.ndarray:
-    """Return three orthonormal spin axes, one per row, for a fixture turned by `skew_deg` about the body diagonal (1, 1, 1)."""
+    """
+    Return three orthonormal spin axes, one per row.
+
+    For a fixture turned by `skew_deg` about the body diagonal (1, 1, 1).
+    """
     return Rotation.from_rotvec(np.deg2rad(skew_deg) * np.ones(3) / np.sqrt(3)).as_matrix().T
 
 
 def average_headings(tilt: float, up: np.ndarray, noise_sd: float, *, n_headings: int = 4) -> Run:
-    """Return the mean of a tilted position over equally spaced headings, in which the error of levelling cancels."""
+    """
+    Return the mean of a tilted position over equally spaced headings.
+
+    The error of levelling cancels in this mean.
+    """
     parts = [
         face(up, noise_sd, tilt, azimuth=2 * np.pi * k / n_headings) for k in range(n_headings)
     ]
@@ -151,7 +181,11 @@ def average_headings(tilt: float, up: np.ndarray, noise_sd: float, *, n_headings
 
 
 def stack_runs(runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return forces (n, 3), lever-arm matrices (n, 3, 3) and noise sd (n,) of all rows of the runs in order."""
+    """
+    Return forces, lever-arm matrices and noise of all rows of the runs in order.
+
+    The shapes are (n, 3) for forces, (n, 3, 3) for lever-arm matrices and (n,) for the noise sd.
+    """
     noise = np.concatenate([np.full(len(run.force), run.noise_sd) for run in runs])
     arm_matrix = np.concatenate([lever_matrix(run.rate, run.alpha) for run in runs])
     return np.concatenate([run.force for run in runs]), arm_matrix, noise
@@ -177,13 +211,21 @@ TOLERANCES = np.array([1e-4 * STANDARD_GRAVITY, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e
 
 
 def predict(runs: Sequence[Run], values: np.ndarray) -> np.ndarray:
-    """Return the readings of one accelerometer, shape (n_rows,), for parameters in `PARAM_NAMES` order."""
+    """
+    Return the readings of one accelerometer, shape (n_rows,).
+
+    For parameters in `PARAM_NAMES` order.
+    """
     force, arm_matrix, _ = stack_runs(runs)
     return values[0] + (force + arm_matrix @ values[4:]) @ values[1:4]
 
 
 def jacobian(runs: Sequence[Run], values: np.ndarray) -> np.ndarray:
-    """Return the derivative of the readings by `PARAM_NAMES`, each row over its noise sd, shape (n_rows, 7)."""
+    """
+    Return the derivative of the readings by `PARAM_NAMES`, each row over its noise sd.
+
+    Shape (n_rows, 7).
+    """
     force, arm_matrix, noise = stack_runs(runs)
     columns = [
         np.ones(len(force)),
@@ -201,7 +243,9 @@ def judge_design(
     tolerances: np.ndarray = TOLERANCES,
 ) -> list[ToleranceScaled]:
     """
-    Predict the precision of a design, one `ToleranceScaled` per accelerometer: sd over tolerance and weak directions.
+    Predict the precision of a design, one `ToleranceScaled` per accelerometer.
+
+    Sd over tolerance and weak directions.
 
     An sd over tolerance above 1 means that the parameter must not be reported as a plain value.
 
@@ -213,7 +257,11 @@ def judge_design(
 
 
 def weak_arms(judged: Sequence[ToleranceScaled]) -> list[str]:
-    """Return names such as 'r_xy' (sensor x, component y) of arms whose predicted sd exceeds the tolerance."""
+    """
+    Return the names of arms with a predicted sd above the tolerance.
+
+    The names have the form 'r_xy' (sensor x, component y).
+    """
     return [
         f'r_{sensor}{PARAM_NAMES[k][-1]}'
         for sensor, one in zip('xyz', judged)
@@ -230,7 +278,11 @@ def arm_errors(
     rng: np.random.Generator,
     n_draws: int,
 ) -> np.ndarray:
-    """Draw errors of one estimated arm from the covariance that the runs predict, m, shape (n_draws, 3)."""
+    """
+    Draw errors of one estimated arm from the covariance that the runs predict, m.
+
+    Shape (n_draws, 3).
+    """
     factor = np.linalg.qr(jacobian(runs, np.concatenate([[0.0], matrix_row, arm])), mode='r')
     return np.linalg.solve(factor, rng.normal(size=(len(PARAM_NAMES), n_draws))).T[:, 4:]
 
@@ -306,14 +358,22 @@ def fit_joint(
 def fit_triad(
     runs: Sequence[Run], readings: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[JointFit]]:
-    """Fit the three accelerometers of a recording, readings of shape (n_rows, 3); return matrix (3, 3), arms (3, 3), bias (3,), fits."""
+    """
+    Fit the three accelerometers of a recording, readings of shape (n_rows, 3).
+
+    Return matrix (3, 3), arms (3, 3), bias (3,), fits.
+    """
     fits = [fit_joint(runs, column) for column in np.asarray(readings, float).T]
     values = np.array([fit.values[0] for fit in fits])
     return values[:, 1:4], values[:, 4:], values[:, 0], fits
 
 
 def _reduce(runs, readings):
-    """Return Q, R and Q'y of the system with columns 1, f_j and W_jk; products m_j r_k are its last nine unknowns."""
+    """
+    Return Q, R and Q'y of the system with columns 1, f_j and W_jk.
+
+    Products m_j r_k are its last nine unknowns.
+    """
     force, arm_matrix, noise = stack_runs(runs)
     design = (
         np.column_stack([np.ones(len(force)), force, arm_matrix.reshape(len(force), 9)])
@@ -338,7 +398,11 @@ def _linearise(factor, target, values):
 
 
 def _solve_stack(slope, rest):
-    """Solve a stack of small least-squares problems by QR with scaled columns; return steps and inverse factors."""
+    """
+    Solve a stack of small least-squares problems by QR with scaled columns.
+
+    Return steps and inverse factors.
+    """
     norms = np.linalg.norm(slope, axis=1)
     if np.any(norms == 0):
         _refuse(slope[np.argmax(np.any(norms == 0, axis=1))])
@@ -353,7 +417,8 @@ def _solve_stack(slope, rest):
 def _refuse(slope):
     solve_linear(slope, np.zeros(len(slope)), PARAM_NAMES)
     raise NotObservableError(
-        'the runs must determine bias, matrix row and arm, got a system singular to rounding; add runs'
+        'the runs must determine bias, matrix row and arm, got a system singular to rounding; add'
+        ' runs'
     )
 
 

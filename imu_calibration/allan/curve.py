@@ -22,10 +22,12 @@ PER_OCTAVE = 2
 
 def averaging_factors(n_samples: int, per_octave: int = PER_OCTAVE) -> np.ndarray:
     """
-    Return the numbers of samples per mean at which the variance of `n_samples` is computed, integers in rising order.
+    Return the numbers of samples per mean at which the variance is computed.
 
-    Spaced evenly in the logarithm, up to half of the samples. Beyond `FULL` they are multiples of a power of two, as the halved
-    rates need.
+    They are integers in rising order for the variance of `n_samples`.
+
+    Spaced evenly in the logarithm, up to half of the samples. Beyond `FULL` they are multiples of a
+    power of two, as the halved rates need.
     """
     if n_samples < 2:
         return np.zeros(0, np.int64)
@@ -108,7 +110,12 @@ class AllanSums:
             level.forget()
 
     def by_stretch(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the variances of each stretch, (n_stretches, n_scales, n_columns), and their numbers of terms, (n_stretches, n_scales)."""
+        """
+        Return the variances of each stretch and their numbers of terms.
+
+        The shapes are (n_stretches, n_scales, n_columns) for the variances and (n_stretches,
+        n_scales) for the numbers of terms.
+        """
         squares, terms = (np.diff(np.array(values), axis=0) for values in zip(*self._until))
         return squares / (2.0 * np.maximum(terms, 1)[:, :, None]), terms.astype(float)
 
@@ -119,7 +126,9 @@ class AllanSums:
 
 
 class _Level:
-    """Second differences at one rate: `factors` in samples of that rate, results to the rows `index`."""
+    """
+    Second differences at one rate: `factors` in samples of that rate, results to the rows `index`.
+    """
 
     def __init__(self, index, factors, n_columns):
         self.index, self.factors = index, factors
@@ -133,14 +142,22 @@ class _Level:
         self.odd = np.zeros((self.n_columns, 0)), np.zeros(0)
 
     def halved(self, rows, counts):
-        """Return sums of pairs of samples and the share of each that is present; a sample without a mate waits."""
+        """
+        Return sums of pairs of samples and the share of each that is present.
+
+        A sample without a mate waits.
+        """
         rows, counts = (np.concatenate(pair, axis=-1) for pair in zip(self.odd, (rows, counts)))
         n = len(counts) // 2 * 2
         self.odd = rows[:, n:], counts[n:]
         return rows[:, 0:n:2] + rows[:, 1:n:2], 0.5 * (counts[0:n:2] + counts[1:n:2])
 
     def push(self, rows, counts, size, squares, terms):
-        """Add the second differences that end in the new samples, each the sum of `size` original ones."""
+        """
+        Add the second differences that end in the new samples.
+
+        Each new sample is the sum of `size` original ones.
+        """
         old = self.sums.shape[1]
         self.sums = np.concatenate([self.sums, self.sums[:, -1:] + np.cumsum(rows, axis=1)], axis=1)
         self.counts = np.concatenate([self.counts, self.counts[-1] + np.cumsum(counts)])
@@ -187,7 +204,10 @@ class _Level:
 
 
 MAX_STEP_JITTER = 0.2
-"""Largest typical departure of steps from the period, in periods, up to which a single step is believed."""
+"""
+Largest typical departure of steps from the period, in periods, up to which a single step is
+believed.
+"""
 STAMP_WINDOW_SAMPLES = 64
 """Samples over which irregular stamps are averaged."""
 
@@ -208,7 +228,11 @@ class SampleGrid:
         self._last_ns: int | None = None
 
     def steps(self, stamp_ns: np.ndarray) -> np.ndarray:
-        """Return for each sample the number of periods since the one before, at least 1, shape (n,); the first of a stretch counts 1."""
+        """
+        Return for each sample the number of periods since the one before, at least 1, shape (n,).
+
+        The first of a stretch counts 1.
+        """
         before = stamp_ns[0] - round(self._period_ns) if self._last_ns is None else self._last_ns
         step = np.diff(stamp_ns, prepend=before) / self._period_ns
         self._last_ns = int(stamp_ns[-1])
@@ -236,7 +260,9 @@ def _lost(step):
 
 
 def spread(values: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (values, present) with a row for every period: missing samples are zero and not present."""
+    """
+    Return (values, present) with a row for every period: missing samples are zero and not present.
+    """
     place = np.cumsum(steps) - 1
     if place[-1] == len(values) - 1:
         return values, np.ones(len(values), bool)
@@ -324,7 +350,11 @@ class RestReader:
     """For recordings in volts or counts."""
 
     def read(self, *bare: Sink, raw: Sink | None = None) -> None:
-        """Push the samples of each part without trends into the sinks `bare`, and unchanged into `raw`."""
+        """
+        Push the samples of each part into the sinks `bare` and `raw`.
+
+        The samples in `bare` are without trends and the samples in `raw` are unchanged.
+        """
         for (epoch, _), pieces in groupby(self._pieces(), key=itemgetter(0, 1)):
             grid = SampleGrid(self.period)
             for *_, imu in pieces:

@@ -111,7 +111,11 @@ def _sensor_section(sensor, axes):
 
 
 def _entry(terms, unit):
-    """Return value, interval, status, reason and unit of three axes; None where an axis has no such figure."""
+    """
+    Return value, interval, status, reason and unit of three axes.
+
+    None where an axis has no such figure.
+    """
     return {
         'value': [
             None if term is None or term.value is None else float(term.value) for term in terms
@@ -170,16 +174,16 @@ def noise_from_text(text: str) -> NoiseFigures:
     found = str(document.get('format'))
     if found != NOISE_FORMAT:
         raise DocumentError(
-            f"a noise document must have 'format: {NOISE_FORMAT}', got '{found}'; give a file written by "
-            "'imu_calibration noise'",
+            f"a noise document must have 'format: {NOISE_FORMAT}', got '{found}'; give a file"
+            " written by 'imu_calibration noise'",
             code='document_format',
         )
     try:
         return _parse(document)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise DocumentError(
-            f'a noise document must have the parts of {NOISE_FORMAT}, one is missing or has another shape '
-            f'({type(error).__name__}: {error}); identify the noise again',
+            f'a noise document must have the parts of {NOISE_FORMAT}, one is missing or has another'
+            f' shape ({type(error).__name__}: {error}); identify the noise again',
             code='document_parts',
         ) from error
 
@@ -266,8 +270,8 @@ def _term(name, entry, k):
     interval = tuple(math.inf if end is None else float(end) for end in entry['interval95'][k])
     if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
         raise DocumentError(
-            f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in rising order, got "
-            f'{status!r} and {list(interval)}; write the noise document again',
+            f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in"
+            f' rising order, got {status!r} and {list(interval)}; write the noise document again',
             code='status_or_interval',
         )
     if (value is None) != (status == HELD) or (value is not None and not np.isfinite(float(value))):
@@ -292,7 +296,11 @@ RUNS = (1.0, 10.0, 60.0, 600.0)
 
 
 def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]]]:
-    """Return the standard deviation of the position along one horizontal axis after each of `RUNS`, m, by sensor, of the worst axes."""
+    """
+    Return the standard deviation of the position along one horizontal axis after each of `RUNS`, m.
+
+    By sensor, of the worst axes.
+    """
     return [
         (
             seconds,
@@ -326,7 +334,9 @@ def position_sd(
     gravity: float = STANDARD_GRAVITY,
 ) -> np.ndarray:
     """
-    Return the standard deviation of the position by each process of one axis, m, shape (n_processes,).
+    Return the standard deviation of the position by each process of one axis, m.
+
+    Shape (n_processes,).
 
     Parameters
     ----------
@@ -467,7 +477,11 @@ def duration(seconds: float) -> str:
 
 
 def requested(axis: AxisFigures) -> list[Term]:
-    """Return the figures of an axis that count: white noise and the slow part, or the random walk where no slow part is seen."""
+    """
+    Return the figures of an axis that count.
+
+    White noise and the slow part, or the random walk where no slow part is seen.
+    """
     names = [WHITE.name, *(axis.form or (RANDOM_WALK.name,))]
     return [axis.terms[name] for name in [*names, *([TIME_KEY] if GAUSS_MARKOV in names else [])]]
 
@@ -490,7 +504,11 @@ def exit_code(figures: NoiseFigures) -> int:
 
 
 def lines(figures: NoiseFigures) -> list[str]:
-    """Return the notes on the figures: excluded parts, subtracted trends, other forms that fit, required recording time."""
+    """
+    Return the notes on the figures.
+
+    Excluded parts, subtracted trends, other forms that fit, required recording time.
+    """
     found = [_rest_line(figures.recording)]
     for sensor in SENSORS:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
@@ -502,12 +520,13 @@ def lines(figures: NoiseFigures) -> list[str]:
         for name in axis.form
     ):
         found.append(
-            'slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for this recording; '
-            'values of a second recording can lie outside'
+            'slow noise (bias instability, Gauss–Markov, random walk): the intervals are valid for'
+            ' this recording; values of a second recording can lie outside'
         )
     longest = _longest(figures)
     runs = [
-        f'{significant(float(np.linalg.norm(list(shares.values()))), 2)} m after {duration(seconds)}'
+        f'{significant(float(np.linalg.norm(list(shares.values()))), 2)} m after'
+        f' {duration(seconds)}'
         for seconds, shares in position_budget(figures)
     ]
     return [
@@ -546,12 +565,13 @@ def _axis_lines(name, sensor, axis):
         found.append(f'{name}: {others} explains the curve as well as {said(axis.form)}')
     if axis.excess > 1:
         found.append(
-            f'{name}: the curve deviates from every model by {np.sqrt(axis.excess):.2g} times the chance limit'
-            f'{_hump(sensor, axis)}; intervals are wider by that'
+            f'{name}: the curve deviates from every model by {np.sqrt(axis.excess):.2g} times the'
+            f' chance limit{_hump(sensor, axis)}; intervals are wider by that'
         )
     if axis.scatter > WORTH_SAYING:
         found.append(
-            f'{name}: from rest to rest the noise differs by {axis.scatter / 2:.0%} beyond chance; intervals are wider by that'
+            f'{name}: from rest to rest the noise differs by {axis.scatter / 2:.0%} beyond chance;'
+            ' intervals are wider by that'
         )
     return found
 
@@ -564,7 +584,10 @@ def _hump(sensor, axis):
         axis.oscillation,
         for_people(UNITS[sensor], NOISE_QUANTITY),
     )
-    return f', with an oscillation of {significant(amplitude * factor, 2)} {unit} at {significant(frequency, 3)} Hz'
+    return (
+        f', with an oscillation of {significant(amplitude * factor, 2)} {unit} at'
+        f' {significant(frequency, 3)} Hz'
+    )
 
 
 def said(form: tuple[str, ...]) -> str:
@@ -604,14 +627,16 @@ def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HOR
         densities = figures.densities(sensor, horizon)
         units = NOISE_UNITS[sensor]
         found.append(
-            f'for filters, {sensor}: white noise {significant(densities.white)} {units[WHITE.name]},'
+            f'for filters, {sensor}: white noise {significant(densities.white)}'
+            f' {units[WHITE.name]},'
         )
         found.append(
-            f'    random walk {_bounded(densities.walk)} {units[RANDOM_WALK.name]} ({BASIS[densities.basis]})'
+            f'    random walk {_bounded(densities.walk)} {units[RANDOM_WALK.name]}'
+            f' ({BASIS[densities.basis]})'
         )
         found += [
-            f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))} {UNITS[sensor]}, '
-            f'bias step sd {_bounded(densities.step_sd(rate))} {UNITS[sensor]}'
+            f'    at {rate:.6g} Hz: sample sd {significant(densities.sample_sd(rate))}'
+            f' {UNITS[sensor]}, bias step sd {_bounded(densities.step_sd(rate))} {UNITS[sensor]}'
             for rate in rates
         ]
     return found

@@ -1,4 +1,8 @@
-"""The noise figures of an IMU, and the parameters of filters from them: discrete noise, and Gauss-Markov processes for the slow part."""
+"""
+The noise figures of an IMU, and the parameters of filters from them.
+
+Discrete noise, and Gauss-Markov processes for the slow part.
+"""
 
 from dataclasses import dataclass, field
 
@@ -19,7 +23,10 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess
 
 HORIZON = 100.0
-"""s; for a filter with white noise and a random walk only: the walk has the same Allan variance at this averaging time."""
+"""
+s; for a filter with white noise and a random walk only: the walk has the same Allan variance at
+this averaging time.
+"""
 SLOW_PROCESSES = (FLICKER.name, RANDOM_WALK.name, GAUSS_MARKOV)
 
 
@@ -30,7 +37,10 @@ class AxisFigures(AxisNoise):
     trends: tuple[AxisTrend, ...] = ()
     """Trends that were subtracted before the noise was estimated."""
     record_for: dict[str, float | None] = field(default_factory=dict)
-    """Name of a figure that is not determined -> seconds of rest that would do, None: more than two days of it."""
+    """
+    Name of a figure that is not determined -> seconds of rest that would do, None: more than two
+    days of it.
+    """
     sample_sd: float = 0.0
     """Standard deviation of single samples as measured."""
     deviation: tuple[float, ...] = ()
@@ -45,9 +55,11 @@ class AxisFigures(AxisNoise):
                 time = self.terms[TIME_KEY] if name == GAUSS_MARKOV else None
                 found.append(
                     (
-                        PROCESSES[name]
-                        if time is None
-                        else gauss_markov(time.value or time.interval[0]),
+                        (
+                            PROCESSES[name]
+                            if time is None
+                            else gauss_markov(time.value or time.interval[0])
+                        ),
                         term.value**2,
                     )
                 )
@@ -58,7 +70,8 @@ class AxisFigures(AxisNoise):
         """
         The density of the white noise; where its interval contains zero, its upper end.
 
-        Without an upper end, the density of white noise with the variance of the samples: a finite bound for filters and weights.
+        Without an upper end, the density of white noise with the variance of the samples: a finite
+        bound for filters and weights.
         """
         term = self.terms[WHITE.name]
         if term.value is not None and term.interval[0] > 0:
@@ -73,8 +86,8 @@ class AxisFigures(AxisNoise):
         """
         Return the density of the random walk that replaces the slow part, and its basis.
 
-        The walk with the total Allan variance of the slow processes at the horizon; without a slow part in the curve, the
-        largest walk that the curve allows.
+        The walk with the total Allan variance of the slow processes at the horizon; without a slow
+        part in the curve, the largest walk that the curve allows.
         """
         slow = [
             (process, coefficient)
@@ -88,9 +101,9 @@ class AxisFigures(AxisNoise):
             for process, coefficient in slow
         )
         density = float(np.sqrt(3.0 * variance / horizon))
-        return density, 'walk' if [process.name for process, _ in slow] == [
-            RANDOM_WALK.name
-        ] else 'equivalent'
+        return density, (
+            'walk' if [process.name for process, _ in slow] == [RANDOM_WALK.name] else 'equivalent'
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +130,11 @@ class NoiseFigures:
         return {'accelerometer': self.accelerometer, 'gyroscope': self.gyroscope}[name]
 
     def densities(self, sensor: str, horizon: float = HORIZON) -> 'Densities':
-        """Return the two noise parameters of most filters for a sensor: its worst axis with a finite figure."""
+        """
+        Return the two noise parameters of most filters for a sensor.
+
+        Its worst axis with a finite figure.
+        """
         walks = [axis.walk(horizon) for axis in self.sensor(sensor)]
         walk, basis = max([found for found in walks if np.isfinite(found[0])] or walks)
         return Densities(float(max(axis.white for axis in self.sensor(sensor))), float(walk), basis)
@@ -132,14 +149,21 @@ class Densities:
     walk: float
     """Per second and root hertz."""
     basis: str
-    """'walk' (found), 'equivalent' (replaces other slow noise) or 'bound' (none was seen: at most so much)."""
+    """
+    'walk' (found), 'equivalent' (replaces other slow noise) or 'bound' (none was seen: at most so
+    much).
+    """
 
     def sample_sd(self, rate: float) -> float:
         """Return the standard deviation of the white noise of a sample at a rate (Hz)."""
         return self.white * float(np.sqrt(rate))
 
     def step_sd(self, rate: float) -> float:
-        """Return the standard deviation by which the bias steps from one sample to the next at a rate (Hz)."""
+        """
+        Return the standard deviation of the step of the bias between samples.
+
+        It is the step from one sample to the next at a rate (Hz).
+        """
         return self.walk / float(np.sqrt(rate))
 
 
@@ -151,7 +175,9 @@ PROCESS_TIMES = PROCESS_TIME_RATIO ** np.arange(1, 8)
 
 def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
     """
-    Return sensor -> its bias processes, from the mean of the axes' variances; empty for a sensor without slow noise.
+    Return sensor -> its bias processes, from the mean of the axes' variances.
+
+    Empty for a sensor without slow noise.
 
     Figures that are held do not enter: a bound is no measurement.
     """

@@ -21,22 +21,33 @@ from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import DETERMINED
 
 CYCLES = 64
-"""Cycles of the hump's frequency in a segment: a resonance of quality below 16 is wider than the neighbouring ordinates of the test."""
+"""
+Cycles of the hump's frequency in a segment: a resonance of quality below 16 is wider than the
+neighbouring ordinates of the test.
+"""
 FEWEST_CYCLES = 16
 """Cycles in the longest rest, at least: with fewer, slow noise and a line are not separable."""
 PER_CYCLE = 16
 """Block means per cycle: twice the hump's frequency, the highest under test, has eight."""
 LINE_HALF_BINS, LINE_NEIGHBOUR_BINS = 2, 9
-"""Half width of a line under a Hann window, and distance of the farthest neighbouring ordinates, in bins."""
+"""
+Half width of a line under a Hann window, and distance of the farthest neighbouring ordinates, in
+bins.
+"""
 HANN_INDEPENDENT_SHARE = 2 / 3
 """Share of independent ordinates under a Hann window, whose noise bandwidth is 1.5 bins."""
 LINE_P_VALUE = 1e-4
-"""Significance level over all frequencies under test: six axes of 100 recordings without a line give 0.06 false ones."""
+"""
+Significance level over all frequencies under test: six axes of 100 recordings without a line give
+0.06 false ones.
+"""
 
 
 class ToneSearch:
     """
-    Search for a line between half and twice the frequency of a hump in one axis, block by block, at constant memory.
+    Search for a line near the frequency of a hump in one axis, block by block.
+
+    The search covers half to twice the frequency of the hump, at constant memory.
 
     Parameters
     ----------
@@ -90,7 +101,11 @@ class ToneSearch:
         self._samples = np.zeros(0)
 
     def line(self) -> tuple[float, float] | None:
-        """Return (frequency in Hz, amplitude) of the most significant line, None without a significant one."""
+        """
+        Return (frequency in Hz, amplitude) of the most significant line.
+
+        None without a significant one.
+        """
         bins = np.arange(LINE_NEIGHBOUR_BINS, len(self._power) - LINE_NEIGHBOUR_BINS)
         hertz = 1 / (max(self._size, 1) * self._step)
         bins = bins[(bins * hertz >= 0.5 * self._frequency) & (bins * hertz <= 2 * self._frequency)]
@@ -129,7 +144,10 @@ LENGTHS = 60.0 * np.array(
 )
 """Recordings that are thought of, s: from ten minutes to two days."""
 RELATIVE_SD = 0.24
-"""Standard deviation of a coefficient over the coefficient at which the 95 % interval of its root has a ratio of 1.6."""
+"""
+Standard deviation of a coefficient over the coefficient at which the 95 % interval of its root has
+a ratio of 1.6.
+"""
 SCALES_FROM = 0.1
 """s; shorter averaging times determine the white noise only, at any length of recording."""
 
@@ -152,7 +170,11 @@ class RecordingTimes:
     def needed(
         self, processes: tuple[NoiseProcess, ...], coefficients: np.ndarray, index: int
     ) -> float | None:
-        """Return the shortest of `LENGTHS` in which coefficient `index` of a model is determined, s; None when none is long enough."""
+        """
+        Return the shortest of `LENGTHS` in which coefficient `index` of a model is determined, s.
+
+        None when none is long enough.
+        """
         for length in LENGTHS:
             if self.relative_sd(length, processes, coefficients, index=index) <= RELATIVE_SD:
                 return float(length)
@@ -166,7 +188,11 @@ class RecordingTimes:
         *,
         index: int,
     ) -> float:
-        """Return the standard deviation of a coefficient over the coefficient, from one recording at rest of this length."""
+        """
+        Return the standard deviation of a coefficient over the coefficient.
+
+        From one recording at rest of this length.
+        """
         moments = self._moments(seconds)
         design, tensor = moments.design(processes), moments.tensor(processes)
         columns = Whitener(np.einsum('p,q,pqij->ij', coefficients, coefficients, tensor))(
@@ -195,7 +221,11 @@ EPOCH_GAP = 1.0
 
 @dataclass(frozen=True, eq=False)
 class RestingRecord:
-    """The Allan curves of the parts at rest of a recording, the excluded parts and the subtracted trends."""
+    """
+    The Allan curves of the parts at rest of a recording.
+
+    The excluded parts and the subtracted trends are included.
+    """
 
     curve: AllanCurve
     """Allan variances of the six axes."""
@@ -234,7 +264,8 @@ def identify_noise(
     Parameters
     ----------
     source : callable
-        Returns the blocks of the recording, from the beginning at each call; it is read twice, and again where a curve has a hump.
+        Returns the blocks of the recording, from the beginning at each call; it is read twice, and
+        again where a curve has a hump.
     nominal : NominalScaling, optional
         For recordings in volts or counts.
 
@@ -269,7 +300,11 @@ def identify_noise(
 def read_rest(
     source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None
 ) -> RestingRecord:
-    """Read a recording twice, first for parts at rest and trends, then for the Allan curves; arguments as for `identify_noise`."""
+    """
+    Read a recording twice, first for parts at rest and trends, then for the Allan curves.
+
+    Arguments as for `identify_noise`.
+    """
     found = survey(source(), nominal)
     pieces = [still_parts(chunks, found.period) for chunks in found.epochs]
     parts, left_out = (
@@ -279,8 +314,9 @@ def read_rest(
     seconds = sum(part.seconds for of_epoch in parts for part in of_epoch)
     if seconds < MIN_CURVE_SAMPLES * found.period or not found.period:
         raise InputError(
-            f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for {seconds:.1f} s; '
-            'record with the IMU lying still on something heavy, for an hour if you can',
+            f'the IMU must rest for at least {MIN_CURVE_SAMPLES} samples, it rested for'
+            f' {seconds:.1f} s; record with the IMU lying still on something heavy, for an hour if'
+            ' you can',
             code='rest_too_short',
         )
     clock = _Clock(found.epochs)
@@ -311,8 +347,8 @@ def _require_scatter(curve):
     ]
     if frozen:
         raise InputError(
-            f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of its readings; '
-            'record with a finer resolution',
+            f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of its'
+            ' readings; record with a finer resolution',
             code='coarse_steps',
         )
 
@@ -352,7 +388,11 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
 
 
 def _record_for(axis, times):
-    """Return the required recording time of each figure that is not determined; a bound counts with its upper limit."""
+    """
+    Return the required recording time of each figure that is not determined.
+
+    A bound counts with its upper limit.
+    """
     found = {}
     for name, term in axis.terms.items():
         asked = name in (WHITE.name, RANDOM_WALK.name, *axis.form)
@@ -391,7 +431,11 @@ class _Clock:
         return (stamp_ns - self._first[epoch]) * 1e-9 + self._offset[epoch]
 
     def temperature(self, found):
-        """Return (time, degrees Celsius) of the thinned temperatures, or None; they belong to the first epoch of the clock."""
+        """
+        Return (time, degrees Celsius) of the thinned temperatures, or None.
+
+        They belong to the first epoch of the clock.
+        """
         if found.temperature is None:
             return None
         stamp_ns, values = found.temperature

@@ -23,11 +23,15 @@ MAX_WEIGHT_ROUNDS = 25
 FLOOR = 1e-6
 """Least share of the upper limit of each process in the weights, so that they are finite."""
 RIDGE = 0.02
-"""Added to the correlations, which are good to a hundredth: neighbouring scales are nearly the same."""
+"""
+Added to the correlations, which are good to a hundredth: neighbouring scales are nearly the same.
+"""
 SHORTEST_TIME = 4.0
 """Shortest correlation time of a bias, s."""
 TIME_RATIO, TIME_RATIO_OF_WEIGHTS = 1.1, 1.3
-"""Correlation times are tried on a grid of the first ratio, weights are made on one of the second."""
+"""
+Correlation times are tried on a grid of the first ratio, weights are made on one of the second.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +84,22 @@ class Moments:
 
     @cached_property
     def times(self) -> np.ndarray:
-        """Correlation times that are tried, s, always from the same grid; shorter ones belong to filters, not to a bias."""
+        """
+        Correlation times that are tried, s, always from the same grid.
+
+        Shorter ones belong to filters, not to a bias.
+        """
         longest = max(4 * self.scales.tau[self.used][-1], 2 * SHORTEST_TIME)
         first, last = (round(np.log(t) / np.log(TIME_RATIO)) for t in (SHORTEST_TIME, longest))
         return TIME_RATIO ** np.arange(first, last + 1.0)
 
     @cached_property
     def wander(self) -> np.ndarray:
-        """Expectations of Gauss-Markov processes of unit variance with these times, shape (n_used, n_times)."""
+        """
+        Expectations of Gauss-Markov processes of unit variance with these times.
+
+        Shape (n_used, n_times).
+        """
         return self.design(tuple(gauss_markov(time) for time in self.times))
 
     def design(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
@@ -98,7 +110,11 @@ class Moments:
         )[self.used]
 
     def tensor(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
-        """Return the products of `ScaleCovariance.tensor` at the scales used; for weights a nearby correlation time will do."""
+        """
+        Return the products of `ScaleCovariance.tensor` at the scales used.
+
+        For weights a nearby correlation time will do.
+        """
         rounded = tuple(
             gauss_markov(_rounded(process.time)) if process.time else process
             for process in processes
@@ -111,7 +127,11 @@ class Moments:
         return self.variance[self.used]
 
     def covariance(self, design: np.ndarray, tensor: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the covariance of the variances used for coefficients `values`: sampling error and variation between parts."""
+        """
+        Return the covariance of the variances used for coefficients `values`.
+
+        Sampling error and variation between parts.
+        """
         chance = np.einsum('p,q,pqij->ij', values, values, tensor)
         if not self.scatter:
             return chance
@@ -198,7 +218,9 @@ class Whitener:
 
 
 def _cholesky(matrix):
-    """Return the factor of a correlation matrix with approximation errors in its smallest eigenvalues."""
+    """
+    Return the factor of a correlation matrix with approximation errors in its smallest eigenvalues.
+    """
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
@@ -212,7 +234,11 @@ def _rounded(time):
 
 
 def _first_guess(design, target, moments):
-    """Return coefficients that follow the curve on a logarithmic scale, more closely at short averaging times."""
+    """
+    Return coefficients that follow the curve on a logarithmic scale.
+
+    They follow it more closely at short averaging times.
+    """
     from scipy.optimize import nnls
 
     weight = 1.0 / (target * np.sqrt(moments.scales.tau[moments.used]))
@@ -224,9 +250,12 @@ def fit_with_time(
     moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None
 ) -> MomentFit:
     """
-    Fit given processes and, as the last one, a Gauss-Markov process whose correlation time is estimated too.
+    Fit given processes and.
 
-    With fixed weights the best time minimises the weighted sum of squares; the weights are updated until the time converges.
+    As the last one, a Gauss-Markov process whose correlation time is estimated too.
+
+    With fixed weights the best time minimises the weighted sum of squares; the weights are updated
+    until the time converges.
     """
     whitener = Whitener(np.diag((moments.target**2 * moments.scales.tau[moments.used])))
     fit, seen = None, set()
@@ -241,7 +270,11 @@ def fit_with_time(
 
 
 def _best_time(moments, processes, whitener, fixed):
-    """Return the index of the time with the smallest sum of squares at given weights, no coefficient being negative."""
+    """
+    Return the index of the time with the smallest sum of squares at given weights.
+
+    No coefficient is negative.
+    """
     last = len(processes)
     known = whitener(moments.design(processes))
     wander, times = whitener(moments.wander), moments.times
@@ -262,7 +295,11 @@ def _best_time(moments, processes, whitener, fixed):
 
 
 def _costs(known, wander, rest, held):
-    """Return the sums of squares with these columns and one of `wander` each; infinite where a coefficient would be negative."""
+    """
+    Return the sums of squares with these columns and one of `wander` each.
+
+    Infinite where a coefficient would be negative.
+    """
     basis, triangle = np.linalg.qr(known)
     own, beside = (values - basis @ (basis.T @ values) for values in (wander, rest))
     amount = (
@@ -334,7 +371,11 @@ def score_at_zero(moments: Moments, fit: MomentFit) -> float:
 def time_interval(
     moments: Moments, fits: Sequence[MomentFit], weights: Sequence[float], *, excess: float = 1.0
 ) -> tuple[float, float]:
-    """Return the interval of the time of models whose last process is Gauss-Markov, s; infinite where a random walk fits as well."""
+    """
+    Return the interval of the time of models whose last process is Gauss-Markov, s.
+
+    Infinite where a random walk fits as well.
+    """
     times = moments.times
     best = int(np.argmin(np.abs(np.log(times / fits[0].processes[-1].time))))
     members = [_ScoreOfTime(moments, fit, excess) for fit in fits]
@@ -360,18 +401,28 @@ def _first(values, refused):
 
 
 def _averaged(members, weights, value):
-    """Return the `tails` of several models at `value`, averaged with weights of sum 1, shape (2,)."""
+    """
+    Return the `tails` of several models at `value`, averaged with weights of sum 1, shape (2,).
+    """
     return weights @ [member.tails(value) for member in members]
 
 
 class _Score:
-    """Where the misfit in the direction of one parameter lies in its distribution, at a value that is tried."""
+    """
+    Where the misfit in the direction of one parameter lies in its distribution.
+
+    The parameter is at a value that is tried.
+    """
 
     def __init__(self, moments, fit, excess):
         self.moments, self.fit, self._excess, self._tails = moments, fit, excess, {}
 
     def tails(self, value):
-        """Return the probabilities of a larger and of a smaller misfit than observed, if `value` is true."""
+        """
+        Return the probabilities of a larger and of a smaller misfit than observed.
+
+        If `value` is true.
+        """
         if value not in self._tails:
             fit, direction, others = self.at(value)
             self._tails[value] = _tails(self.moments, fit, direction, others, self._excess)
@@ -384,7 +435,11 @@ class _ScoreOfCoefficient(_Score):
         self.index = index
 
     def relative_sd(self):
-        """Return the standard deviation of the coefficient by its information, as a share of it; large where there is none."""
+        """
+        Return the standard deviation of the coefficient by its information, as a share of it.
+
+        Large where there is none.
+        """
         if not self.fit.coefficients[self.index] > 0:
             return np.inf
         whiten = Whitener(self._excess * self.fit.covariance)
@@ -395,7 +450,12 @@ class _ScoreOfCoefficient(_Score):
         )
 
     def at(self, value):
-        """Return the fit with the coefficient fixed, its own direction, and the directions of the other parameters."""
+        """
+        Return the fit with the coefficient fixed, and the directions of the parameters.
+
+        The values are the fit, the coefficient's own direction, and the directions of the other
+        parameters.
+        """
         processes = self.fit.processes
         if processes[-1].time and (value > 0 or self.index != len(processes) - 1):
             fit = fit_with_time(self.moments, processes[:-1], {self.index: value})
@@ -419,7 +479,12 @@ class _ScoreOfCoefficient(_Score):
 
 class _ScoreOfTime(_Score):
     def at(self, value):
-        """Return the fit with the time fixed, the direction of a longer time, and the directions of the coefficients."""
+        """
+        Return the fit with the time fixed, and the directions of the parameters.
+
+        The values are the fit, the direction of a longer time, and the directions of the
+        coefficients.
+        """
         processes = (*self.fit.processes[:-1], gauss_markov(value))
         fit = fit_processes(self.moments, processes, None, start=self.fit.coefficients)
         design = self.moments.design(processes)
@@ -431,7 +496,11 @@ class _ScoreOfTime(_Score):
 
 
 def _by_time(moments, time):
-    """Return the derivative of the Gauss-Markov curve by the logarithm of its time, by a central difference."""
+    """
+    Return the derivative of the Gauss-Markov curve by the logarithm of its time.
+
+    By a central difference.
+    """
     late, early = (
         moments.design((gauss_markov(time * factor),))[:, 0]
         for factor in (1 + LOG_TIME_STEP, 1 - LOG_TIME_STEP)
@@ -440,7 +509,11 @@ def _by_time(moments, time):
 
 
 def _tails(moments, fit, direction, others, excess):
-    """Return (probability above, probability below) of the efficient score of `direction` given `others`."""
+    """
+    Return (probability above, probability below) of an efficient score.
+
+    It is the efficient score of `direction` given `others`.
+    """
     covariance = excess * fit.covariance
     whiten = Whitener(covariance)
     own = _beside(whiten(direction), [whiten(other) for other in others])
@@ -465,8 +538,8 @@ def _third_moment(weights, covariance, expected):
     """
     Return the third central moment of a weighted sum of Allan variances.
 
-    A variance of mean f and variance v from a sum of squares has the third moment 2 v^2 / f (chi-square); mixed ones are computed as
-    ``2 (v_ij v_jk v_ki)^(2/3) / (f_i f_j f_k)^(1/3)``.
+    A variance of mean f and variance v from a sum of squares has the third moment 2 v^2 / f
+    (chi-square); mixed ones are computed as ``2 (v_ij v_jk v_ki)^(2/3) / (f_i f_j f_k)^(1/3)``.
     """
     pair = np.cbrt(np.abs(covariance)) ** 2
     scaled = weights / np.cbrt(expected)
@@ -488,7 +561,11 @@ def pearson_tails(score: float, skewness: float) -> tuple[float, float]:
 
 
 def _crossing(function, start, step):
-    """Return where a positive function becomes negative, from `start` on by growing steps of the logarithm."""
+    """
+    Return where a positive function becomes negative.
+
+    From `start` on by growing steps of the logarithm.
+    """
     from scipy.optimize import brentq  # here, because its import is slow
 
     if not function(start) > 0:

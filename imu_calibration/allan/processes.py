@@ -8,7 +8,10 @@ import numpy as np
 from scipy.special import factorial
 
 SMALL = 1.0
-"""Below this argument the Gauss-Markov kernel is summed as a series: its leading terms cancel in fourth differences."""
+"""
+Below this argument the Gauss-Markov kernel is summed as a series: its leading terms cancel in
+fourth differences.
+"""
 SERIES = 1.0 / factorial(np.arange(20, 2, -1))
 """Coefficients of ``exp(u) - 1 - u - u^2 / 2``, the highest first, without the factor u^3."""
 
@@ -20,7 +23,10 @@ class NoiseProcess:
     name: str
     """Name in noise.yaml."""
     kernel: Callable[[np.ndarray], np.ndarray]
-    """Generalised covariance of the integral at lags in s; even, known up to even polynomials of degree two."""
+    """
+    Generalised covariance of the integral at lags in s; even, known up to even polynomials of
+    degree two.
+    """
     lattice: bool = False
     """Whether the kernel lives on the sampling instants only (a spike at zero)."""
     time: float = 0.0
@@ -28,7 +34,11 @@ class NoiseProcess:
 
 
 def allan_variance(process: NoiseProcess, tau: np.ndarray) -> np.ndarray:
-    """Return the Allan variance of a process of unit coefficient: ``(3 G(0) - 4 G(tau) + G(2 tau)) / tau^2``."""
+    """
+    Return the Allan variance of a process of unit coefficient.
+
+    ``(3 G(0) - 4 G(tau) + G(2 tau)) / tau^2``.
+    """
     tau = np.asarray(tau, float)
     return (
         3 * process.kernel(0.0 * tau) - 4 * process.kernel(tau) + process.kernel(2 * tau)
@@ -39,7 +49,8 @@ def mean_covariance(process: NoiseProcess, lag: np.ndarray, seconds: float) -> n
     """
     Return the generalised covariance of means over `seconds` whose beginnings are `lag` s apart.
 
-    For processes without a variance (random walk, flicker) it holds for combinations whose weights sum to zero.
+    For processes without a variance (random walk, flicker) it holds for combinations whose weights
+    sum to zero.
     """
     lag = np.asarray(lag, float)
     return (
@@ -73,7 +84,9 @@ RANDOM_WALK = NoiseProcess('random_walk', _random_walk)
 
 @lru_cache(maxsize=512)
 def gauss_markov(time: float) -> NoiseProcess:
-    """Return the first-order Gauss-Markov process of unit variance and correlation time `time`, s."""
+    """
+    Return the first-order Gauss-Markov process of unit variance and correlation time `time`, s.
+    """
 
     def kernel(lag):
         u = np.abs(lag) / time
@@ -91,7 +104,10 @@ FLATNESS = (2 * np.log(2) / np.pi) ** 0.5
 
 SECOND_DIFFERENCE = (1.0, -2.0, 1.0)
 DENSE = np.arange(-36, 37) / 12
-"""Lags around where a difference begins or ends, in units of the shorter averaging time; good to thousandths of a correlation."""
+"""
+Lags around where a difference begins or ends, in units of the shorter averaging time; good to
+thousandths of a correlation.
+"""
 LAG_GROWTH, MAX_LAG_RATIO = 1.5, 64.0
 """Further lags grow by this factor, up to this many of the longer averaging time."""
 DIFFERENCE_ROUNDING = 1e-14
@@ -138,7 +154,11 @@ class ScaleCovariance:
         return self._expectations[process]
 
     def product(self, one: NoiseProcess, other: NoiseProcess) -> np.ndarray:
-        """Return the part of the covariance that is multiplied by the product of two coefficients, shape (n_scales, n_scales)."""
+        """
+        Return the part of the covariance that is multiplied by the product of two coefficients.
+
+        Shape (n_scales, n_scales).
+        """
         if other.lattice:
             one, other = other, one
         if (one, other) not in self._products:
@@ -153,11 +173,18 @@ class ScaleCovariance:
         return self._products[one, other]
 
     def tensor(self, processes: tuple[NoiseProcess, ...]) -> np.ndarray:
-        """Return the products of all pairs, shape (n_processes, n_processes, n_scales, n_scales)."""
+        """
+        Return the products of all pairs, shape (n_processes, n_processes, n_scales, n_scales).
+        """
         return np.array([[self.product(one, other) for other in processes] for one in processes])
 
     def _sum(self, first, second):
-        """Sum products of correlations over integer lags, both interpolated linearly between the available lags: exact for white noise."""
+        """
+        Sum products of correlations over integer lags.
+
+        Both correlations are interpolated linearly between the available lags, which is exact for
+        white noise.
+        """
         (a, b), (c, d) = ((values[:, :-1], values[:, 1:]) for values in (first, second))
         inside = self._step * (2 * a * c + a * d + b * c + 2 * b * d) / 6
         corners = (b - a) * (d - c) / (6 * np.maximum(self._step, 1.0))
@@ -174,7 +201,11 @@ class ScaleCovariance:
         return total
 
     def _share(self, lag):
-        """Return the number of pairs of terms at distance `lag`, over twice the product of the numbers of terms."""
+        """
+        Return the number of pairs of terms at distance `lag`, normalised.
+
+        The number is divided by twice the product of the numbers of terms.
+        """
         pairs, terms = np.zeros_like(lag), [np.zeros_like(self._short), np.zeros_like(self._long)]
         for length, number in zip(*self._lengths):
             here = [
@@ -189,7 +220,11 @@ class ScaleCovariance:
         return pairs / (2.0 * terms[0] * terms[1])
 
     def _correlation(self, process):
-        """Return the covariance of second differences at the lags for a unit coefficient, shape (n_pairs, n_lags)."""
+        """
+        Return the covariance of second differences at the lags for a unit coefficient.
+
+        Shape (n_pairs, n_lags).
+        """
         if process not in self._correlations:
             for known in [
                 other for other in self._correlations if other.time
@@ -215,9 +250,12 @@ class ScaleCovariance:
 
 def _lags(short, long, length):
     """
-    Return the lags (in samples, integers) at which the correlation of each pair is evaluated, sorted, shape (n_pairs, n_lags).
+    Return the lags at which the correlation of each pair is evaluated.
 
-    Dense where one difference begins or ends inside the other, and where the number of pairs of terms in the longest stretch bends.
+    They are in samples, sorted integers of shape (n_pairs, n_lags).
+
+    Dense where one difference begins or ends inside the other, and where the number of pairs of
+    terms in the longest stretch bends.
     """
     far = 3.0 * LAG_GROWTH ** np.arange(
         1, int(np.log(MAX_LAG_RATIO * float((long / short).max())) / np.log(LAG_GROWTH)) + 2
@@ -231,7 +269,9 @@ def _lags(short, long, length):
 
 
 def _sorted_lengths(lengths):
-    """Return (lengths, numbers): each stretch, or classes of about equal length where there are many."""
+    """
+    Return (lengths, numbers): each stretch, or classes of about equal length where there are many.
+    """
     lengths = np.sort(np.asarray(lengths, float))
     if len(lengths) <= MOST_LENGTHS:
         return lengths, np.ones(len(lengths))

@@ -1,4 +1,8 @@
-"""The first pass over a recording (short means, period, temperature, faults), and the parts at rest, from which its noise is estimated."""
+"""
+The first pass over a recording (short means, period, temperature, faults), and the parts at rest.
+
+From which its noise is estimated.
+"""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -14,7 +18,9 @@ from imu_calibration.preprocessing.scan import CHUNK_SECONDS, Chunks, ChunkSerie
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 OUTLIER = 8.0
-"""Scatter and steps count as motion beyond so many of their usual (robust) deviations from the median."""
+"""
+Scatter and steps count as motion beyond so many of their usual (robust) deviations from the median.
+"""
 LEAST_GROWTH = 1.25
 """A scatter within this factor of the median is no motion, however regular it is otherwise."""
 FROZEN = 0.05
@@ -51,7 +57,10 @@ class StillPart:
 
 
 LEFT_OUT = ('motion', 'short_rests', 'other_sampling_rate')
-"""Reasons for which seconds are not used: motion and the time around it, pieces too short, another sampling rate."""
+"""
+Reasons for which seconds are not used: motion and the time around it, pieces too short, another
+sampling rate.
+"""
 
 
 def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], dict[str, float]]:
@@ -83,7 +92,11 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], dict[st
 
 
 def _at_the_usual_rate(chunks, period):
-    """Return the chunks around which most have the usual period; a chunk with a lost sample is longer, its neighbours are not."""
+    """
+    Return the chunks around which most have the usual period.
+
+    A chunk with a lost sample is longer, its neighbours are not.
+    """
     if not len(chunks):
         return np.zeros(0, bool)
     return (
@@ -112,13 +125,21 @@ def _usual(chunks, still):
 
 
 def _least_scatter(sd):
-    """Return the least meaningful scatter of each column: the quantisation steps where a coarse converter often repeats a value."""
+    """
+    Return the least meaningful scatter of each column.
+
+    The quantisation steps where a coarse converter often repeats a value.
+    """
     frozen = (sd == 0).mean(axis=0) > FROZEN
     return np.where(frozen, np.maximum(np.quantile(sd, 0.9, axis=0), 1e-300), 1e-300)
 
 
 def _stepping(mean, still, width):
-    """Return the chunks at which the means of `width` chunks before and after differ by more than they usually do."""
+    """
+    Return the chunks at which the means before and after differ unusually.
+
+    The means of `width` chunks before and after differ by more than they usually do.
+    """
     sums, count = (
         np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
         for values in (np.where(still[:, None], mean - mean[0], 0.0), still[:, None].astype(float))
@@ -217,7 +238,11 @@ def survey(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None)
 
 
 def _period(epochs):
-    """Return the period of most chunks: the mean of those near the median, since stamps may be rounded to milliseconds."""
+    """
+    Return the period of most chunks.
+
+    The mean of those near the median, since stamps may be rounded to milliseconds.
+    """
     steps = (
         np.concatenate([chunks.duration / chunks.size for chunks in epochs])
         if epochs

@@ -35,11 +35,17 @@ MAX_COST_EXCESS = 6.0
 PRICE, PRICE_OF_TIME = 2.0, 7.0
 """Cost of a coefficient, and of a correlation time, for which many are tried."""
 TIME_STEP = 8
-"""Stride over the correlation times; each is tested for a clearly higher likelihood than the time of best fit."""
+"""
+Stride over the correlation times; each is tested for a clearly higher likelihood than the time of
+best fit.
+"""
 MIN_FORM_WEIGHT = 0.05
 """Forms less likely than this, against the best, are excluded from intervals."""
 MIN_COMPARED_MEANS = 6.0
-"""Forms are compared at averaging times of which the longest part holds so many: with fewer, logarithms are far from Gaussian."""
+"""
+Forms are compared at averaging times of which the longest part holds so many: with fewer,
+logarithms are far from Gaussian.
+"""
 QUANTISATION_P_VALUE = 1e-3
 """Probability below which quantisation is included."""
 
@@ -60,7 +66,9 @@ class Choice:
 
     @property
     def rivals(self) -> tuple[MomentFit, ...]:
-        """Other forms that explain the curve nearly as well, except supersets of a form named before."""
+        """
+        Other forms that explain the curve nearly as well, except supersets of a form named before.
+        """
         found: list[MomentFit] = []
         for fit in self.fits:
             if fit.cost - self.best.cost <= MAX_COST_EXCESS and not any(
@@ -70,7 +78,11 @@ class Choice:
         return tuple(found)
 
     def having(self, name: str) -> tuple[list[MomentFit], list[float]]:
-        """Return the fits with a process, the best first, and the likelihood of each relative to it; negligible ones are omitted."""
+        """
+        Return the fits with a process, the best first, and the likelihood of each relative to it.
+
+        Negligible ones are omitted.
+        """
         found = [fit for fit in self.fits if name in fit.names]
         weights = [1.0, *(float(np.exp(-0.5 * (fit.cost - found[0].cost))) for fit in found[1:])]
         return [fit for fit, weight in zip(found, weights) if weight > MIN_FORM_WEIGHT], [
@@ -84,7 +96,11 @@ class Choice:
         return Choice((replace(fit, cost=self.best.cost),), self.moments)
 
     def close(self, name: str) -> MomentFit | None:
-        """Return the best form with a process among those that explain the curve nearly as well, or None."""
+        """
+        Return the best form with a process among those that explain the curve nearly as well.
+
+        Or None.
+        """
         near = [
             fit
             for fit in self.fits
@@ -94,14 +110,22 @@ class Choice:
 
 
 def _is_part(form, wider):
-    """Return whether a form is a special case of another one: a random walk is a Gauss-Markov process that never forgets."""
+    """
+    Return whether a form is a special case of another one.
+
+    A random walk is a Gauss-Markov process that never forgets.
+    """
     return all(
         name in wider or (name == RANDOM_WALK.name and GAUSS_MARKOV in wider) for name in form
     )
 
 
 def choose_form(moments: Moments, excess: float = 1.0) -> Choice:
-    """Fit every form, with quantisation where the curve shows it; `excess`: factor on all covariances of an unexplained curve."""
+    """
+    Fit every form, with quantisation where the curve shows it.
+
+    `excess`: factor on all covariances of an unexplained curve.
+    """
     fits = _all_forms(moments, (), excess)
     wider = fit_form(moments, fits[0].form, (QUANTISATION.name,))
     if score_at_zero(moments, wider) < QUANTISATION_P_VALUE:
@@ -122,7 +146,9 @@ def _all_forms(moments, fast, excess):
 def fit_form(
     moments: Moments, form: tuple[str, ...], fast: tuple[str, ...] = (), *, excess: float = 1.0
 ) -> MomentFit:
-    """Fit white noise, `fast` processes and the slow ones of a form; squares are divided by `excess`."""
+    """
+    Fit white noise, `fast` processes and the slow ones of a form; squares are divided by `excess`.
+    """
     names = (*fast, WHITE.name, *form)
     fit = fit_names(moments, names)
     fit = _likeliest(moments, fit) if GAUSS_MARKOV in form else fit
@@ -135,7 +161,11 @@ def fit_form(
 
 
 def _likeliest(moments, fit):
-    """Return the fit with another correlation time where one is plainly likelier: the weights of a long time can keep it long."""
+    """
+    Return the fit with another correlation time where one is plainly likelier.
+
+    The weights of a long time can keep it long.
+    """
 
     def at(time):
         found = fit_processes(moments, (*fit.processes[:-1], gauss_markov(time)))
@@ -161,7 +191,9 @@ def fit_names(moments: Moments, names: tuple[str, ...]) -> MomentFit:
 
 def log_cost(moments: Moments, fit: MomentFit, excess: float = 1.0) -> float:
     """
-    Return minus twice the log likelihood of the logarithms of the variances except for a constant, with `excess` times their covariance.
+    Return minus twice the log likelihood of the logarithms of the variances except for a constant.
+
+    With `excess` times their covariance.
 
     Infinite for a fit that expects no variance at some averaging time.
     """
@@ -188,7 +220,10 @@ def without_finest(moments: Moments, count: int) -> Moments:
 
 
 DETERMINED_RATIO = 1.6
-"""Upper over lower end of the 95 % interval up to which a figure counts as determined: a quarter to either side."""
+"""
+Upper over lower end of the 95 % interval up to which a figure counts as determined: a quarter to
+either side.
+"""
 MISFIT_P_VALUE = 1e-3
 """Probability of a misfit below which the shortest averaging times are left out."""
 LEAST_SCALES = 8
@@ -196,7 +231,10 @@ LEAST_SCALES = 8
 LONGEST_LEFT_OUT = 2.0
 """s; a model that fails beyond is wrong for another reason than a filter in the sensor."""
 WHITE_SHARE = 0.5
-"""Least share of white noise in the shortest variance for which shorter averaging times of an unexplained curve are excluded."""
+"""
+Least share of white noise in the shortest variance for which shorter averaging times of an
+unexplained curve are excluded.
+"""
 FILTER_TIME_RATIO = 8.0
 """Where a filter shows, averaging times up to so many of the longest that shows it are left out."""
 TIME_KEY = 'correlation_time'
@@ -235,11 +273,17 @@ class AxisNoise:
     alternatives: dict[str, Term] = field(default_factory=dict)
     """Figures of processes that occur only in these forms."""
     shortest: float = 0.0
-    """Shortest averaging time that was fitted, s; longer than the period where the sensor filters its noise."""
+    """
+    Shortest averaging time that was fitted, s; longer than the period where the sensor filters its
+    noise.
+    """
     excess: float = 1.0
     """Factor on all covariances because the misfit exceeds the sampling error, at least 1."""
     oscillation: tuple[float, float] | None = None
-    """Frequency (Hz) and amplitude: of the sine with the largest hump that no model explains; from a recording, of its line."""
+    """
+    Frequency (Hz) and amplitude: of the sine with the largest hump that no model explains; from a
+    recording, of its line.
+    """
     scatter: float = 0.0
     """Standard deviation of the level of the variances from rest to rest, over the level."""
     fit: Any = None
@@ -276,14 +320,22 @@ def identify_axis(moments: Moments) -> AxisNoise:
 
 
 def scatter_of(moments: Moments) -> float:
-    """Return the excess variation of the level of the variances between parts; the sampling error is that of a model with every slope."""
+    """
+    Return the excess variation of the level of the variances between parts.
+
+    The sampling error is that of a model with every slope.
+    """
     fit = fit_names(moments, RICHEST[0])
     expected = moments.design(fit.processes) @ fit.coefficients
     return moments.parts.scatter(moments.used, np.diag(fit.covariance) / expected**2)
 
 
 def _hump(moments, fit):
-    """Return frequency and amplitude of the sine that makes the largest excess; its Allan variance is a^2 sin^4(x) / x^2, x = pi f tau."""
+    """
+    Return frequency and amplitude of the sine that makes the largest excess.
+
+    Its Allan variance is a^2 sin^4(x) / x^2, x = pi f tau.
+    """
     beyond = moments.target - moments.design(fit.processes) @ fit.coefficients
     highest = int(np.argmax(beyond / np.sqrt(np.diag(fit.covariance))))
     if beyond[highest] <= 0:
@@ -295,7 +347,9 @@ def _hump(moments, fit):
 
 def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the prediction for every averaging time of a recording: the variance, and the degrees of freedom of a measured one.
+    Return the prediction for every averaging time of a recording.
+
+    The variance, and the degrees of freedom of a measured one.
 
     The level of the noise differs there from part to part as it did where it was identified.
     """
@@ -311,10 +365,13 @@ def predicted(moments: Moments, axis: AxisNoise) -> tuple[np.ndarray, np.ndarray
 
 def _fit_range(moments):
     """
-    Return the moments without the averaging times at which the sensor filters its noise, and the remaining misfit.
+    Return the moments without filtered averaging times, and the remaining misfit.
 
-    The shortest ones are excluded until one of the richest models explains the others. Where none does (vibration), those are kept that
-    are explained best, as long as their shortest still shows white noise, else all.
+    The averaging times at which the sensor filters its noise are removed.
+
+    The shortest ones are excluded until one of the richest models explains the others. Where none
+    does (vibration), those are kept that are explained best, as long as their shortest still shows
+    white noise, else all.
 
     Returns
     -------
@@ -344,7 +401,11 @@ def _fit_range(moments):
 
 
 def _with_margin(moments, count, most):
-    """Return the moments without the scales at which a detected filter still bends the curve, by 1 - 3/2 (its time) / tau."""
+    """
+    Return the moments without the scales at which a detected filter still bends the curve.
+
+    By 1 - 3/2 (its time) / tau.
+    """
     tau = moments.scales.tau
     return (
         without_finest(moments, min(int(np.sum(tau < FILTER_TIME_RATIO * tau[count])), most))
@@ -354,7 +415,9 @@ def _with_margin(moments, count, most):
 
 
 def _figures(choice, name, excess):
-    """Return the terms of one process: its figure, and the correlation time of a Gauss-Markov process."""
+    """
+    Return the terms of one process: its figure, and the correlation time of a Gauss-Markov process.
+    """
     fits, weights = choice.having(name)
     index = fits[0].names.index(name)
     interval = coefficient_interval(choice.moments, fits, weights, name=name, excess=excess)

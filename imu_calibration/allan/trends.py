@@ -1,4 +1,9 @@
-"""Trends in the readings at rest (temperature, settling after turn-on, steady drift), and noise that is not the same at every rest."""
+"""
+Trends in the readings at rest, and noise that differs between rests.
+
+The trends are due to temperature, settling after turn-on and steady drift. The noise is not the
+same at every rest.
+"""
 
 from dataclasses import dataclass, field
 
@@ -14,7 +19,10 @@ from imu_calibration.allan.processes import (
 
 MAX_TREND_BLOCKS = 200
 MIN_TREND_SDS = {'temperature': 3.3, 'turn_on': 4.0, 'ramp': 4.0}
-"""A trend counts from this many standard deviations on: 1 in 1000, also with the shapes of turn-on that are tried."""
+"""
+A trend counts from this many standard deviations on: 1 in 1000, also with the shapes of turn-on
+that are tried.
+"""
 MIN_WARMTH_RANGE = 0.1
 """Range of the temperature, K, above which a trend with it is tested."""
 MIN_SPARE_BLOCKS = 12
@@ -22,7 +30,9 @@ MIN_SPARE_BLOCKS = 12
 SETTLING_SHARES = (1 / 40, 1 / 20, 1 / 10, 1 / 5)
 """Time constants of turn-on that are tried, as shares of the recording."""
 WALK_VARIANCE_RATIOS = np.concatenate([[0.0], np.geomspace(1e-4, 1e5, 37)])
-"""Variance of the random walk in the middle of the recording over that of the white noise of a block."""
+"""
+Variance of the random walk in the middle of the recording over that of the white noise of a block.
+"""
 TEMPERATURE_TREND, TURN_ON_TREND, RAMP_TREND = 'temperature', 'turn_on', 'ramp'
 
 
@@ -84,7 +94,9 @@ def _shape_of(name, constant=0.0):
 
 
 def _log_determinants(triangles):
-    """Return the logarithms of the determinants of ``T.T @ T``, for triangular T of shape (k, n, n)."""
+    """
+    Return the logarithms of the determinants of ``T.T @ T``, for triangular T of shape (k, n, n).
+    """
     return 2 * np.log(np.abs(np.diagonal(triangles, axis1=1, axis2=2))).sum(axis=1)
 
 
@@ -129,7 +141,11 @@ class TrendSearch:
         return len(self.blocks.time) - self._constants.shape[1] >= MIN_SPARE_BLOCKS
 
     def find(self, axis: int) -> tuple[AxisTrend, ...]:
-        """Return the trends of an axis (0 to 5), the temperature first; none of one that never changes."""
+        """
+        Return the trends of an axis (0 to 5), the temperature first.
+
+        None of one that never changes.
+        """
         if not self.usable or not np.any(np.ptp(self.blocks.mean[:, axis])):
             return ()
         chosen: list[tuple[str, float]] = []
@@ -155,7 +171,11 @@ class TrendSearch:
         )
 
     def _clearest(self, axis, chosen, names):
-        """Return the (name, time constant) of the most significant coefficient given the selected ones, or None."""
+        """
+        Return the (name, time constant) of the most significant coefficient, or None.
+
+        The significance is given the coefficients that are already selected.
+        """
         span = np.ptp(self.blocks.time) + self.blocks.seconds
         taken = {name for name, _ in chosen}
         tried = [
@@ -184,7 +204,11 @@ class TrendSearch:
     def regress(
         self, axis: int, trends: list[tuple[str, float]]
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return coefficients, their standard deviations, and the index of the likeliest ratio of `WALK_VARIANCE_RATIOS`."""
+        """
+        Return coefficients, their standard deviations, and the index of a ratio.
+
+        The index is that of the likeliest ratio of `WALK_VARIANCE_RATIOS`.
+        """
         design, target = (
             np.column_stack([self._constants, self.columns(trends)]),
             self.blocks.mean[:, axis],
@@ -277,15 +301,22 @@ class Parts:
     """Second differences that each is the mean of, shape (n_parts, n_scales)."""
 
     def share(self) -> np.ndarray:
-        """Return the variance of the mean of all parts over that of a part, if only their levels differ, shape (n_scales,)."""
+        """
+        Return the variance of the mean of all parts over that of a part.
+
+        If only their levels differ, shape (n_scales,).
+        """
         return (self.terms**2).sum(axis=0) / self.terms.sum(axis=0) ** 2
 
     def scatter(self, used: np.ndarray, chance: np.ndarray) -> float:
         """
-        Return the standard deviation between parts of the level of the variances, over the level, in excess of sampling error.
+        Return the relative standard deviation of the variances' level between parts.
 
-        The moment estimate of DerSimonian and Laird (Controlled Clinical Trials 7:177, 1986) with the numbers of terms for weights,
-        averaged over the averaging times, weighted by precision.
+        It is the standard deviation between parts of the level of the variances, over the level, in
+        excess of sampling error.
+
+        The moment estimate of DerSimonian and Laird (Controlled Clinical Trials 7:177, 1986) with
+        the numbers of terms for weights, averaged over the averaging times, weighted by precision.
 
         Parameters
         ----------

@@ -1,4 +1,8 @@
-"""Position of one IMU relative to another on the same rigid body, by a robust fit with Student-t errors and noisy columns."""
+"""
+Position of one IMU relative to another on the same rigid body.
+
+By a robust fit with Student-t errors and noisy columns.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -23,7 +27,10 @@ from imu_calibration.kinematics.rotations import skew
 TAIL_DOF = 3
 """Degrees of freedom of Student's t of the residuals: knocks cause long tails."""
 MOTION_SHARE = 0.05
-"""Windows with less lever-arm acceleration than this share of the strongest are left out: the noise estimate is that of motion."""
+"""
+Windows with less lever-arm acceleration than this share of the strongest are left out: the noise
+estimate is that of motion.
+"""
 CLUSTER = 2.0
 """Errors are independent between segments of this length, s."""
 
@@ -78,10 +85,16 @@ class Fit:
     hessian: np.ndarray
     """Derivative of the estimating equations by the values, shape (8, 8)."""
     seen: tuple
-    """Signal shares of the arm's information without the noise of the columns, with their directions."""
+    """
+    Signal shares of the arm's information without the noise of the columns, with their directions.
+    """
 
     def weighted(self, index: np.ndarray | slice) -> np.ndarray:
-        """Return design' times the derivative of the weighted residual by the residual, for some windows, shape (n, p, 3)."""
+        """
+        Return design' times the derivative of the weighted residual by the residual.
+
+        For some windows, shape (n, p, 3).
+        """
         turned, residual = np.swapaxes(self.design[index], 1, 2), self.residual[index]
         along = np.einsum('npi,ni->np', turned, residual) * self.weight_fall[index, None]
         return turned * self.weights[index, None, None] - along[:, :, None] * residual[:, None, :]
@@ -142,7 +155,11 @@ def _reduced(normal):
 
 
 def _normal(design, weights, excess):
-    """Weighted normal matrix, less the contribution of the noise of the angular acceleration (errors in variables)."""
+    """
+    Weighted normal matrix, corrected for errors in variables.
+
+    The contribution of the noise of the angular acceleration is subtracted (errors in variables).
+    """
     flat = (design * np.sqrt(weights)[:, None, None]).reshape(-1, design.shape[2])
     normal = flat.T @ flat
     ridge = 1e-12 * np.maximum(np.diag(normal), 1e-12)
@@ -152,10 +169,13 @@ def _normal(design, weights, excess):
 
 def _robust_fit(design, target, alpha_noise):
     """
-    Student-t regression by reweighting; returns (values, weights, negated derivative of the weights, excess of the normal matrix).
+    Student-t regression by reweighting.
 
-    The weight decreases with the residual, so the derivative of a weighted residual is smaller than its weight:
-    ``weight - weight_fall residual^2``. The noise in the columns biases the values in this proportion.
+    Returns (values, weights, negated derivative of the weights, excess of the normal matrix).
+
+    The weight decreases with the residual, so the derivative of a weighted residual is smaller than
+    its weight: ``weight - weight_fall residual^2``. The noise in the columns biases the values in
+    this proportion.
     """
     weights, weight_fall, size = np.ones(len(design)), np.zeros(len(design)), np.zeros(len(design))
     flat, values = design.reshape(-1, design.shape[2]), np.full(design.shape[2], np.inf)
@@ -175,7 +195,11 @@ def _robust_fit(design, target, alpha_noise):
 
 
 def _jackknife_covariance(fit, centres):
-    """Delete-one-cluster jackknife over stretches of time: errors within a stretch may have any correlation."""
+    """
+    Delete-one-cluster jackknife over stretches of time.
+
+    Errors within a stretch may have any correlation.
+    """
     label = np.unique(np.floor((centres - centres[0]) / CLUSTER).astype(int), return_inverse=True)[
         1
     ]
@@ -191,14 +215,19 @@ def _jackknife_covariance(fit, centres):
 
 
 def response(fit: Fit, columns: np.ndarray) -> np.ndarray:
-    """Return the derivative of the values by small changes of the left-hand side, columns (n, 3, k)."""
+    """
+    Return the derivative of the values by small changes of the left-hand side, columns (n, 3, k).
+    """
     return np.linalg.solve(
         fit.hessian, np.einsum('npi,nik->pk', fit.weighted(slice(None)), columns, optimize=True)
     )
 
 
 NUISANCE = ('bias.x', 'bias.y', 'bias.z', 'force_offset', 'rate_delay')
-"""Differences of the accelerometers' biases and stamps, and the gyroscopes' delay relative to the accelerometers."""
+"""
+Differences of the accelerometers' biases and stamps, and the gyroscopes' delay relative to the
+accelerometers.
+"""
 ARM_PRIOR = 1.0
 """m; an arm whose sd exceeds half of it is not observable."""
 ARM_TOLERANCE = 1e-3
@@ -206,7 +235,9 @@ ARM_TOLERANCE = 1e-3
 UNCALIBRATED_SCALE_SD = 0.03
 """Scale and misalignment of a consumer gyroscope without calibration from poses."""
 DELAY_ROUNDS = 5
-"""Rounds in which the windows of the rates are shifted by the delay until the residual delay vanishes."""
+"""
+Rounds in which the windows of the rates are shifted by the delay until the residual delay vanishes.
+"""
 WINDOWS_LEAST = 40
 """With fewer windows eight parameters and their scatter are not determined."""
 
@@ -226,7 +257,10 @@ class RelativeArm:
     statuses: tuple
     """'determined' (sd within 1 mm) or 'weak' for x, y, z."""
     diagnostics: dict
-    """Plain numbers: windows, clipped share, residuals, nuisances, contribution of the calibration to the sd."""
+    """
+    Plain numbers: windows, clipped share, residuals, nuisances, contribution of the calibration to
+    the sd.
+    """
 
     @property
     def arm_sd(self) -> np.ndarray:
@@ -237,14 +271,20 @@ class RelativeArm:
         """Return the remarks for the user."""
         d = self.diagnostics
         turn = np.degrees(Rotation.from_matrix(self.mat_ab).magnitude())
-        yield f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f} ms late'
         yield (
-            f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f} % of the moving time left out '
-            f'as clipped; the arm explains the difference of the accelerometers from {d["signal_rms"]:.2f} '
-            f'down to {d["residual_rms"]:.2f} m/s^2'
+            f'B is turned by {turn:.2f} deg against A; its stamps are {1e3 * self.time_offset:+.2f}'
+            ' ms late'
+        )
+        yield (
+            f'{d["windows"]} windows of {1e3 * d["window"]:.0f} ms, {100 * d["clipped_share"]:.0f}'
+            ' % of the moving time left out as clipped; the arm explains the difference of the'
+            f' accelerometers from {d["signal_rms"]:.2f} down to {d["residual_rms"]:.2f} m/s^2'
         )
         if not d['calibrated']:
-            yield 'no poses at rest to calibrate the two IMUs with: scale errors of a consumer gyroscope are in the sd'
+            yield (
+                'no poses at rest to calibrate the two IMUs with: scale errors of a consumer'
+                ' gyroscope are in the sd'
+            )
         for axis, status in zip('xyz', self.statuses):
             if status != 'determined':
                 yield f'the arm along {axis} is weak; twist fast about the other two axes'
@@ -252,11 +292,14 @@ class RelativeArm:
 
 def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
     """
-    Estimate the arm r of ``f_B - f_A = alpha x r + omega x (omega x r)`` between two IMUs on one rigid body.
+    Estimate the arm r between two IMUs on one rigid body.
 
-    Both sides are integrated over short windows with the same smooth weight; alpha enters as minus the integral of the
-    weight's derivative times the rate, so no signal is differentiated. Windows with clipped samples are excluded. Biases,
-    scales and axes come from a calibration by hand of each IMU, from the poses in the same recording.
+    The arm satisfies ``f_B - f_A = alpha x r + omega x (omega x r)``.
+
+    Both sides are integrated over short windows with the same smooth weight; alpha enters as minus
+    the integral of the weight's derivative times the rate, so no signal is differentiated. Windows
+    with clipped samples are excluded. Biases, scales and axes come from a calibration by hand of
+    each IMU, from the poses in the same recording.
 
     Parameters
     ----------
@@ -290,7 +333,11 @@ def estimate_arm(imu_a: ImuSamples, imu_b: ImuSamples) -> RelativeArm:
 
 
 def _build_rows(a, b, rotation, delay):
-    """Integrate both sides over windows without clipping, the rates `delay` seconds later on their clocks."""
+    """
+    Integrate both sides over windows without clipping.
+
+    The rates are `delay` seconds later on their clocks.
+    """
     length, offset = window_length(a, b), rotation.offset
     centres = window_centres(a, b, offset=offset, length=length)
     force_a, force_b = (
@@ -317,14 +364,16 @@ def _build_rows(a, b, rotation, delay):
     keep = free & moving
     if keep.sum() < WINDOWS_LEAST:
         raise NotObservableError(
-            f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got {keep.sum()}; '
-            'twist both IMUs together about all axes for 20 s or more, below the range of the gyroscopes'
+            f'the arm needs {WINDOWS_LEAST} windows of fast twisting without clipping, got'
+            f' {keep.sum()}; twist both IMUs together about all axes for 20 s or more, below the'
+            ' range of the gyroscopes'
         )
     lag = 0.1 * (centres[1] - centres[0])  # the second derivative, for the small delay column only
     later, sooner = (
         make_windows(a.time, centres[keep] + delay + s * lag, length).slope(a.rate) for s in (1, -1)
     )
-    # half of the difference of two gyroscopes is the error of their mean, if their errors are independent
+    # half of the difference of two gyroscopes is the error of their mean, if their errors are
+    # independent
     noise = np.mean((alpha_b - alpha_a)[keep] ** 2) / 4
     force = force_b.select(keep).mean(b.force @ rotation.mat_ab.T)
     return ArmRows(
@@ -348,7 +397,11 @@ def _products(integrate, rate):
 
 
 def _calibration_covariance(fit, rows, a, b):
-    """Contribution of the uncertainty of the gyroscopes' matrices: ``rate -> (1 - E) rate`` with the sd of E."""
+    """
+    Contribution of the uncertainty of the gyroscopes' matrices.
+
+    ``rate -> (1 - E) rate`` with the sd of E.
+    """
     columns = []
     for p in range(3):
         for q in range(3):
@@ -405,7 +458,9 @@ def _result(rows, fit, delay, rotation, streams):
 
 
 def _require_seen(seen, sd):
-    """Refuse when the signal of a direction of the arm is the gyroscopes' noise, or hardly above it."""
+    """
+    Refuse when the signal of a direction of the arm is the gyroscopes' noise, or hardly above it.
+    """
     shares, directions = seen
     direction = directions[:, np.argmin(shares)]
     worst = (
@@ -415,8 +470,8 @@ def _require_seen(seen, sd):
     )
     if shares.min() < 0.5 or not np.all(sd < 0.5 * ARM_PRIOR):
         raise NotObservableError(
-            f'the motion must show the whole arm, along {"xyz"[worst]} only {max(shares.min(), 0):.0%} of the '
-            f'signal is not noise and the sd is {np.max(sd):.2g} m; '
-            f'rotate fast also about the axes perpendicular to {"xyz"[worst]}',
+            f'the motion must show the whole arm, along {"xyz"[worst]} only'
+            f' {max(shares.min(), 0):.0%} of the signal is not noise and the sd is {np.max(sd):.2g}'
+            f' m; rotate fast also about the axes perpendicular to {"xyz"[worst]}',
             code='arm_not_observable',
         )

@@ -1,4 +1,9 @@
-"""Two IMUs on one rigid body: readings calibrated by hand, rotation and time offset of B relative to A, weighted integrals over windows."""
+"""
+Two IMUs on one rigid body.
+
+Readings calibrated by hand, rotation and time offset of B relative to A, weighted integrals over
+windows.
+"""
 
 from dataclasses import dataclass
 
@@ -12,13 +17,17 @@ from imu_calibration.references.gravity.hand_calibration import HandCalibration,
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 SINE_POWER = 6
-"""The weight is sin^6: with eight samples per window its sums equal its integrals, and its ends are smooth to fifth order."""
+"""
+The weight is sin^6: with eight samples per window its sums equal its integrals, and its ends are
+smooth to fifth order.
+"""
 SAMPLES_LEAST = 8
 """Samples per window; with fewer the sums depend on the positions of the samples."""
 INTEGRATION_SECONDS = 0.12
 """
-Length of the windows over which the motion is integrated, s; never below `SAMPLES_LEAST`. In shorter ones the noise of the angular
-acceleration shortens the arm, in longer ones fast motion averages out.
+Length of the windows over which the motion is integrated, s; never below `SAMPLES_LEAST`. In
+shorter ones the noise of the angular acceleration shortens the arm, in longer ones fast motion
+averages out.
 """
 MAX_BRIDGED_SECONDS = 0.1
 """Windows do not bridge longer holes, s; never below five periods."""
@@ -33,9 +42,10 @@ class Windows(AlignedArrays):
     """
     Windows of one length over one stream.
 
-    For a signal x and the weight phi of a window (zero at its ends, integral 1): ``mean = int phi x dt`` and, by parts,
-    ``slope = int phi dx/dt dt = -int (dphi/dt) x dt``. Both apply the same low-pass, so an equation between x, its
-    derivative and other signals also holds for its weighted integrals, for any motion between the samples.
+    For a signal x and the weight phi of a window (zero at its ends, integral 1): ``mean = int phi x
+    dt`` and, by parts, ``slope = int phi dx/dt dt = -int (dphi/dt) x dt``. Both apply the same
+    low-pass, so an equation between x, its derivative and other signals also holds for its weighted
+    integrals, for any motion between the samples.
     """
 
     index: np.ndarray
@@ -50,7 +60,9 @@ class Windows(AlignedArrays):
         return _weighted(self.index, self.weight, values)
 
     def slope(self, values: np.ndarray) -> np.ndarray:
-        """Return the weighted means of the time derivative of values (n, k), shape (n_windows, k)."""
+        """
+        Return the weighted means of the time derivative of values (n, k), shape (n_windows, k).
+        """
         return _weighted(self.index, self.weight_slope, values)
 
     def touches(self, flags: np.ndarray) -> np.ndarray:
@@ -148,8 +160,9 @@ def clipped(values: np.ndarray) -> np.ndarray:
     """
     Return which samples are at the end of the range, shape (n,).
 
-    The end of the range is a largest reading of one sign, over all axes, that occurs repeatedly; a largest reading
-    that occurs at most twice is due to the motion. The two ends may differ by one count.
+    The end of the range is a largest reading of one sign, over all axes, that occurs repeatedly; a
+    largest reading that occurs at most twice is due to the motion. The two ends may differ by one
+    count.
     """
     flagged = np.zeros(len(values), bool)
     for signed in (values, -values):
@@ -163,7 +176,8 @@ def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
     """Refuse IMUs that were not recorded at the same time."""
     if len(imu_a) < 2 * SAMPLES_LEAST or len(imu_b) < 2 * SAMPLES_LEAST:
         raise InputError(
-            f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and {len(imu_b)}; check the topics',
+            f'both IMUs must have at least {2 * SAMPLES_LEAST} samples, got {len(imu_a)} and'
+            f' {len(imu_b)}; check the topics',
             code='too_few_samples',
         )
     overlap = min(imu_a.stamp_ns[-1], imu_b.stamp_ns[-1]) - max(
@@ -171,8 +185,8 @@ def require_overlap(imu_a: ImuSamples, imu_b: ImuSamples) -> None:
     )
     if overlap <= 0:
         raise InputError(
-            f'the two IMUs must have been recorded at the same time, their stamps differ by {-1e-9 * overlap:.1f} s; '
-            'check the clocks',
+            'the two IMUs must have been recorded at the same time, their stamps differ by'
+            f' {-1e-9 * overlap:.1f} s; check the clocks',
             code='no_overlap',
         )
 
@@ -189,7 +203,8 @@ def window_centres(a: PairedImu, b: PairedImu, *, offset: float, length: float) 
     end = min(a.time[-1], b.time[-1] - offset) - margin
     if end - begin < step:
         raise InputError(
-            f'the two IMUs must overlap by more than {2 * margin:.1f} s, got {end - begin + 2 * margin:.1f} s; record longer'
+            f'the two IMUs must overlap by more than {2 * margin:.1f} s, got'
+            f' {end - begin + 2 * margin:.1f} s; record longer'
         )
     first = a.time[np.searchsorted(a.time, begin)]
     return first + step * np.arange(int((end - first) / step) + 1)
@@ -208,7 +223,12 @@ class RelativeRotation:
 
 
 def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
-    """Return the rotation from the directions at rest if both were calibrated, otherwise from the rates; the offset from the rates."""
+    """
+    Return the rotation and the offset.
+
+    The rotation is from the directions at rest if both were calibrated, otherwise from the rates.
+    The offset is from the rates.
+    """
     offset, length = 0.0, window_length(a, b)
     for _ in range(OFFSET_ROUNDS):
         centres = window_centres(a, b, offset=offset, length=length)
@@ -235,7 +255,11 @@ def relative_rotation(a: PairedImu, b: PairedImu) -> RelativeRotation:
 
 
 def _directions_at_rest(a, b, offset):
-    """Return mean forces of both over the times when both rest, or None when there are too few directions."""
+    """
+    Return mean forces of both over the times when both rest.
+
+    Or None when there are too few directions.
+    """
     if a.calibration is None or b.calibration is None:
         return None
     pairs = []

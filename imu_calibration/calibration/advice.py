@@ -1,7 +1,10 @@
 """
-Next attitude by hand: the planner for plan, terminal, status, picture and the motions that a calibration requests.
+Next attitude by hand.
 
-The gain of a step is the decrease of the excess (logarithms of standard deviations over tolerances), its cost the duration in seconds.
+The planner for plan, terminal, status, picture and the motions that a calibration requests.
+
+The gain of a step is the decrease of the excess (logarithms of standard deviations over
+tolerances), its cost the duration in seconds.
 """
 
 from __future__ import annotations
@@ -27,7 +30,10 @@ HOLD_TIME = 3.0
 TURN_BEGINS, TURN_RATE = 0.5, 60.0 * DEG
 """s, rad/s; time to begin and to end a turn, and its rate."""
 TURNED = 0.35
-"""rad, 20 degrees: smaller turns between two poses carry little information about the gyroscope and are easily made wrong."""
+"""
+rad, 20 degrees: smaller turns between two poses carry little information about the gyroscope and
+are easily made wrong.
+"""
 ROUNDED = 15
 """deg, rounding of a turn in instructions."""
 
@@ -39,7 +45,9 @@ class HandStep:
     up: np.ndarray
     """Direction of the sensor that points up then, unit vector, shape (3,)."""
     axis: np.ndarray | None = None
-    """Axis of the sensor to turn about, counter-clockwise seen from its tip; None: from anywhere."""
+    """
+    Axis of the sensor to turn about, counter-clockwise seen from its tip; None: from anywhere.
+    """
     angle: float = 0.0
     """Angle of the turn, rad."""
 
@@ -78,7 +86,10 @@ class HandStep:
         if not self.is_turn:
             return hold
         about = DIRECTIONS[int(np.argmax(DIRECTIONS @ self.axis))]
-        return f'turn it by {round(self.angle / DEG / ROUNDED) * ROUNDED} deg about its {direction_words(about)} axis and {hold}'
+        return (
+            f'turn it by {round(self.angle / DEG / ROUNDED) * ROUNDED} deg about its'
+            f' {direction_words(about)} axis and {hold}'
+        )
 
 
 def direction_words(up: np.ndarray) -> str:
@@ -87,7 +98,11 @@ def direction_words(up: np.ndarray) -> str:
 
 
 def shortest_turn(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return (axis in the sensor frame, angle) of the shortest turn of the sensor that brings `end` up where `start` was."""
+    """
+    Return (axis in the sensor frame, angle) of the shortest turn of the sensor.
+
+    The turn brings `end` up where `start` was.
+    """
     about = np.cross(end, start)
     size = np.linalg.norm(about)
     angle = float(np.arctan2(size, start @ end))
@@ -95,7 +110,12 @@ def shortest_turn(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, float
 
 
 def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
-    """Return the design of the shortest turn from one direction up to another for the gyroscope's matrix, shape (2, 9)."""
+    """
+    Return the design of the shortest turn between two directions up.
+
+    It is the design for the gyroscope's matrix, shape (2, 9), of the turn from one direction up to
+    another.
+    """
     if start is None:
         return np.zeros((2, 9))
     about, angle = shortest_turn(start, end)
@@ -106,7 +126,11 @@ def turn_rows(start: np.ndarray | None, end: np.ndarray) -> np.ndarray:
 
 
 def steps_from(up: np.ndarray | None) -> tuple[tuple[HandStep, ...], np.ndarray]:
-    """Return the step to each of `DIRECTIONS`, by the shortest turn from the current one, and the `turn_rows` of each, shape (26, 2, 9)."""
+    """
+    Return the step to each of `DIRECTIONS`.
+
+    By the shortest turn from the current one, and the `turn_rows` of each, shape (26, 2, 9).
+    """
     return _steps_from(None if up is None else tuple(up.tolist()))
 
 
@@ -123,7 +147,11 @@ def _steps_from(up):
 
 
 def _rotation_slopes(about, angle=np.pi):
-    """Return the derivative of the rotation error in the turned frame by the gyroscope's matrix, near the identity, shape (3, 9)."""
+    """
+    Return the derivative of the rotation error by the gyroscope's matrix.
+
+    It is in the turned frame, near the identity, and has shape (3, 9).
+    """
     cross = skew(about)
     # integral over the turn of the remaining rotation, C(angle - t)
     to_come = (
@@ -135,16 +163,28 @@ def _rotation_slopes(about, angle=np.pi):
 
 
 TREMBLING, CREEPING = 1.5e-3, 5e-4
-"""m/s^2, rad/s (0.03 deg/s); expected sd of the means of a pose from noise, trembling and creeping hands, before it is estimated."""
+"""
+m/s^2, rad/s (0.03 deg/s); expected sd of the means of a pose from noise, trembling and creeping
+hands, before it is estimated.
+"""
 GOAL_SHARE = 0.85
-"""Share of the tolerance as goal: the scatter of some twenty poses and turns, a part of every standard deviation, is known to a sixth."""
+"""
+Share of the tolerance as goal: the scatter of some twenty poses and turns, a part of every standard
+deviation, is known to a sixth.
+"""
 MOST_STEPS = 60
 MIN_POSE_GAIN = 1e-3
-"""Poses with a smaller relative gain are not planned; other information is required, such as the gravity."""
+"""
+Poses with a smaller relative gain are not planned; other information is required, such as the
+gravity.
+"""
 WEIGHTS = (0.0, 1.0)
 """Exponents of the seconds of a step in its choice: `foretold` tries both."""
 SERVES = 0.5
-"""Share of the best gain per second for one sensor from which the next step of the common plan is recommended for it too."""
+"""
+Share of the best gain per second for one sensor from which the next step of the common plan is
+recommended for it too.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,10 +209,15 @@ class HandKnowledge:
     """Current vertical in the sensor frame, shape (3,); None: unknown."""
 
     def after(self, ups: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """Return the information after a turn to each of several directions, with these `turn_rows` (k, 2, 9), and a rest."""
+        """
+        Return the information after a turn to each of several directions.
+
+        With these `turn_rows` (k, 2, 9), and a rest.
+        """
         bias, matrix, *_ = self.model.linear(self.values)
         forces = bias + self.model.gravity * ups @ matrix.T
-        # temperature and time at the reference point: one more pose there has no information about thermal effects
+        # temperature and time at the reference point: one more pose there has no information about
+        # thermal effects
         count = len(ups)
         warmth = np.full(count, self.model.model.temperature_ref_c)
         norms = self.model.norm_rows(
@@ -182,7 +227,11 @@ class HandKnowledge:
         return self.information + np.einsum('kri,krj->kij', rows, rows)
 
     def rows(self, norms: np.ndarray, turns: np.ndarray) -> np.ndarray:
-        """Return the design of poses in sd, shape (k, 6, n): from lengths of gravity (k, n), rates at rest, turns (k, 2, 9)."""
+        """
+        Return the design of poses in sd, shape (k, 6, n).
+
+        From lengths of gravity (k, n), rates at rest, turns (k, 2, 9).
+        """
         rows = np.zeros((len(norms), 6, self.model.size))
         rows[:, 0] = norms / self.pose_sd
         rows[:, 1:4, self.model.gyro_bias] = np.eye(3) / self.drift_sd
@@ -197,14 +246,21 @@ class HandKnowledge:
     def missing(
         self, information: np.ndarray, only: Sequence[int] | slice = slice(None)
     ) -> np.ndarray:
-        """Return the remaining `excess` of all or some parameters given some information; leading axes are kept."""
+        """
+        Return the remaining `excess` of all or some parameters given some information.
+
+        Leading axes are kept.
+        """
         return excess(self.sd(information)[..., only], self.tolerances[only])
 
     def best(
         self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0
     ) -> tuple[HandStep, np.ndarray, np.ndarray]:
         """
-        Return (the step with the largest gain per second, relative gain of each of `DIRECTIONS`, information after the step).
+        Return (best step, gains of `DIRECTIONS`, information after the step).
+
+        The step is the one with the largest gain per second. The gain of each of `DIRECTIONS` is
+        relative.
 
         only : sequence of int, optional
             Parameters for which the gain is computed; by default all.
@@ -233,9 +289,12 @@ class HandKnowledge:
 
 def foretold(knowledge: HandKnowledge) -> list[HandStep]:
     """
-    Return the steps still needed: the shorter of the plans with and without the seconds of each step in its choice.
+    Return the steps still needed.
 
-    The largest gain per second is not always the shortest plan: it begins with small turns, after which more remains to be done.
+    The shorter of the plans with and without the seconds of each step in its choice.
+
+    The largest gain per second is not always the shortest plan: it begins with small turns, after
+    which more remains to be done.
     """
     plans = [_rollout(knowledge, weight) for weight in WEIGHTS]
     return min(plans, key=lambda plan: (plan[1], sum(step.seconds for step in plan[0])))[0]
@@ -255,9 +314,13 @@ def _rollout(knowledge, weight):
 
 def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     """
-    Return {'parameters': {name: sd over tolerance}, 'needs': the step that helps most} for each sensor that is not fully determined.
+    Return the undetermined parameters and the needs of each undetermined sensor.
 
-    Recommended is the next step of the common plan, shown in the picture, if it serves the sensor; otherwise the best step for the sensor.
+    The values are {'parameters': {name: sd over tolerance}, 'needs': the step that helps most} for
+    each sensor that is not fully determined.
+
+    Recommended is the next step of the common plan, shown in the picture, if it serves the sensor;
+    otherwise the best step for the sensor.
     """
     knowledge, lacking = knowledge_after(hand), {}
     for name, status, sd, tolerance in zip(
@@ -295,14 +358,17 @@ def knowledge_at_first(
     poses: Poses | None = None,
 ) -> HandKnowledge:
     """
-    Return the HandKnowledge before the first solution: from the poses only, at nominal values and with the default scatter.
+    Return the HandKnowledge before the first solution.
+
+    From the poses only, at nominal values and with the default scatter.
 
     Parameters
     ----------
     model : HandModel
     tolerances : ndarray, shape (n,)
     noise : tuple
-        Contribution of the sensor noise to a pose (m/s^2), to its mean rate (rad/s) and to a turn (rad).
+        Contribution of the sensor noise to a pose (m/s^2), to its mean rate (rad/s) and to a turn
+        (rad).
     poses : Poses, optional
         Poses so far.
 
@@ -332,7 +398,11 @@ def knowledge_at_first(
 
 
 def knowledge_after(hand: HandCalibration) -> HandKnowledge:
-    """Return the HandKnowledge of a solution: its information, reduced by the growth of its standard deviations beyond noise."""
+    """
+    Return the HandKnowledge of a solution.
+
+    Its information, reduced by the growth of its standard deviations beyond noise.
+    """
     model, statistics, poses = hand.hand_model, hand.statistics, hand.poses
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
     known = expected < 0.5 * model.priors

@@ -1,10 +1,14 @@
 """
-Model selection by `calibrate` and `diagnose` in common: effects that the data support are added to the model.
+Model selection by `calibrate` and `diagnose` in common.
 
-The recording is calibrated with the requested model, then every effect of the catalogue is tested as in a diagnosis. Significant effects
-are added to the model. An effect is rejected when a formula beyond the catalogue makes it unnecessary, when the estimates from parts of
-the recording differ, or when it is not significant with the widened standard deviations; it then widens the standard deviations instead.
-So do alternatives to a chosen effect that fit nearly as well, and the unexplained residual: by the change of a bias that it may cause.
+Effects that the data support are added to the model.
+
+The recording is calibrated with the requested model, then every effect of the catalogue is tested
+as in a diagnosis. Significant effects are added to the model. An effect is rejected when a formula
+beyond the catalogue makes it unnecessary, when the estimates from parts of the recording differ, or
+when it is not significant with the widened standard deviations; it then widens the standard
+deviations instead. So do alternatives to a chosen effect that fit nearly as well, and the
+unexplained residual: by the change of a bias that it may cause.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +48,9 @@ Solved = tuple[Solution, SessionData, SensorModel]
 
 @dataclass(frozen=True, eq=False)
 class EvidentSolution:
-    """A solution with the effects that its recordings support, and the result of the search for them."""
+    """
+    A solution with the effects that its recordings support, and the result of the search for them.
+    """
 
     solution: Solution
     """Solution of the requested model with the added effects, its covariance widened."""
@@ -78,7 +84,9 @@ def calibrate_by_evidence(
     names: Sequence[str] | None = None,
 ) -> EvidentResult:
     """
-    Calibrate from one or several recordings of the same IMU; effects that they support are added to the requested model.
+    Calibrate from one or several recordings of the same IMU.
+
+    Effects that they support are added to the requested model.
 
     Parameters
     ----------
@@ -166,7 +174,9 @@ def ask_kept(
     solved: Solved, table: Table, options: CalibrationOptions, *, known: ModelExtension
 ) -> EvidentSolution:
     """
-    Return the supported effects when columns cannot be recomputed: missing effects are reported and widen the covariance.
+    Return the supported effects when columns cannot be recomputed.
+
+    Missing effects are reported and widen the covariance.
 
     Parameters
     ----------
@@ -202,7 +212,11 @@ def ask_kept(
 
 
 def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
-    """Return the windows of each recording that suffice for a search of effects, the largest recording first."""
+    """
+    Return the windows of each recording that suffice for a search of effects.
+
+    The largest recording is first.
+    """
     return [
         windows
         for windows in (spread.windows for spread in gathered.spreads)
@@ -211,7 +225,11 @@ def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
 
 
 def _clipped(found):
-    """Return the solution of a search that found a limit, with only the saturated samples removed from its windows; else None."""
+    """
+    Return the solution of a search that found a limit.
+
+    With only the saturated samples removed from its windows; else None.
+    """
     return (
         extended_solution(
             found.problem.space,
@@ -232,7 +250,11 @@ def _examined(found):
 
 
 def _changes(searches, added):
-    """Return the changes of the requested model by searches (the first has priority) and their effects."""
+    """
+    Return the changes of the requested model by searches, and their effects.
+
+    The first search has priority.
+    """
     found, model = searches[0], searches[0].problem.baseline
     clipping = (
         model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name
@@ -278,7 +300,9 @@ def _without_faint(found, solution):
 
 
 def _named_elsewhere(found, others):
-    """Return the effects that the search found in other recordings only, larger recordings first."""
+    """
+    Return the effects that the search found in other recordings only, larger recordings first.
+    """
     more = {}
     for question in (question for other in others for question in other.adopted):
         more.setdefault(question.effect.key, question)
@@ -291,9 +315,12 @@ def _named_elsewhere(found, others):
 
 def stands_out(solution: Solution, question: Question) -> bool:
     """
-    Return whether an effect belongs into the model of a solution, with standard deviations that include all allowances.
+    Return whether an effect belongs into the model of a solution.
 
-    Its size is plausible, by the threshold that the verdict uses; it differs from its prior significantly, and so does one coefficient.
+    With standard deviations that include all allowances.
+
+    Its size is plausible, by the threshold that the verdict uses; it differs from its prior
+    significantly, and so does one coefficient.
     """
     effect, part = question.effect, solution.model.slices[question.sensor, question.name]
     at = np.arange(part.start, part.start + effect.n_amplitudes)
@@ -313,7 +340,11 @@ def stands_out(solution: Solution, question: Question) -> bool:
 
 
 def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
-    """Return the options of the baseline model of the search: effects that were not requested have to be significant."""
+    """
+    Return the options of the baseline model of the search.
+
+    Effects that were not requested have to be significant.
+    """
     return replace(
         options,
         accelerometer_model=options.accelerometer_model or BARE,
@@ -343,7 +374,11 @@ def _baseline_model(options, table, solved):
 
 
 def _strange(found):
-    """Return implausible effect -> share of the excess variance that it explains; the first of several investigations has priority."""
+    """
+    Return implausible effect -> share of the excess variance that it explains.
+
+    The first of several investigations has priority.
+    """
     return {
         question.name: each.explained.share(each.named, question)
         for each in reversed(found)
@@ -362,7 +397,11 @@ def _point(found):
 
 
 def _moves(found, lacking=()):
-    """Return (changes of parameters by other choices of effects, weight): rejected, doubtful, implausible or missing effects, rivals."""
+    """
+    Return (changes of parameters by other choices of effects, weight).
+
+    Rejected, doubtful, implausible or missing effects, rivals.
+    """
     moves = [
         (found.search.moved_by(found.named, question, found.problem.space.names), 1.0)
         for question in (*found.unstable, *found.rejected, *found.implausible, *lacking)
@@ -414,7 +453,9 @@ def extended_solution(
 
 
 def _in_trusted_band(noise, slow_only):
-    """Return the noise with weight zero for fast parts on axes where only the slow part is compared."""
+    """
+    Return the noise with weight zero for fast parts on axes where only the slow part is compared.
+    """
     return replace(
         noise,
         moving={

@@ -118,7 +118,11 @@ def to_bytes(
 
 
 def _packed(values, arrays):
-    """Return a column of values as plain lists, one column per part of values of equal type; arrays of one shape are appended as one."""
+    """
+    Return a column of values as plain lists, one column per part of values of equal type.
+
+    Arrays of one shape are appended as one.
+    """
     if all(issubclass(kind, SAVED_PLAIN) for kind in set(map(type, values))):
         return ['plain', values]
     kinds = [_kind(value) for value in values]
@@ -157,7 +161,9 @@ def _packed(values, arrays):
 
 
 def _kind(value):
-    """Return the shape, the keys, the length or the type, which values of one column have in common."""
+    """
+    Return the shape, the keys, the length or the type, which values of one column have in common.
+    """
     if isinstance(value, np.ndarray):
         return value.shape
     if isinstance(value, dict):
@@ -168,7 +174,11 @@ def _kind(value):
 
 
 def _unpacked(column, numbers):
-    """Return the values that `_packed` wrote; their arrays are read from the beginning of the file `numbers`."""
+    """
+    Return the values that `_packed` wrote.
+
+    Their arrays are read from the beginning of the file `numbers`.
+    """
     name, size, *parts = column
     if name == 'plain':
         return size
@@ -192,7 +202,10 @@ def _unpacked(column, numbers):
 
 def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
     """
-    Return (SessionData, SensorModel of its columns, effects added to the requested model) in an archive.
+    Return (SessionData, SensorModel, added effects) in an archive.
+
+    The SensorModel is that of the columns of the data. The effects are the ones added to the
+    requested model.
 
     Raises
     ------
@@ -220,18 +233,24 @@ def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
         raise
     except Exception as error:  # damaged archives, arrays and headers raise many kinds
         raise DocumentError(
-            f'a saved accumulator must be a whole file of {SAVED_FORMAT}, this file of {len(data)} bytes is damaged or has '
-            f'a different format ({shortened(str(error), 200)}); remove the file',
+            f'a saved accumulator must be a whole file of {SAVED_FORMAT}, this file of {len(data)}'
+            f' bytes is damaged or has a different format ({shortened(str(error), 200)}); remove'
+            ' the file',
             code='accumulator_damaged',
         ) from error
 
 
 def require_columns(known: SensorModel, model: SensorModel) -> None:
-    """Raise a DocumentError unless the columns of a saved accumulator, of the model `known`, are those of `model`."""
+    """
+    Raise a DocumentError unless the columns of a saved accumulator match.
+
+    The columns of the accumulator, of the model `known`, must be the columns of `model`.
+    """
     if not known.has_columns_of(model):
         raise DocumentError(
-            f'a saved accumulator must contain the columns of the requested model, it has {_text(known)}, '
-            f'requested is {_text(model)}; start without resume, or with the old model',
+            'a saved accumulator must contain the columns of the requested model, it has'
+            f' {_text(known)}, requested is {_text(model)}; start without resume, or with the old'
+            ' model',
             code='other_model',
         )
 
@@ -242,7 +261,11 @@ def _text(model):
 
 
 class Collector:
-    """Feeds blocks to the window finder and reduces its windows; the same object serves bags and live topics."""
+    """
+    Feeds blocks to the window finder and reduces its windows.
+
+    The same object serves bags and live topics.
+    """
 
     def __init__(
         self,
@@ -339,7 +362,9 @@ class Collector:
 
 @dataclass(frozen=True)
 class GatherStep:
-    """The map step with its arguments bound, so that it can be sent to another process or machine."""
+    """
+    The map step with its arguments bound, so that it can be sent to another process or machine.
+    """
 
     table: Table
     """The reference."""
@@ -350,14 +375,18 @@ class GatherStep:
     nominal: NominalScaling | None = None
     """For recordings in volts or counts."""
     names: tuple = ()
-    """Names of the recordings for messages; with several of them an error names the one at fault."""
+    """
+    Names of the recordings for messages; with several of them an error names the one at fault.
+    """
     spread: bool = False
     """Whether windows are kept for the search of effects."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
     def __call__(self, numbered: tuple[int, Callable]) -> SessionData:
-        """Return the SessionData of a recording, given (its number, callable that yields its blocks)."""
+        """
+        Return the SessionData of a recording, given (its number, callable that yields its blocks).
+        """
         session, source = numbered
         return naming(self.names, session)(
             self.read, source(), session, Preflight(self.table.gravity_value)
@@ -372,7 +401,9 @@ class GatherStep:
         windows: list | StoredWindows | None = None,
     ) -> SessionData:
         """
-        Return the SessionData of a recording, which is read once, for its windows and for the checks.
+        Return the SessionData of a recording, which is read once.
+
+        For its windows and for the checks.
 
         All windows, unused ones too, are appended to `windows`.
 
@@ -422,14 +453,22 @@ class LiveCollector(Collector):
         self.gathered.spreads[0].add(kept)
 
     def take_model(self, model: SensorModel) -> None:
-        """Gather the columns of another model from now on; those of all kept windows are computed again."""
+        """
+        Gather the columns of another model from now on.
+
+        Those of all kept windows are computed again.
+        """
         self.model, self.gathered = (
             model,
             self.gathered.anew(self.store.reduced(model, self.table, self.session)),
         )
 
     def snapshot(self, pending: bool) -> tuple[SessionData, WindowStore]:
-        """Return copies of the gathered data and of the store; with `pending`, open windows are closed in the copies."""
+        """
+        Return copies of the gathered data and of the store.
+
+        With `pending`, open windows are closed in the copies.
+        """
         twin = copy.copy(self)
         twin.gathered, twin.store = copied(self.gathered), self.store.copy()
         if pending:

@@ -108,7 +108,10 @@ def waiting_groups(model: SensorModel) -> list[GroupState]:
 MIN_CELL_WORTH = 0.02
 """A cell with a gain below this share of the excess is not proposed for a pose."""
 MAX_MOTIONS_AHEAD, MIN_MOTION_GAIN = 20, 0.01
-"""Most standard motions that are planned ahead, and the least share of the excess that the best one must remove."""
+"""
+Most standard motions that are planned ahead, and the least share of the excess that the best one
+must remove.
+"""
 GAUGE_SHOWN = 1e-7
 """m; how exactly the origin is the mean of the sensitive points here."""
 MAX_MOTION_SECONDS = 300.0
@@ -124,7 +127,10 @@ class Step:
     up: np.ndarray | None = None
     """Direction of the sensor frame to turn up and hold, unit vector, shape (3,)."""
     axis: np.ndarray | None = None
-    """Axis of the sensor frame to turn about, counter-clockwise seen from its tip, unit vector, shape (3,)."""
+    """
+    Axis of the sensor frame to turn about, counter-clockwise seen from its tip, unit vector, shape
+    (3,).
+    """
     angle: float = 0.0
     """Angle of the rotation, rad; 0: continuous."""
 
@@ -134,7 +140,9 @@ class Coverage:
     """The displayed state of a session."""
 
     worth: np.ndarray
-    """Share of the excess that a rest with each of `DIRECTIONS` up would remove, 0 to 1, shape (26,)."""
+    """
+    Share of the excess that a rest with each of `DIRECTIONS` up would remove, 0 to 1, shape (26,).
+    """
     seen: np.ndarray
     """Directions that have been up at rest, unit vectors, shape (k, 3)."""
     up: np.ndarray | None
@@ -146,12 +154,17 @@ class Coverage:
     done: bool = False
     """Whether every parameter group is determined."""
     arms: np.ndarray | None = None
-    """Sensitive points of the accelerometer's axes, m in the sensor frame, rows x, y, z, shape (3, 3); None while they are not known."""
+    """
+    Sensitive points of the accelerometer's axes, m in the sensor frame, rows x, y, z, shape (3, 3);
+    None while they are not known.
+    """
     frame_id: str = ''
     """Frame of the sensor."""
 
     def with_done(self, groups: Sequence[GroupState]) -> 'Coverage':
-        """Return the coverage that is done where every group is determined; never without groups."""
+        """
+        Return the coverage that is done where every group is determined; never without groups.
+        """
         return replace(
             self, done=bool(groups) and all(group.status == DETERMINED for group in groups)
         )
@@ -164,7 +177,11 @@ NOTHING_SEEN = Coverage(
 
 
 def excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
-    """Return the excess of standard deviations over their tolerances: ``sum log max(sd / tolerance, 1)``; leading axes are kept."""
+    """
+    Return the excess of standard deviations over their tolerances.
+
+    ``sum log max(sd / tolerance, 1)``; leading axes are kept.
+    """
     return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
 
 
@@ -175,10 +192,13 @@ def share_gained(before: float, after: np.ndarray) -> np.ndarray:
 
 def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     """
-    Return the Coverage of a calibration on a table: each cell is a rest of five seconds with that direction up.
+    Return the Coverage of a calibration on a table.
 
-    The next step is the standard motion with the largest gain per second; `seconds` is the time of it and of all later ones needed. If
-    these do not suffice, it is the motion that the solution proposes for the parameter with the largest sd in tolerances.
+    Each cell is a rest of five seconds with that direction up.
+
+    The next step is the standard motion with the largest gain per second; `seconds` is the time of
+    it and of all later ones needed. If these do not suffice, it is the motion that the solution
+    proposes for the parameter with the largest sd in tolerances.
 
     Parameters
     ----------
@@ -195,7 +215,8 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     def expected_sd(information):
         return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
 
-    # unmodelled effects widen the standard deviations beyond those of the information matrix; the same factor is predicted
+    # unmodelled effects widen the standard deviations beyond those of the information matrix; the
+    # same factor is predicted
     wider = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
 
     def left(information):
@@ -222,7 +243,11 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
 
 
 def _foretold(information, left, added, motions):
-    """Return (first motion, seconds of all) of the motions that remove the excess; (None, NaN) if these motions do not suffice."""
+    """
+    Return (first motion, seconds of all) of the motions that remove the excess.
+
+    (None, NaN) if these motions do not suffice.
+    """
     first, seconds, missing = None, 0.0, left(information)
     more = [added(motion) for motion in motions] if missing else []
     for _ in range(MAX_MOTIONS_AHEAD):
@@ -274,7 +299,9 @@ def _arms(result):
 
 
 RADIUS = 0.5
-"""Of the sphere, m; the picture has no scale of its own but that of the arms, which are drawn larger."""
+"""
+Of the sphere, m; the picture has no scale of its own but that of the arms, which are drawn larger.
+"""
 ARMS_TIMES = 10.0
 """Arms are millimetres."""
 WANTED, VISITED, DONE_COLOUR, ARROW, NOW, TEXT_COLOUR = (
@@ -289,7 +316,11 @@ SEEN_DIAMETER = 0.03
 
 
 def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...], float]]:
-    """Yield (place, colour, diameter) of each cell: orange and large where a rest still has a gain, green and small elsewhere."""
+    """
+    Yield (place, colour, diameter) of each cell.
+
+    Orange and large where a rest still has a gain, green and small elsewhere.
+    """
     most = max(float(coverage.worth.max()), MIN_CELL_WORTH)
     for direction, worth in zip(DIRECTIONS, coverage.worth, strict=True):
         share = 0.0 if coverage.done or worth < MIN_CELL_WORTH else float(worth) / most
@@ -306,7 +337,11 @@ def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...]
 def arrows_of(
     coverage: Coverage,
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray, tuple[float, ...]]]:
-    """Yield (name, start, end, colour) of each arrow: up direction now, direction or axis of the next motion, arms that are not zero."""
+    """
+    Yield (name, start, end, colour) of each arrow.
+
+    Up direction now, direction or axis of the next motion, arms that are not zero.
+    """
     step, centre = coverage.next, np.zeros(3)
     if coverage.up is not None:
         yield 'up now', centre, 0.85 * RADIUS * coverage.up, NOW

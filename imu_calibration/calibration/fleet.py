@@ -1,4 +1,8 @@
-"""Many units: the map step calibrates one, the merge step compares them. Plain functions, for any scheduler."""
+"""
+Many units: the map step calibrates one, the merge step compares them.
+
+Plain functions, for any scheduler.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +28,10 @@ class Unit:
     name: str
     """Name of the unit."""
     sources: tuple
-    """Callables that yield the blocks of a recording from its start at each call; must be picklable for another process."""
+    """
+    Callables that yield the blocks of a recording from its start at each call; must be picklable
+    for another process.
+    """
     bags: tuple = ()
     """Names of the recordings."""
     provenance: object = None

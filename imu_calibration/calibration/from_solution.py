@@ -40,25 +40,34 @@ class ModelChanges:
     added: tuple[str, ...] = ()
     """Added to the model because the data support them."""
     unstable: tuple[str, ...] = ()
-    """Not added because the estimates of parts of the recording differ; the standard deviations allow for them."""
+    """
+    Not added because the estimates of parts of the recording differ; the standard deviations allow
+    for them.
+    """
     implausible: dict[str, float] = field(default_factory=dict)
     """
-    Not added because no known instrument has effects of this size -> explained share of the excess variance; the standard
-    deviations allow for them.
+    Not added because no known instrument has effects of this size -> explained share of the excess
+    variance; the standard deviations allow for them.
     """
     lacking: tuple[str, ...] = ()
-    """Demanded, but the motion of before is no longer kept, so that they cannot join; the standard deviations allow for them."""
+    """
+    Demanded, but the motion of before is no longer kept, so that they cannot join; the standard
+    deviations allow for them.
+    """
     unexplained: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Sensor -> rms and axes of its unexplained residual, by the test of `diagnose`."""
     stamp_jitter: dict[str, Any] = field(default_factory=dict)
-    """Sd of independent errors of the stamps and the variance ratios they cause (`StampJitter`), empty where not significant."""
+    """
+    Sd of independent errors of the stamps and the variance ratios they cause (`StampJitter`), empty
+    where not significant.
+    """
 
     def to_mapping(self) -> dict:
         """Return the part of a document's statistics."""
         return {
-            {'unstable': 'denied'}.get(name, name): list(value)
-            if isinstance(value, tuple)
-            else value
+            {'unstable': 'denied'}.get(name, name): (
+                list(value) if isinstance(value, tuple) else value
+            )
             for name, value in vars(self).items()
             if value
         }
@@ -66,7 +75,11 @@ class ModelChanges:
 
 @dataclass(frozen=True, eq=False)
 class ModelExtension:
-    """Effects that a recording supports: the result of a search as needed for further solutions of the same and more windows."""
+    """
+    Effects that a recording supports.
+
+    The result of a search as needed for further solutions of the same and more windows.
+    """
 
     added: tuple[tuple[str, str], ...] = ()
     """(sensor, effect) in addition to the requested ones."""
@@ -84,7 +97,11 @@ class ModelExtension:
         return replace(asked, added=self.added, point=self.point)
 
     def disagreement(self, names: Sequence[str]) -> np.ndarray:
-        """Return the covariance of the changes of parameters by other choices of effects, shape (n_params, n_params)."""
+        """
+        Return the covariance of the changes of parameters by other choices of effects.
+
+        Shape (n_params, n_params).
+        """
         total = np.zeros((len(names),) * 2)
         for moved, weight in self.moves:
             shift = np.array([moved.get(name, 0.0) for name in names])
@@ -92,7 +109,11 @@ class ModelExtension:
         return total
 
     def applied(self, solution: Solution) -> Solution:
-        """Return a solution of `options`, or that without clipped samples, with the covariance of rejected and collinear effects."""
+        """
+        Return a solution of `options`, or that without clipped samples.
+
+        With the covariance of rejected and collinear effects.
+        """
         found = self.clipped or solution
         return replace(
             found, terms=with_term(found.terms, REJECTED, self.disagreement(found.param_names))
@@ -107,7 +128,11 @@ class ModelExtension:
 def motions_needed(
     solution: Solution, tolerances: np.ndarray, table: Table
 ) -> dict[str, tuple[str, float]]:
-    """Return parameter that is not determined -> (the motion that would serve it best, its sd after a minute of it)."""
+    """
+    Return undetermined parameter -> (best motion, its sd after a minute of it).
+
+    The motion is the one that would serve best a parameter that is not determined.
+    """
     return observability.needed_motions(
         solution,
         tolerances,
@@ -156,7 +181,8 @@ def document(
         Parts of the document.
     changes : ModelChanges
     uncorrected : Uncorrected
-        Effects in time that compensation does not correct; their centres are included in the values.
+        Effects in time that compensation does not correct; their centres are included in the
+        values.
     tested : names, optional
         Parameters that are replaced by a likelihood-ratio test.
 
@@ -195,7 +221,12 @@ def document(
 def weak_on_table(
     solution: Solution, tolerances: np.ndarray, needed: dict[str, tuple[str, float]]
 ) -> tuple[dict, ...]:
-    """Return the weak directions with the motions that would help, and the parameters that none of them names."""
+    """
+    Return the weak directions with helpful motions, and the unnamed parameters.
+
+    The motions would help with the weak directions. The parameters are the ones that none of the
+    directions names.
+    """
     directions = observability.weak_directions(
         solution.covariance, tolerances, solution.param_names
     )
@@ -228,7 +259,9 @@ def _need(weights, needed):
 
 
 def _besides(directions, needed, in_tolerances):
-    """Return (sds in tolerances, motion) of the parameters that none of the worst directions names."""
+    """
+    Return (sds in tolerances, motion) of the parameters that none of the worst directions names.
+    """
     named, others = set().union(*directions), {}
     for name, (text, _) in needed.items():
         if name not in named:
@@ -237,7 +270,11 @@ def _besides(directions, needed, in_tolerances):
 
 
 def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
-    """Return the solution with the uncertainty of gravity, a common scale of the accelerometer matrix, in its covariance."""
+    """
+    Return the solution with the uncertainty of gravity in its covariance.
+
+    This uncertainty is a common scale of the accelerometer matrix.
+    """
     direction = np.zeros(len(solution.values))
     part = solution.model.part('accelerometer', Role.LINEAR)
     direction[part] = solution.values[part] * table.gravity_sd_value / table.gravity_value

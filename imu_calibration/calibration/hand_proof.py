@@ -28,9 +28,15 @@ from imu_calibration.references.gravity.poses import distinct_attitudes
 HAND_PROOF_FOLDS = 8
 """Number of held-out parts."""
 ATTITUDES_LEAST = 10
-"""Fewest remaining attitudes when a part is held out: nine parameters of the accelerometer need one equation each."""
+"""
+Fewest remaining attitudes when a part is held out: nine parameters of the accelerometer need one
+equation each.
+"""
 FEW_ATTITUDES = 6
-"""Fewest remaining attitudes when one pose is held out: biases and scale factors of the accelerometer need one equation each."""
+"""
+Fewest remaining attitudes when one pose is held out: biases and scale factors of the accelerometer
+need one equation each.
+"""
 TURNS_LEAST = 6
 """Fewest remaining turns, and fewest held-out turns in total."""
 TURN_ANGLE_UNIT = 'rad per turn'
@@ -39,12 +45,16 @@ TURN_ANGLE_UNIT = 'rad per turn'
 
 def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     """
-    Return the proof of a calibration by hand: sensor -> entry of a document (see `calibration.proof`).
+    Return the proof of a calibration by hand.
 
-    Every eighth pose, with few attitudes one pose, is held out with the turns that begin or end there: one step from the solution without
-    their rows. The error of the accelerometer is the length of its corrected reading in a pose less gravity; that of the
-    gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end of a turn. Readings are corrected as by
-    compensation; with effects that have settled the last third of the poses is evaluated. With too few poses or turns there is no entry.
+    Sensor -> entry of a document (see `calibration.proof`).
+
+    Every eighth pose, with few attitudes one pose, is held out with the turns that begin or end
+    there: one step from the solution without their rows. The error of the accelerometer is the
+    length of its corrected reading in a pose less gravity; that of the gyroscope the angle between
+    gravity rotated by its rates and gravity in the pose at the end of a turn. Readings are
+    corrected as by compensation; with effects that have settled the last third of the poses is
+    evaluated. With too few poses or turns there is no entry.
 
     Parameters
     ----------
@@ -95,7 +105,11 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
 def held_out_values(
     hand: HandCalibration, turns: Sequence[TurnData]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return (mask of the held-out poses, parameters estimated without them) of each fold; none with too few poses."""
+    """
+    Return (mask of the held-out poses, parameters estimated without them) of each fold.
+
+    None with too few poses.
+    """
     folds = _folds(hand.poses)
     return list(zip(folds, values_without(hand, turns, folds)))
 
@@ -103,7 +117,11 @@ def held_out_values(
 def values_without(
     hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """Return the parameters without the poses of each mask and the turns that begin or end there: one Gauss-Newton step."""
+    """
+    Return the parameters without the poses of each mask and the turns that begin or end there.
+
+    One Gauss-Newton step.
+    """
     model = hand.hand_model
     system = GravityRows(model, hand.used_poses, turns).linearise(
         replace(hand.state, values=hand.values)
@@ -132,7 +150,11 @@ def values_without(
 
 
 def _folds(poses):
-    """Return masks of the poses to hold out in turn: an eighth of them, or with few attitudes one pose; none with too few."""
+    """
+    Return masks of the poses to hold out in turn.
+
+    An eighth of them, or with few attitudes one pose; none with too few.
+    """
     number = np.arange(len(poses.start))
     for count, least in ((HAND_PROOF_FOLDS, ATTITUDES_LEAST), (len(number), FEW_ATTITUDES)):
         folds = [number % count == fold for fold in range(count)]
@@ -186,7 +208,11 @@ def corrected_with(
     rate: np.ndarray | None = None,
     temperature_c: np.ndarray | None = None,
 ) -> Corrected:
-    """Return readings corrected as by compensation with the parameters `values` of `model`; shape (n, 3); without `rate` at rest."""
+    """
+    Return readings corrected as by compensation with the parameters `values` of `model`.
+
+    Shape (n, 3); without `rate` at rest.
+    """
     rate = np.zeros_like(force) if rate is None else rate
     known = Calibration(
         model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size
@@ -202,7 +228,11 @@ def turn_errors(
     turns: Sequence[TurnData],
     gyroscope: np.ndarray,
 ) -> np.ndarray:
-    """Return the angle errors of turns, rad, with the accelerometer of `values` and the parameters `gyroscope` of the gyroscope."""
+    """
+    Return the angle errors of turns, rad.
+
+    With the accelerometer of `values` and the parameters `gyroscope` of the gyroscope.
+    """
     mixed = values.copy()
     for part in (model.gyro_bias, model.gyro_matrix, model.extra_index('gyroscope')):
         mixed[part] = gyroscope[part]
@@ -221,7 +251,9 @@ def turn_errors(
 
 def turn_error(poses: Poses, turn: TurnData, rates: np.ndarray, *, up: np.ndarray) -> float:
     """
-    Return the angle between the direction of gravity after a turn and that before it rotated by corrected rates, rad.
+    Return the angle between gravity after a turn and rotated gravity before it, rad.
+
+    The direction of gravity before the turn is rotated by corrected rates.
 
     Parameters
     ----------

@@ -1,4 +1,8 @@
-"""A calibration by hand, with the effects that it supports, and with the document and result of a calibration on a table."""
+"""
+A calibration by hand.
+
+With the effects that it supports, and with the document and result of a calibration on a table.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -82,7 +86,9 @@ def solve_by_evidence(
     data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False
 ) -> EvidentHand:
     """
-    Estimate from poses and turns, with the supported effects in addition to the requested model (`investigate_by_hand`).
+    Estimate from poses and turns.
+
+    With the supported effects in addition to the requested model (`investigate_by_hand`).
 
     Parameters
     ----------
@@ -127,7 +133,11 @@ def solve_by_evidence(
 
 
 def _solved(data, found, options):
-    """Return the calibration with the requested model and the findings; if the model is unchanged, the one of the search."""
+    """
+    Return the calibration with the requested model and the findings.
+
+    If the model is unchanged, the one of the search.
+    """
     asked, names, base = _asked(data, options), found.names, found.baseline.model
     same = all(getattr(base, sensor) == _joined(asked[sensor], names[sensor]) for sensor in SENSORS)
     return (
@@ -154,7 +164,11 @@ def _faint(hand, found, asked):
 def extended_by_hand(
     data: HandData, found: 'HandInvestigation', options: HandOptions
 ) -> HandCalibration:
-    """Return the calibration with the requested model and the findings; unstable or implausible effects increase its covariance."""
+    """
+    Return the calibration with the requested model and the findings.
+
+    Unstable or implausible effects increase its covariance.
+    """
     asked, names = _asked(data, options), found.names
     extended = replace(
         options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}
@@ -189,7 +203,11 @@ class HandResult(CalibrationResult):
     observations: ClassVar[str] = 'poses'
 
     def window_errors(self) -> WindowErrors:
-        """Return the errors of the poses, after: held out; relative to gravity along its estimated direction, and to zero rate."""
+        """
+        Return the errors of the poses, after: held out.
+
+        Relative to gravity along its estimated direction, and to zero rate.
+        """
         hand, poses = self.hand, self.hand.poses
         force, rate = poses.force, poses.rate
         true, zero = hand.gravity * hand.state.up, np.zeros_like(rate)
@@ -222,7 +240,11 @@ class HandResult(CalibrationResult):
         return {}
 
     def error_budget(self) -> ErrorBudget:
-        """Return noise and gravity, the only reference. The sds contain the uncertainty of a gravity that was not given."""
+        """
+        Return noise and gravity, the only reference.
+
+        The sds contain the uncertainty of a gravity that was not given.
+        """
         model, values, known = (
             self.calibration.model,
             self.calibration.values,
@@ -240,7 +262,10 @@ class HandResult(CalibrationResult):
             {'noise': self.calibration.own_sd, 'gravity': gravity},
             {
                 'noise': 'noise, scatter of poses and turns, as this recording shows them',
-                'gravity': f'gravity {"known" if known else "not given: the standard one is known"} to {gravity_sd:.2g} m/s²',
+                'gravity': (
+                    f'gravity {"known" if known else "not given: the standard one is known"} to'
+                    f' {gravity_sd:.2g} m/s²'
+                ),
             },
         )
 
@@ -279,7 +304,9 @@ def read_by_hand(
     preflight: Preflight | None = None,
 ) -> HandRecording:
     """
-    Return the `HandRecording` of a complete stream of SampleBlock, with the findings of `preflight`; `nominal` as for the `BlockCleaner`.
+    Return the `HandRecording` of a complete stream of SampleBlock.
+
+    With the findings of `preflight`; `nominal` as for the `BlockCleaner`.
 
     Raises
     ------
@@ -341,7 +368,8 @@ def calibrate_without_table(
     """
     if len(sources) != 1:
         raise InputError(
-            f'calibration by hand needs one recording, got {len(sources)}; calibrate them separately and compare the results'
+            f'calibration by hand needs one recording, got {len(sources)}; calibrate them'
+            ' separately and compare the results'
         )
     return evident_result(
         read_by_hand(sources[0](), options.nominal, Preflight(options.gravity)), options, provenance
@@ -359,9 +387,10 @@ def evident_result(
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
     evident = solve_by_evidence(data, asked, as_asked=options.as_asked)
-    return hand_result(
-        evident, recording, options, provenance=provenance, turns=data.turns
-    ), evident
+    return (
+        hand_result(evident, recording, options, provenance=provenance, turns=data.turns),
+        evident,
+    )
 
 
 def hand_result(
@@ -373,7 +402,9 @@ def hand_result(
     turns: Sequence[TurnData] = (),
 ) -> HandResult:
     """
-    Return an EvidentHand as a result for reports and documents, evaluated on its poses and `turns` if these are enough.
+    Return an EvidentHand as a result for reports and documents.
+
+    It is evaluated on its poses and `turns` if these are enough.
 
     Raises
     ------
@@ -448,11 +479,14 @@ def check_by_hand(
     source: Callable, calibration: Calibration, options: CalibrationOptions = CalibrationOptions()
 ) -> CheckResult:
     """
-    Prove a calibration on a recording of its IMU held still in some attitudes, with turns between them.
+    Prove a calibration on a recording of its IMU held still in some attitudes.
 
-    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of the gyroscope the angle between gravity
-    rotated by its rates and gravity in the pose at the end of a turn, and its mean reading at rest. Before: readings unchanged; after: as
-    corrected by compensation. Directions of gravity are those of the corrected accelerometer for both.
+    With turns between them.
+
+    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of
+    the gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end
+    of a turn, and its mean reading at rest. Before: readings unchanged; after: as corrected by
+    compensation. Directions of gravity are those of the corrected accelerometer for both.
 
     Parameters
     ----------
@@ -461,7 +495,8 @@ def check_by_hand(
     calibration : Calibration
         From a table or by hand.
     options : CalibrationOptions
-        The local gravity, if it differs from that of the calibration, and the conversion of volts or counts.
+        The local gravity, if it differs from that of the calibration, and the conversion of volts
+        or counts.
 
     Raises
     ------
@@ -488,14 +523,22 @@ def check_by_hand(
 
 
 def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
-    """Return the reference gravity for readings at rest, m/s^2: the given one, or that of the calibration."""
+    """
+    Return the reference gravity for readings at rest, m/s^2.
+
+    The given one, or that of the calibration.
+    """
     return options.gravity or calibration.conditions.get('gravity') or STANDARD_GRAVITY
 
 
 def prove_readings(
     data: HandData, before: ImuSamples, after: ImuSamples, *, gravity: float
 ) -> dict:
-    """Return the proof of corrected samples `after` against the raw ones: sensor -> entry of a document (see `calibration.proof`)."""
+    """
+    Return the proof of corrected samples `after` against the raw ones.
+
+    Sensor -> entry of a document (see `calibration.proof`).
+    """
     poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))

@@ -1,4 +1,8 @@
-"""Scale factors and the nine installation angles that a sensor matrix contains, in the units of the papers as well."""
+"""
+Scale factors and the nine installation angles that a sensor matrix contains.
+
+They are in the units of the papers as well.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +20,8 @@ class Derived:
     """
     Parameters of the three sensing elements, derived from the matrix of one sensor.
 
-    Row i of the matrix is ``scale_i * unit vector along element i`` (Zhang 2017, eq. 5-9, with the rows of the cosines normalised).
+    Row i of the matrix is ``scale_i * unit vector along element i`` (Zhang 2017, eq. 5-9, with the
+    rows of the cosines normalised).
     """
 
     sensor: str
@@ -80,13 +85,21 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
 
 
 def split(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (scale factors, unit vectors along the elements) of a sensor matrix, shapes (3,) and (3, 3)."""
+    """
+    Return (scale factors, unit vectors along the elements) of a sensor matrix.
+
+    Shapes (3,) and (3, 3).
+    """
     scale = np.linalg.norm(matrix, axis=1)
     return scale, matrix / scale[:, None]
 
 
 def angles_of(axes: np.ndarray) -> np.ndarray:
-    """Return the angle between each unit vector and each coordinate axis, rad; exact for small angles too, shape (n, 3)."""
+    """
+    Return the angle between each unit vector and each coordinate axis, rad.
+
+    Exact for small angles too, shape (n, 3).
+    """
     axes = np.asarray(axes, float)
     across = np.stack([np.hypot(axes[:, j - 2], axes[:, j - 1]) for j in range(3)], axis=1)
     return np.arctan2(across, axes)
@@ -97,7 +110,11 @@ def _angle(first, second):
 
 
 def _angle_sd(axis, j, spread):
-    """Return the sd of the angle to coordinate axis j; near zero, where the angle has no slope, that of the tilt itself."""
+    """
+    Return the sd of the angle to coordinate axis j.
+
+    Near zero, where the angle has no slope, that of the tilt itself.
+    """
     others = [k for k in range(3) if k != j]
     across, tilt = axis[others], spread[np.ix_(others, others)]
     size = np.linalg.norm(across)
@@ -120,10 +137,12 @@ def in_paper_units(
     derived: Derived, nominal: NominalScaling | Mapping | None = None
 ) -> tuple[tuple[str, str, np.ndarray, np.ndarray], ...]:
     """
-    Return scale factors and biases in the units of the source papers, as (quantity, unit, values (3,), sds (3,)).
+    Return scale factors and biases in the units of the source papers.
 
-    Accelerometers: V/g and V for a recording in volts (`nominal` given), else g/g and mg. Gyroscopes: V/(deg/s) and V, else the
-    plain ratio and deg/s.
+    As (quantity, unit, values (3,), sds (3,)).
+
+    Accelerometers: V/g and V for a recording in volts (`nominal` given), else g/g and mg.
+    Gyroscopes: V/(deg/s) and V, else the plain ratio and deg/s.
 
     Parameters
     ----------

@@ -1,4 +1,8 @@
-"""Calibration during the motion, its settings and snapshots: windows and solutions while data arrive, with the same result as offline."""
+"""
+Calibration during the motion, its settings and snapshots.
+
+Windows and solutions while data arrive, with the same result as offline.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -77,7 +81,9 @@ class LiveSnapshot:
 
     def solved(self, options: CalibrationOptions) -> Solved:
         """
-        Return (Solution, SessionData, SensorModel of the columns) for other options, as from a recording.
+        Return (Solution, SessionData, SensorModel of the columns) for other options.
+
+        As from a recording.
 
         If the windows are no longer kept, the gathered columns are used.
         """
@@ -230,9 +236,10 @@ class LiveCalibration:
     """
     One live session: `push` for new blocks, `solve` when it is due.
 
-    Windows are found and reduced by the same objects as for recordings, and solved by the same functions, so that the result is
-    that of `calibrate_by_evidence` on the same samples, after the search of effects (`last`, `LiveSnapshot.evidence`) and `adopt`.
-    Memory is bounded: samples in reduced form, a bounded store of windows for columns that must be computed again.
+    Windows are found and reduced by the same objects as for recordings, and solved by the same
+    functions, so that the result is that of `calibrate_by_evidence` on the same samples, after the
+    search of effects (`last`, `LiveSnapshot.evidence`) and `adopt`. Memory is bounded: samples in
+    reduced form, a bounded store of windows for columns that must be computed again.
 
     Parameters
     ----------
@@ -242,7 +249,8 @@ class LiveCalibration:
         Model and settings of the estimate.
     settings : LiveSettings
     saved : bytes, optional
-        The bytes from `saved` of an earlier run; this session is then merged with it, at its reference temperature.
+        The bytes from `saved` of an earlier run; this session is then merged with it, at its
+        reference temperature.
 
     Raises
     ------
@@ -273,7 +281,10 @@ class LiveCalibration:
         self.last: LiveSnapshot | None = None
         """The data of the last solution."""
         self.needs_linearising = False
-        """Whether the last solution is outside the validity of its linearisation, and the store is too small to linearise again."""
+        """
+        Whether the last solution is outside the validity of its linearisation, and the store is too
+        small to linearise again.
+        """
         asked = self._asked
         if known is not None:
             if asked.needs_temperature:
@@ -321,7 +332,11 @@ class LiveCalibration:
         return next(filter(None, known), '')
 
     def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
-        """Use other settings from now on, by hand without effect; raises an InputError when they cannot be changed any more."""
+        """
+        Use other settings from now on, by hand without effect.
+
+        Raises an InputError when they cannot be changed any more.
+        """
         if isinstance(settings, LiveSettings):
             self.settings = settings
         elif isinstance(settings, WindowSettings):
@@ -336,7 +351,11 @@ class LiveCalibration:
 
     @property
     def model(self) -> SensorModel | None:
-        """The model of the gathered columns; None while a thermal effect waits for the first temperature."""
+        """
+        The model of the gathered columns.
+
+        None while a thermal effect waits for the first temperature.
+        """
         return None if self._collector is None else self._collector.model
 
     def push(self, block: SampleBlock) -> list[Window]:
@@ -384,8 +403,8 @@ class LiveCalibration:
         Parameters
         ----------
         pending : bool
-            Include the windows that are still open, as at the end of a recording; the session itself is
-            unchanged.
+            Include the windows that are still open, as at the end of a recording; the session
+            itself is unchanged.
         provenance : dict, optional
             For the document.
 
@@ -425,9 +444,12 @@ class LiveCalibration:
 
     def adopt(self, extension: ModelExtension) -> bool:
         """
-        Add the effects that windows of this session support to the model of all further solutions; return whether the model changes.
+        Add the effects that windows of this session support to the model of all further solutions.
 
-        No change with the option `as_asked`, or when windows that need other columns are no longer kept.
+        Return whether the model changes.
+
+        No change with the option `as_asked`, or when windows that need other columns are no longer
+        kept.
         """
         collector = self._collector
         if (
@@ -459,7 +481,8 @@ class LiveCalibration:
     def _begun(self) -> LiveCollector:
         if self._collector is None:
             raise InputError(
-                'a thermal effect needs temperatures, none were received; publish imu/temperature or omit the effect',
+                'a thermal effect needs temperatures, none were received; publish imu/temperature'
+                ' or omit the effect',
                 code='temperature_missing',
             )
         return self._collector
@@ -471,7 +494,9 @@ class LiveCalibration:
 
     def residuals(self, windows: Sequence[Window]) -> ImuSamples | None:
         """
-        Return measured minus predicted of windows from `push`, as ImuSamples, or None before the first solution.
+        Return measured minus predicted of windows from `push`, as ImuSamples.
+
+        Or None before the first solution.
 
         Every k-th sample, so that there are at most `residual_rate` per second.
         """

@@ -1,4 +1,9 @@
-"""Live calibration by hand: poses, attitudes and turns are counted, the missing motion is reported, the result is that of a recording."""
+"""
+Live calibration by hand.
+
+Poses, attitudes and turns are counted, the missing motion is reported, the result is that of a
+recording.
+"""
 
 from __future__ import annotations
 
@@ -128,7 +133,8 @@ def hand_status(
         'next': '; '.join(needs),
     }
     parts = [
-        f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")}, {_plural(found.turns, "turn")}'
+        f'{_plural(len(found.rests), "pose")} in {_plural(found.attitudes, "attitude")},'
+        f' {_plural(found.turns, "turn")}'
     ]
     if found.dropped:
         parts.append(
@@ -146,7 +152,9 @@ def hand_status(
 
 
 def unseen(found: PoseScan) -> list[str]:
-    """Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first."""
+    """
+    Return the faces ('+x', ...) that have not been up, the one furthest from all attitudes first.
+    """
     if found.poses is None:
         return list(FACE_DIRECTIONS)
     up = unit_rows(found.poses.force)
@@ -177,8 +185,8 @@ def _needs(found, not_seen, calibration, *, step, hints):
                 hints,
             )
         ]
-    return Progress.WEAK, [step] if step else list(
-        dict.fromkeys(item['needs'] for item in calibration.undetermined)
+    return Progress.WEAK, (
+        [step] if step else list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
     )
 
 
@@ -187,7 +195,11 @@ def _plural(count, noun):
 
 
 def knowledge_of(found: PoseScan, result: HandResult | None, options: HandOptions) -> HandKnowledge:
-    """Return the HandKnowledge of a session: before the first solution from its poses, then from the solution."""
+    """
+    Return the HandKnowledge of a session.
+
+    Before the first solution from its poses, then from the solution.
+    """
     if result is not None:
         return knowledge_after(result.hand)
     model = HandModel(
@@ -204,7 +216,11 @@ def knowledge_of(found: PoseScan, result: HandResult | None, options: HandOption
 def hand_coverage(
     found: PoseScan, result: HandResult | None, options: HandOptions, *, frame_id: str = ''
 ) -> Coverage:
-    """Return the Coverage of a session by hand: the cells, the next pose with the turn to it, and the remaining seconds."""
+    """
+    Return the Coverage of a session by hand.
+
+    The cells, the next pose with the turn to it, and the remaining seconds.
+    """
     seen = ups_of(found.poses)
     up = None if found.poses is None else seen[-1]
     knowledge = knowledge_of(found, result, options)
@@ -227,7 +243,10 @@ def hand_coverage(
 
 
 SEARCH_SHARE = 0.05
-"""Largest share of time for the search for rest: after an hour at 200 Hz a search runs every ten seconds or so."""
+"""
+Largest share of time for the search for rest: after an hour at 200 Hz a search runs every ten
+seconds or so.
+"""
 SEARCH_STEP = 0.5
 """Least duration of new samples between searches for rest, s."""
 _FIRST_NEEDS = {
@@ -235,16 +254,19 @@ _FIRST_NEEDS = {
     'gyroscope': 'turn it from one attitude to the next, within half a minute',
 }
 MAX_LIVE_POSES = 200
-"""The computation time grows with the third power of the number of poses; the oldest are discarded."""
+"""
+The computation time grows with the third power of the number of poses; the oldest are discarded.
+"""
 
 
 class LiveByHand:
     """
     One live session without a table: `push` arriving samples, `solve` when due.
 
-    The samples are cleaned, searched and solved by the functions for recordings, and all are kept up to the memory limit: the result
-    equals `calibrate_without_table` on the same samples. Beyond the limit (`hand_samples`) it is the result for the
-    kept samples. A clock reset, for which a recording is refused, is treated as a pause.
+    The samples are cleaned, searched and solved by the functions for recordings, and all are kept
+    up to the memory limit: the result equals `calibrate_without_table` on the same samples. Beyond
+    the limit (`hand_samples`) it is the result for the kept samples. A clock reset, for which a
+    recording is refused, is treated as a pause.
 
     Parameters
     ----------
@@ -309,7 +331,11 @@ class LiveByHand:
         return '' if imu is None else imu.frame_id
 
     def change(self, settings: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
-        """Use other settings from now on: for the poses in all samples, another gravity, another number of samples."""
+        """
+        Use other settings from now on.
+
+        For the poses in all samples, another gravity, another number of samples.
+        """
         if isinstance(settings, LiveSettings):
             self.settings = settings
         elif isinstance(settings, WindowSettings):
@@ -337,7 +363,11 @@ class LiveByHand:
         )
 
     def push(self, block: SampleBlock) -> list[ImuSamples]:
-        """Add arriving samples; return the poses completed since the last call, as mean ImuSamples, one each, in a list."""
+        """
+        Add arriving samples.
+
+        Return the poses completed since the last call, as mean ImuSamples, one each, in a list.
+        """
         self._drops.update(block.dropped or {})
         imu = block.imu
         if imu is None or not len(imu):
@@ -388,7 +418,8 @@ class LiveByHand:
         Parameters
         ----------
         pending : bool
-            Include the last sample, which may prove to be a stray; the current rest is included in any case.
+            Include the last sample, which may prove to be a stray; the current rest is included in
+            any case.
         provenance : dict, optional
             For the document.
 
@@ -407,8 +438,8 @@ class LiveByHand:
         imu = store.samples()
         if imu is None or len(imu) < 3:
             raise NotObservableError(
-                f'calibration by hand needs {MIN_ATTITUDES} different attitudes at rest, no sample was received; '
-                'check the topic',
+                f'calibration by hand needs {MIN_ATTITUDES} different attitudes at rest, no sample'
+                ' was received; check the topic',
                 code='no_samples',
             )
         self._search(store)
@@ -426,10 +457,12 @@ class LiveByHand:
 
     def residuals(self, poses: Sequence[ImuSamples]) -> ImuSamples | None:
         """
-        Return measured minus predicted of poses from `push`, as ImuSamples, or None before the first solution.
+        Return measured minus predicted of poses from `push`, as ImuSamples.
 
-        The direction of gravity in a pose is estimated, so only the length of the specific force can differ from its
-        prediction; the rate is compared with zero.
+        Or None before the first solution.
+
+        The direction of gravity in a pose is estimated, so only the length of the specific force
+        can differ from its prediction; the rate is compared with zero.
         """
         if self.result is None or not poses:
             return None
@@ -468,7 +501,11 @@ class LiveByHand:
         return self._shown[1]
 
     def status(self, hints: dict[str, str] | None = None) -> LiveState:
-        """Return the LiveState: progress, and the pose or turn with the largest gain; `hints` as for `errors.with_hint`."""
+        """
+        Return the LiveState: progress, and the pose or turn with the largest gain.
+
+        `hints` as for `errors.with_hint`.
+        """
         status = hand_status(
             self.found,
             self.result.calibration if self.result else None,
@@ -486,12 +523,16 @@ class LiveByHand:
 
 
 def _check_model(model):
-    """Refuse effects that need a table, and effects of temperature: a live session stores no temperatures with the poses."""
+    """
+    Refuse effects that need a table, and effects of temperature.
+
+    A live session stores no temperatures with the poses.
+    """
     thermal = [effect.name for effect in model.effects if 'temperature' in effect.needs]
     if thermal:
         raise InputError(
-            f'{", ".join(thermal)} must be estimated by hand from a recording, live no temperatures are kept; '
-            "record a bag and run 'imu_calibration calibrate BAG', or omit it",
+            f'{", ".join(thermal)} must be estimated by hand from a recording, live no temperatures'
+            " are kept; record a bag and run 'imu_calibration calibrate BAG', or omit it",
             code='offline_only',
         )
     HandModel(model, STANDARD_GRAVITY)

@@ -1,9 +1,12 @@
 """
-Does a calibration help on held-out data? Errors of short pieces before and after, by sensor and by regime of motion.
+Does a calibration help on held-out data? Errors of short pieces before and after.
 
-The error of a piece is its mean reading, corrected as compensation corrects it, minus the reference, before with nominal parameters and
-after with the calibration. The position of the table's reference point and the delay of the readings, which compensation does not correct,
-are estimated for each side: so a wrong scale that compensates for a lag is visible.
+By sensor and by regime of motion.
+
+The error of a piece is its mean reading, corrected as compensation corrects it, minus the
+reference, before with nominal parameters and after with the calibration. The position of the
+table's reference point and the delay of the readings, which compensation does not correct, are
+estimated for each side: so a wrong scale that compensates for a lag is visible.
 """
 
 from collections.abc import Sequence
@@ -48,9 +51,10 @@ def prove_solution(
     """
     Return the proof of a solution on held-out windows: sensor -> entry of a document (see `prove`).
 
-    Every fold of windows is predicted with parameters estimated without it, as compensation applies them (`applied_values`).
-    The correction is linearised at the reference motion, ``true + matrix^-1 (measured - output(true))``, which the statistics of windows
-    allow; it differs from that of readings by the square of the errors.
+    Every fold of windows is predicted with parameters estimated without it, as compensation applies
+    them (`applied_values`). The correction is linearised at the reference motion, ``true +
+    matrix^-1 (measured - output(true))``, which the statistics of windows allow; it differs from
+    that of readings by the square of the errors.
 
     Parameters
     ----------
@@ -81,7 +85,9 @@ def prove_readings(
     before: HeldOut, after: HeldOut, model: SensorModel, *, reference: np.ndarray
 ) -> dict:
     """
-    Return the proof of corrected readings `after` and raw readings `before`, with the columns of `model`: bias, matrix, reference.
+    Return the proof of corrected readings `after` and raw readings `before`.
+
+    With the columns of `model`: bias, matrix, reference.
 
     `reference` has the parameters of the table and the clock, shape (n_params,).
     """
@@ -92,14 +98,18 @@ def prove_readings(
 
 def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
     """
-    Return sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows', 'seconds', 'delay_s', 'regimes'}.
+    Return for each sensor the figures before and after, with their statistics.
+
+    The result is sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows',
+    'seconds', 'delay_s', 'regimes'}.
 
     Parameters
     ----------
     model : SensorModel
     before, after : tuple
-        (HeldOut with the columns of `model`, candidates): each candidate has parameters for the blocks of each fold, in turn. The candidate
-        with the smaller error counts: each side may be compared with the table as it was estimated or as it was described.
+        (HeldOut with the columns of `model`, candidates): each candidate has parameters for the
+        blocks of each fold, in turn. The candidate with the smaller error counts: each side may be
+        compared with the table as it was estimated or as it was described.
 
     """
     blocks = before[0].blocks
@@ -142,7 +152,11 @@ def nominal_values(model: SensorModel) -> np.ndarray:
 
 
 def reference_model(calibration: Calibration, table: Table) -> SensorModel:
-    """Return the model of a recording of corrected readings: bias, matrix, and the effects of the table and the clock that are known."""
+    """
+    Return the model of a recording of corrected readings.
+
+    Bias, matrix, and the effects of the table and the clock that are known.
+    """
     known, same_joints = calibration.model, calibration.model.joint_names == table.joint_names
     names = {
         sensor: tuple(
@@ -171,7 +185,11 @@ def reference_model(calibration: Calibration, table: Table) -> SensorModel:
 
 
 def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray:
-    """Return nominal values of the sensors with those of a calibration for the table and the clock, shape (n_params,)."""
+    """
+    Return nominal values of the sensors with those of a calibration for the table and the clock.
+
+    Shape (n_params,).
+    """
     values = nominal_values(model)
     for effect in calibration.model.effects:
         if effect.key in model.slices and _of_reference(effect):
@@ -182,7 +200,9 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
 
 
 def with_reference(model: SensorModel, values: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return the values with the table and the clock of other values `reference`, shape (n_params,)."""
+    """
+    Return the values with the table and the clock of other values `reference`, shape (n_params,).
+    """
     values = values.copy()
     for effect in model.effects:
         if _of_reference(effect):
@@ -195,7 +215,11 @@ def _of_reference(effect: Effect) -> bool:
 
 
 def _errors(held_out, model, sensor, folds, regimes):
-    """Return the Errors of parameters (one set for each fold in turn), with the delay and the common arm that suit them best."""
+    """
+    Return the Errors of parameters (one set for each fold in turn).
+
+    With the delay and the common arm that suit them best.
+    """
     parts = [
         (k, regimes.index(regime), rows, folds[k % len(folds)])
         for k, block in enumerate(held_out.blocks)
@@ -213,7 +237,11 @@ def _errors(held_out, model, sensor, folds, regimes):
 
 
 def _nuisances(stacked):
-    """Return the nuisances that minimise ``error + sum(nuisance change)``, the delay first, and the sum of squares without a delay."""
+    """
+    Return the nuisances that minimise ``error + sum(nuisance change)``.
+
+    The delay is the first nuisance. The sum of squares without a delay is returned as well.
+    """
     error, changes = stacked[0].ravel(), stacked[1:].reshape(len(stacked) - 1, -1)
     best = np.linalg.lstsq(changes.T, -error, rcond=1e-9)[0]
     others = changes[1:]
@@ -224,7 +252,12 @@ def _nuisances(stacked):
 
 
 class _Correction:
-    """How rows ``[columns | d(true input)/dt | output]`` become errors of corrected readings, and how nuisances change these."""
+    """
+    How rows of columns and outputs become errors of corrected readings.
+
+    The rows are ``[columns | d(true input)/dt | output]``. How nuisances change these errors is
+    included.
+    """
 
     def __init__(self, model, sensor, values):
         total = coefficients(model, sensor, values)
@@ -238,7 +271,11 @@ class _Correction:
             self.arms.append(coefficients(model, sensor, moved) - total)
 
     def errors(self, rows):
-        """Return errors and their change with each nuisance, (1 + n_nuisances, k, 3): the delay, s, and the arm, m."""
+        """
+        Return errors and their change with each nuisance, (1 + n_nuisances, k, 3).
+
+        The delay, s, and the arm, m.
+        """
         columns, slope, output = (
             rows[:, : -2 * N_AXES],
             rows[:, -2 * N_AXES : -N_AXES],
@@ -261,7 +298,9 @@ def compared(
     before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = N_AXES
 ) -> dict:
     """
-    Return {'before', 'after', 'ci95'}: rms per component, and the interval of their ratio over resamples of complete blocks.
+    Return {'before', 'after', 'ci95'}.
+
+    Rms per component, and the interval of their ratio over resamples of complete blocks.
 
     Parameters
     ----------

@@ -1,4 +1,8 @@
-"""A finished calibration with the data for a report, for any kind of reference; its summary and its exit code."""
+"""
+A finished calibration with the data for a report, for any kind of reference.
+
+Its summary and its exit code.
+"""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -15,7 +19,10 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
 
 GRAVITY_SD = 5e-4
-"""Standard deviation of the local gravity where a table description or the options give it without one, m/s^2."""
+"""
+Standard deviation of the local gravity where a table description or the options give it without
+one, m/s^2.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +40,10 @@ class WindowErrors:
     before: dict
     """Sensor -> error of the mean reading, shape (n, 3)."""
     after: dict
-    """Sensor -> error of the mean corrected with parameters that were estimated without the window, shape (n, 3)."""
+    """
+    Sensor -> error of the mean corrected with parameters that were estimated without the window,
+    shape (n, 3).
+    """
     floor: dict
     """Sensor -> sd of the mean from noise, shape (n, 3)."""
 
@@ -57,7 +67,9 @@ class ErrorBudget:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CalibrationResult(ABC):
-    """A calibration with the data for a report: on a table a `TableResult`, by hand a `HandResult`."""
+    """
+    A calibration with the data for a report: on a table a `TableResult`, by hand a `HandResult`.
+    """
 
     calibration: Calibration
     """The document's content."""
@@ -66,7 +78,10 @@ class CalibrationResult(ABC):
     tolerances: np.ndarray
     """Tolerance of each parameter."""
     needed: dict[str, tuple[str, float]]
-    """Parameter that is not determined -> (the motion that would serve it best, its sd after a minute of that motion, NaN when unknown)."""
+    """
+    Parameter that is not determined -> (the motion that would serve it best, its sd after a minute
+    of that motion, NaN when unknown).
+    """
     options: CalibrationOptions = CalibrationOptions()
     """Options of the requested model."""
     reference: str
@@ -89,7 +104,11 @@ class CalibrationResult(ABC):
 
     @property
     def singular_values(self) -> np.ndarray:
-        """Singular values of the design in units of the tolerances, descending; none by hand, where directions are estimated too."""
+        """
+        Singular values of the design in units of the tolerances, descending.
+
+        None by hand, where directions are estimated too.
+        """
         return np.zeros(0)
 
     @abstractmethod
@@ -116,7 +135,11 @@ def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> l
 
 
 def exit_code(calibration: Calibration) -> int:
-    """Return 0 when each sensor helps, every requested parameter is determined and no data were lost, else 3."""
+    """
+    Return 0 when the calibration of every sensor is complete, else 3.
+
+    It is 0 when each sensor helps, every requested parameter is determined and no data were lost.
+    """
     harmful = most_cautious(calibration.decisions.values()) is not HELPS
     lacking = harmful or any(status != DETERMINED for status in calibration.requested.values())
     return (

@@ -62,7 +62,8 @@ def calibrate(
     Parameters
     ----------
     sources : sequence of callables
-        Each returns an iterator of SampleBlock when called; called again when effects must be linearised again.
+        Each returns an iterator of SampleBlock when called; called again when effects must be
+        linearised again.
     table : Table
         The reference.
     options : CalibrationOptions
@@ -80,7 +81,8 @@ def calibrate(
     Raises
     ------
     InputError
-        When a recording cannot be used or is of another frame, with its name when there are several.
+        When a recording cannot be used or is of another frame, with its name when there are
+        several.
 
     """
     return conclude(
@@ -101,7 +103,9 @@ def solve_recordings(
     keep_windows: bool = False,
 ) -> tuple[Solution, SessionData, SensorModel]:
     """
-    Return (Solution, SessionData, SensorModel of the gathered columns) of recordings; arguments as in `calibrate`.
+    Return (Solution, SessionData, SensorModel of the gathered columns) of recordings.
+
+    Arguments as in `calibrate`.
 
     keep_windows : bool
         Whether windows are kept for the search of effects (`by_evidence`).
@@ -130,9 +134,12 @@ def solve_in_passes(
     model: SensorModel, options: CalibrationOptions, solved: Callable
 ) -> tuple[Solution, SessionData, SensorModel]:
     """
-    Return (Solution, SessionData, SensorModel of the gathered columns) at the solution of a linearisation that is valid there.
+    Return (Solution, SessionData, SensorModel) at a valid linearisation.
 
-    ``solved(model, judged_from)`` returns (Solution, SessionData) with the columns of a model, and windows from that time on for the proof.
+    The SensorModel is that of the gathered columns. The linearisation is valid at the solution.
+
+    ``solved(model, judged_from)`` returns (Solution, SessionData) with the columns of a model, and
+    windows from that time on for the proof.
     """
     again, judged_from = _at_time_constants(model, options, lambda trial: solved(trial, 0.0)), 0.0
     for _ in range(MAX_TABLE_PASSES):
@@ -150,7 +157,9 @@ def solve_in_passes(
 
 def _at_time_constants(model, options, solved):
     """
-    Return the model with the columns of requested warm-ups at the time constant with the smallest residuals of window means.
+    Return the model with the columns of requested warm-ups.
+
+    The columns are at the time constant with the smallest residuals of window means.
 
     The iteration from the prior does not converge to a time constant that is several times shorter.
     """
@@ -170,14 +179,19 @@ def _first_temperature(sources):
         if block.temperature is not None and len(block.temperature):
             return float(block.temperature.temperature_c[0])
     raise InputError(
-        'a thermal effect needs temperatures, the recording has none; record imu/temperature or omit the effect'
+        'a thermal effect needs temperatures, the recording has none; record imu/temperature or'
+        ' omit the effect'
     )
 
 
 def solve_gathered(
     gathered: SessionData, model: SensorModel, options: CalibrationOptions = CalibrationOptions()
 ) -> Solution:
-    """Return the Solution of gathered data with the columns of `model` for the requested effects: the reduce step."""
+    """
+    Return the Solution of gathered data with the columns of `model` for the requested effects.
+
+    The reduce step.
+    """
     narrow = settle_model(model, options, gathered)
     accumulator = (
         gathered.accumulator if narrow is model else restrict(gathered.accumulator, model, narrow)
@@ -195,7 +209,9 @@ def calibration_of_saved(
     data: bytes, table: Table, options: CalibrationOptions = CalibrationOptions()
 ) -> Calibration:
     """
-    Return the calibration of a saved live session (`LiveCalibration.saved`), with the model of its columns and the added effects.
+    Return the calibration of a saved live session (`LiveCalibration.saved`).
+
+    With the model of its columns and the added effects.
 
     Raises
     ------
@@ -234,7 +250,11 @@ def conclude(
     provenance: dict | None = None,
     changes: ModelChanges = ModelChanges(),
 ) -> TableResult:
-    """Judge a solution of data gathered with `model`, name the missing motions, and return the TableResult."""
+    """
+    Judge a solution, name the missing motions, and return the TableResult.
+
+    The solution is of data gathered with `model`.
+    """
     tolerances = tolerances_of(solution.model, options.tolerances)
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)
@@ -275,7 +295,11 @@ def conclude(
 
 
 def _by_default(model, options):
-    """Return the parameters of each effect that is in the model unasked: levelling, the Earth's rate, arms of the accelerometers."""
+    """
+    Return the parameters of each effect that is in the model unasked.
+
+    Levelling, the Earth's rate, arms of the accelerometers.
+    """
     arms = options.accelerometer_model is None
     return [
         model.slices[effect.key]
@@ -303,7 +327,10 @@ class CheckResult:
     """The errors of a calibration on a recording."""
 
     proof: dict
-    """Sensor -> error before and after, interval and amount of data, by regime (see `proof.prove`); {}: not determined."""
+    """
+    Sensor -> error before and after, interval and amount of data, by regime (see `proof.prove`);
+    {}: not determined.
+    """
     findings: tuple = ()
     """Findings of the checks of the recording."""
     why: str = 'fewer than three windows of rest or motion were found; record for longer'
@@ -364,7 +391,9 @@ def check_on_table(
     names: Sequence[str] = (),
 ) -> CheckResult:
     """
-    Return the errors of a calibration on recordings of its IMU on a table, of the readings that compensation writes.
+    Return the errors of a calibration on recordings of its IMU on a table.
+
+    They are the errors of the readings that compensation writes.
 
     Parameters
     ----------
@@ -410,7 +439,11 @@ def check_on_table(
 
 
 def _with_corrected(source, calibration, options):
-    """Yield the blocks of a recording with corrected readings in addition to the raw ones, as compensation writes them into a bag."""
+    """
+    Yield the blocks of a recording with corrected readings in addition to the raw ones.
+
+    As compensation writes them into a bag.
+    """
     temperature = None
     if invertible(calibration.model).needs_temperature:
         known = [block.temperature for block in source() if block.temperature is not None]
@@ -428,7 +461,11 @@ def _with_corrected(source, calibration, options):
 
 
 def _both(window):
-    """Return a window with raw readings and the same with corrected ones, both without samples that cannot be corrected."""
+    """
+    Return a window with raw readings and the same with corrected ones.
+
+    Both are without samples that cannot be corrected.
+    """
     known = np.isfinite(window.corrected).all(axis=1)
     if not known.all():
         window = window.select(known)

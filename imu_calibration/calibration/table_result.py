@@ -1,9 +1,10 @@
 """
 The result of a calibration on a table, and its error budget after section V of Avrutov 2017.
 
-The paper sums errors of the reference and of the outputs as if they were independent, with sign. Noise gives the covariance of the
-solution; a wrong reference that changes the predicted output by ``dA c`` moves the parameters by ``G^+ dA c``, where errors of the rows
-are common when the table is not level and independent when an encoder is read in every pose.
+The paper sums errors of the reference and of the outputs as if they were independent, with sign.
+Noise gives the covariance of the solution; a wrong reference that changes the predicted output by
+``dA c`` moves the parameters by ``G^+ dA c``, where errors of the rows are common when the table is
+not level and independent when an encoder is read in every pose.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +45,9 @@ from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBl
 from imu_calibration.selection.residual_blocks import residuals
 
 LEVELLING_SD = 2 * ARCMIN
-"""Levelling of the table in each of two directions, rad; counts when table_tilt is not estimated."""
+"""
+Levelling of the table in each of two directions, rad; counts when table_tilt is not estimated.
+"""
 JOINT_POSITION_SD = 10 * ARCMIN / 60
 """Position of each joint, independent in every window, rad."""
 TABLE_RATE_SD = 1e-4
@@ -57,8 +60,8 @@ def error_budget(result: 'TableResult') -> ErrorBudget:
     """
     Return the ErrorBudget of a calibration on a table.
 
-    First order, around the solution; weights of the solver. All windows at rest are used, and the moving windows with kept
-    samples.
+    First order, around the solution; weights of the solver. All windows at rest are used, and the
+    moving windows with kept samples.
 
     Parameters
     ----------
@@ -89,7 +92,11 @@ def error_budget(result: 'TableResult') -> ErrorBudget:
 
 
 def _causes(result, gravity_sd):
-    """Return (name, text, scattered, changes); a change maps (table, motion) to values that differ by one sd."""
+    """
+    Return (name, text, scattered, changes).
+
+    A change maps (table, motion) to values that differ by one sd.
+    """
     found = []
     if result.solution.model.find('reference', Role.TILT) is None:
         text = f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated'
@@ -139,9 +146,12 @@ def _heavier(change, table, motion):
 
 def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.ndarray:
     """
-    Return how each window's share of each change moves the parameters, shape (n_changes, n_windows, n_params).
+    Return how each window's share of each change moves the parameters.
 
-    Summed over windows: the shift of the estimate when all windows err together. A shift is estimate minus truth.
+    Shape (n_changes, n_windows, n_params).
+
+    Summed over windows: the shift of the estimate when all windows err together. A shift is
+    estimate minus truth.
     """
     solution, sources = result.solution, list(_sources(result))
     outputs = [_outputs(result, source, changes) for source in sources]
@@ -216,7 +226,11 @@ def _sources(result):
 
 
 def _outputs(result, source, changes):
-    """Return sensor -> (columns, changes of the output, shape (n_changes, n, 3)) at the samples of a window."""
+    """
+    Return sensor -> (columns, changes of the output) at the samples of a window.
+
+    The changes have shape (n_changes, n, 3).
+    """
     model, temperature, known = (
         result.solution.model,
         source.temperature_c,
@@ -258,7 +272,11 @@ class TableResult(CalibrationResult):
 
     @property
     def singular_values(self) -> np.ndarray:
-        """Singular values of the design in units of the tolerances; directions that the gauge fixes by convention are left out."""
+        """
+        Singular values of the design in units of the tolerances.
+
+        Directions that the gauge fixes by convention are left out.
+        """
         convention = make_prior(self.solution.model).root[len(self.tolerances) :]
         values = tolerance_scaled_singular_values(
             self.solution.information + convention.T @ convention, self.tolerances
@@ -266,7 +284,11 @@ class TableResult(CalibrationResult):
         return values[len(convention) :]
 
     def window_errors(self) -> WindowErrors:
-        """Return the errors of window means before and after, against the table; after: predicted without the fold of the window."""
+        """
+        Return the errors of window means before and after, against the table.
+
+        After: predicted without the fold of the window.
+        """
         held_out = (
             self.gathered.held_out
             if self.gathered.held_out.n_windows

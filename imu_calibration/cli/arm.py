@@ -39,17 +39,20 @@ def run(options: Options) -> VerbResult:
 
     if len(options.imu_topic) != 2:
         raise InputError(
-            f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both IMUs'
+            f'--imu-topic must be given twice, A and B, got {len(options.imu_topic)}; name both'
+            ' IMUs'
         )
     frames = options.frame_id or [None, None]
     if len(frames) != 2:
         raise InputError(
-            f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both frames'
+            f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both'
+            ' frames'
         )
     topics = [Topics(imu=topic, frame=frame) for topic, frame in zip(options.imu_topic, frames)]
     if len({(topic.lstrip('/'), frame) for topic, frame in zip(options.imu_topic, frames)}) == 1:
         raise InputError(
-            f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a frame_id for each',
+            f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a'
+            ' frame_id for each',
             key='frame_id',
             code='same_imu',
         )

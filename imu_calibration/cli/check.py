@@ -16,7 +16,11 @@ def add_arguments(parser: OneLineParser) -> None:
 
 
 def run(options: Options) -> VerbResult:
-    """Print the errors before and after with their interval and the decision; exit code 0 when it helps each sensor, otherwise 3."""
+    """
+    Print the errors before and after with their interval and the decision.
+
+    Exit code 0 when it helps each sensor, otherwise 3.
+    """
     from imu_calibration.cli.show import show_table, warn
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import error_text

@@ -1,10 +1,15 @@
-"""``imu_calibration compensate``: a bag with the corrected topic in addition to the original ones."""
+"""
+``imu_calibration compensate``: a bag with the corrected topic in addition to the original ones.
+"""
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 
 EXAMPLES = (
     'drive --calibration result/calibration.yaml --output drive_corrected',
-    'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2 --output drive_corrected',
+    (
+        'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2'
+        ' --output drive_corrected'
+    ),
 )
 
 

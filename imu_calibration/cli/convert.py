@@ -24,8 +24,11 @@ def add_arguments(parser: OneLineParser) -> None:
         metavar='QUANTITY=NAMES:UNIT',
         nargs='+',
         default=[],
-        help='replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C joint.JOINT=NAME:deg; a name may '
-        'be a column number, a leading minus reverses the sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s mdeg/s, rad deg',
+        help=(
+            'replaces the guess: time=NAME:s force=X,Y,Z:g rate=X,Y,Z:deg/s temperature=NAME:C'
+            ' joint.JOINT=NAME:deg; a name may be a column number, a leading minus reverses the'
+            ' sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s mdeg/s, rad deg'
+        ),
     )
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 

@@ -1,4 +1,8 @@
-"""``imu_calibration diagnose``: the errors of the model, their causes, the extended model, and the measured gain."""
+"""
+``imu_calibration diagnose``.
+
+The errors of the model, their causes, the extended model, and the measured gain.
+"""
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 

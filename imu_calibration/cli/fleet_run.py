@@ -36,7 +36,9 @@ from msg_adapters.storages import suffixes
 
 def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
     """
-    Return (name, paths of recordings) for each unit: a bag, or a sub-folder that holds bags, which are joined.
+    Return (name, paths of recordings) for each unit.
+
+    A bag, or a sub-folder that holds bags, which are joined.
 
     Parameters
     ----------
@@ -71,7 +73,8 @@ def find_units(folder: str, output: str) -> list[tuple[str, list[Path]]]:
     units = [(name if names.count(name) == 1 else bags[0].name, bags) for name, bags in units]
     if not units:
         raise InputError(
-            f'{folder} must hold one bag or one sub-folder with bags per unit, there is none; give the folder above the bags'
+            f'{folder} must hold one bag or one sub-folder with bags per unit, there is none; give'
+            ' the folder above the bags'
         )
     return units
 
@@ -159,7 +162,9 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
 
 
 def _table(options, bags):
-    """Return the chain of joints; a description in recordings is read from the first readable one."""
+    """
+    Return the chain of joints; a description in recordings is read from the first readable one.
+    """
     stand, topics = options.stand(), topics_of(options.choices())
     if stand is None:
         raise InputError(
@@ -197,7 +202,12 @@ def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
 
 
 def unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
-    """Return one row per unit: decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI; None: unknown."""
+    """
+    Return one row per unit.
+
+    Decisions, exit code, reason of a refusal, samples lost, each parameter with its sd, SI; None:
+    unknown.
+    """
     names = list(
         dict.fromkeys(
             name
@@ -238,7 +248,11 @@ def unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
 
 
 def csv_text(rows: Sequence[dict[str, Any]]) -> str:
-    """Return rows as CSV with a heading; unknown values are empty, and text that a spreadsheet would calculate begins with a quote."""
+    """
+    Return rows as CSV with a heading.
+
+    Unknown values are empty, and text that a spreadsheet would calculate begins with a quote.
+    """
     text = io.StringIO()
     written = csv.DictWriter(text, rows[0] if rows else CSV_KEYS, lineterminator='\n')
     written.writeheader()
@@ -253,7 +267,11 @@ def _cell(value):
 
 
 def shown(spread: Spread) -> tuple[str, ...]:
-    """Return the printed cells of a parameter: name, mean, spread, typical sd, unit, ratio, the units at the ends."""
+    """
+    Return the printed cells of a parameter.
+
+    Name, mean, spread, typical sd, unit, ratio, the units at the ends.
+    """
     factor, unit = for_people(spread.unit, spread.name)
     if not spread.count:
         return spread.name, 'held', '', '', unit, '', ''
@@ -304,7 +322,8 @@ def show_fleet(
             )
     calibrated = sum(result.calibration is not None for result in results)
     out.print(
-        f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in {folder}'
+        f'written: {calibrated} of {len(results)} units, summary.csv, units.csv and summary.html in'
+        f' {folder}'
     )
 
 

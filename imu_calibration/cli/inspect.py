@@ -1,4 +1,8 @@
-"""``imu_calibration inspect``: topics of a recording, suspicious properties, and the parameters that it determines."""
+"""
+``imu_calibration inspect``.
+
+Topics of a recording, suspicious properties, and the parameters that it determines.
+"""
 
 from dataclasses import asdict
 
@@ -19,7 +23,11 @@ def add_arguments(parser: OneLineParser) -> None:
 
 
 def run(options: Options) -> VerbResult:
-    """Read each Imu topic and print its properties; with a table also the motions and the parameters that they determine."""
+    """
+    Read each Imu topic and print its properties.
+
+    With a table also the motions and the parameters that they determine.
+    """
     from imu_calibration.cli.show import show_findings
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.preprocessing.checks import refuse
@@ -162,20 +170,24 @@ def _judge(out, look, hints):
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
         out.print(
-            f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]} samples'
+            f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]}'
+            ' samples'
         )
     _show_parameters(out, result.calibration)
     return exit_code(result.calibration)
 
 
 def _show_by_hand(out, found, hints):
-    """Print whether the recording can be calibrated by hand, and which parameters that determines."""
+    """
+    Print whether the recording can be calibrated by hand, and which parameters that determines.
+    """
     if isinstance(found, ImuCalibrationError):
         out.print(f'not usable for calibration without a table: {found.with_hint(hints)}')
         return
     windows = found.calibration.statistics['windows']
     out.print(
-        f'by hand, without a table, it determines, from {windows["static"]} poses and {windows["turns"]} turns between them:'
+        f'by hand, without a table, it determines, from {windows["static"]} poses and'
+        f' {windows["turns"]} turns between them:'
     )
     _show_parameters(out, found.calibration)
 

@@ -21,7 +21,11 @@ SWEEP, SWEEP_STEP_SECONDS = 10, 0.2
 
 
 class ProgressBars:
-    """Listens to `imu_calibration.core.progress`: the bar of the present phase, removed before other text; it moves between reports too."""
+    """
+    Listens to `imu_calibration.core.progress`.
+
+    The bar of the present phase, removed before other text; it moves between reports too.
+    """
 
     def __init__(self, *, verbose: bool = False):
         self._verbose, self._ended = verbose, threading.Event()
@@ -105,7 +109,10 @@ class BarFreeStream:
 
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-"""The matrices are narrow: several BLAS threads cost more than they save, above all next to other programs."""
+"""
+The matrices are narrow: several BLAS threads cost more than they save, above all next to other
+programs.
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -121,7 +128,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: Namespace) -> int:
-    """Run the verb that was parsed and print its document if --json is given; return the exit code."""
+    """
+    Run the verb that was parsed and print its document if --json is given; return the exit code.
+    """
     from imu_calibration.cli.parser import complain
     from imu_calibration.core.errors import ImuCalibrationError, printable
     from imu_calibration.core.progress import listening
@@ -145,7 +154,8 @@ def run(options: Namespace) -> int:
         else:
             text, key, name = (
                 printable(
-                    f'{type(error).__name__}: {error}; check disk space, memory, permissions and the input'
+                    f'{type(error).__name__}: {error}; check disk space, memory, permissions and'
+                    ' the input'
                 ),
                 None,
                 '',
@@ -168,7 +178,11 @@ CLI_FORMAT = 'imu_calibration/cli/1'
 
 
 def json_text(verb: str, exit_code: int, document: Mapping[str, Any]) -> str:
-    """Return one JSON document: format, verb, exit code, and the result or the error; numbers that are not finite become null."""
+    """
+    Return one JSON document: format, verb, exit code, and the result or the error.
+
+    Numbers that are not finite become null.
+    """
     from imu_calibration.core.documents import json_types
 
     part = 'error' if 'error' in document else 'result'

@@ -1,4 +1,8 @@
-"""Arguments of the offline tool: the verbs, options that all or several of them have, and refusals in one line."""
+"""
+Arguments of the offline tool.
+
+The verbs, options that all or several of them have, and refusals in one line.
+"""
 
 from __future__ import annotations
 
@@ -19,29 +23,68 @@ if TYPE_CHECKING:
     from imu_calibration.use_cases.recordings import Stand
 
 VERBS = {
-    'inspect': 'Topics, rates, gaps, stamps, suspicious units and axes, motions found, and the parameters that the recording determines.',
-    'calibrate': 'Write calibration.yaml and report.html from one or several recordings of the same IMU.',
+    'inspect': (
+        'Topics, rates, gaps, stamps, suspicious units and axes, motions found, and the parameters'
+        ' that the recording determines.'
+    ),
+    'calibrate': (
+        'Write calibration.yaml and report.html from one or several recordings of the same IMU.'
+    ),
     'compensate': 'Write a bag with the corrected Imu topic in addition to all other topics.',
     'check': 'Test a calibration on a recording: errors before and after, by sensor and by motion.',
-    'diagnose': 'Find the errors of the model, name their causes, extend the model, and measure the gain on held-out data.',
+    'diagnose': (
+        'Find the errors of the model, name their causes, extend the model, and measure the gain on'
+        ' held-out data.'
+    ),
     'simulate': 'Write a bag of a simulated session on a turntable, with truth.yaml.',
-    'compare': 'Test whether two calibrations agree, in units of their combined standard deviation.',
-    'arm': 'Position of one IMU relative to another on the same rigid body, from their measurements in motion.',
-    'fleet': 'Calibrate a folder of many units: one result each, and a summary table with the spread of each parameter.',
-    'noise': 'Identify white noise, bias instability and random walk from a recording at rest: noise.yaml and report.html.',
-    'plan': 'Plan the motions that bring every parameter within its tolerance: plan.yaml, a joint trajectory and report.html.',
-    'convert': 'Write a text log (CSV) as a bag; columns and units are found from the header and the values, and printed.',
-    'export': 'Write a calibration and its noise in the format of another program, and state the information that is lost.',
+    'compare': (
+        'Test whether two calibrations agree, in units of their combined standard deviation.'
+    ),
+    'arm': (
+        'Position of one IMU relative to another on the same rigid body, from their measurements in'
+        ' motion.'
+    ),
+    'fleet': (
+        'Calibrate a folder of many units: one result each, and a summary table with the spread of'
+        ' each parameter.'
+    ),
+    'noise': (
+        'Identify white noise, bias instability and random walk from a recording at rest:'
+        ' noise.yaml and report.html.'
+    ),
+    'plan': (
+        'Plan the motions that bring every parameter within its tolerance: plan.yaml, a joint'
+        ' trajectory and report.html.'
+    ),
+    'convert': (
+        'Write a text log (CSV) as a bag; columns and units are found from the header and the'
+        ' values, and printed.'
+    ),
+    'export': (
+        'Write a calibration and its noise in the format of another program, and state the'
+        ' information that is lost.'
+    ),
     'import': 'Read the calibration of another program, so that it can be compared and used.',
-    'effects': 'List the catalogue of effects: sensor, unit, tolerance, equation, and the motion that determines each.',
-    'watch': 'Watch a running calibration_node: bars in units of tolerance, next motion, streams, first finding.',
-    'view': 'Write an MCAP for Foxglove: residual before and after, coverage, parameters with bands, spectrum of the residual.',
+    'effects': (
+        'List the catalogue of effects: sensor, unit, tolerance, equation, and the motion that'
+        ' determines each.'
+    ),
+    'watch': (
+        'Watch a running calibration_node: bars in units of tolerance, next motion, streams, first'
+        ' finding.'
+    ),
+    'view': (
+        'Write an MCAP for Foxglove: residual before and after, coverage, parameters with bands,'
+        ' spectrum of the residual.'
+    ),
 }
-"""Name -> one line of help; each is a module of this package with EXAMPLES, `add_arguments` and `run`."""
+"""
+Name -> one line of help; each is a module of this package with EXAMPLES, `add_arguments` and `run`.
+"""
 
 EXIT_CODES = (
-    'Exit codes: 0 done; 1 refused, nothing written; 3 written, but a parameter is not determined, a sensor is unproven or '
-    'harmful, or part of the input was unusable; 130 interrupted.'
+    'Exit codes: 0 done; 1 refused, nothing written; 3 written, but a parameter is not determined,'
+    ' a sensor is unproven or harmful, or part of the input was unusable; 130 interrupted.'
 )
 
 
@@ -58,7 +101,11 @@ BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Refuses with one line and exit code 1; `common` and `expert` declare an option in one of the two groups."""
+    """
+    Refuses with one line and exit code 1.
+
+    `common` and `expert` declare an option in one of the two groups.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{'add_help': False, **options})
@@ -73,7 +120,8 @@ class OneLineParser(argparse.ArgumentParser):
             known = getattr(options, 'verb_options', ())
             self.prog += f' {options.verb}'
             self.error(
-                f'unrecognized arguments: {" ".join(extra)}{did_you_mean(extra[0].partition("=")[0], known)}'
+                'unrecognized arguments:'
+                f' {" ".join(extra)}{did_you_mean(extra[0].partition("=")[0], known)}'
             )
         return options
 
@@ -105,7 +153,11 @@ class OneLineParser(argparse.ArgumentParser):
         )
 
     def add_stand(self, without: str) -> None:
-        """Add the options of the table or arm that moves the IMU; `without` describes the case without them."""
+        """
+        Add the options of the table or arm that moves the IMU.
+
+        `without` describes the case without them.
+        """
         self.common('--table', metavar='TABLE', help=f'description of the table (YAML); {without}')
         self.common(
             '--urdf',
@@ -115,7 +167,10 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--imu-link',
             metavar='LINK',
-            help='link with the IMU, default its frame_id; without --urdf: of /robot_description in the bag',
+            help=(
+                'link with the IMU, default its frame_id; without --urdf: of /robot_description in'
+                ' the bag'
+            ),
         )
         self.expert(
             '--allow-xacro',
@@ -131,12 +186,20 @@ class OneLineParser(argparse.ArgumentParser):
         )
 
     def add_recording(self, without: str) -> None:
-        """Add the options of the table or arm and of the topics of a recording; `without` as for `add_stand`."""
+        """
+        Add the options of the table or arm and of the topics of a recording.
+
+        `without` as for `add_stand`.
+        """
         self.add_stand(without)
         self.add_topics()
 
     def add_session(self, *, searched: bool = True) -> None:
-        """Add the options of a calibration: local gravity, recording, labels of the result, and model (`add_model`)."""
+        """
+        Add the options of a calibration.
+
+        Local gravity, recording, labels of the result, and model (`add_model`).
+        """
         self.common(
             '--gravity',
             type=float,
@@ -161,7 +224,11 @@ class OneLineParser(argparse.ArgumentParser):
         self.add_model(searched=searched)
 
     def add_model(self, *, searched: bool = True) -> None:
-        """Add the options that choose the parameters to estimate; `searched`: and the option that omits the search for effects."""
+        """
+        Add the options that choose the parameters to estimate.
+
+        `searched`: and the option that omits the search for effects.
+        """
         self.expert(
             '--accelerometer-model',
             metavar='MODEL',
@@ -232,7 +299,11 @@ class Options(argparse.Namespace):
         return {key: '--' + key.replace('_', '-') for key in ERROR_KEYS if key in vars(self)}
 
     def require_place(self, bags: Sequence[str]) -> None:
-        """Refuse an output folder with the result of another verb or of other inputs, except with --force."""
+        """
+        Refuse an output folder with a different result, except with --force.
+
+        The folder is refused if it holds the result of another verb or of other inputs.
+        """
         if not self.force and (Path(self.output) / 'calibration.yaml').exists():
             from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
 
@@ -255,12 +326,18 @@ def complain(text: str) -> None:
 
 
 def print_line(text: str, indent: str = '', *, stream: TextIO | None = None) -> None:
-    """Print a line on `stream` (standard output), broken between words at the width of a terminal."""
+    """
+    Print a line on `stream` (standard output), broken between words at the width of a terminal.
+    """
     Terminal.of(stream).print(text, indent=indent)
 
 
 def folded(text: str, indent: str = '', last: str = '') -> str:
-    """Return a line broken between words at the width of standard output; `last` ends each but the last part."""
+    """
+    Return a line broken between words at the width of standard output.
+
+    `last` ends each but the last part.
+    """
     return f'{last}\n'.join(wrapped(text, Terminal.of().width - len(last), indent))
 
 
@@ -269,7 +346,9 @@ def make_parser(verb: str | None = None) -> OneLineParser:
     parser = OneLineParser(
         prog='imu_calibration',
         epilog=EXIT_CODES,
-        description='Calibrate, compensate and diagnose inertial measurement units from recordings.',
+        description=(
+            'Calibrate, compensate and diagnose inertial measurement units from recordings.'
+        ),
     )
     parser.add_argument(
         '--version', action='version', version=f'imu_calibration {imu_calibration.__version__}'
@@ -281,11 +360,15 @@ def make_parser(verb: str | None = None) -> OneLineParser:
 def add_verbs(
     parser: argparse.ArgumentParser, verb: str | None = None, *, required: bool = True
 ) -> None:
-    """Add the verbs to a parser; only the module of `verb` is imported and declares its arguments; an unknown verb is refused."""
+    """
+    Add the verbs to a parser; only the module of `verb` is imported and declares its arguments.
+
+    An unknown verb is refused.
+    """
     if verb is not None and not verb.startswith('-') and verb not in VERBS:
         complain(
-            f"{parser.prog}: the verb must be one of {', '.join(VERBS)}, got '{verb}'{did_you_mean(verb, VERBS)}; "
-            f"see '{parser.prog} --help'"
+            f'{parser.prog}: the verb must be one of {", ".join(VERBS)}, got'
+            f" '{verb}'{did_you_mean(verb, VERBS)}; see '{parser.prog} --help'"
         )
         raise SystemExit(1)
     verbs = parser.add_subparsers(

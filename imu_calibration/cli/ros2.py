@@ -1,4 +1,6 @@
-"""``ros2 imu VERB``: the verbs of the plain command with the same options, output and exit codes."""
+"""
+``ros2 imu VERB``: the verbs of the plain command with the same options, output and exit codes.
+"""
 
 import sys
 from argparse import ArgumentParser, Namespace
@@ -31,7 +33,9 @@ class ImuCommand(CommandExtension):
         add_verbs(parser, *after, required=False)
 
     def main(self, *, args: Namespace, **_: ArgumentParser) -> int:
-        """Run the verb and return its exit code; without a verb print the list, as `ros2` commands do."""
+        """
+        Run the verb and return its exit code; without a verb print the list, as `ros2` commands do.
+        """
         if getattr(args, 'verb', None) is None:
             self._parser.print_help()
             return 0

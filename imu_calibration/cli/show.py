@@ -45,7 +45,11 @@ def show_table(
 
 
 def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:
-    """Print the warnings about a recording (`preflight` in the statistics of a calibration) on standard error, a line each."""
+    """
+    Print the warnings about a recording on standard error, a line each.
+
+    The warnings are `preflight` in the statistics of a calibration.
+    """
     for item in found:
         complain(f'warning: {printable(item["text"])}')
 

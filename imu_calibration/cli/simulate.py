@@ -1,4 +1,8 @@
-"""``imu_calibration simulate``: a bag of a simulated session or of a replayed recording, with the true parameters."""
+"""
+``imu_calibration simulate``.
+
+A bag of a simulated session or of a replayed recording, with the true parameters.
+"""
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.errors import InputError
@@ -7,7 +11,10 @@ from msg_adapters.storages import identifiers
 
 EXAMPLES = (
     '--effect gyro_g_sensitivity --grade consumer --table table.yaml --output session',
-    '--replay recording --calibration result/calibration.yaml --table table.yaml --output simulated',
+    (
+        '--replay recording --calibration result/calibration.yaml --table table.yaml --output'
+        ' simulated'
+    ),
 )
 
 
@@ -22,7 +29,10 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.common(
         '--replay',
         metavar='BAG',
-        help='simulate the IMU of --calibration on the joints, stamps, temperature and noise of a recording',
+        help=(
+            'simulate the IMU of --calibration on the joints, stamps, temperature and noise of a'
+            ' recording'
+        ),
     )
     parser.common(
         '--effect',
@@ -94,12 +104,16 @@ def run(options: Options) -> VerbResult:
     if options.replay is None:
         made = simulate(
             **options.arguments_for(simulate)
-            | {'effects': options.effect, 'table': options.stand()}
+            | {
+                'effects': options.effect,
+                'table': options.stand(),
+            }
         )
     else:
         if options.calibration is None:
             raise InputError(
-                '--replay requires the IMU to simulate, no calibration was given; add --calibration FILE',
+                '--replay requires the IMU to simulate, no calibration was given; add --calibration'
+                ' FILE',
                 key='calibration',
                 code='replay_without_calibration',
             )

@@ -1,4 +1,9 @@
-"""Text on standard output: lines break between words at the width of a terminal, with colours on a terminal; a file has neither."""
+"""
+Text on standard output.
+
+Lines break between words at the width of a terminal, with colours on a terminal; a file has
+neither.
+"""
 
 import os
 import shutil
@@ -34,7 +39,11 @@ class Terminal:
 
     @classmethod
     def of(cls, stream: TextIO | None = None) -> 'Terminal':
-        """Return the terminal of a stream (standard output), with colours unless NO_COLOR is set (no-color.org)."""
+        """
+        Return the terminal of a stream (standard output).
+
+        With colours unless NO_COLOR is set (no-color.org).
+        """
         stream = stream or sys.stdout
         moves = stream.isatty()
         coloured = moves and not os.environ.get('NO_COLOR') and os.environ.get('TERM') != 'dumb'
@@ -72,7 +81,9 @@ class Terminal:
         self, rows: Sequence[Sequence[Cell]], *, right: Sequence[int] = (), gap: int = 2
     ) -> list[str]:
         """
-        Return the lines of a table without rules; a column that is too wide is at least as wide as its longest word.
+        Return the lines of a table without rules.
+
+        A column that is too wide is at least as wide as its longest word.
 
         Parameters
         ----------
@@ -115,7 +126,11 @@ class Terminal:
 
 
 def wrapped(text: str, width: int, indent: str | None = None) -> list[str]:
-    """Return the lines of one line of text, broken between words; further lines begin with `indent`, by default its indentation."""
+    """
+    Return the lines of one line of text, broken between words.
+
+    Further lines begin with `indent`, by default its indentation.
+    """
     if len(text) <= width:
         return [text]
     indent = ' ' * (len(text) - len(text.lstrip())) if indent is None else indent

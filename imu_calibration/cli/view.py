@@ -24,7 +24,9 @@ def add_arguments(parser: OneLineParser) -> None:
 
 
 def run(options: Options) -> VerbResult:
-    """Write the file, print the layout to open it with and the missing parts; return the exit code."""
+    """
+    Write the file, print the layout to open it with and the missing parts; return the exit code.
+    """
     from imu_calibration.use_cases.resources import config_file
     from imu_calibration.use_cases.view import foxglove, view
 

@@ -39,7 +39,8 @@ def run(options: Options) -> VerbResult:
         import rclpy
     except ImportError as error:
         raise InputError(
-            'to watch a node rclpy must be installed, it is not; source ROS, or install ros-jazzy-rclpy'
+            'to watch a node rclpy must be installed, it is not; source ROS, or install'
+            ' ros-jazzy-rclpy'
         ) from error
     from rclpy.context import Context
     from rclpy.executors import ExternalShutdownException
@@ -62,8 +63,8 @@ def _watch(watcher, options):
     if not watcher.statuses:
         others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
         raise InputError(
-            f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s; start it, or name it "
-            f'with --node, as `ros2 node list` shows it{others}'
+            f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s;"
+            f' start it, or name it with --node, as `ros2 node list` shows it{others}'
         )
     out = Terminal.of()
     if options.once or options.json:
@@ -166,7 +167,11 @@ class NodeStatus:
 
 
 def ratio_of(status: NodeStatus) -> float:
-    """Return the standard deviation of a parameter group in units of its tolerance, NaN before there is one."""
+    """
+    Return the standard deviation of a parameter group in units of its tolerance.
+
+    It is NaN before there is one.
+    """
     found = {key.partition(' [')[0]: value for key, value in status.values.items()}
     try:
         return float(found['standard error']) / float(found['tolerance'])

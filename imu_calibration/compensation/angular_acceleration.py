@@ -14,8 +14,9 @@ class CausalDerivative:
     """
     Slope of a straight line through the last `taps` samples of the rate.
 
-    The slope is that of the middle of the window: the delay is ``(taps - 1) / 2`` periods. The noise of the slope is
-    ``rate_sd * sqrt(12 / (taps (taps^2 - 1))) / period``, the smallest that a linear filter of that length can have.
+    The slope is that of the middle of the window: the delay is ``(taps - 1) / 2`` periods. The
+    noise of the slope is ``rate_sd * sqrt(12 / (taps (taps^2 - 1))) / period``, the smallest that a
+    linear filter of that length can have.
     """
 
     taps: int
@@ -35,7 +36,9 @@ class CausalDerivative:
         return index / (index @ index) / self.period
 
     def noise_sd(self, rate_sd: float) -> float:
-        """Return the standard deviation of the angular acceleration for white rate noise, rad/s^2."""
+        """
+        Return the standard deviation of the angular acceleration for white rate noise, rad/s^2.
+        """
         return rate_sd * np.sqrt(12.0 / (self.taps * (self.taps**2 - 1.0))) / self.period
 
 
@@ -47,14 +50,17 @@ def choose_derivative(
     period: float, rate_sd: float, arm: float, *, force_sd: float
 ) -> CausalDerivative:
     """
-    Return the shortest window whose noise, through the arm, is below a third of the accelerometer's noise.
+    Return the shortest window with little enough noise through the arm.
+
+    The noise of the window, through the arm, is below a third of the accelerometer's noise.
 
     Parameters
     ----------
     period : float
         Sampling period, s.
     rate_sd, force_sd : float
-        Noise of single samples, rad/s and m/s^2; when one is unknown (zero) the window has half the largest delay.
+        Noise of single samples, rad/s and m/s^2; when one is unknown (zero) the window has half the
+        largest delay.
     arm : float
         Longest corrected lever arm, m.
 
@@ -77,18 +83,24 @@ MAX_SUM_AGE = 1000
 """The running sums are recomputed after this many samples, so that rounding does not accumulate."""
 NO_SLOPE = (0.0, 0.0, 0.0)
 WHOLE_GAP_SHARE, MAX_LATE_STEP = 0.25, 3.5
-"""A longer step is a gap if it is within this share of a whole number of periods, or longer than this many of them."""
+"""
+A longer step is a gap if it is within this share of a whole number of periods, or longer than this
+many of them.
+"""
 
 
 class StampedDerivative:
     """
-    Slope of a straight line through the last samples of a vector, updated one sample or one block at a time.
+    Slope of a straight line through the last samples of a vector.
 
-    The samples count as equally spaced, as from a sensor with its own clock, independent of the jitter of their stamps; the
-    stamps show missing samples: a step of about a whole number of periods; otherwise a stamp was late. A gap shorter than the
-    window is bridged by a straight line; after a longer one, or when the clock is set back by more than a second, the window restarts.
-    A duplicate or late sample does not enter the window and gets the derivative of the newest one. While the window is less
-    than half full the derivative is zero.
+    It is updated one sample or one block at a time.
+
+    The samples count as equally spaced, as from a sensor with its own clock, independent of the
+    jitter of their stamps; the stamps show missing samples: a step of about a whole number of
+    periods; otherwise a stamp was late. A gap shorter than the window is bridged by a straight
+    line; after a longer one, or when the clock is set back by more than a second, the window
+    restarts. A duplicate or late sample does not enter the window and gets the derivative of the
+    newest one. While the window is less than half full the derivative is zero.
 
     Parameters
     ----------
@@ -178,13 +190,19 @@ class StampedDerivative:
         self._newest = stamp_ns
 
     def seed(self, other: 'StampedDerivative') -> None:
-        """Copy the past of another derivative of the same stream, within the length of this window."""
+        """
+        Copy the past of another derivative of the same stream, within the length of this window.
+        """
         self._newest = other._newest
         for x, y, z in list(other._window)[-self.taps :]:
             self._add(x, y, z)
 
     def push_block(self, stamp_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
+        """
+        Return the derivatives after each of the samples of a block, shape (n, 3).
+
+        The same as `push` one by one.
+        """
         out = np.empty(values.shape)
         steps = np.diff(stamp_ns) / self._period_ns
         bounds = np.concatenate(
@@ -203,7 +221,11 @@ class StampedDerivative:
         return out
 
     def _regular(self, stamp_ns, values, start, end, out):
-        """Fill out[start:end], where every step is regular and the window is full of samples of this very stretch."""
+        """
+        Fill out[start:end].
+
+        Where every step is regular and the window is full of samples of this very stretch.
+        """
         taps = self.taps
         index = (taps - 1) / 2 - np.arange(taps)
         stretch = values[start - taps + 1 : end]
@@ -217,12 +239,16 @@ class StampedDerivative:
 
 class TimedDerivative:
     """
-    Slope of a straight line through the last samples of a vector by least squares over their stamps, for irregular sampling.
+    Slope of a straight line through the last samples, for irregular sampling.
 
-    ``slope = sum((t_k - mean t) v_k) / Sxx``, ``Sxx = sum((t_k - mean t)^2)``. The window is the shortest with at least the Sxx of
-    `derivative` at equal steps: its noise does not exceed that of `derivative`, and the mean delay is about the same. A sample whose stamp
-    is earlier than the newest stamp is not used. A step of more than two windows and 16 periods restarts the window, as does a clock set
-    back by more than a second; the derivative is zero until Sxx equals that of half a window.
+    The line through the samples of a vector is fitted by least squares over their stamps.
+
+    ``slope = sum((t_k - mean t) v_k) / Sxx``, ``Sxx = sum((t_k - mean t)^2)``. The window is the
+    shortest with at least the Sxx of `derivative` at equal steps: its noise does not exceed that of
+    `derivative`, and the mean delay is about the same. A sample whose stamp is earlier than the
+    newest stamp is not used. A step of more than two windows and 16 periods restarts the window, as
+    does a clock set back by more than a second; the derivative is zero until Sxx equals that of
+    half a window.
 
     Parameters
     ----------

@@ -16,7 +16,9 @@ from imu_calibration.kinematics.rotations import Reference, lever_matrix, rotati
 
 
 class FittedErrors(Protocol):
-    """A model of the errors of an IMU with the values of its parameters and how well they are known."""
+    """
+    A model of the errors of an IMU with the values of its parameters and how well they are known.
+    """
 
     @property
     def model(self) -> SensorModel:
@@ -54,31 +56,47 @@ class FittedErrors(Protocol):
         """Return the value of the effect that plays a role for a sensor, or None."""
 
     def noise(self, sensor: str, period: float | None = None) -> tuple[Any, Any]:
-        """Return (standard deviation of a sample, sd of window offsets and bias process), each shape (3,)."""
+        """
+        Return (standard deviation of a sample, sd of window offsets and bias process).
+
+        Each has shape (3,).
+        """
 
 
 MAX_INVERSION_STEPS = 12
 """Fixed-point steps at most; each gains the size of the non-linear effects, about three digits."""
 CONVERGED = 1e-2
 """
-Samples whose last step is larger (m/s^2, rad/s) lie outside the range in which the non-linear effects can be inverted; they become NaN.
+Samples whose last step is larger (m/s^2, rad/s) lie outside the range in which the non-linear
+effects can be inverted; they become NaN.
 
-Close to zero input, where the sign of the asymmetry is open, the steps alternate by up to 1e-3, which is no failure.
+Close to zero input, where the sign of the asymmetry is open, the steps alternate by up to 1e-3,
+which is no failure.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """Samples after compensation, in the sensor frame and at the gauge's origin, or in the target frame and point."""
+    """
+    Samples after compensation.
+
+    They are in the sensor frame and at the gauge's origin, or in the target frame and point.
+    """
 
     force: np.ndarray
     """Specific force, m/s^2, shape (n, 3)."""
     rate: np.ndarray
     """Angular rate, rad/s, shape (n, 3)."""
     flagged: np.ndarray
-    """True where the output cannot be trusted: the input was saturated, or too large for the inversion, shape (n,)."""
+    """
+    True where the output cannot be trusted: the input was saturated, or too large for the
+    inversion, shape (n,).
+    """
     marks: np.ndarray
-    """Variance of saturated (force, rate): the square of the range, the only information on the true value; otherwise 0. Shape (n, 2)."""
+    """
+    Variance of saturated (force, rate): the square of the range, the only information on the true
+    value; otherwise 0. Shape (n, 2).
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,20 +123,24 @@ class Transfer:
         Parameters
         ----------
         xyz, rpy : sequence of 3 floats
-            Pose of the sensor in the target frame, as in a static transform or a URDF joint from target to sensor: roll, pitch,
-            yaw in rad about the fixed axes x, y, z.
+            Pose of the sensor in the target frame, as in a static transform or a URDF joint from
+            target to sensor: roll, pitch, yaw in rad about the fixed axes x, y, z.
 
         """
         if len(xyz) != 3 or len(rpy) != 3 or not np.all(np.isfinite([*xyz, *rpy])):
             raise InputError(
-                f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and rpy {list(rpy)}; '
-                'correct it',
+                f'the pose of the sensor must be three finite numbers each, got xyz {list(xyz)} and'
+                f' rpy {list(rpy)}; correct it',
                 code='pose_numbers',
             )
         return cls(frame_id, rotation_from_rpy(np.asarray(rpy)), np.asarray(xyz, float))
 
     def is_close(self, other: 'Transfer | None') -> bool:
-        """Return whether another transfer has the same frames and, within a micrometre and a microradian, the same pose."""
+        """
+        Return whether another transfer has the same frames and the same pose.
+
+        The pose is compared within a micrometre and a microradian.
+        """
         return (
             other is not None
             and self.frame_id == other.frame_id
@@ -131,7 +153,11 @@ class Transfer:
         return tuple(Rotation.from_matrix(self.mat_ts.T).as_quat().tolist())
 
     def turned_quaternion(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """Return the orientation of the target frame for that of the sensor, both (x, y, z, w); zeros remain zeros."""
+        """
+        Return the orientation of the target frame for that of the sensor, both (x, y, z, w).
+
+        Zeros remain zeros.
+        """
         px, py, pz, pw = quaternion
         qx, qy, qz, qw = self._quaternion_st
         return (
@@ -183,8 +209,8 @@ def compensate(
     Return corrected samples.
 
     Solves ``measured = output(true)`` for both sensors together by fixed-point steps
-    ``x <- x + matrix^-1 (measured - output(x))``: gyroscope and accelerometer depend on one another through g-sensitivity
-    and lever arms.
+    ``x <- x + matrix^-1 (measured - output(x))``: gyroscope and accelerometer depend on one another
+    through g-sensitivity and lever arms.
 
     Parameters
     ----------
@@ -207,7 +233,8 @@ def compensate(
     model, values = invertible_values(calibration)
     if temperature_c is None and model.needs_temperature:
         raise InputError(
-            'the calibration has thermal effects and needs temperatures, none were received; provide imu/temperature',
+            'the calibration has thermal effects and needs temperatures, none were received;'
+            ' provide imu/temperature',
             code='temperature_missing',
         )
     with np.errstate(over='ignore', invalid='ignore'):
@@ -265,7 +292,11 @@ def moved(
 
 
 def saturation_level(calibration: FittedErrors, sensor: str) -> float:
-    """Return the reading from which a sensor counts as saturated, infinite without a saturation in the calibration."""
+    """
+    Return the reading from which a sensor counts as saturated.
+
+    It is infinite without a saturation in the calibration.
+    """
     level = calibration.of(sensor, Role.LIMIT)
     return np.inf if level is None else float(level) * (1 - 1e-6)
 
@@ -273,7 +304,11 @@ def saturation_level(calibration: FittedErrors, sensor: str) -> float:
 def saturation_marks(
     calibration: FittedErrors, force_s: np.ndarray, rate_s: np.ndarray
 ) -> np.ndarray:
-    """Return the square of the saturation level where a component of (force, rate) reaches it, otherwise 0; shape (n, 2)."""
+    """
+    Return the square of the saturation level where a component reaches it, else 0.
+
+    The components are the ones of (force, rate), and the result has shape (n, 2).
+    """
     marks = np.zeros((len(force_s), 2))
     for k, (sensor, measured) in enumerate(zip(SENSORS, (force_s, rate_s))):
         level = saturation_level(calibration, sensor)
@@ -291,19 +326,22 @@ def arms_of(calibration: FittedErrors) -> np.ndarray:
 def outside_conditions(
     calibration: FittedErrors, fastest: float = 0.0, temperature_c: Sequence[float] | None = None
 ) -> list[str]:
-    """Return lines on a largest rate (rad/s) and temperatures outside the range of the calibration."""
+    """
+    Return lines on a largest rate (rad/s) and temperatures outside the range of the calibration.
+    """
     lines = []
     largest = calibration.conditions.get('largest_rate')
     if largest is not None and fastest > 1.1 * largest + 0.1:
         lines.append(
-            f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up to the rates of use'
+            f'the rate reaches {fastest:.2f} rad/s, the calibration saw {largest:.2f}; calibrate up'
+            ' to the rates of use'
         )
     limits = calibration.conditions.get('temperature_range_c')
     if limits and temperature_c:
         low, high = min(temperature_c), max(temperature_c)
         if low < limits[0] - 5 or high > limits[1] + 5:
             lines.append(
-                f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw {limits[0]:.1f} to {limits[1]:.1f} C; '
-                'calibrate there'
+                f'the temperature runs from {low:.1f} to {high:.1f} C, the calibration saw'
+                f' {limits[0]:.1f} to {limits[1]:.1f} C; calibrate there'
             )
     return lines

@@ -13,7 +13,10 @@ from imu_calibration.effects.forward_equations import coefficients_at_point, col
 from imu_calibration.kinematics.rotations import Reference
 
 DIFFERENCE_STEPS = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-2] * 3)
-"""Steps of the central differences in force, rate and derivative of the rate: small against the curvature, large against rounding."""
+"""
+Steps of the central differences in force, rate and derivative of the rate: small against the
+curvature, large against rounding.
+"""
 
 
 MAX_KNOWN_COVARIANCE = 1e30
@@ -21,7 +24,11 @@ MAX_KNOWN_COVARIANCE = 1e30
 
 
 def is_known(covariance: np.ndarray) -> bool:
-    """Return whether a covariance from a message is usable: neither NaN nor huge, variances not negative, not all zero."""
+    """
+    Return whether a covariance from a message is usable.
+
+    Neither NaN nor huge, variances not negative, not all zero.
+    """
     return bool(
         np.all(np.abs(covariance) < MAX_KNOWN_COVARIANCE)
         and np.any(covariance)
@@ -34,12 +41,15 @@ class Sensitivity:
     """
     How corrected force and rate follow their inputs at one sample.
 
-    The derivative of the rate is formed from the same readings as the rate, so their noise is correlated: the newest reading
-    enters both.
+    The derivative of the rate is formed from the same readings as the rate, so their noise is
+    correlated: the newest reading enters both.
     """
 
     gain: np.ndarray
-    """d(force, rate) / d(measured force, measured rate, derivative of the measured rate), shape (6, 9)."""
+    """
+    d(force, rate) / d(measured force, measured rate, derivative of the measured rate), shape (6,
+    9).
+    """
     parameters: np.ndarray
     """Covariance of (force, rate) from the calibration's parameters, shape (6, 6)."""
     newest: float
@@ -55,8 +65,9 @@ class Sensitivity:
         """
         Return the covariances of corrected (force, rate), each shape (3, 3).
 
-        ``A N_f A' + (B + w C) N_w (B + w C)' + v C N_w C' + C E C'`` with A, B, C the gains by force, rate and derivative, w the newest
-        weight, v the earlier ones, and E the covariance of the derivative's error (its delay); plus the parameters' share.
+        ``A N_f A' + (B + w C) N_w (B + w C)' + v C N_w C' + C E C'`` with A, B, C the gains by
+        force, rate and derivative, w the newest weight, v the earlier ones, and E the covariance of
+        the derivative's error (its delay); plus the parameters' share.
         """
         results, error_cov = [], self.slope_error.covariance(rate_cov)
         for k in (0, 3):
@@ -108,7 +119,11 @@ class Uncertainty:
         self.use(None)
 
     def use(self, derivative: CausalDerivative | None, period: float | None = None) -> None:
-        """Use the angular acceleration of another CausalDerivative, or of none, and the noise of samples `period` s apart."""
+        """
+        Use the angular acceleration of another CausalDerivative, or of none.
+
+        The noise of samples `period` s apart is used as well.
+        """
         self.noise = tuple(
             np.diag(self._calibration.noise(sensor, period)[0] ** 2) for sensor in SENSORS
         )
@@ -167,7 +182,9 @@ class Uncertainty:
         return (np.array(above) - below) / (2 * step.sum())
 
     def _parameter_slopes(self, true, alpha, beside):
-        """Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params)."""
+        """
+        Return d(measured force, rate) / d(parameters) at the true motion, shape (6, n_params).
+        """
         temperature = np.full(1, self._model.temperature_ref_c + beside[0])
         ref = Reference(
             np.zeros(1),

@@ -17,15 +17,29 @@ HEALTH_BLOCK_SECONDS = 0.25
 N_BLOCKS = 4
 """Blocks in a row that must agree, one second."""
 MOST_RATE = 0.1
-"""rad/s; larger than the rest reading of any gyroscope that is calibrated, so that a faster rotation is no rest."""
+"""
+rad/s; larger than the rest reading of any gyroscope that is calibrated, so that a faster rotation
+is no rest.
+"""
 MOST_SHAKE = np.array([0.6] * 3 + [0.06] * 3)
-"""Standard deviation within a block, m/s^2 and rad/s: above that of an idling engine, below that of driving over a floor."""
+"""
+Standard deviation within a block, m/s^2 and rad/s: above that of an idling engine, below that of
+driving over a floor.
+"""
 MAX_BLOCK_CHANGE = np.array([0.05] * 3 + [3e-3] * 3)
-"""Largest difference of block means in addition to noise, m/s^2 and rad/s: 0.3 degrees of tilt, 0.2 degrees per second."""
+"""
+Largest difference of block means in addition to noise, m/s^2 and rad/s: 0.3 degrees of tilt, 0.2
+degrees per second.
+"""
 MAX_STOP_SECONDS = 30.0
-"""s; a longer rest counts as several, so that a bias that drifts while the robot is parked is tracked."""
+"""
+s; a longer rest counts as several, so that a bias that drifts while the robot is parked is tracked.
+"""
 TIMES_NOISE = 6.0
-"""Range of four means of noise, in their standard deviations: exceeded once in ten thousand times by three axes of two sensors."""
+"""
+Range of four means of noise, in their standard deviations: exceeded once in ten thousand times by
+three axes of two sensors.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +53,19 @@ class Stop:
     n_samples: int
     """Samples in its later half."""
     mean: np.ndarray
-    """Mean of specific force and rate over the later half, m/s^2 and rad/s, shape (6,): a slow stop settles in the earlier half."""
+    """
+    Mean of specific force and rate over the later half, m/s^2 and rad/s, shape (6,): a slow stop
+    settles in the earlier half.
+    """
     others: np.ndarray
     """Mean of the further columns over the later half, shape (k,)."""
     shake_sd: np.ndarray
     """Standard deviation of the samples in the blocks of the later half, shape (6,)."""
     change: np.ndarray
-    """Mean over the later half less that over the earlier half, shape (6,): bounds the error of `mean` while the motion decays."""
+    """
+    Mean over the later half less that over the earlier half, shape (6,): bounds the error of `mean`
+    while the motion decays.
+    """
 
     @property
     def seconds(self) -> float:
@@ -57,7 +77,8 @@ class StopDetector:
     """
     Processes readings in pieces of any length; the result does not depend on the division.
 
-    A robot that rotates steadily at less than `MOST_RATE` about the vertical is not separable from one at rest.
+    A robot that rotates steadily at less than `MOST_RATE` about the vertical is not separable from
+    one at rest.
 
     Parameters
     ----------
@@ -71,7 +92,10 @@ class StopDetector:
         self._most_variance = (MOST_SHAKE + 4 * self._noise_sd) ** 2
         self._rest: np.ndarray = np.zeros((0, 1))
         self._blocks: list[np.ndarray] = []
-        """Start, end, samples, means of the columns, variances of force and rate; shape (3 + 6 + k + 6,) each."""
+        """
+        Start, end, samples, means of the columns, variances of force and rate; shape (3 + 6 + k +
+        6,) each.
+        """
         self._stand: list[np.ndarray] = []
         self._stop: Stop | None = None
 
@@ -114,7 +138,11 @@ class StopDetector:
         self._stop = _stop_of(np.array(self._stand)) if self._stand else None
 
     def _may_be_still(self, block):
-        """Return whether a block turns and shakes little enough by itself; most blocks of a robot that drives do not."""
+        """
+        Return whether a block turns and shakes little enough by itself.
+
+        Most blocks of a robot that drives do not.
+        """
         return block[6:9] @ block[6:9] < MOST_RATE**2 and bool(
             (block[-6:] <= self._most_variance).all()
         )
@@ -160,9 +188,9 @@ class GyroBiasUpdate:
     """
     The residual bias after compensation, a Gauss-Markov process that every stop measures.
 
-    Between stops ``b <- phi b, P <- phi^2 P + (1 - phi^2) S^2`` with ``phi = exp(-dt / time)``; at a stop the Kalman update with the mean
-    of the corrected rate. Without stops the update decays and its uncertainty returns to S: that of the calibration, or that of the stops
-    if it is larger.
+    Between stops ``b <- phi b, P <- phi^2 P + (1 - phi^2) S^2`` with ``phi = exp(-dt / time)``; at
+    a stop the Kalman update with the mean of the corrected rate. Without stops the update decays
+    and its uncertainty returns to S: that of the calibration, or that of the stops if it is larger.
 
     Parameters
     ----------
@@ -184,7 +212,9 @@ class GyroBiasUpdate:
 
     def measure(self, start: float, now: float, *, rate: np.ndarray, variance: np.ndarray) -> None:
         """
-        Process the mean of the corrected rate over a stop until now; as the stop grows, the longer mean replaces the shorter one.
+        Process the mean of the corrected rate over a stop until now.
+
+        As the stop grows, the longer mean replaces the shorter one.
 
         Parameters
         ----------
@@ -238,7 +268,9 @@ LIMIT = 4.0
 MIN_STOP_SECONDS = 2.0
 """Shortest stop that is tested, s."""
 WORSE = 1.5
-"""Times the error without calibration, from which a calibration does harm rather than too little."""
+"""
+Times the error without calibration, from which a calibration does harm rather than too little.
+"""
 
 
 class HealthWord(StrEnum):
@@ -315,14 +347,16 @@ class CalibrationHealth:
         Parameters
         ----------
         stop : Stop
-            Of corrected readings without any update; its `others` are the measured specific force and rate.
+            Of corrected readings without any update; its `others` are the measured specific force
+            and rate.
 
         """
         if stop.seconds < MIN_STOP_SECONDS or np.linalg.norm(stop.mean[3:]) > MOST_MOVED:
             return  # too short, or a slow and steady turn
         if self._judged != stop.start:
             self._judged, self.n_stops = stop.start, self.n_stops + 1
-        # A mean with a trend is not rest: motion that decays is an error of the mean of about its change.
+        # A mean with a trend is not rest: motion that decays is an error of the mean of about its
+        # change.
         of_mean = (
             np.maximum(stop.shake_sd, self.noise_sd) ** 2 / stop.n_samples + (2 * stop.change) ** 2
         )
@@ -345,7 +379,11 @@ class CalibrationHealth:
         )
 
     def _evaluated(self, stop, of_mean, n_stops, bias_update):
-        """Return the state after a stop, from the variance of its mean, (6,), and the corrected bias with its variance, or None."""
+        """
+        Return the state after a stop.
+
+        From the variance of its mean, (6,), and the corrected bias with its variance, or None.
+        """
         total = self._known + np.diag(of_mean)
         along = stop.mean[:3] / max(np.linalg.norm(stop.mean[:3]), 1e-9)
         rate_off = np.maximum(np.abs(stop.mean[3:]) - EARTH_RATE, 0) / np.sqrt(np.diag(total)[3:])
@@ -368,20 +406,20 @@ class CalibrationHealth:
         if unit := unit_of_rest(measured_length):
             return LiveState(
                 UNIT,
-                f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit}, it must be m/s^2; '
-                'correct the driver',
+                f'the measured specific force at rest is {measured_length:.4g}: the unit is {unit},'
+                ' it must be m/s^2; correct the driver',
                 values,
             )
         lines = []
         if rate_off[axis] > LIMIT:
             lines.append(
-                f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about {"xyz"[axis]}, '
-                f'{rate_off[axis]:.0f} times its sd'
+                f'the bias of the gyroscope has moved by {rate[axis] / DEG:+.3g} deg/s about'
+                f' {"xyz"[axis]}, {rate_off[axis]:.0f} times its sd'
             )
         if force_off > LIMIT:
             lines.append(
-                f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f} times its sd beyond what '
-                'places differ by'
+                f'gravity reads {length:.3f} m/s^2 instead of {self._gravity:.3f}, {force_off:.0f}'
+                ' times its sd beyond what places differ by'
             )
         if bias_update is not None:
             bias, variance = bias_update
@@ -407,7 +445,8 @@ class CalibrationHealth:
             return LiveState(
                 HARMS,
                 '; '.join(lines)
-                + ': without the calibration it would be less; is it the right one? calibrate again',
+                + ': without the calibration it would be less; is it the right one? calibrate'
+                ' again',
                 values,
             )
         if bias_update is not None and force_off <= LIMIT:
@@ -423,7 +462,9 @@ class CalibrationHealth:
 
 SIX = tuple[float, ...]
 AS_STOPS = [0, 4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
-"""Columns of a sample for the detection of stops: time, force, rate, measured force, measured rate."""
+"""
+Columns of a sample for the detection of stops: time, force, rate, measured force, measured rate.
+"""
 
 
 class StopWatch:
@@ -443,7 +484,11 @@ class StopWatch:
         self._offset: tuple[float, float, float] | None = None
 
     def follow(self, stamp_ns: int, measured: SIX, corrected: SIX) -> SIX:
-        """Process a sample (rate x, y, z, force x, y, z; measured and corrected); return the corrected one minus the bias update."""
+        """
+        Process a sample (rate x, y, z, force x, y, z; measured and corrected).
+
+        Return the corrected one minus the bias update.
+        """
         since = stamp_ns - self._first_ns
         self._waiting.append((since, *corrected, *measured))
         if since >= self._look or since < 0:

@@ -1,9 +1,10 @@
 """
 Compensation of one sample after another: a function written for one calibration, in plain floats.
 
-The text of the function is made of the texts of the column groups and of the coefficients that the catalogue's own compensation uses
-(`compensation.compensate`), multiplied out; zeros are left out. With bias, matrix and lever arms it is one straight line of products; every
-further effect adds fixed-point steps.
+The text of the function is made of the texts of the column groups and of the coefficients that the
+catalogue's own compensation uses (`compensation.compensate`), multiplied out; zeros are left out.
+With bias, matrix and lever arms it is one straight line of products; every further effect adds
+fixed-point steps.
 """
 
 import re
@@ -24,7 +25,9 @@ from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text
 from imu_calibration.effects.forward_equations import coefficients_at_point
 
 CONVERGED_CHANGE = 1e-13
-"""Sum of the changes in one fixed-point step (m/s^2, rad/s) below which the iteration has converged."""
+"""
+Sum of the changes in one fixed-point step (m/s^2, rad/s) below which the iteration has converged.
+"""
 MAX_KERNEL_CHARACTERS = 200_000
 """Largest number of characters of a kernel; compiling it needs about a second and 100 MB."""
 BEFOREHAND = {'temperature', 'thermal branch', 'vibration', 'reference temperature'}
@@ -35,11 +38,13 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     """
     Return the function that compensates one sample.
 
-    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch, sx, sy, sz) -> (fx, fy, fz, wx, wy, wz)`` reads the measured specific
-    force (m/s^2) and rate (rad/s), the derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here),
-    and the temperature above the calibration's reference temperature (K). Where they are left out, which way that came
-    (`kinematics.signal_history`) and how much it vibrates (`kinematics.signal_history`, (m/s^2)^2) are 0.
-    Where the non-linear effects cannot be undone it returns NaN.
+    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch, sx, sy, sz) -> (fx, fy, fz, wx, wy,
+    wz)`` reads the measured specific force (m/s^2) and rate (rad/s), the derivative of the
+    *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here), and the
+    temperature above the calibration's reference temperature (K). Where they are left out, which
+    way that came (`kinematics.signal_history`) and how much it vibrates
+    (`kinematics.signal_history`, (m/s^2)^2) are 0. Where the non-linear effects cannot be undone it
+    returns NaN.
 
     Parameters
     ----------
@@ -56,15 +61,19 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     namespace, text = dict(SCALAR_FUNCTIONS), kernel_text(calibration, transfer)
     if len(text) > MAX_KERNEL_CHARACTERS:
         raise InputError(
-            f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS} characters of arithmetic, got '
-            f'{len(text)}; use fewer or shorter effects'
+            f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS}'
+            f' characters of arithmetic, got {len(text)}; use fewer or shorter effects'
         )
     exec(compile(text, '<compensation kernel>', 'exec'), namespace)
     return namespace['kernel']
 
 
 def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> str:
-    """Return the Python text of the function that `make_kernel` compiles: measured f, w, a to true force u, rate v and slope g."""
+    """
+    Return the Python text of the function that `make_kernel` compiles.
+
+    Measured f, w, a to true force u, rate v and slope g.
+    """
     model, values = invertible_values(calibration)
     known = _known(model.temperature_ref_c)
     accel, gyro = (_Part(model, sensor, values, known) for sensor in SENSORS)
@@ -84,7 +93,8 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
         and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'}
         and not accel.bends
     ):
-        # No iteration is needed: the rate follows from the readings, and the disturbance of the force follows from the rate.
+        # No iteration is needed: the rate follows from the readings, and the disturbance of the
+        # force follows from the rate.
         lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
         force = [_with_slope(row, slope) for row in _less(_less(accel.alone, accel.rest), at_arm)]
     else:
@@ -95,7 +105,11 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
 
 
 class _Part:
-    """One sensor: true = alone - rest(true), each three sums of products (`effects.expressions`), `alone` in the measured readings."""
+    """
+    One sensor: true = alone - rest(true), each three sums of products.
+
+    The sums are described in `effects.expressions`. `alone` is in the measured readings.
+    """
 
     def __init__(self, model, sensor, values, known):
         matrix, bias = (model.value(sensor, role, values) for role in (Role.LINEAR, Role.OFFSET))
@@ -143,7 +157,11 @@ def _known(temperature_ref_c):
 
 
 def _iteration(accel, gyro):
-    """Return the lines that compute the true force in u and the true rate in v, by the same steps as `compensation.compensate`."""
+    """
+    Return the lines that compute the true force in u and the true rate in v.
+
+    By the same steps as `compensation.compensate`.
+    """
     # ax, ay, az are already in gx, gy, gz: a is the force, b the rate, from matrix and bias only.
     lines = _assigned('a', accel.alone, '    ') + _assigned('b', gyro.alone, '    ')
     lines += [
@@ -182,7 +200,11 @@ def _less(rows, others):
 
 
 def _with_slope(row, slope):
-    """Return a sum in which the angular acceleration, which enters as it is, is replaced by the derivative of the measured rate."""
+    """
+    Return a sum with the derivative of the measured rate as angular acceleration.
+
+    The derivative replaces the angular acceleration, which enters as it is.
+    """
     places = {(f'g{axis}',): measured for axis, measured in zip(AXES, slope)}
     return added(
         *(

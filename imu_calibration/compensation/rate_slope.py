@@ -1,4 +1,8 @@
-"""The derivative of the measured rate for stamps of any kind, by equal steps or by least squares over the stamps, and its error."""
+"""
+The derivative of the measured rate for stamps of any kind.
+
+By equal steps or by least squares over the stamps, and its error.
+"""
 
 from collections import deque
 from collections.abc import Callable
@@ -28,16 +32,30 @@ from imu_calibration.preprocessing.stamping import (
 REVIEWED_STAMPS = 4 * LAG + 1
 """Stamps needed to separate counted from irregular stamps."""
 CHANGED = {REGULAR: 0.02, COUNTED: 0.05, IRREGULAR: 0.25}
-"""A period that differs by more than this share is a new one; the scatter of the stamps limits the resolution of the latter two."""
+"""
+A period that differs by more than this share is a new one; the scatter of the stamps limits the
+resolution of the latter two.
+"""
 FASTEST_NS = 10_000.0
 """Irregular stamps with a shorter mean step are frozen: they contain no time for a derivative."""
 AGREE = 4
-"""Reviews in a row that replace irregular stamps by counted ones: so many blocks contain new stamps only."""
+"""
+Reviews in a row that replace irregular stamps by counted ones: so many blocks contain new stamps
+only.
+"""
 RECENT_SPAN = 1.0, 64, 2048
-"""Seconds, smallest and largest number of samples from which the error of the derivative is estimated."""
+"""
+Seconds, smallest and largest number of samples from which the error of the derivative is estimated.
+"""
 ROUGH = 0.02
-"""Seconds over which the rate is compared where there is no derivative: the longest delay that a derivative may have."""
-WITHOUT = ': no angular acceleration, the lever-arm effect is not corrected and the covariance includes its size'
+"""
+Seconds over which the rate is compared where there is no derivative: the longest delay that a
+derivative may have.
+"""
+WITHOUT = (
+    ': no angular acceleration, the lever-arm effect is not corrected and the covariance includes'
+    ' its size'
+)
 """Consequence of frozen stamps."""
 
 
@@ -51,18 +69,26 @@ class SlopeError:
     """That noise is this times the covariance of the rate, 1/s^2."""
 
     def covariance(self, rate_cov: np.ndarray) -> np.ndarray:
-        """Return the covariance of the error without the noise, not negative in any direction, shape (3, 3)."""
+        """
+        Return the covariance of the error without the noise, not negative in any direction.
+
+        Shape (3, 3).
+        """
         sizes, directions = np.linalg.eigh(self.moment - self.noise_gain * rate_cov)
         return (directions * np.maximum(sizes, 0.0)) @ directions.T
 
 
 class RateSlope:
     """
-    Derivative of the rate of a stream, one sample or one block at a time; the outcome does not depend on how the stream is cut.
+    Derivative of the rate of a stream, one sample or one block at a time.
 
-    Regular stamps show where samples are missing. Where stamps scatter about a clock (packets, times of arrival, jitter, in any order) the
-    samples are counted: `_count_on`. Irregular stamps are used as they are: least squares over the stamped times. Where stamps are frozen
-    the derivative is zero and `error` returns its size. The kind of the stamps is reviewed every `CLOCK_BLOCK` samples.
+    The outcome does not depend on how the stream is cut.
+
+    Regular stamps show where samples are missing. Where stamps scatter about a clock (packets,
+    times of arrival, jitter, in any order) the samples are counted: `_count_on`. Irregular stamps
+    are used as they are: least squares over the stamped times. Where stamps are frozen the
+    derivative is zero and `error` returns its size. The kind of the stamps is reviewed every
+    `CLOCK_BLOCK` samples.
 
     Parameters
     ----------
@@ -130,7 +156,11 @@ class RateSlope:
         return slope
 
     def push_block(self, stamp_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the derivatives after each of the samples of a block, shape (n, 3): the same as `push` one by one."""
+        """
+        Return the derivatives after each of the samples of a block, shape (n, 3).
+
+        The same as `push` one by one.
+        """
         out, start = np.empty(values.shape), 0
         while start < len(values):
             stop = self._usual_until(stamp_ns, values, start)
@@ -146,7 +176,11 @@ class RateSlope:
         return out
 
     def settle(self, line: StampLine) -> None:
-        """Use the derivative for stamps of that kind; the window is kept while the period is unchanged."""
+        """
+        Use the derivative for stamps of that kind.
+
+        The window is kept while the period is unchanged.
+        """
         self.line, self._doubtful, self._agreeing = line, [], 0
         self._longest_ns = (
             line.high_ns - line.low_ns + stamping.MAX_REGULAR_STEP * line.period_ns
@@ -202,9 +236,10 @@ class RateSlope:
         """
         Return the recent error of the derivative.
 
-        The error of a delayed derivative is the change of the true one in that time, estimated a delay later:
-        ``alpha(t + delay) - alpha(t)``. Without one the error is the whole derivative, from the rate over `ROUGH` seconds; also after a
-        change of the stamps, until there is new motion.
+        The error of a delayed derivative is the change of the true one in that time, estimated a
+        delay later: ``alpha(t + delay) - alpha(t)``. Without one the error is the whole derivative,
+        from the rate over `ROUGH` seconds; also after a change of the stamps, until there is new
+        motion.
         """
         recent = np.array(list(self._recent)).reshape(-1, 3)
         if len(recent) < stamping.MIN_PERIOD_STEPS and self._all_of_it is not None:
@@ -243,8 +278,9 @@ class RateSlope:
         """
         Return the derivative after a sample that is counted.
 
-        After a step longer than the scatter of the stamps samples may be lost, or one stamp was late. The derivative is kept until a later
-        stamp decides; the window is restarted when half a window of samples has not decided, or at once where the step exceeds a window.
+        After a step longer than the scatter of the stamps samples may be lost, or one stamp was
+        late. The derivative is kept until a later stamp decides; the window is restarted when half
+        a window of samples has not decided, or at once where the step exceeds a window.
         """
         self._ahead_ns = step_ns + (self._ahead_ns if self._doubtful else 0)
         self._doubtful.append(reading)
@@ -264,7 +300,11 @@ class RateSlope:
         return slope
 
     def _review(self) -> None:
-        """Classify the latest stamps again; after the first block following a change, update the error of the derivative."""
+        """
+        Classify the latest stamps again.
+
+        After the first block following a change, update the error of the derivative.
+        """
         if self.line is not None and self._young:
             self._young = False
             self._changed()
@@ -301,7 +341,11 @@ class RateSlope:
         self._due = CLOCK_BLOCK
 
     def _usual_until(self, stamp_ns: np.ndarray, values: np.ndarray, start: int) -> int:
-        """Return the number of samples of a block for which only the window moves: no duplicate message, the same class of stamps."""
+        """
+        Return the number of samples of a block for which only the window moves.
+
+        No duplicate message, the same class of stamps.
+        """
         if self.line is None or self.line.word != REGULAR:
             return start
         before = np.array(self._stamps, np.int64)[-CLOCK_BLOCK:]
@@ -336,7 +380,9 @@ def _stand_still(line: StampLine) -> bool:
 
 
 def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
-    """Return whether stamps, shape (..., n), are from a clock of that period, without a missing one."""
+    """
+    Return whether stamps, shape (..., n), are from a clock of that period, without a missing one.
+    """
     step = np.diff(stamps, axis=-1)
     within = np.all(stamping.is_regular(step, period_ns), axis=-1)
     return within & (

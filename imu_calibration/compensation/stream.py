@@ -61,7 +61,8 @@ class CompensationStream:
         model = invertible(calibration.model)
         if model.needs_temperature and temperature is None:
             raise InputError(
-                'the calibration has thermal effects and needs temperatures, the recording has none; record imu/temperature',
+                'the calibration has thermal effects and needs temperatures, the recording has'
+                ' none; record imu/temperature',
                 code='temperature_missing',
             )
         if temperature is not None and model.uses('thermal branch'):
@@ -80,7 +81,8 @@ class CompensationStream:
         """
         Return `Corrected` for the next block of ImuSamples.
 
-        A reading that is NaN, absent or broken remains NaN and does not affect its neighbours or the other sensor.
+        A reading that is NaN, absent or broken remains NaN and does not affect its neighbours or
+        the other sensor.
         """
         if self.slope.line is None and len(imu):
             first = imu.stamp_ns[:10_000]
@@ -125,16 +127,20 @@ class CompensationStream:
                 'force': imu.force_s[k],
                 'rate': imu.rate_s[k],
                 'derivative': slope[k],
-                'dt': 0.0
-                if temperature is None
-                else float(temperature[k]) - self.calibration.model.temperature_ref_c,
+                'dt': (
+                    0.0
+                    if temperature is None
+                    else float(temperature[k]) - self.calibration.model.temperature_ref_c
+                ),
                 'branch': 0.0 if branch is None else float(branch[k]),
                 'vibration': (0.0,) * 3 if vibration is None else tuple(vibration[k].tolist()),
             }
         return corrected
 
     def _vibration_of(self, force_s, finite):
-        """Return the variance of vibration at the finite samples of a block; None if it is not needed."""
+        """
+        Return the variance of vibration at the finite samples of a block; None if it is not needed.
+        """
         if self._vibration is None:
             return None
         vibration = np.tile(self._vibration.now, (len(force_s), 1))
@@ -142,7 +148,9 @@ class CompensationStream:
         return vibration
 
     def _warmth_at(self, stamp_ns):
-        """Return (temperatures, thermal branches) at stamps; None if they are absent or not needed."""
+        """
+        Return (temperatures, thermal branches) at stamps; None if they are absent or not needed.
+        """
         if self.temperature is None or not len(self.temperature):
             return None, None
         origin = self.temperature.stamp_ns[0]
@@ -151,8 +159,10 @@ class CompensationStream:
         if len(values):
             self._temperatures += [float(values.min()), float(values.max())]
             self._temperatures = [min(self._temperatures), max(self._temperatures)]
-        return values, None if self.temperature.branch is None else np.interp(
-            at, known, self.temperature.branch
+        return values, (
+            None
+            if self.temperature.branch is None
+            else np.interp(at, known, self.temperature.branch)
         )
 
     def propagate(
@@ -164,7 +174,8 @@ class CompensationStream:
         Parameters
         ----------
         force_cov, rate_cov : ndarray or None
-            Covariances of the readings, shape (3, 3); zero, invalid or None: the noise of the calibration is used.
+            Covariances of the readings, shape (3, 3); zero, invalid or None: the noise of the
+            calibration is used.
 
         """
         self._uncertainty.use(self.slope.derivative, self.slope.period)
@@ -177,7 +188,9 @@ class CompensationStream:
         )
 
     def warnings(self) -> list[str]:
-        """Return lines on samples outside the conditions of the calibration, or without correction."""
+        """
+        Return lines on samples outside the conditions of the calibration, or without correction.
+        """
         lines = outside_conditions(self.calibration, self._fastest, self._temperatures)
         if (
             self.frame_id
@@ -185,8 +198,8 @@ class CompensationStream:
             and self.frame_id != self.calibration.frame_id
         ):
             lines.append(
-                f"the messages carry frame_id '{self.frame_id}', the calibration is for '{self.calibration.frame_id}': "
-                'make sure that it is the same sensor'
+                f"the messages carry frame_id '{self.frame_id}', the calibration is for"
+                f" '{self.calibration.frame_id}': make sure that it is the same sensor"
             )
         if self.slope.n_without and uses_slope(self.calibration, self.transfer):
             lines.append(
@@ -194,7 +207,8 @@ class CompensationStream:
             )
         if self.flagged:
             lines.append(
-                f'{self.flagged} samples are saturated or too large to be corrected: they cannot be trusted'
+                f'{self.flagged} samples are saturated or too large to be corrected: they cannot be'
+                ' trusted'
             )
         return lines
 
@@ -231,7 +245,8 @@ def refuse_corrected(topic: str) -> None:
     """
     if topic.rstrip('/').endswith(CORRECTED_TOPIC_ENDINGS):
         raise InputError(
-            f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw topic",
+            f"the topic must carry raw measurements, '{topic}' is corrected already; name the raw"
+            ' topic',
             key='imu_topic',
             code='corrected_already',
         )
@@ -253,7 +268,8 @@ def requested_transfer(
         return Transfer.from_pose(frame_id, xyz, rpy)
     if any(xyz) or any(rpy):
         raise InputError(
-            'a pose in the target frame needs the name of that frame, none was given; give the target frame as well',
+            'a pose in the target frame needs the name of that frame, none was given; give the'
+            ' target frame as well',
             key='target_frame',
             code='frame_name_missing',
         )
@@ -261,7 +277,11 @@ def requested_transfer(
 
 
 def late_ns(calibration: FittedErrors, wanted: bool = True) -> int:
-    """Return the correction of stamps, ns, positive backwards: the time_offset of the calibration if `wanted`, otherwise 0."""
+    """
+    Return the correction of stamps, ns, positive backwards.
+
+    The time_offset of the calibration if `wanted`, otherwise 0.
+    """
     late = calibration.of('reference', Role.DELAY) if wanted else None
     return 0 if late is None else round(float(late) * 1e9)
 
@@ -327,7 +347,8 @@ def _as_samples(calibration, force_s, rate_s, time):
     if time is None:
         if np.any(arms_of(calibration)):
             raise InputError(
-                'the calibration has lever arms and needs the time of each reading, none was given; give `time` in seconds',
+                'the calibration has lever arms and needs the time of each reading, none was given;'
+                ' give `time` in seconds',
                 code='time_missing',
             )
         time = np.arange(len(force_s)) * 0.01
@@ -409,7 +430,11 @@ class SampleCompensation:
     def correct(
         self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float
     ) -> tuple[float, ...] | None:
-        """Return corrected rate and specific force, six floats, or None if no sample can be published; `counts` has the reason."""
+        """
+        Return corrected rate and specific force, six floats, or None if no sample can be published.
+
+        `counts` has the reason.
+        """
         total, dt = wx + wy + wz + fx + fy + fz, self.dt
         if total - total != 0.0 or dt is None:
             self.counts['no temperature yet' if dt is None else 'not finite'] += 1
@@ -437,9 +462,12 @@ class SampleCompensation:
         self, force_cov: np.ndarray | None, rate_cov: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the covariances of corrected (force, rate), each (3, 3), at the sample of their last update.
+        Return the covariances of corrected (force, rate), each (3, 3).
 
-        Covariances of the readings, (3, 3), may be zero or invalid: the noise of the calibration is used; or None: not measured.
+        They are the covariances at the sample of their last update.
+
+        Covariances of the readings, (3, 3), may be zero or invalid: the noise of the calibration is
+        used; or None: not measured.
         """
         force, rate = (
             np.zeros((3, 3)) if cov is None else cov if is_known(cov) else noise
@@ -459,13 +487,19 @@ class SampleCompensation:
         self.revision += 1
 
     def prepare(self, before: 'SampleCompensation') -> None:
-        """Prepare the replacement of `before`: compute period and covariances at its latest sample, which is slow."""
+        """
+        Prepare the replacement of `before`.
+
+        Compute period and covariances at its latest sample, which is slow.
+        """
         self.slope.prepare(before.slope)
         self.last = before.last
         self.refresh()
 
     def follow(self, before: 'SampleCompensation') -> None:
-        """Continue from another compensation: same past of the rate, same temperature, same counts."""
+        """
+        Continue from another compensation: same past of the rate, same temperature, same counts.
+        """
         self.counts, self.corrected, self.fastest_squared = (
             before.counts,
             before.corrected,

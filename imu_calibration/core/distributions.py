@@ -1,8 +1,10 @@
 """
-Probabilities of an equal or larger value by chance: upper tails of the distributions of significance tests.
+Probabilities of an equal or larger value by chance.
 
-The same numbers as ``scipy.stats``, by special functions only; the import of scipy.stats is slower than that of
-all remaining modules together, and every command and node would wait for it.
+Upper tails of the distributions of significance tests.
+
+The same numbers as ``scipy.stats``, by special functions only; the import of scipy.stats is slower
+than that of all remaining modules together, and every command and node would wait for it.
 """
 
 import numpy as np
@@ -11,22 +13,38 @@ from scipy.special import bdtrc, chdtrc, chdtri, fdtrc, ndtr
 
 
 def chi2_sf(x: ArrayLike, dof: ArrayLike) -> np.ndarray:
-    """Return the probability that chi-square of `dof` degrees of freedom lies above `x`; one below zero, nan without degrees of freedom."""
+    """
+    Return the probability that chi-square of `dof` degrees of freedom lies above `x`.
+
+    One below zero, nan without degrees of freedom.
+    """
     return np.where(np.asarray(dof) > 0, chdtrc(dof, np.maximum(x, 0.0)), np.nan)[()]
 
 
 def chi2_isf(chance: ArrayLike, dof: ArrayLike) -> np.ndarray:
-    """Return the value that chi-square of `dof` degrees of freedom exceeds with probability `chance`, between zero and one."""
+    """
+    Return the value that chi-square exceeds with probability `chance`.
+
+    Chi-square has `dof` degrees of freedom, and the probability is between zero and one.
+    """
     return chdtri(dof, chance)
 
 
 def f_sf(x: ArrayLike, dof: ArrayLike, dof_below: ArrayLike) -> np.ndarray:
-    """Return the probability that F lies above `x`, with the degrees of freedom above and below the line; one below zero."""
+    """
+    Return the probability that F lies above `x`.
+
+    With the degrees of freedom above and below the line; one below zero.
+    """
     return fdtrc(dof, dof_below, np.maximum(x, 0.0))
 
 
 def binom_sf(x: ArrayLike, trials: ArrayLike, chance: float) -> np.ndarray:
-    """Return the probability of more than `x` successes in `trials` (int) of probability `chance`; one below zero."""
+    """
+    Return the probability of more than `x` successes in `trials` (int) of probability `chance`.
+
+    One below zero.
+    """
     return bdtrc(x, trials, chance)
 
 

@@ -1,4 +1,8 @@
-"""Documents as YAML text (the same content gives the same bytes), and opening of untrusted files: regular ones only, up to a size."""
+"""
+Documents as YAML text (the same content gives the same bytes), and opening of untrusted files.
+
+Regular ones only, up to a size.
+"""
 
 import io
 import math
@@ -18,19 +22,33 @@ import numpy as np
 from imu_calibration.core.errors import DocumentError, shortened
 
 MAX_DOCUMENT_CHARACTERS = 2_000_000
-"""Largest number of characters of a document; the covariance of a hundred parameters has 300 000."""
+"""
+Largest number of characters of a document; the covariance of a hundred parameters has 300 000.
+"""
 MOST_PARTS = 60_000
-"""Largest number of numbers, texts, lists and mappings in a document: they are read in half a second."""
+"""
+Largest number of numbers, texts, lists and mappings in a document: they are read in half a second.
+"""
 MAX_SCALAR_CHARACTERS = 5000
-"""Largest number of characters of one text or number; the time of a number in base sixty grows with the square of its length."""
+"""
+Largest number of characters of one text or number; the time of a number in base sixty grows with
+the square of its length.
+"""
 NO_SUCH_VALUE = (ValueError, OverflowError, TypeError, AttributeError)
 """Exceptions of the parser for malformed dates and numbers."""
 NUMBER_START, MAX_NUMBER_CHARACTERS = re.compile(r'[-+0-9][0-9_:.a-fxA-F+-]*'), 100
-"""Start of a number, and its largest number of characters; larger integers do not fit into a float."""
+"""
+Start of a number, and its largest number of characters; larger integers do not fit into a float.
+"""
 FLOAT = re.compile(r'[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]{1,3}$')
-"""Numbers such as 1e-6 and 1.5e3: the rules of YAML 1.1 require a point and a sign of the exponent; YAML 1.2, ROS and JSON do not."""
+"""
+Numbers such as 1e-6 and 1.5e3: the rules of YAML 1.1 require a point and a sign of the exponent;
+YAML 1.2, ROS and JSON do not.
+"""
 MAX_DOCUMENT_DEPTH = 20
-"""Deepest nesting of lists and mappings; the stack of a recursive parser overflows well above it."""
+"""
+Deepest nesting of lists and mappings; the stack of a recursive parser overflows well above it.
+"""
 
 
 def finite(value: float) -> float | None:
@@ -92,7 +110,11 @@ def to_text(document: dict[str, Any]) -> str:
 
 @cache
 def _with_floats(name: str) -> Any:
-    """Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`: a text that resembles a number is then quoted."""
+    """
+    Return PyYAML's reader or writer of that name, in C where available, with `FLOAT`.
+
+    A text that resembles a number is then quoted.
+    """
     import yaml
 
     kind: Any = type(name, (getattr(yaml, f'C{name}', getattr(yaml, name)),), {})
@@ -126,8 +148,8 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
     Raises
     ------
     DocumentError
-        When the text is not YAML, is too large or too deep, repeats a key or is built on aliases; a text of a few lines could otherwise
-        exhaust the memory.
+        When the text is not YAML, is too large or too deep, repeats a key or is built on aliases; a
+        text of a few lines could otherwise exhaust the memory.
 
     """
     import yaml
@@ -145,7 +167,11 @@ def parsed(text: str, what: str, aliases: bool = False) -> Any:
 
 
 def _look_through(events, what, aliases):
-    """Refuse documents that need much time or memory, from the events of the parser, which need neither."""
+    """
+    Refuse documents that need much time or memory.
+
+    From the events of the parser, which need neither.
+    """
     count, sizes, open_parts = (
         0,
         {},
@@ -163,7 +189,8 @@ def _look_through(events, what, aliases):
             continue
         if kind == 'AliasEvent' and not (aliases and event.anchor in sizes):
             raise DocumentError(
-                f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor}); write it without',
+                f'a {what} must not use aliases, this document has YAML aliases (*{event.anchor});'
+                ' write it without',
                 code='yaml_alias',
             )
         if open_parts and open_parts[-1][2] is not None:
@@ -186,15 +213,17 @@ def _look_through(events, what, aliases):
 
 
 def _check_key(event, mapping, what):
-    """Refuse a key that the open mapping has already, and one that merges another mapping into it."""
+    """
+    Refuse a key that the open mapping has already, and one that merges another mapping into it.
+    """
     mapping[3] = not mapping[3]
     if mapping[3]:  # this is a value
         return
     key = getattr(event, 'value', None)
     if key in mapping[2] or (key == '<<' and event.implicit[0]):
         raise DocumentError(
-            f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line '
-            f'{event.start_mark.line + 1}; remove it',
+            f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line'
+            f' {event.start_mark.line + 1}; remove it',
             code='key_repeated',
         )
     mapping[2].update([key] if key is not None else [])
@@ -203,13 +232,16 @@ def _check_key(event, mapping, what):
 def _within_limits(number, limit, what, unit):
     if number > limit:
         raise DocumentError(
-            f'a {what} must not have more than {limit} {unit}, this one has more; is it the right file?',
+            f'a {what} must not have more than {limit} {unit}, this one has more; is it the right'
+            ' file?',
             code='document_limit',
         )
 
 
 def version_of(text: str) -> str:
-    """Return twelve characters that change whenever a document does: the beginning of its SHA-256."""
+    """
+    Return twelve characters that change whenever a document does: the beginning of its SHA-256.
+    """
     from hashlib import sha256
 
     return sha256(text.encode()).hexdigest()[:12]
@@ -221,7 +253,9 @@ ARRAYS_BASE, ARRAYS_RATIO = 64 << 20, 20
 
 def open_regular(path: str | PathLike[str]) -> BinaryIO:
     """
-    Open a regular file, or a link to one, for reading; a FIFO would block, and a device may never end.
+    Open a regular file, or a link to one, for reading.
+
+    A FIFO would block, and a device may never end.
 
     Raises
     ------
@@ -240,7 +274,9 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
 
 def load_arrays(data: bytes) -> Any:
     """
-    Return the arrays of an .npz archive as a context manager; each is decompressed at its first use.
+    Return the arrays of an .npz archive as a context manager.
+
+    Each is decompressed at its first use.
 
     Raises
     ------

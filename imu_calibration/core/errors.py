@@ -1,8 +1,9 @@
 """
 Errors that a user can act on: one line with the requirement, the value received and the remedy.
 
-The core states the requirement. If an input is missing, the error has a key of `ERROR_KEYS`, and the program that prints the error adds its
-local name: an option of the command line, a parameter or topic of a node, an argument in a notebook.
+The core states the requirement. If an input is missing, the error has a key of `ERROR_KEYS`, and
+the program that prints the error adds its local name: an option of the command line, a parameter or
+topic of a node, an argument in a notebook.
 """
 
 from collections.abc import Iterable
@@ -83,7 +84,11 @@ class DocumentError(InputError):
 
 
 def printable(text: str) -> str:
-    """Return a text with a question mark for each line end, control character, change of direction and undecodable byte."""
+    """
+    Return a text with a question mark for each unsafe character.
+
+    These are each line end, control character, change of direction and undecodable byte.
+    """
     return (
         text
         if text.isprintable() and '\ufffd' not in text
@@ -95,7 +100,11 @@ def printable(text: str) -> str:
 
 
 def shortened(text: str, length: int = 60) -> str:
-    """Return a text on one line without control characters, truncated at `length` characters: for received text, which may be anything."""
+    """
+    Return a text on one line without control characters, truncated at `length` characters.
+
+    For received text, which may be anything.
+    """
     text = printable(' '.join(text[: length * 4].split()))
     return text if len(text) <= length else f'{text[: length - 3]}...'
 
@@ -116,8 +125,8 @@ def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
     key : str or None
         A key of `ERROR_KEYS`.
     hints : dict
-        Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``, or for a key of `REMEDY_VERBS` a phrase with ``{}`` for the
-        text; a key without a local name adds nothing.
+        Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``, or for a key of
+        `REMEDY_VERBS` a phrase with ``{}`` for the text; a key without a local name adds nothing.
 
     """
     if key in REMEDY_VERBS:

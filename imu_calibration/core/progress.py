@@ -1,4 +1,8 @@
-"""Progress of long work and states for the user: the core reports phases, which have no effect without a listener."""
+"""
+Progress of long work and states for the user.
+
+The core reports phases, which have no effect without a listener.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -44,7 +48,9 @@ def report(phase: str, done: float = 0.0, total: float = 0.0) -> None:
 
 
 def counter(phase: str, total: float) -> Callable[[float], None]:
-    """Return a function of the amount done since its last call; a total of 0 suppresses the reports."""
+    """
+    Return a function of the amount done since its last call; a total of 0 suppresses the reports.
+    """
     done = 0.0
 
     def advance(amount):

@@ -10,7 +10,10 @@ from numpy.typing import ArrayLike
 from imu_calibration.core.errors import InputError
 
 FIRST_NS = 1_000_000_000
-"""Stamp of the first sample where times do not count from an epoch: a stamp of zero means unset in ROS."""
+"""
+Stamp of the first sample where times do not count from an epoch: a stamp of zero means unset in
+ROS.
+"""
 EPOCH = 1e8
 """s; larger times count from 1970."""
 
@@ -26,7 +29,11 @@ def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
 
 
 class AlignedArrays:
-    """Slicing and joining for dataclasses whose array fields share their first axis; a field may hold another such object, or None."""
+    """
+    Slicing and joining for dataclasses whose array fields share their first axis.
+
+    A field may hold another such object, or None.
+    """
 
     def __len__(self) -> int:
         return next(len(value) for value in vars(self).values() if isinstance(value, np.ndarray))
@@ -35,18 +42,25 @@ class AlignedArrays:
         """Return the rows at `index` (slice, mask or integer array)."""
         return type(self)(
             **{
-                name: value[index]
-                if isinstance(value, np.ndarray)
-                else value.select(index)
-                if isinstance(value, AlignedArrays)
-                else value
+                name: (
+                    value[index]
+                    if isinstance(value, np.ndarray)
+                    else value.select(index)
+                    if isinstance(value, AlignedArrays)
+                    else value
+                )
                 for name, value in vars(self).items()
             }
         )
 
     @classmethod
     def concatenate(cls, parts: Iterable[Any]) -> Any:
-        """Join `parts` in order; a field that one of them lacks is None, and fields that are not arrays are those of the first part."""
+        """
+        Join `parts` in order.
+
+        A field that one of them lacks is None, and fields that are not arrays are those of the
+        first part.
+        """
         parts = list(parts)
         return cls(
             **{name: _joined([getattr(part, name) for part in parts]) for name in vars(parts[0])}
@@ -116,7 +130,10 @@ class ImuSamples(AlignedArrays):
     frame_id: str = ''
     """Frame of the first message."""
     corrected: np.ndarray | None = None
-    """Corrected specific force and rate that belong to the readings, shape (n, 6), where a calibration is checked."""
+    """
+    Corrected specific force and rate that belong to the readings, shape (n, 6), where a calibration
+    is checked.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +151,9 @@ class JointSamples(AlignedArrays):
 
     @classmethod
     def of_angles(cls, stamp_ns: np.ndarray, angles: dict[str, np.ndarray]) -> 'JointSamples':
-        """Return the samples of joint angles by name, rad, each of shape (n,); without velocities."""
+        """
+        Return the samples of joint angles by name, rad, each of shape (n,); without velocities.
+        """
         position = np.column_stack(list(angles.values()))
         return cls(stamp_ns, position, np.full(position.shape, np.nan), tuple(angles))
 
@@ -148,7 +167,9 @@ class TemperatureSamples(AlignedArrays):
     temperature_c: np.ndarray
     """Temperature, degrees Celsius, shape (n,)."""
     branch: np.ndarray | None = None
-    """Thermal branch (`kinematics.signal_history`), in [-1, 1], shape (n,); None if not computed."""
+    """
+    Thermal branch (`kinematics.signal_history`), in [-1, 1], shape (n,); None if not computed.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,13 +234,14 @@ class SampleBlock:
             wanted = (n, 3) if name in ('force', 'rate') else (n,)
             if values.shape != wanted or n < 1:
                 raise InputError(
-                    f'{name} must have shape {str(wanted).replace("-1", "n")} with at least one row, got {values.shape}; '
-                    'correct the array',
+                    f'{name} must have shape {str(wanted).replace("-1", "n")} with at least one'
+                    f' row, got {values.shape}; correct the array',
                     code='array_shape',
                 )
         if not np.isfinite(time).all():
             raise InputError(
-                f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are not; remove these rows'
+                f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are'
+                ' not; remove these rows'
             )
         stamp_ns = stamps_of(time)
         return cls(
@@ -252,7 +274,11 @@ class NominalScaling:
 
 
 def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
-    """Return (start, stop) of each run of true flags, half open, shape (n_runs, 2); cut where `broken`, (n - 1,), separates neighbours."""
+    """
+    Return (start, stop) of each run of true flags, half open, shape (n_runs, 2).
+
+    Cut where `broken`, (n - 1,), separates neighbours.
+    """
     flags = np.asarray(flags, bool)
     joined = flags[1:] & flags[:-1] & np.logical_not(broken)
     starts, stops = flags & ~np.append(False, joined), flags & ~np.append(joined, False)
@@ -260,7 +286,12 @@ def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
 
 
 def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
-    """Return the smallest step from one reading to the next in each column, (n, k), above the share `least` of the largest, shape (k,)."""
+    """
+    Return the smallest step from one reading to the next in each column.
+
+    The columns are (n, k). The step is above the share `least` of the largest, and the result has
+    shape (k,).
+    """
     steps = []
     for column in readings.T:  # one at a time: the temporary arrays of a long recording are large
         step = np.abs(np.diff(column))
@@ -271,6 +302,10 @@ def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
 
 
 def rounding_variance(readings: np.ndarray) -> np.ndarray:
-    """Return the variance of rounding, ``step^2 / 12`` of the smallest step, of each column, shape (k,); 0 where none changes."""
+    """
+    Return the variance of rounding, ``step^2 / 12`` of the smallest step, of each column.
+
+    Shape (k,); 0 where none changes.
+    """
     step = smallest_step(readings, 1e-12)
     return np.where(np.isfinite(step), step, 0.0) ** 2 / 12

@@ -1,4 +1,6 @@
-"""Every adjustable number, declared once: YAML files, options and ROS parameters are made from here."""
+"""
+Every adjustable number, declared once: YAML files, options and ROS parameters are made from here.
+"""
 
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
@@ -27,9 +29,15 @@ class Setting:
     fixed: str = 'it is read at the start'
     """Why not, when it does not."""
     session: bool = False
-    """Whether it names an input of a session: settings files omit it, because they would override earlier options."""
+    """
+    Whether it names an input of a session: settings files omit it, because they would override
+    earlier options.
+    """
     path: bool = False
-    """Whether it is the path of a file; such a ROS parameter is read-only, because any participant can set writable ones."""
+    """
+    Whether it is the path of a file; such a ROS parameter is read-only, because any participant can
+    set writable ones.
+    """
     choices: tuple = ()
     """Permitted values; (): any."""
     name: str = ''
@@ -78,11 +86,13 @@ def _checked(declared, value):
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         if (low is not None and value < low) or (high is not None and value > high):
             raise InputError(
-                f"setting '{declared.name}' must lie in [{low}, {high}], got {value!r}; choose a value inside"
+                f"setting '{declared.name}' must lie in [{low}, {high}], got {value!r}; choose a"
+                ' value inside'
             )
     if declared.choices and value not in declared.choices:
         raise InputError(
-            f"setting '{declared.name}' must be one of {', '.join(declared.choices)}, got '{value}'; choose one",
+            f"setting '{declared.name}' must be one of {', '.join(declared.choices)}, got"
+            f" '{value}'; choose one",
             code='choice_unknown',
         )
     return value

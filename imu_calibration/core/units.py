@@ -1,4 +1,8 @@
-"""Constants, and customary units with as many digits as a standard deviation supports: for printed values, never for arithmetic."""
+"""
+Constants, and customary units with as many digits as a standard deviation supports.
+
+For printed values, never for arithmetic.
+"""
 
 import math
 
@@ -73,7 +77,11 @@ OTHER_UNITS = {'g': 1 / STANDARD_GRAVITY, 'mg': 1e3 / STANDARD_GRAVITY}
 
 
 def unit_of_rest(length: float) -> str:
-    """Return the unit other than m/s^2 in which a specific force at rest has this length, within a fifth; '' for none."""
+    """
+    Return the unit other than m/s^2 in which a force at rest has this length.
+
+    The length of the specific force agrees within a fifth. The result is '' for none.
+    """
     return next(
         (
             unit
@@ -86,15 +94,17 @@ def unit_of_rest(length: float) -> str:
 
 def for_people(unit: str, quantity: str = '') -> tuple[float, str]:
     """
-    Return (factor, unit) that converts an SI value to its customary unit; (1, unit) where that is the SI unit.
+    Return (factor, unit) that converts an SI value to its customary unit.
+
+    (1, unit) where that is the SI unit.
 
     Parameters
     ----------
     unit : str
         SI unit.
     quantity : str
-        `NOISE_QUANTITY`, or a parameter, whose name begins with its sensor: '(m/s^2)^-1' is mg/g² of an accelerometer and
-        % per g of a gyroscope.
+        `NOISE_QUANTITY`, or a parameter, whose name begins with its sensor: '(m/s^2)^-1' is mg/g²
+        of an accelerometer and % per g of a gyroscope.
 
     """
     kinds = (quantity.rpartition('.')[2], quantity.partition('.')[0], '')
@@ -107,7 +117,11 @@ def decimals(sd: float) -> int:
 
 
 def with_sd(value: float, sd: float) -> tuple[str, str]:
-    """Return value and standard deviation as text with no more digits than the standard deviation supports."""
+    """
+    Return value and standard deviation as text.
+
+    The text has no more digits than the standard deviation supports.
+    """
     if not np.isfinite(sd) or sd <= 0:
         return f'{value:.6g}', f'{sd:.2g}'
     places = decimals(sd)
@@ -115,7 +129,11 @@ def with_sd(value: float, sd: float) -> tuple[str, str]:
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """Return a number as plain text with `digits` significant digits; powers of ten only where zeros would not help."""
+    """
+    Return a number as plain text with `digits` significant digits.
+
+    Powers of ten only where zeros would not help.
+    """
     if value == 0 or not np.isfinite(value):
         return f'{value:g}'
     if not 1e-4 <= abs(value) < 1e6:
@@ -124,6 +142,10 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def error_text(value: float, unit: str, digits: int = 3) -> str:
-    """Return an error figure as it is printed everywhere: in the customary unit of an SI unit, with three significant digits."""
+    """
+    Return an error figure as it is printed everywhere.
+
+    In the customary unit of an SI unit, with three significant digits.
+    """
     factor, shown = for_people(unit)
     return f'{significant(value * factor, digits)} {shown}'

@@ -1,4 +1,6 @@
-"""The calibration: parameters with covariance, statuses, reasons, nominal values and plausible sizes."""
+"""
+The calibration: parameters with covariance, statuses, reasons, nominal values and plausible sizes.
+"""
 
 from __future__ import annotations
 
@@ -59,17 +61,24 @@ class Calibration:
     provenance: dict = field(default_factory=dict)
     """Software version, bag names and hashes, options."""
     decision: dict[str, str] = field(default_factory=dict)
-    """Sensor -> decision in the file (`decision.SensorDecision`); see `decisions` for a sensor without one."""
+    """
+    Sensor -> decision in the file (`decision.SensorDecision`); see `decisions` for a sensor without
+    one.
+    """
     decision_reasons: dict[str, str] = field(default_factory=dict)
     """Sensor -> the reason for the decision."""
     notes: tuple = ()
     """Parameters within tolerance, warnings, notes and next steps, a line each."""
     proof: dict = field(default_factory=dict)
     """
-    Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on held-out data; {}: never measured.
+    Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on
+    held-out data; {}: never measured.
     """
     covariance_terms: dict[str, np.ndarray] = field(default_factory=dict)
-    """Term (`estimation.solution`) -> its variance of each parameter, shape (n_params,); the sum is that of `covariance`."""
+    """
+    Term (`estimation.solution`) -> its variance of each parameter, shape (n_params,); the sum is
+    that of `covariance`.
+    """
     held_reason: dict[str, str] = field(default_factory=dict)
     """Held parameter -> the reason (`status.reasons_held`)."""
     judgement: Verdict | None = None
@@ -87,12 +96,20 @@ class Calibration:
 
     @property
     def common_scale(self) -> dict:
-        """{'sd', 'tolerance', 'status'} of the accelerometer's common scale by hand, {} where gravity counts as exact."""
+        """
+        {'sd', 'tolerance', 'status'} of the accelerometer's common scale by hand.
+
+        It is {} where gravity counts as exact.
+        """
         return self.statistics.get('by_hand', {}).get('common_scale', {})
 
     @property
     def own_sd(self) -> np.ndarray:
-        """Standard deviations without `common_scale`, relative to which the other parameters are judged, shape (n_params,)."""
+        """
+        Standard deviations without `common_scale`, shape (n_params,).
+
+        The other parameters are judged relative to them.
+        """
         common = self.covariance_terms.get(GRAVITY, 0.0) if self.common_scale else 0.0
         return np.sqrt(np.clip(np.diag(self.covariance) - common, 0, None))
 
@@ -108,7 +125,11 @@ class Calibration:
         return self.values[self.model.slices[sensor, effect]].reshape(found.shape)
 
     def of(self, sensor: str, role: Role) -> Any:
-        """Return the value of the effect in a place of a sensor's equation (`effects.base.Role`) in its documented shape, or None."""
+        """
+        Return the value of the effect in a place of a sensor's equation, or None.
+
+        The place is an `effects.base.Role`, and the value has its documented shape.
+        """
         return self.model.value(sensor, role, self.values)
 
     def has(self, sensor: str, effect: str) -> bool:
@@ -122,9 +143,12 @@ class Calibration:
 
     def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,), from the statistics.
+        Return (standard deviation of a sample, sd of window offsets and wander), each shape (3,).
 
-        With a noise density and a `period` (s), the sample sd is for that rate; else for the rate of the recording.
+        From the statistics.
+
+        With a noise density and a `period` (s), the sample sd is for that rate; else for the rate
+        of the recording.
         """
         found = self.statistics.get(sensor, {})
         white = np.asarray(found.get('noise_sd', [0.0] * 3), float)
@@ -141,7 +165,11 @@ class Calibration:
 
     @property
     def decisions(self) -> dict[str, SensorDecision]:
-        """Sensor -> decision: the more cautious of that in the file and that of the proof; UNPROVEN without both."""
+        """
+        Sensor -> decision: the more cautious of that in the file and that of the proof.
+
+        UNPROVEN without both.
+        """
         found = {}
         for sensor in SENSORS:
             known = [SensorDecision(self.decision[sensor])] if sensor in self.decision else []
@@ -154,7 +182,11 @@ class Calibration:
 
     @property
     def requested(self) -> dict[str, str]:
-        """Status of the requested parameters and of the common scale, by name; table, clock and the common arm are nuisances."""
+        """
+        Status of the requested parameters and of the common scale, by name.
+
+        Table, clock and the common arm are nuisances.
+        """
         nuisances = set(np.array(self.param_names)[~self.model.requested])
         return {
             name: status
@@ -176,7 +208,8 @@ class Calibration:
         Parameters
         ----------
         samples : ImuSamples, or array_like, shape (n, 3)
-            Readings of one IMU in order of time, or measured specific force in the sensor frame, m/s^2.
+            Readings of one IMU in order of time, or measured specific force in the sensor frame,
+            m/s^2.
         rate_s : array_like, shape (n, 3), optional
             Measured angular rate of the same samples, rad/s.
         time : array_like, shape (n,), optional
@@ -187,7 +220,8 @@ class Calibration:
         Returns
         -------
         ImuSamples, or (ndarray, ndarray)
-            Corrected specific force and rate, of the same type as the input; NaN where a reading cannot be corrected.
+            Corrected specific force and rate, of the same type as the input; NaN where a reading
+            cannot be corrected.
 
         """
         from imu_calibration.compensation.stream import compensate_readings
@@ -199,7 +233,10 @@ class Calibration:
         counts = ', '.join(
             f'{known.count(status)} {status}' for status in Status if status in known
         )
-        return f'<Calibration of {self.frame_id or "an IMU"}: {decisions_text(self.decisions)}, {counts}>'
+        return (
+            f'<Calibration of {self.frame_id or "an IMU"}: {decisions_text(self.decisions)},'
+            f' {counts}>'
+        )
 
     def __str__(self):
         rows = [PARAMETER_HEADINGS, *parameter_rows(self)]
@@ -252,16 +289,20 @@ def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
 
 
 READINGS = {'accelerometer': {'force'}, 'gyroscope': {'rate', 'angular acceleration'}}
-"""Sensor -> items of `ColumnGroup.uses` that are computed from its readings to correct the other sensor."""
+"""
+Sensor -> items of `ColumnGroup.uses` that are computed from its readings to correct the other
+sensor.
+"""
 
 
 def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibration:
     """
     Return a calibration without correction of the given sensors.
 
-    Biases and matrices of these sensors are their priors', with the priors' standard deviations, which the covariances of corrected
-    readings propagate; their other effects, except range limits, are removed. So are corrections of the other sensor that use their
-    readings: a g-sensitivity by the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
+    Biases and matrices of these sensors are their priors', with the priors' standard deviations,
+    which the covariances of corrected readings propagate; their other effects, except range limits,
+    are removed. So are corrections of the other sensor that use their readings: a g-sensitivity by
+    the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
     """
     model = calibration.model
     names = {
@@ -327,40 +368,67 @@ def listed(names: Sequence[str]) -> str:
 
 
 MIN_COEFFICIENT_SDS = 3.0
-"""Standard deviations by which one coefficient of an effect must differ from its prior for the effect to be added."""
+"""
+Standard deviations by which one coefficient of an effect must differ from its prior for the effect
+to be added.
+"""
 
 
 def one_significant(distance: np.ndarray, sd: np.ndarray) -> bool:
-    """Return whether one of several coefficients differs from its prior by more than MIN_COEFFICIENT_SDS standard deviations."""
+    """
+    Return whether one of several coefficients differs from its prior.
+
+    It must differ by more than MIN_COEFFICIENT_SDS standard deviations.
+    """
     return bool(np.any(np.abs(distance) > MIN_COEFFICIENT_SDS * sd))
 
 
 DIAGONAL = (0.5, 2.0)
 """Scale factors that an instrument in SI units can have: data sheets promise a few per cent."""
 OFF_DIAGONAL = 0.5
-"""Largest off-diagonal element: axes 30 degrees from orthogonal; the mount is part of the table description."""
+"""
+Largest off-diagonal element: axes 30 degrees from orthogonal; the mount is part of the table
+description.
+"""
 LARGEST_BIAS = {'accelerometer': 16 * STANDARD_GRAVITY, 'gyroscope': 4000 * DEG}
 """The largest full scales of such sensors, m/s^2 and rad/s."""
 
 
 def beyond_instruments(calibration: Calibration, sensor: str) -> str:
-    """Return which value of a sensor's matrix or bias belongs to no instrument, with the limit; '' where none does."""
+    """
+    Return which value of a sensor's matrix or bias belongs to no instrument, with the limit.
+
+    '' where none does.
+    """
     matrix, bias = (np.asarray(calibration.of(sensor, role)) for role in (Role.LINEAR, Role.OFFSET))
     diagonal, off = np.diag(matrix), np.abs(matrix - np.diag(np.diag(matrix))).max()
     for value in (diagonal.min(), diagonal.max()):
         if not DIAGONAL[0] <= value <= DIAGONAL[1]:
-            return f'a scale factor must be {DIAGONAL[0]:g} to {DIAGONAL[1]:g}, it is {significant(value)}'
+            return (
+                f'a scale factor must be {DIAGONAL[0]:g} to {DIAGONAL[1]:g}, it is'
+                f' {significant(value)}'
+            )
     if off > OFF_DIAGONAL:
-        return f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is {significant(off)}'
+        return (
+            f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is'
+            f' {significant(off)}'
+        )
     if np.abs(bias).max() > LARGEST_BIAS[sensor]:
-        return f'a bias must be within full scale ({significant(LARGEST_BIAS[sensor])} SI), it is {significant(np.abs(bias).max())}'
+        return (
+            f'a bias must be within full scale ({significant(LARGEST_BIAS[sensor])} SI), it is'
+            f' {significant(np.abs(bias).max())}'
+        )
     return ''
 
 
 def true_calibration(
     model: SensorModel, values: np.ndarray, frame_id: str, *, simulated: dict[str, Any]
 ) -> Calibration:
-    """Return the exact calibration of a simulated IMU; `simulated` describes the simulation in its provenance."""
+    """
+    Return the exact calibration of a simulated IMU.
+
+    `simulated` describes the simulation in its provenance.
+    """
     return Calibration(
         model.at(values),
         values,
@@ -374,17 +442,28 @@ def true_calibration(
 
 
 def beyond_known(share: float, section: str) -> str:
-    """Return the message for an effect that explains a share of the excess variance with a size that no known instrument has."""
+    """
+    Return the message for an effect of a size that no known instrument has.
+
+    The effect explains a share of the excess variance with this size.
+    """
     of_what = (
         'of tables: check the description of the table, the mount, the stamps'
         if section == 'reference'
         else 'of such sensors: check saturation, the mount, the scale'
     )
-    return f'explains {100 * share:.0f} % of the residual, but its size exceeds the literature values {of_what}'
+    return (
+        f'explains {100 * share:.0f} % of the residual, but its size exceeds the literature values'
+        f' {of_what}'
+    )
 
 
 def implausible(calibration: Calibration, sensor: str | None = None) -> list[str]:
-    """Return one line for each parameter group, of one sensor or of all, that is outside the range of all grades of instruments."""
+    """
+    Return one line for each parameter group that is out of range.
+
+    The groups are of one sensor or of all, and outside the range of all grades of instruments.
+    """
     lines = []
     for effect in calibration.model.effects:
         if sensor not in (None, effect.sensor):
@@ -394,7 +473,8 @@ def implausible(calibration: Calibration, sensor: str | None = None) -> list[str
             grade, largest, source = effect.plausible
             size = max(map(abs, amplitudes))
             lines.append(
-                f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, '
-                f'more than ten times the known values of {grade} instruments ({largest:.3g}; {source}): check units and axes'
+                f'{effect.sensor} {effect.name} reaches {size:.3g} {effect.unit_of(0)}, more than'
+                f' ten times the known values of {grade} instruments ({largest:.3g}; {source}):'
+                ' check units and axes'
             )
     return lines

@@ -22,12 +22,18 @@ from imu_calibration.kinematics.joint import JointNames
 CONDITION_LIMIT = 20.0
 """A sensor matrix with a larger condition number cannot belong to three independent axes."""
 MAX_VALUE = 1e9
-"""Values and standard deviations above this occur with no sensor in any unit; their products would overflow."""
+"""
+Values and standard deviations above this occur with no sensor in any unit; their products would
+overflow.
+"""
 RANGE_C = (-273.15, 1000.0)
 """Temperatures of a sensor, degrees Celsius."""
 MAX_DOCUMENT_JOINTS = 30
 COVARIANCE_ROUNDING = 1e-6
-"""Tolerance for rounding, relative to the variances, of the test that a covariance is positive semidefinite."""
+"""
+Tolerance for rounding, relative to the variances, of the test that a covariance is positive
+semidefinite.
+"""
 
 
 def _is_number(value, low=-MAX_VALUE, high=MAX_VALUE):
@@ -127,12 +133,17 @@ KEYS_OF_PARTS = {
     'notes': _is_list_of(_is_text),
     'proof': {sensor: _is_proof for sensor in SENSORS},
 }
-"""Part of a document -> requirement if present: a function, or a mapping with requirements of its entries."""
+"""
+Part of a document -> requirement if present: a function, or a mapping with requirements of its
+entries.
+"""
 
 
 def check_parts(document: Mapping, known: Mapping = KEYS_OF_PARTS, place: str = '') -> None:
     """
-    Refuse a document in which a part of `known` has another type or range; other parts are not checked.
+    Refuse a document in which a part of `known` has another type or range.
+
+    Other parts are not checked.
 
     Raises
     ------
@@ -153,8 +164,8 @@ def check_parts(document: Mapping, known: Mapping = KEYS_OF_PARTS, place: str = 
             check_parts(value or {}, wanted, f'{place}{name}.')
         elif not wanted(value):
             raise DocumentError(
-                f"'{place}{name}' must have the type and range of the format, got {shortened(repr(value))}; "
-                'correct the calibration file or calibrate again',
+                f"'{place}{name}' must have the type and range of the format, got"
+                f' {shortened(repr(value))}; correct the calibration file or calibrate again',
                 code='part_value',
             )
 
@@ -163,12 +174,14 @@ def check_numbers(calibration: Calibration) -> Calibration:
     """
     Return the calibration if its values are possible for an IMU.
 
-    In the result a sensor with an ill-conditioned matrix has nominal parameters and the decision `harms`; the other sensor can be used.
+    In the result a sensor with an ill-conditioned matrix has nominal parameters and the decision
+    `harms`; the other sensor can be used.
 
     Raises
     ------
     DocumentError
-        When a value is not finite, a covariance is not positive semidefinite, or both sensor matrices are ill-conditioned.
+        When a value is not finite, a covariance is not positive semidefinite, or both sensor
+        matrices are ill-conditioned.
 
     """
     values, covariance = calibration.values, calibration.covariance
@@ -186,7 +199,8 @@ def check_numbers(calibration: Calibration) -> Calibration:
         )
     if max(np.max(np.abs(values[~levels])), math.sqrt(np.max(np.abs(covariance)))) > MAX_VALUE:
         raise DocumentError(
-            f'values and standard deviations must be below {MAX_VALUE:g}, some are not; calibrate again',
+            f'values and standard deviations must be below {MAX_VALUE:g}, some are not; calibrate'
+            ' again',
             code='too_large',
         )
     _check_covariance(covariance)
@@ -214,8 +228,10 @@ def _without_ill_conditioned(calibration):
         sensor: float(np.linalg.cond(calibration.of(sensor, Role.LINEAR))) for sensor in SENSORS
     }
     wrong = {
-        sensor: f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its condition number is {number:.3g}; '
-        'calibrate again with more attitudes'
+        sensor: (
+            f'the {sensor} matrix must be well conditioned (below {CONDITION_LIMIT:g}), its'
+            f' condition number is {number:.3g}; calibrate again with more attitudes'
+        )
         for sensor, number in condition.items()
         if not number < CONDITION_LIMIT
     }
@@ -243,7 +259,8 @@ def _check_covariance(covariance):
         or np.linalg.eigvalsh(correlation)[0] < -COVARIANCE_ROUNDING
     ):
         raise DocumentError(
-            'the covariance must be symmetric and positive semidefinite, it is not; calibrate again',
+            'the covariance must be symmetric and positive semidefinite, it is not; calibrate'
+            ' again',
             code='not_a_covariance',
         )
 
@@ -266,8 +283,8 @@ def parts_of(document: Mapping) -> dict[str, Any]:
         _check_unit(entry.get('unit'), effect)
         if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
             raise DocumentError(
-                f"the standard deviations of '{effect.name}' must not be negative, some are or are no numbers; "
-                'calibrate again',
+                f"the standard deviations of '{effect.name}' must not be negative, some are or are"
+                ' no numbers; calibrate again',
                 code='negative_sd',
             )
     terms = document.get('covariance_terms') or {}
@@ -332,19 +349,23 @@ def _model(document):
                 )
             members[sensor].append(name)
             entries[sensor, name] = part[name]
-    return SensorModel(
-        *(tuple(members[s]) for s in SECTIONS),
-        joint_names=joint_names,
-        temperature_ref_c=float(document.get('reference_temperature_c', 25.0)),
-        catalogue=catalogue,
-    ), entries
+    return (
+        SensorModel(
+            *(tuple(members[s]) for s in SECTIONS),
+            joint_names=joint_names,
+            temperature_ref_c=float(document.get('reference_temperature_c', 25.0)),
+            catalogue=catalogue,
+        ),
+        entries,
+    )
 
 
 def _shaped(value, effect):
     array = np.asarray(value, float)
     if array.shape != effect.shape or np.asarray(value).dtype == bool:
         raise DocumentError(
-            f"'{effect.name}' must be numbers of shape {effect.shape}, got {array.shape}; correct the file",
+            f"'{effect.name}' must be numbers of shape {effect.shape}, got {array.shape}; correct"
+            ' the file',
             code='shape',
         )
     return array.ravel()
@@ -364,7 +385,8 @@ def _check_unit(found, effect):
     wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
     if found is not None and found != wanted:
         raise DocumentError(
-            f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct the file",
+            f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct"
+            ' the file',
             code='unit',
         )
 
@@ -384,15 +406,19 @@ def _centre(model, entries):
             or not np.all(np.isfinite(value))
         ):
             raise DocumentError(
-                f'the centre {shortened(repr(name))} must have one finite number for each column of its effect; '
-                'correct the calibration file',
+                f'the centre {shortened(repr(name))} must have one finite number for each column of'
+                ' its effect; correct the calibration file',
                 code='centre',
             )
     return found
 
 
 def _covariance(given, model, entries):
-    """Return the covariance in the model's order; without one, the diagonal of the standard deviations."""
+    """
+    Return the covariance in the model's order.
+
+    Without one, the diagonal of the standard deviations.
+    """
     if not given:
         return np.diag(
             np.concatenate([_shaped(entries[e.key]['sd'], e) for e in model.effects]) ** 2
@@ -425,15 +451,15 @@ def checked_tolerances(
     for section, entries in mapping.items():
         if section not in known or not isinstance(entries, dict):
             raise InputError(
-                f'a tolerance file must have the mappings {", ".join(SECTIONS)}, it has {shortened(repr(section))}: '
-                f'{shortened(repr(entries))}; correct it',
+                f'a tolerance file must have the mappings {", ".join(SECTIONS)}, it has'
+                f' {shortened(repr(section))}: {shortened(repr(entries))}; correct it',
                 code='tolerance_section',
             )
         for name, value in entries.items():
             if name not in known[section]:
                 raise InputError(
-                    f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is not one; '
-                    f'its effects are {", ".join(known[section])}',
+                    f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is'
+                    f' not one; its effects are {", ".join(known[section])}',
                     code='tolerance_name',
                 )
             if (
@@ -442,7 +468,8 @@ def checked_tolerances(
                 or not 0 < value < np.inf
             ):
                 raise InputError(
-                    f"the tolerance of '{name}' must be a number above zero, got {shortened(repr(value))}; correct it"
+                    f"the tolerance of '{name}' must be a number above zero, got"
+                    f' {shortened(repr(value))}; correct it'
                 )
     return mapping
 
@@ -536,8 +563,8 @@ def from_mapping(document: Any) -> Calibration:
     ) as error:
         text = str(error) if isinstance(error, InputError) else f'{type(error).__name__}: {error}'
         raise DocumentError(
-            f'a calibration document must have the parts of {CALIBRATION_FORMAT}, one is missing or has another shape '
-            f'({shortened(text, 200)}); calibrate again',
+            f'a calibration document must have the parts of {CALIBRATION_FORMAT}, one is missing or'
+            f' has another shape ({shortened(text, 200)}); calibrate again',
             code=getattr(error, 'code', '') or 'document_parts',
         ) from error
     return check_numbers(calibration)
@@ -547,14 +574,14 @@ def _check_format(found):
     name, _, number = str(found).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
         raise DocumentError(
-            f"a calibration document must have 'format: {CALIBRATION_FORMAT}', got {shortened(repr(found))}; "
-            "give a file written by 'imu_calibration calibrate'",
+            f"a calibration document must have 'format: {CALIBRATION_FORMAT}', got"
+            f" {shortened(repr(found))}; give a file written by 'imu_calibration calibrate'",
             code='document_format',
         )
     if int(number) > int(CALIBRATION_FORMAT.partition('/')[2]):
         raise DocumentError(
-            f"a calibration document must not be newer than '{CALIBRATION_FORMAT}', got {shortened(repr(found))}; "
-            'update imu_calibration',
+            f"a calibration document must not be newer than '{CALIBRATION_FORMAT}', got"
+            f' {shortened(repr(found))}; update imu_calibration',
             code='document_newer',
         )
 

@@ -29,7 +29,10 @@ class Row:
     unit: str
     """SI unit."""
     ratio: float | None
-    """Difference in combined standard deviations; None when either is held or fixed, or the uncertainty of neither is known."""
+    """
+    Difference in combined standard deviations; None when either is held or fixed, or the
+    uncertainty of neither is known.
+    """
 
 
 @dataclass(frozen=True)
@@ -39,13 +42,19 @@ class Comparison:
     rows: tuple
     """One Row per common parameter."""
     agree: bool | None
-    """Whether no group differs significantly, corrected for the number of groups; None when undecided."""
+    """
+    Whether no group differs significantly, corrected for the number of groups; None when undecided.
+    """
     lines: tuple
     """The verdict as text."""
 
 
 def moved_beyond_sd(first: Calibration, second: Calibration) -> bool:
-    """Return whether a later calibration differs: in its parameters, or in a value by more than the sd of the first."""
+    """
+    Return whether a later calibration differs.
+
+    In its parameters, or in a value by more than the sd of the first.
+    """
     if first.param_names != second.param_names:
         return True
     return bool(np.any(np.abs(second.values - first.values) > first.sd))
@@ -55,8 +64,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     """
     Compare two calibrations, group by group.
 
-    The squared distance of a group of k parameters, ``d' (P1 + P2)^-1 d``, is chi-square with k degrees of freedom when both are
-    honest; groups are judged at 1 % over all groups (Holm).
+    The squared distance of a group of k parameters, ``d' (P1 + P2)^-1 d``, is chi-square with k
+    degrees of freedom when both are honest; groups are judged at 1 % over all groups (Holm).
 
     Raises
     ------
@@ -67,7 +76,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     common = [name for name in first.param_names if name in second.param_names]
     if not common:
         raise InputError(
-            'two calibrations must have parameters in common, these have none; compare files of the same kind',
+            'two calibrations must have parameters in common, these have none; compare files of the'
+            ' same kind',
             code='nothing_in_common',
         )
     notes = _notes(first, second)
@@ -116,7 +126,8 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         )
     if len(parts) < 2:
         lines.append(
-            'agreement of the calibrations cannot be tested: the uncertainties of imported values are unknown'
+            'agreement of the calibrations cannot be tested: the uncertainties of imported values'
+            ' are unknown'
         )
         return Comparison(rows, None, tuple(lines))
     lines.append('the calibrations disagree' if rejected else 'the calibrations agree')

@@ -29,7 +29,10 @@ class SensorDecision(StrEnum):
     HELPS = 'helps'
     """The 95 % interval of error after / error before lies below 1."""
     UNPROVEN = 'unproven'
-    """The interval includes 1, there is none, or the held-out windows of the accelerometer have one attitude."""
+    """
+    The interval includes 1, there is none, or the held-out windows of the accelerometer have one
+    attitude.
+    """
     HARMS = 'harms'
     """The interval lies above 1."""
 
@@ -66,7 +69,12 @@ def decisions_text(decisions: Mapping[str, SensorDecision]) -> str:
 
 
 def reason_of(entry: Mapping | None) -> str:
-    """Return the reason for `decide`: errors before and after, the interval of their ratio, and where it does not help the likely cause."""
+    """
+    Return the reason for `decide`.
+
+    Errors before and after, the interval of their ratio, and where it does not help the likely
+    cause.
+    """
     if not entry or not entry['windows']:
         return NO_PROOF
     earlier = entry.get('earlier')
@@ -83,15 +91,16 @@ def reason_of(entry: Mapping | None) -> str:
         else _cause(entry)
     )
     return (
-        f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, after / before {ratio_text(entry)})'
-        f'{more}{cause}'
+        f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, after /'
+        f' before {ratio_text(entry)}){more}{cause}'
     )
 
 
 def worse_regimes(entry: Mapping) -> list[str]:
     """Return a line for each regime in which the error grows."""
     return [
-        f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name} (after / before {ratio_text(part)})'
+        f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name}'
+        f' (after / before {ratio_text(part)})'
         for name, part in harmed(entry).items()
     ]
 
@@ -120,7 +129,10 @@ def _cause(entry):
     late, share = entry.get('delay_s', 0.0), entry.get('delay_explains', 0.0)
     if abs(late) > MIN_NAMED_DELAY and share > DELAY_SHARE:
         side = 'late' if late > 0 else 'early'
-        return f'; likely cause: the readings are {abs(late) * 1e3:.0f} ms {side}, which the model does not include'
+        return (
+            f'; likely cause: the readings are {abs(late) * 1e3:.0f} ms {side}, which the model'
+            ' does not include'
+        )
     regimes = entry.get('regimes') or {}
     rest = regimes.get('rest', {'after': 0.0})
     if (
@@ -130,10 +142,19 @@ def _cause(entry):
     ):
         return '; likely cause: the bias has changed'
     if regimes and set(harmed(entry)) == {'angular acceleration'}:
-        return '; likely cause: the error correlates with angular acceleration: a lever arm, a varying lag, a loose mount'
+        return (
+            '; likely cause: the error correlates with angular acceleration: a lever arm, a varying'
+            ' lag, a loose mount'
+        )
     if entry['after'] < HARM * entry['before']:
-        return '; likely cause: the error is close to the smallest that this recording can show, or the parameters change during it'
-    return '; likely cause: parameters that this motion hardly determines are biased by an effect that the model does not include'
+        return (
+            '; likely cause: the error is close to the smallest that this recording can show, or'
+            ' the parameters change during it'
+        )
+    return (
+        '; likely cause: parameters that this motion hardly determines are biased by an effect that'
+        ' the model does not include'
+    )
 
 
 class StatementKind(StrEnum):
@@ -168,7 +189,9 @@ class Reason:
     """Sensors with parameters that it concerns."""
 
     def advice(self, hints: dict[str, str] | None = None) -> str:
-        """Return the next step with the local name of its key (`errors.with_hint`); empty for none."""
+        """
+        Return the next step with the local name of its key (`errors.with_hint`); empty for none.
+        """
         return with_hint(self.next, self.key, hints or {}) if self.next else ''
 
 
@@ -185,7 +208,10 @@ class Verdict:
     requested: int
     """Requested parameters."""
     limiting: tuple[str, float]
-    """The requested parameter with the largest sd in units of its tolerance, and that ratio; ('', 0) without any."""
+    """
+    The requested parameter with the largest sd in units of its tolerance, and that ratio; ('', 0)
+    without any.
+    """
 
     @property
     def word(self) -> SensorDecision:

@@ -47,7 +47,9 @@ def user_path(text: str) -> Path:
 
 
 def read_text(path: str | PathLike[str], what: str) -> str:
-    """Return the text of a file, or refuse in one line; not more than a document may hold is read."""
+    """
+    Return the text of a file, or refuse in one line; not more than a document may hold is read.
+    """
     try:
         with io.TextIOWrapper(open_regular(path), encoding='utf-8') as stream:
             text = stream.read(documents.MAX_DOCUMENT_CHARACTERS + 1)
@@ -75,7 +77,9 @@ def _why(error):
 
 
 def read_mapping(path: str | PathLike[str], what: str, checked: Callable | type = dict) -> Any:
-    """Return the mapping in a YAML file, as `checked` returns it; an error of either names the file."""
+    """
+    Return the mapping in a YAML file, as `checked` returns it; an error of either names the file.
+    """
     try:
         return checked(documents.from_text(read_text(path, what), what))
     except InputError as error:
@@ -95,7 +99,11 @@ def read_tolerances(path: Path, catalogue: Catalogue = CATALOGUE) -> dict[str, d
 
 
 def read_effects(path: str | PathLike[str]) -> Catalogue:
-    """Return the catalogue with the effects that a YAML file defines, a file of effects or a calibration."""
+    """
+    Return the catalogue with the effects that a YAML file defines.
+
+    The file is a file of effects or a calibration.
+    """
     return read_mapping(path, 'file of effects', CATALOGUE.with_document)
 
 
@@ -107,7 +115,8 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
     ----------
     path : path-like
     allow_xacro : bool
-        Expand a .xacro file. Its expressions can execute any Python code, so that expanding it is running a program.
+        Expand a .xacro file. Its expressions can execute any Python code, so that expanding it is
+        running a program.
 
     Raises
     ------
@@ -120,15 +129,16 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
         return text
     if not allow_xacro:
         raise InputError(
-            f'a .xacro file is a program and needs explicit permission to run, got {path}; expand it to a .urdf, or allow it '
-            'if you trust its author',
+            f'a .xacro file is a program and needs explicit permission to run, got {path}; expand'
+            ' it to a .urdf, or allow it if you trust its author',
             key='allow_xacro',
         )
     try:
         import xacro
     except ImportError as error:
         raise InputError(
-            "a .xacro file needs the package xacro, it is not installed; install 'imu_calibration[arm]'",
+            'a .xacro file needs the package xacro, it is not installed; install'
+            " 'imu_calibration[arm]'",
             code='package_missing',
         ) from error
     try:
@@ -136,8 +146,8 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
     except Exception as error:  # expressions in macros may raise any exception
         reason = shortened(str(error), 200) or type(error).__name__
         raise InputError(
-            f'the robot description {path} must be one that xacro can expand, it says: {reason}; correct it, or expand it '
-            'yourself to a .urdf',
+            f'the robot description {path} must be one that xacro can expand, it says: {reason};'
+            ' correct it, or expand it yourself to a .urdf',
             code='xacro_fails',
         ) from error
 
@@ -197,14 +207,20 @@ def write_text(path: str | PathLike[str], text: str) -> None:
 
 
 def write_texts(folder: str | PathLike[str], texts: Mapping[str, str]) -> None:
-    """Write {name: text} into a folder, which is made; raises as `make_folder` and `write_whole`."""
+    """
+    Write {name: text} into a folder, which is made; raises as `make_folder` and `write_whole`.
+    """
     place = make_folder(folder)
     for name, text in texts.items():
         write_text(place / name, text)
 
 
 def hash_of(path: str | PathLike[str]) -> str:
-    """Return the SHA-256 of a file, or of the data files of a bag in order of name, as hexadecimal digits."""
+    """
+    Return the SHA-256 of a file, or of the data files of a bag in order of name.
+
+    As hexadecimal digits.
+    """
     path = Path(path)
     files = (
         sorted(f for f in path.rglob('*') if f.is_file() and f.name != 'metadata.yaml')
@@ -221,7 +237,11 @@ def hash_of(path: str | PathLike[str]) -> str:
 
 @lru_cache
 def _hash_of_unchanged(files):
-    """Return the hash of (path, size, time of the last change, inode) of each file: a bag is read once in a process."""
+    """
+    Return the hash of (path, size, time of the last change, inode) of each file.
+
+    A bag is read once in a process.
+    """
     digest = hashlib.sha256()
     for file, *_ in files:
         with open(file, 'rb') as stream:
@@ -238,7 +258,8 @@ def write_whole(path: str | PathLike[str], data: bytes, to_disk: bool = True) ->
     path : path-like
     data : bytes
     to_disk : bool
-        Wait until the data are on the disk, so that they survive a power failure; seconds on a busy disk.
+        Wait until the data are on the disk, so that they survive a power failure; seconds on a busy
+        disk.
 
     Raises
     ------
@@ -301,7 +322,11 @@ def put_aside(path: str | PathLike[str]) -> Path:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove the temporary files of processes that were killed while they wrote a file; errors are ignored."""
+    """
+    Remove the temporary files of processes that were killed while they wrote a file.
+
+    Errors are ignored.
+    """
     with suppress(OSError, ValueError):
         for found in path.parent.glob(f'.[0-9]*.{_ending(path)}'):
             number = found.name.split('.')[1]
@@ -325,8 +350,13 @@ def _ending(path: Path) -> str:
 
 @contextmanager
 def _beside(path):
-    """Yield an unpredictable name in the same folder for a new file; an error becomes one line, and that file is removed."""
-    # A link placed under a predictable name would be followed; a suffix to a name of the longest length would exceed the limit.
+    """
+    Yield an unpredictable name in the same folder for a new file.
+
+    An error becomes one line, and that file is removed.
+    """
+    # A link placed under a predictable name would be followed; a suffix to a name of the longest
+    # length would exceed the limit.
     beside = path.parent / f'.{os.getpid()}.{token_hex(8)}.{_ending(path)}'
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

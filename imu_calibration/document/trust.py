@@ -31,9 +31,15 @@ AGAIN = (
     '; it is proven for its last third only, and the error returns where the effect starts again'
 )
 LAST_SHARE = 2.0 / 3.0
-"""Effects that have settled are proven on the windows after this share of the recording: the value at its end is applied."""
+"""
+Effects that have settled are proven on the windows after this share of the recording: the value at
+its end is applied.
+"""
 SETTLED = 0.1
-"""An effect in time has settled if a recording of twice the length would change it by at most this share more: 2.3 time constants."""
+"""
+An effect in time has settled if a recording of twice the length would change it by at most this
+share more: 2.3 time constants.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +49,10 @@ class Uncorrected:
     centre: Centre = field(default_factory=dict)
     """Column group -> values of its columns at which the effect is applied."""
     sizes: tuple[dict[str, Any], ...] = ()
-    """Entries of the statistics: effect, sensor, 'applied' (`END` or `MEAN`), rms of the rest on each axis and its unit."""
+    """
+    Entries of the statistics: effect, sensor, 'applied' (`END` or `MEAN`), rms of the rest on each
+    axis and its unit.
+    """
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the part of a document's statistics."""
@@ -102,7 +111,11 @@ def uncorrected_on_table(
 
 
 def _moved(effect, columns, change):
-    """Return columns at parameters that differ by `change` from the point of the columns: of a time constant, to first order."""
+    """
+    Return columns at parameters that differ by `change` from the point of the columns.
+
+    Of a time constant, to first order.
+    """
     if not effect.time_constant:
         return columns
     plain, slopes = np.split(columns, 2)
@@ -112,7 +125,9 @@ def _moved(effect, columns, change):
 def uncorrected_in_time(
     model: SensorModel, values: np.ndarray, times: Sequence[float] | np.ndarray, *, end: float
 ) -> Uncorrected:
-    """Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`."""
+    """
+    Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`.
+    """
     centre, sizes = {}, []
     for effect in not_applied(model):
         at_end, at_times = has_settled(model, effect, end), columns_at(model, effect, times)
@@ -133,7 +148,11 @@ def end_of(accumulator: Accumulator) -> float:
 
 
 def judged_from_of(model: SensorModel, end: float) -> float:
-    """Return the time from which windows are judged, s: the last third until `end` where an effect of the model has settled."""
+    """
+    Return the time from which windows are judged, s.
+
+    The last third until `end` where an effect of the model has settled.
+    """
     return (
         LAST_SHARE * end
         if any(has_settled(model, effect, end) for effect in not_applied(model))
@@ -143,10 +162,13 @@ def judged_from_of(model: SensorModel, end: float) -> float:
 
 def has_settled(model: SensorModel, effect: Effect, end: float) -> bool:
     """
-    Return whether an effect in time has settled at the end of a recording, s, at the point of the model.
+    Return whether an effect in time has settled at the end of a recording, s.
 
-    Then its value at the end is applied: it holds until the next start. Otherwise the mean is applied, with the least error in a recording
-    that repeats the drift; a drift that continues exceeds either.
+    The effect is evaluated at the point of the model.
+
+    Then its value at the end is applied: it holds until the next start. Otherwise the mean is
+    applied, with the least error in a recording that repeats the drift; a drift that continues
+    exceeds either.
     """
     if not in_time(effect):
         return False
@@ -181,13 +203,18 @@ def _size(effect, rms, at_end):
 
 
 def uncorrected_lines(statistics: Mapping[str, Any]) -> list[str]:
-    """Return a line for each effect that compensation replaces by a constant, from the statistics of a document."""
+    """
+    Return a line for each effect that compensation replaces by a constant.
+
+    From the statistics of a document.
+    """
     lines = []
     for entry in statistics.get('uncorrected') or ():
         size = error_text(max(entry['rms']), entry['unit'])
         lines.append(
-            f'{entry["effect"]} is not corrected: the {entry["sensor"]} bias has its value at the {entry["applied"]}, '
-            f'with an error of {size} rms during the recording{AGAIN if entry["applied"] == END else ""}'
+            f'{entry["effect"]} is not corrected: the {entry["sensor"]} bias has its value at the'
+            f' {entry["applied"]}, with an error of {size} rms during the'
+            f' recording{AGAIN if entry["applied"] == END else ""}'
         )
     return lines
 
@@ -216,10 +243,11 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     """
     Return the part of a calibration that is applied.
 
-    A sensor with the decision `helps` is always corrected. Offline `unproven` is corrected with a caution, and `harms` only with the user's
-    consent. Live `unproven` is corrected only with consent, and `harms` never. By hand the accelerometer defines the axes of the gyroscope,
-    so that the gyroscope is not corrected without it. A sensor with implausible values is never corrected, nor, live, an unproven sensor
-    with most of its parameters undetermined.
+    A sensor with the decision `helps` is always corrected. Offline `unproven` is corrected with a
+    caution, and `harms` only with the user's consent. Live `unproven` is corrected only with
+    consent, and `harms` never. By hand the accelerometer defines the axes of the gyroscope, so that
+    the gyroscope is not corrected without it. A sensor with implausible values is never corrected,
+    nor, live, an unproven sensor with most of its parameters undetermined.
 
     Parameters
     ----------
@@ -232,7 +260,8 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
     Raises
     ------
     DocumentError
-        When no sensor is corrected (code `no_sensor_helps`); the key is `anyway` where consent would change that.
+        When no sensor is corrected (code `no_sensor_helps`); the key is `anyway` where consent
+        would change that.
 
     """
     words, refused = calibration.decisions, refused_sensors(calibration, anyway=anyway, live=live)
@@ -296,7 +325,10 @@ def _mostly_undetermined(calibration, sensor):
 
 def _text(calibration, sensor):
     """Return the decision on a sensor with its reason."""
-    return f'{calibration.decisions[sensor]}: {calibration.decision_reasons.get(sensor) or reason_of(calibration.proof.get(sensor))}'
+    return (
+        f'{calibration.decisions[sensor]}:'
+        f' {calibration.decision_reasons.get(sensor) or reason_of(calibration.proof.get(sensor))}'
+    )
 
 
 def usage(calibration: Calibration) -> str:
@@ -309,7 +341,9 @@ def usage(calibration: Calibration) -> str:
 
 
 def caveats(calibration: Calibration) -> list[str]:
-    """Return the caveats for a user of the calibration in addition to the decisions, a line each."""
+    """
+    Return the caveats for a user of the calibration in addition to the decisions, a line each.
+    """
     return uncorrected_lines(calibration.statistics) + (
         [text] if (text := missing(calibration)) else []
     )
@@ -328,8 +362,9 @@ def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Ca
     """
     Return the calibration with the white noise of noise.yaml in its statistics.
 
-    `noise_density` (per root hertz, by axis) gives the standard deviation of a sample at any rate; `noise_sd` is that at the rate at
-    which the noise was recorded. Compensation and its covariances read both through `Calibration.noise`.
+    `noise_density` (per root hertz, by axis) gives the standard deviation of a sample at any rate;
+    `noise_sd` is that at the rate at which the noise was recorded. Compensation and its covariances
+    read both through `Calibration.noise`.
     """
     statistics = dict(calibration.statistics)
     for sensor in SENSORS:

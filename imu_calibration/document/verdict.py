@@ -35,7 +35,10 @@ from imu_calibration.preprocessing.window import UnusedReason
 from imu_calibration.selection.stamp_jitter import jitter_text
 
 MAX_MISFIT_RATIO = 10.0
-"""Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit the model."""
+"""
+Moving windows that scatter by more than this factor in variance beyond the noise at rest do not fit
+the model.
+"""
 NOTED_MISFIT = 2.0
 """From this factor on the misfit is worth a note."""
 LOST_SHARE = 0.05
@@ -51,7 +54,11 @@ def _worse(calibration):
 
 
 def _unused_rests(calibration):
-    """Return a warning about rests without any static window: noise and sds are then estimated only from motion."""
+    """
+    Return a warning about rests without any static window.
+
+    Noise and sds are then estimated only from motion.
+    """
     counts = calibration.statistics.get('stream') or {}
     unused = {
         reason: counts.get(reason, 0)
@@ -66,9 +73,10 @@ def _unused_rests(calibration):
     return [
         Reason(
             WARNING,
-            f'the recording has {total} samples at rest, but no static window is used '
-            f'({", ".join(f"{count} {reason}" for reason, count in unused.items() if count)}): noise and bias changes '
-            'come from motion only, and the standard deviations of the biases may be too small',
+            f'the recording has {total} samples at rest, but no static window is used'
+            f' ({", ".join(f"{count} {reason}" for reason, count in unused.items() if count)}):'
+            ' noise and bias changes come from motion only, and the standard deviations of the'
+            ' biases may be too small',
             'reduce static_minimum, or increase quiet_ratio',
             key='setting',
         )
@@ -82,13 +90,18 @@ CHANGES = {
         'diagnose',
     ),
     'denied': (
-        'not added to the model, because parts of the recording disagree, no coefficient is significant or the size is implausible: '
-        '{}; the standard deviations allow for it',
+        (
+            'not added to the model, because parts of the recording disagree, no coefficient is'
+            ' significant or the size is implausible: {}; the standard deviations allow for it'
+        ),
         'see the evidence',
         'diagnose',
     ),
     'lacking': (
-        'the motion demands {}, which cannot join the model, since not all of it is kept: the standard deviations allow for it',
+        (
+            'the motion demands {}, which cannot join the model, since not all of it is kept: the'
+            ' standard deviations allow for it'
+        ),
         'calibrate the recording offline',
         None,
     ),
@@ -98,7 +111,10 @@ CHANGES = {
         None,
     ),
 }
-"""Entry of the statistics -> (note with the names, next step, its key) on a change of the model by the recording."""
+"""
+Entry of the statistics -> (note with the names, next step, its key) on a change of the model by the
+recording.
+"""
 
 
 def _adopted(calibration):
@@ -159,11 +175,19 @@ def _with_size(calibration, name):
         np.argmax(np.abs(calibration.values[part]) / np.maximum(calibration.sd[part], 1e-300))
     )
     factor, unit = for_people(effect.unit_of(best - part.start), calibration.param_names[best])
-    return f'{name} ({significant(calibration.values[best] * factor)} ± {significant(calibration.sd[best] * factor, 2)} {unit})'
+    return (
+        f'{name} ({significant(calibration.values[best] * factor)} ±'
+        f' {significant(calibration.sd[best] * factor, 2)} {unit})'
+    )
 
 
 def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
-    """Return kind of window -> ratio of the residual variance of the sensor to that of its noise and of errors of the stamps."""
+    """
+    Return kind of window -> ratio of residual variance to expected variance.
+
+    It is the ratio of the residual variance of the sensor to that of its noise and of errors of the
+    stamps.
+    """
     chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
     by_stamps = (
         (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
@@ -191,7 +215,9 @@ def helps_everywhere(entry: Mapping | None) -> bool:
 
 def misfits(calibration: Calibration) -> list[Reason]:
     """
-    Return the residuals in motion above the noise at rest: notes, or warnings where they are far above; diagnoses use the same test.
+    Return the residuals in motion above the noise at rest.
+
+    Notes, or warnings where they are far above; diagnoses use the same test.
 
     Without a rest they are compared with their slow part; lags are visible in the fast part.
     """
@@ -222,7 +248,9 @@ def misfits(calibration: Calibration) -> list[Reason]:
 
 
 def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
-    """Return notes on biases that move from window to window by more than the tolerance on their mean."""
+    """
+    Return notes on biases that move from window to window by more than the tolerance on their mean.
+    """
     reasons, by_hand = [], calibration.gauge.get('axes') == HAND_AXES
     for sensor in SENSORS:
         part = calibration.model.part(sensor, Role.OFFSET)
@@ -232,10 +260,11 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
             reasons.append(
                 Reason(
                     NOTE,
-                    f'the {sensor} reads the same motion differently from window to window by '
-                    f'{significant(scatter * factor, 2)} {unit}, more than '
-                    'the tolerance on its bias: the mean is well determined, the present bias is not',
-                    f'record after warm-up{"" if by_hand else ", on a rigid table"}, or estimate the bias in use',
+                    f'the {sensor} reads the same motion differently from window to window by'
+                    f' {significant(scatter * factor, 2)} {unit}, more than the tolerance on its'
+                    ' bias: the mean is well determined, the present bias is not',
+                    f'record after warm-up{"" if by_hand else ", on a rigid table"}, or estimate'
+                    ' the bias in use',
                     sensors=(sensor,),
                 )
             )
@@ -282,9 +311,10 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     """
     Return the Verdict on a calibration.
 
-    The decision follows from the proof (`decision.decide`); `helps` without rests and with large residuals becomes `unproven`. Warnings are
-    values beyond any known instrument, residuals in motion far above the noise at rest, known causes that are not in the model, and a
-    sensor without any determined parameter.
+    The decision follows from the proof (`decision.decide`); `helps` without rests and with large
+    residuals becomes `unproven`. Warnings are values beyond any known instrument, residuals in
+    motion far above the noise at rest, known causes that are not in the model, and a sensor without
+    any determined parameter.
 
     Parameters
     ----------
@@ -336,7 +366,9 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
 
 
 def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
-    """Return the calibration with its verdict, which its document contains; arguments as in `judge`."""
+    """
+    Return the calibration with its verdict, which its document contains; arguments as in `judge`.
+    """
     found = judge(calibration, tolerances)
     counts = {
         'requested': found.requested,
@@ -375,12 +407,19 @@ def _decision(calibration, sensor):
 
 
 def _reason(calibration, sensor):
-    more = '; unproven, because stamps that are late by a period of this motion without rests would give the same errors'
+    more = (
+        '; unproven, because stamps that are late by a period of this motion without rests would'
+        ' give the same errors'
+    )
     return reason_of(calibration.proof.get(sensor)) + more * _periodic(calibration, sensor)
 
 
 def _periodic(calibration, sensor):
-    """Return whether held-out windows may repeat an error of the clock: no rests, and residuals far above the noise."""
+    """
+    Return whether held-out windows may repeat an error of the clock.
+
+    No rests, and residuals far above the noise.
+    """
     return not rested(calibration) and any(
         ratio > MAX_MISFIT_RATIO for ratio in misfit_ratios(calibration, sensor).values()
     )
@@ -410,7 +449,9 @@ def _implausible(calibration):
 
 
 def _whose(sections):
-    """Return the sensors that something of these sections concerns; table and clock concern both."""
+    """
+    Return the sensors that something of these sections concerns; table and clock concern both.
+    """
     found = set(sections)
     return (
         tuple(sensor for sensor in SENSORS if sensor in found) if found <= set(SENSORS) else SENSORS
@@ -472,7 +513,10 @@ def _undetermined(calibration):
         names = [name for name, found in calibration.requested.items() if found == status]
         if COMMON_SCALE in names:
             names.remove(COMMON_SCALE)
-            what = f'{COMMON_SCALE}: sd {100 * calibration.common_scale["sd"]:.2g} %, that of gravity; it is not part of the other sds'
+            what = (
+                f'{COMMON_SCALE}: sd {100 * calibration.common_scale["sd"]:.2g} %, that of gravity;'
+                ' it is not part of the other sds'
+            )
             reasons.append(
                 Reason(
                     PARAMETERS, what, 'give the local gravity', key='gravity', sensors=SENSORS[:1]
@@ -491,7 +535,9 @@ def _undetermined(calibration):
 
 
 def _by_need(calibration, names):
-    """Return {motion: names}: each name with the motion of the weak direction in which it weighs most."""
+    """
+    Return {motion: names}: each name with the motion of the weak direction in which it weighs most.
+    """
     found = {}
     for name in names:
         weights = [

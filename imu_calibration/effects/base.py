@@ -1,4 +1,6 @@
-"""An effect: one physical cause of sensor output, its columns, its coefficients and their derivatives."""
+"""
+An effect: one physical cause of sensor output, its columns, its coefficients and their derivatives.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +31,10 @@ PRODUCTS = tuple(f'{row}_{pair}' for row in AXES for pair in ('xy', 'yz', 'xz'))
 
 class Role(Enum):
     """
-    Place of an effect in ``output = limit(offset + linear @ (input + lever_matrix @ (arm + arms_i)) + cross @ force + terms)``.
+    Place of an effect in the equation of a sensor's output.
+
+    The equation is ``output = limit(offset + linear @ (input + lever_matrix @ (arm + arms_i)) +
+    cross @ force + terms)``.
 
     A model has at most one effect of a sensor in each place, but any number of terms.
     """
@@ -90,13 +95,15 @@ class Effect:
     """
     One physical cause of sensor output.
 
-    A *sensor* effect acts on one sensor. It has column groups (`effects.expressions`) and computes, from the values of all
-    parameters of the sensor, the coefficients of these columns, so that ``output = sum(columns @ coefficients)``. Products
-    of parameters (matrix times arm) become coefficients of columns of their own; a triangular factor of the columns is
-    then an exact summary of the data.
+    A *sensor* effect acts on one sensor. It has column groups (`effects.expressions`) and computes,
+    from the values of all parameters of the sensor, the coefficients of these columns, so that
+    ``output = sum(columns @ coefficients)``. Products of parameters (matrix times arm) become
+    coefficients of columns of their own; a triangular factor of the columns is then an exact
+    summary of the data.
 
-    A *reference* effect (and a sensor's own lag) instead changes the motion that the sensor is thought to have felt: `warp`
-    gives another table and motion, or the delays of a lag, over which the reference is the weighted mean.
+    A *reference* effect (and a sensor's own lag) instead changes the motion that the sensor is
+    thought to have felt: `warp` gives another table and motion, or the delays of a lag, over which
+    the reference is the weighted mean.
 
     All properties of an effect are fields here; none is derived from its name.
     """
@@ -112,11 +119,17 @@ class Effect:
     unit: str | tuple
     """SI unit of every component (or a tuple, one each)."""
     tolerance: float
-    """Standard deviation up to which a component counts as determined; a user's file of tolerances overrides it."""
+    """
+    Standard deviation up to which a component counts as determined; a user's file of tolerances
+    overrides it.
+    """
     tolerance_reason: str = ''
     """Source of the tolerance; printed with it in config/tolerances.yaml."""
     prior: Any = 0.0
-    """Prior value of every component (or a sequence, one each); where columns depend on it they are first linearised here."""
+    """
+    Prior value of every component (or a sequence, one each); where columns depend on it they are
+    first linearised here.
+    """
     prior_sd: Any
     """Standard deviation of the prior (or a sequence, one each)."""
     explanation: str
@@ -126,31 +139,52 @@ class Effect:
     motion: tuple
     """Standard motions (`estimation.observability`) that show it."""
     compensation: str = 'exact'
-    """'exact' (inverted), 'flagged' (cannot be inverted, output marked) or 'none' (belongs to the table or the session)."""
+    """
+    'exact' (inverted), 'flagged' (cannot be inverted, output marked) or 'none' (belongs to the
+    table or the session).
+    """
     role: Role = Role.TERM
     """Its place in the sensor's equation."""
     groups: tuple = ()
     """The ColumnGroups that its coefficients multiply."""
     group_sensors: tuple = ()
-    """Sensor that each of the groups belongs to, where they differ; empty: all sensors that it acts on."""
+    """
+    Sensor that each of the groups belongs to, where they differ; empty: all sensors that it acts
+    on.
+    """
     coefficients: Callable | None = None
-    """``coefficients(effect, values, point) -> {group name: (n_columns, 3)}`` with `values` as `Values`."""
+    """
+    ``coefficients(effect, values, point) -> {group name: (n_columns, 3)}`` with `values` as
+    `Values`.
+    """
     warp: Callable | Lag | None = None
     """A `Lag`, or ``warp(table, motion, values) -> (table, motion)``."""
     derivative: Callable | None = None
-    """``derivative(ref) -> (n, 3 size)``: the same as the central difference of `warp` for the true input, where it has a closed form."""
+    """
+    ``derivative(ref) -> (n, 3 size)``: the same as the central difference of `warp` for the true
+    input, where it has a closed form.
+    """
     acts_on: tuple = SENSORS
     """Sensors that a warp concerns."""
     needs: tuple = ()
-    """Data it needs: 'temperature', 'cooling' (it turned), 'vibration' (now more, now less), 'rotation', 'dynamic', 'joints'."""
+    """
+    Data it needs: 'temperature', 'cooling' (it turned), 'vibration' (now more, now less),
+    'rotation', 'dynamic', 'joints'.
+    """
     step: float = 1e-4
     """Step of the central difference that turns a warp into columns."""
     plausible: tuple = ()
     """(Grade of instruments, largest plausible size in `unit`, source); empty: unknown."""
     time_constant: bool = False
-    """Whether the last component is a time constant, s, on which the columns depend, and all preceding ones are amplitudes."""
+    """
+    Whether the last component is a time constant, s, on which the columns depend, and all preceding
+    ones are amplitudes.
+    """
     located: bool = False
-    """Whether the last component is the time of a step, s: a search estimates it, least squares does not."""
+    """
+    Whether the last component is the time of a step, s: a search estimates it, least squares does
+    not.
+    """
     sudden: bool = False
     """Whether its value may change at one moment."""
     nonnegative: bool = False
@@ -158,19 +192,31 @@ class Effect:
     smooth: bool = False
     """Whether it changes smoothly in time: any other smooth curve resembles it."""
     against: tuple = ()
-    """Abscissa of its residual plot: 'time', 'temperature', 'force', 'rate', 'angle'; empty: its own signal."""
+    """
+    Abscissa of its residual plot: 'time', 'temperature', 'force', 'rate', 'angle'; empty: its own
+    signal.
+    """
     contained_in: str = ''
     """Effect of the same sensor of which it is a special case."""
     known_size: bool = False
-    """Whether the plausible size is the true one, as for the Earth's rate: a larger value is no explanation."""
+    """
+    Whether the plausible size is the true one, as for the Earth's rate: a larger value is no
+    explanation.
+    """
     moot: Callable | None = None
     """``moot(table) -> (why, what to do) or None``: why it cannot be tested with this table."""
     in_reference: bool = False
-    """Whether a document lists an effect of a sensor under `reference`: it belongs to the table and the session."""
+    """
+    Whether a document lists an effect of a sensor under `reference`: it belongs to the table and
+    the session.
+    """
     nuisance: bool = False
     """Whether it is a nuisance parameter, estimated but not requested."""
     definition: dict | None = None
-    """The plain data that it was made of (`effects.catalogue`), which may travel in documents; None for the catalogue's own."""
+    """
+    The plain data that it was made of (`effects.catalogue`), which may travel in documents; None
+    for the catalogue's own.
+    """
 
     @property
     def key(self) -> tuple[str, str]:
@@ -226,7 +272,11 @@ class Effect:
         return self.plausible[1] if self.plausible else np.inf
 
     def surpasses(self, amplitudes: np.ndarray, sd: np.ndarray | float = 0.0) -> bool:
-        """Return whether amplitudes exceed those of any known instrument by more than three standard deviations."""
+        """
+        Return whether amplitudes exceed the amplitudes of any known instrument.
+
+        They must exceed them by more than three standard deviations.
+        """
         return bool(np.max(np.abs(amplitudes) - 3 * sd) > IMPLAUSIBLE_RATIO * self.largest)
 
     def prior_values(self) -> np.ndarray:
@@ -242,7 +292,11 @@ class Effect:
         return values[: self.n_amplitudes]
 
     def at_time_constant(self, constant: float) -> np.ndarray:
-        """Return the prior values with another time constant, shape (size,): a point of linearisation of a bank."""
+        """
+        Return the prior values with another time constant, shape (size,).
+
+        A point of linearisation of a bank.
+        """
         return np.append(self.prior_values()[:-1], constant)
 
     def param_names(self) -> list[str]:
@@ -318,7 +372,10 @@ LOAD = {
         'load_turns_rate', tuple(f'f_{a} * w_{b}' for a in AXES for b in AXES)
     ),
 }
-"""Columns of a mount that bends with load: force and rate are measured in a frame that rotates with the force."""
+"""
+Columns of a mount that bends with load: force and rate are measured in a frame that rotates with
+the force.
+"""
 CHANGE = {
     'accelerometer': ColumnGroup(
         'force_change', ('f_y * w_z - f_z * w_y', 'f_z * w_x - f_x * w_z', 'f_x * w_y - f_y * w_x')
@@ -334,9 +391,12 @@ WARM_UP = {
 
 def power_coefficients(axes: np.ndarray, products: Sequence[tuple[int, ...]]) -> np.ndarray:
     """
-    Return the coefficients of products of k components of v that give (u_i . v)^k for each row u_i of `axes`, shape (n_products, 3).
+    Return the coefficients of products of k components of v that give (u_i . v)^k.
 
-    The coefficient of ``v_a v_b ...`` is ``u_a u_b ...`` times the number of orders of its factors (multinomial theorem).
+    There is one sum for each row u_i of `axes`, and the result has shape (n_products, 3).
+
+    The coefficient of ``v_a v_b ...`` is ``u_a u_b ...`` times the number of orders of its factors
+    (multinomial theorem).
     """
     return np.stack(
         [
@@ -347,7 +407,11 @@ def power_coefficients(axes: np.ndarray, products: Sequence[tuple[int, ...]]) ->
 
 
 def signed_coefficients(axes: np.ndarray) -> np.ndarray:
-    """Return the coefficients of `SIGNED` that give |u_i . v| for each row u_i of `axes`, shape (9, 3)."""
+    """
+    Return the coefficients of `SIGNED` that give |u_i . v| for each row u_i of `axes`.
+
+    Shape (9, 3).
+    """
     block = np.zeros((3, 3, 3), axes.dtype)
     block[np.arange(3), :, np.arange(3)] = axes
     return block.reshape(9, 3)
@@ -359,8 +423,8 @@ def amplitude_coefficients(
     """
     Return values straight before the columns: ``output_i = sum_k value_ik column_k``.
 
-    With three amplitudes and three columns each column may belong to one axis only (`own_axis`). A last value that is a time constant is
-    accompanied by the columns' derivatives by it.
+    With three amplitudes and three columns each column may belong to one axis only (`own_axis`). A
+    last value that is a time constant is accompanied by the columns' derivatives by it.
     """
     own = values[effect.name]
     amplitudes = own[:-1] if effect.time_constant else own
@@ -373,7 +437,11 @@ def amplitude_coefficients(
 def along_axis_coefficients(
     effect: Effect, values: Values, point: dict[str, Any], *, function: Callable
 ) -> Values:
-    """Return values before a function of the input along each element's own axis; ``function(input axes)`` gives one of each."""
+    """
+    Return values before a function of the input along each element's own axis.
+
+    ``function(input axes)`` gives one of each.
+    """
     matrix = values['matrix'].reshape(3, 3)
     input_axes = matrix / np.sqrt((matrix**2).sum(axis=1))[:, None]
     return {effect.groups[0].name: function(input_axes) * values[effect.name][None, :]}
@@ -396,14 +464,18 @@ def matrix_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -
     """Return the sensor's matrix, or its rows times one value per axis."""
     matrix = values['matrix'].reshape(3, 3)
     return {
-        effect.groups[0].name: matrix.T
-        if effect.name == 'matrix'
-        else (matrix * values[effect.name][:, None]).T
+        effect.groups[0].name: (
+            matrix.T if effect.name == 'matrix' else (matrix * values[effect.name][:, None]).T
+        )
     }
 
 
 def lever_coefficients(effect: Effect, values: Values, point: dict[str, Any]) -> Values:
-    """Return the coefficients of the lever matrix W_jk for output i: m_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse)."""
+    """
+    Return the coefficients of the lever matrix W_jk for output i.
+
+    M_ij r_ik (Zhang 2017, eq. 11-17 with the true inverse).
+    """
     matrix, arms = (
         values['matrix'].reshape(3, 3),
         np.broadcast_to(values[effect.name].reshape(-1, 3), (3, 3)),

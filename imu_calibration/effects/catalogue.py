@@ -74,8 +74,8 @@ def term(
     sensor : str
         'accelerometer' or 'gyroscope'.
     column : str or sequence of three str
-        Arithmetic of the true motion (`effects.expressions`): one column for all axes, or one for each. With `tau` in it the effect has a
-        time constant as its last value.
+        Arithmetic of the true motion (`effects.expressions`): one column for all axes, or one for
+        each. With `tau` in it the effect has a time constant as its last value.
     unit : str
         SI unit of the values.
     tolerance : float
@@ -115,7 +115,8 @@ def term(
             or not 0 < value < math.inf
         ):
             raise InputError(
-                f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60}; correct it",
+                f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60};"
+                ' correct it',
                 code='tolerance_value',
             )
     for key, value in {'unit': unit, 'text': text, 'tolerance_reason': tolerance_reason}.items():
@@ -127,7 +128,8 @@ def term(
     columns = (column,) if isinstance(column, str) else tuple(column)
     if len(columns) not in (1, 3):
         raise InputError(
-            f"effect '{name}' must have one column, or one for each axis, got {len(columns)}; correct it",
+            f"effect '{name}' must have one column, or one for each axis, got {len(columns)};"
+            ' correct it',
             code='column_count',
         )
     group = ColumnGroup(name, columns, name)
@@ -208,14 +210,18 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
         return term(name, **definition)
     except TypeError as error:
         raise InputError(
-            f"effect '{name}' must have sensor, column, unit, tolerance and text, got {definition!r:.200} ({error}); "
-            'correct it',
+            f"effect '{name}' must have sensor, column, unit, tolerance and text, got"
+            f' {definition!r:.200} ({error}); correct it',
             code='definition_keys',
         ) from error
 
 
 def _reduced(effect):
-    """Return how an effect is sent to other processes: by its definition if there is one, because `coefficients` hold functions."""
+    """
+    Return how an effect is sent to other processes.
+
+    By its definition if there is one, because `coefficients` hold functions.
+    """
     return (
         object.__reduce_ex__(effect, 2)
         if effect.definition is None
@@ -277,25 +283,35 @@ class Catalogue:
         *,
         models: Iterable[str] = (),
     ) -> Effect:
-        """Return the effect `name` of `sensor`, or raise `InputError` with the closest name; `models` are suggested too."""
+        """
+        Return the effect `name` of `sensor`, or raise `InputError` with the closest name.
+
+        `models` are suggested too.
+        """
         effects = self.effects(joint_names)
         if (sensor, name) not in effects:
             known = sorted(
                 known_name for known_sensor, known_name in effects if known_sensor == sensor
             )
             raise InputError(
-                f"the {sensor} has no effect '{name}'{did_you_mean(name, [*models, *known])}; choose from {', '.join(known)}",
+                f"the {sensor} has no effect '{name}'{did_you_mean(name, [*models, *known])};"
+                f' choose from {", ".join(known)}',
                 code='effect_unknown',
             )
         return effects[sensor, name]
 
     def owner_of(self, name: str, joint_names: Sequence[str] = JOINTS) -> str:
-        """Return the sensor that an effect name belongs to ('bias' and 'matrix' belong to both and are refused)."""
+        """
+        Return the sensor that an effect name belongs to.
+
+        The names 'bias' and 'matrix' belong to both sensors and are refused.
+        """
         names = [known for _, known in self.effects(joint_names)]
         if names.count(name) != 1:
             known = sorted(n for n in names if names.count(n) == 1)
             raise InputError(
-                f"effect '{name}' is unknown or ambiguous{did_you_mean(name, known)}; choose from {', '.join(known)}",
+                f"effect '{name}' is unknown or ambiguous{did_you_mean(name, known)}; choose from"
+                f' {", ".join(known)}',
                 code='effect_unknown',
             )
         return next(sensor for sensor, known in self.effects(joint_names) if known == name)
@@ -307,7 +323,8 @@ class Catalogue:
         Raises
         ------
         InputError
-            When a name exists, the sensor is unknown, or an effect to be compensated has columns that compensation cannot compute.
+            When a name exists, the sensor is unknown, or an effect to be compensated has columns
+            that compensation cannot compute.
 
         """
         grown = self
@@ -322,8 +339,8 @@ class Catalogue:
         for effect in added:
             if effect.definition is None:
                 raise InputError(
-                    f"effect '{effect.name}' must be made of text to be written into a document, it is made of code; "
-                    'make it with `effects.catalogue.term`',
+                    f"effect '{effect.name}' must be made of text to be written into a document, it"
+                    ' is made of code; make it with `effects.catalogue.term`',
                     code='made_of_code',
                 )
         return {effect.name: effect.definition for effect in added}
@@ -340,8 +357,10 @@ class Catalogue:
         """
         if not isinstance(definitions, dict) or len(definitions) > MOST_ADDED:
             raise InputError(
-                f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit, tolerance, text}}, got '
-                f'{len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))}; correct it',
+                f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit,'
+                ' tolerance, text}, got'
+                f' {len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))};'
+                ' correct it',
                 code='effects_count',
             )
         return self.with_effects(
@@ -350,7 +369,9 @@ class Catalogue:
 
     def with_document(self, document: dict[str, Any]) -> 'Catalogue':
         """
-        Return a catalogue with the effects defined in a document under `effects`: a file of effects, or a calibration.
+        Return a catalogue with the effects defined in a document under `effects`.
+
+        A file of effects, or a calibration.
 
         Raises
         ------
@@ -363,8 +384,10 @@ class Catalogue:
         )
         if strange or 'effects' not in document:
             raise InputError(
-                'a file of effects must hold effects: NAME: {sensor, column, unit, tolerance, text}, it holds '
-                f'{", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"}; correct it',
+                'a file of effects must hold effects: NAME: {sensor, column, unit, tolerance,'
+                ' text}, it holds'
+                f' {", ".join(strange)[:80] or ", ".join(map(str, document))[:80] or "nothing"};'
+                ' correct it',
                 code='effects_file',
             )
         return self.with_definitions(document['effects'] or {})
@@ -379,18 +402,19 @@ def _check(effect, taken):
         'effects'
     }:
         raise InputError(
-            f"an effect must have a name of its own made of letters, digits and underscores, got '{effect.name}'; "
-            'choose another one',
+            'an effect must have a name of its own made of letters, digits and underscores, got'
+            f" '{effect.name}'; choose another one",
             code='effect_name',
         )
     if effect.sensor not in SECTIONS:
         raise InputError(
-            f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}'; correct it"
+            f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}';"
+            ' correct it'
         )
     strange = {quantity for group in effect.groups for quantity in group.uses} - UNDONE_WITH
     if effect.compensation == 'exact' and strange:
         raise InputError(
-            f"effect '{effect.name}' must not use {', '.join(sorted(strange))}, which are unknown during compensation; "
-            "declare it with compensation 'none'",
+            f"effect '{effect.name}' must not use {', '.join(sorted(strange))}, which are unknown"
+            " during compensation; declare it with compensation 'none'",
             code='time_unavailable',
         )

@@ -1,4 +1,8 @@
-"""Columns of effects as text: a safe expression of the sensor inputs, its derivatives, and groups of columns."""
+"""
+Columns of effects as text.
+
+A safe expression of the sensor inputs, its derivatives, and groups of columns.
+"""
 
 import ast
 import math
@@ -32,12 +36,12 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
     'time constant': {'tau': (None,)},
 }
 """
-Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular acceleration in s, level frame to s, joints
-from the base outwards.
+Quantity -> {name in a text: where a Reference holds it}: true specific force, rate and angular
+acceleration in s, level frame to s, joints from the base outwards.
 """
 VOCABULARY = (
-    'f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time, temperature_c, thermal_branch, '
-    'vibration_x .. z, temperature_ref_c, tau'
+    'f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time,'
+    ' temperature_c, thermal_branch, vibration_x .. z, temperature_ref_c, tau'
 )
 """The names, for messages."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
@@ -50,9 +54,15 @@ MAX_CHARACTERS, MAX_COLUMN_DEPTH, MAX_EXPONENT, MAX_PRODUCTS, MAX_COLUMN_NUMBER 
     200,
     1e30,
 )
-"""Characters, depth, exponents, products and size of numbers at most, so that no document costs more than arithmetic should."""
+"""
+Characters, depth, exponents, products and size of numbers at most, so that no document costs more
+than arithmetic should.
+"""
 LONGEST_EXPANDED = 5000
-"""Characters of a column at most when it is multiplied out: nested powers of a function multiply its text by nine at each level."""
+"""
+Characters of a column at most when it is multiplied out: nested powers of a function multiply its
+text by nine at each level.
+"""
 UNBOUNDED_FUNCTIONS = ('sqrt', 'exp', 'expm1', 'log')
 """Functions without a finite value everywhere."""
 OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
@@ -70,8 +80,8 @@ def read(text: str) -> ast.expr:
     Raises
     ------
     InputError
-        When it contains anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and the `FUNCTIONS` of one argument; with
-        the position.
+        When it contains anything but numbers, ``+ - * / **``, brackets, the names in `PLACES` and
+        the `FUNCTIONS` of one argument; with the position.
 
     """
     try:
@@ -106,14 +116,19 @@ class _Refused(Exception):
 def _refusal(text, place, why):
     shown = ' '.join(str(text)[place : place + 30].split())
     return InputError(
-        f'a column must be arithmetic of at most {MAX_CHARACTERS} characters in {VOCABULARY} with {", ".join(FUNCTIONS)} and '
-        f'powers up to {MAX_EXPONENT}, got {why} at character {place + 1}: {shown!r}; correct it',
+        f'a column must be arithmetic of at most {MAX_CHARACTERS} characters in {VOCABULARY} with'
+        f' {", ".join(FUNCTIONS)} and powers up to {MAX_EXPONENT}, got {why} at character'
+        f' {place + 1}: {shown!r}; correct it',
         code='not_arithmetic',
     )
 
 
 def _checked(node, text, depth):
-    """Return the node with constants folded into finite floats: an integer could grow without limit, a float raises."""
+    """
+    Return the node with constants folded into finite floats.
+
+    An integer could grow without limit, a float raises.
+    """
     if depth > MAX_COLUMN_DEPTH:
         raise _Refused(node.col_offset, 'too many brackets')
 
@@ -179,7 +194,11 @@ def names_in(tree: ast.expr) -> set[str]:
 
 
 def may_fail(tree: ast.expr) -> bool:
-    """Return whether a column may be without a finite value somewhere: it divides, or calls a function that is not defined everywhere."""
+    """
+    Return whether a column may be without a finite value somewhere.
+
+    It divides, or calls a function that is not defined everywhere.
+    """
     divides = any(
         isinstance(node.op, ast.Div) and not isinstance(node.right, ast.Constant)
         for node in ast.walk(tree)
@@ -213,13 +232,19 @@ def _sign(x):
 
 
 def _abs(x):
-    """Keep the derivative that an imaginary part carries, which the modulus of a complex number does not."""
+    """
+    Keep the derivative that an imaginary part carries.
+
+    The modulus of a complex number does not keep it.
+    """
     return np.where(np.real(x) < 0, -x, x) if np.iscomplexobj(x) else np.abs(x)
 
 
 def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
     """
-    Return a column as a sum of products, {factors: coefficient}, factors a sorted tuple of Python expressions in plain floats.
+    Return a column as a sum of products, {factors: coefficient}.
+
+    The factors are a sorted tuple of Python expressions in plain floats.
 
     Parameters
     ----------
@@ -238,8 +263,9 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
         case ast.Name():
             if node.id not in known:
                 raise InputError(
-                    f"a column that compensation undoes must do without '{node.id}' ({QUANTITY_OF[node.id]}), "
-                    "which is not known there; declare the effect with compensation 'none'",
+                    f"a column that compensation undoes must do without '{node.id}'"
+                    f' ({QUANTITY_OF[node.id]}), which is not known there; declare the effect with'
+                    " compensation 'none'",
                     code='variable_unavailable',
                 )
             return known[node.id]
@@ -254,9 +280,11 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
             )  # a call costs more than all the arithmetic
             return {
                 (
-                    f'(({argument} > 0) - ({argument} < 0))'
-                    if inline
-                    else f'{called(node)}({argument})',
+                    (
+                        f'(({argument} > 0) - ({argument} < 0))'
+                        if inline
+                        else f'{called(node)}({argument})'
+                    ),
                 ): 1.0
             }
         case ast.BinOp():
@@ -306,8 +334,8 @@ def scaled(terms: dict[tuple[str, ...], float], factor: float) -> dict[tuple[str
 def _multiplied(left, right):
     if len(left) * len(right) > MAX_PRODUCTS:
         raise InputError(
-            f'a column must have at most {MAX_PRODUCTS} products when it is multiplied out, this one has more; '
-            'write it shorter',
+            f'a column must have at most {MAX_PRODUCTS} products when it is multiplied out, this'
+            ' one has more; write it shorter',
             code='column_expands',
         )
     result = added(
@@ -315,8 +343,8 @@ def _multiplied(left, right):
     )
     if sum(len(factor) for factors in result for factor in factors) > LONGEST_EXPANDED:
         raise InputError(
-            f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out, this one has more; '
-            'write it without powers inside of powers',
+            f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out,'
+            ' this one has more; write it without powers inside of powers',
             code='column_expands',
         )
     return result
@@ -361,8 +389,9 @@ class ColumnGroup:
     """
     Columns that belong together, by one text for each.
 
-    The texts (`effects.expressions`) define them completely: arrays of columns, the compensation of a sample and the data
-    that the columns need are derived from them. A group with a time constant `tau` has each column and its derivative by `tau`.
+    The texts (`effects.expressions`) define them completely: arrays of columns, the compensation of
+    a sample and the data that the columns need are derived from them. A group with a time constant
+    `tau` has each column and its derivative by `tau`.
     """
 
     name: str
@@ -421,8 +450,8 @@ class ColumnGroup:
         ref : Reference
             The true motion.
         point : dict
-            'temperature_ref_c', effect name -> values where columns depend on them, 'centre': group -> value to subtract
-            (``SensorModel.full_point``).
+            'temperature_ref_c', effect name -> values where columns depend on them, 'centre': group
+            -> value to subtract (``SensorModel.full_point``).
 
         Raises
         ------
@@ -434,8 +463,8 @@ class ColumnGroup:
             values = {name: getattr(ref, field)[index] for name, field, index in self._places}
         except IndexError as error:
             raise InputError(
-                f"the columns of '{self.name}' refer to more joints than exist: {', '.join(self.text)}; "
-                'correct them'
+                f"the columns of '{self.name}' refer to more joints than exist:"
+                f' {", ".join(self.text)}; correct them'
             ) from error
         values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
         result, count = np.empty((len(ref), self.width)), len(self.text)
@@ -450,9 +479,9 @@ class ColumnGroup:
             result -= point['centre'][self.name]
         if self._may_fail and not np.all(np.isfinite(result)):
             raise InputError(
-                f"the columns of '{self.name}' must be finite in the whole recording, {', '.join(self.text)} is not; "
-                'do not divide by a quantity that '
-                'passes through zero, and use no root or logarithm of a negative quantity',
+                f"the columns of '{self.name}' must be finite in the whole recording,"
+                f' {", ".join(self.text)} is not; do not divide by a quantity that passes through'
+                ' zero, and use no root or logarithm of a negative quantity',
                 code='column_not_finite',
             )
         return result

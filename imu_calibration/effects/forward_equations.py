@@ -16,7 +16,11 @@ from imu_calibration.kinematics.table import Table
 
 
 def _shifted_by(lags, motion, roughly):
-    """Return (weight, motion) pairs: the motion at each sum of the delays of (name, Lag, values) triples."""
+    """
+    Return (weight, motion) pairs.
+
+    The motion at each sum of the delays of (name, Lag, values) triples.
+    """
     delays = [(1.0, np.zeros(()))]
     for _, lag, at in lags:
         some = (lag.single if roughly else lag).delays(motion.time, at)
@@ -40,7 +44,11 @@ INPUT_OF = {'accelerometer': 'force_s', 'gyroscope': 'rate_s'}
 
 
 class References:
-    """The motions that a model's sensors are thought to have felt, each worked out once for both sensors where both feel the same."""
+    """
+    The motions that a model's sensors are thought to have felt.
+
+    Each is worked out once for both sensors where both feel the same.
+    """
 
     def __init__(
         self,
@@ -76,9 +84,12 @@ class References:
         roughly: bool = False,
     ) -> Reference:
         """
-        Return the reference that `sensor` is thought to have felt, with every warp of the model at its point.
+        Return the reference that `sensor` is thought to have felt.
 
-        The motion is shifted once by the sum of all lags; errors of table and encoders act on the shifted motion.
+        With every warp of the model at its point.
+
+        The motion is shifted once by the sum of all lags; errors of table and encoders act on the
+        shifted motion.
 
         Parameters
         ----------
@@ -86,7 +97,8 @@ class References:
         effect, values : Effect and array, optional
             An effect with other values than its point; the reference is then without attitude.
         roughly : bool
-            Approximate a lag by a delay of the same first derivative; a filter averages several delays and costs as many times more.
+            Approximate a lag by a delay of the same first derivative; a filter averages several
+            delays and costs as many times more.
 
         """
         acting: list[tuple[str, Any, Any]] = []
@@ -125,10 +137,13 @@ class References:
 
 def columns(references: References, sensor: str) -> np.ndarray:
     """
-    Return the regressors of `sensor` in the model of `references`, shape (n, n_columns), in the order of ``model.groups(sensor)``.
+    Return the regressors of `sensor` in the model of `references`.
 
-    A warp contributes, per parameter, the three components of the derivative of the true input (`force_s` or `rate_s`);
-    its coefficients are matrix times parameter. The derivative is a difference of the exact kinematics.
+    Shape (n, n_columns), in the order of ``model.groups(sensor)``.
+
+    A warp contributes, per parameter, the three components of the derivative of the true input
+    (`force_s` or `rate_s`); its coefficients are matrix times parameter. The derivative is a
+    difference of the exact kinematics.
     """
     model, ref, parts = references.model, references.at(sensor), []
     layout = model.layout(sensor)
@@ -136,7 +151,8 @@ def columns(references: References, sensor: str) -> np.ndarray:
         'temperature' in group.uses for group in layout.groups.values()
     ):
         raise InputError(
-            'a thermal effect needs temperatures, none were received; record imu/temperature or omit the effect'
+            'a thermal effect needs temperatures, none were received; record imu/temperature or'
+            ' omit the effect'
         )
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     for name in layout.rows:
@@ -149,7 +165,10 @@ def columns(references: References, sensor: str) -> np.ndarray:
 
 def _warp_columns(references, effect, sensor):
     """
-    Return the columns of a warp: d(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are modelled.
+    Return the columns of a warp.
+
+    D(true input)/d(parameter), shape (n, 3 size), and d(lever matrix)/d(parameter) where arms are
+    modelled.
 
     With `folded_arms` the true input is that at the sensitive points, and there is no second block.
     """
@@ -160,8 +179,9 @@ def _warp_columns(references, effect, sensor):
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
         effect = clock  # a lag of zero is a delay to first order
     inputs, levers = [], []
-    # A search folds the arms and needs many warps: forward differences halve the references, with an error of the curvature over a step.
-    # Candidate effects are evaluated with a delay in place of a filter.
+    # A search folds the arms and needs many warps: forward differences halve the references, with
+    # an error of the curvature over a step. Candidate effects are evaluated with a delay in place
+    # of a filter.
     asking = model.folded_arms is not None
     for above, below, width in _steps(effect, model.point_of(effect), forward=asking):
         ends = [
@@ -205,7 +225,11 @@ def _steps(effect, at, forward):
 
 
 def columns_at_point(model: SensorModel, sensor: str, ref: Reference) -> np.ndarray:
-    """Return the columns without the warps' derivatives, which have zero coefficients at the point itself."""
+    """
+    Return the columns without the warps' derivatives.
+
+    These have zero coefficients at the point itself.
+    """
     layout = model.layout(sensor)
     return np.concatenate(
         [group.columns(ref, layout.point) for group in layout.groups.values()], axis=1
@@ -213,7 +237,11 @@ def columns_at_point(model: SensorModel, sensor: str, ref: Reference) -> np.ndar
 
 
 def coefficients(model: SensorModel, sensor: str, values: np.ndarray) -> np.ndarray:
-    """Return the coefficients of the columns for a parameter vector (real or complex), shape (n_columns, 3)."""
+    """
+    Return the coefficients of the columns for a parameter vector (real or complex).
+
+    Shape (n_columns, 3).
+    """
     of_sensor, layout = model.values_of(sensor, values), model.layout(sensor)
     total = np.zeros((layout.width, 3), values.dtype)
     for effect in layout.effects:
@@ -242,7 +270,11 @@ def _add_coefficients(total, model, effect, of_sensor, layout):
 
 
 def all_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
-    """Return the arms from the reference point to the three sensitive points, shape (3, 3), zero where the model has none."""
+    """
+    Return the arms from the reference point to the three sensitive points.
+
+    Shape (3, 3), zero where the model has none.
+    """
     return sum((values[model.slices[e.key]].reshape(-1, 3) for e in model.arms), np.zeros((3, 3)))
 
 
@@ -250,7 +282,8 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
     """
     Return d(coefficients)/d(values) by complex steps, shape (n_columns, 3, n_params).
 
-    Besides its own values an effect's coefficients depend on the sensor's matrix and, for warps, on its arms.
+    Besides its own values an effect's coefficients depend on the sensor's matrix and, for warps, on
+    its arms.
     """
     layout, step = model.layout(sensor), 1e-30
     jacobian = np.zeros((layout.width, 3, len(values)))
@@ -270,7 +303,12 @@ def coefficient_jacobian(model: SensorModel, sensor: str, values: np.ndarray) ->
 def effect_slopes(
     effect: Effect, of_sensor: dict[str, np.ndarray], point: dict[str, Any]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return {group: coefficients (w, 3)} of one effect and {group: derivative by its own values (w, 3, size)}, by complex steps."""
+    """
+    Return the coefficients of one effect and their derivatives, by group.
+
+    They are {group: coefficients (w, 3)} and {group: derivative by its own values (w, 3, size)}, by
+    complex steps.
+    """
     coefficients = effect.coefficients
     if coefficients is None:
         raise ValueError(f'{effect.name} has no coefficients')
@@ -335,11 +373,18 @@ def sensor_output(
 
 
 Centre = Mapping[str, np.ndarray]
-"""Column group -> the values of its columns at which an effect that compensation cannot undo counts as zero, shape (width,)."""
+"""
+Column group -> the values of its columns at which an effect that compensation cannot undo counts as
+zero, shape (width,).
+"""
 
 
 def not_applied(model: SensorModel) -> list[Effect]:
-    """Return the effects of the sensors that compensation cannot undo: drifts, formulas in joint angles or time."""
+    """
+    Return the effects of the sensors that compensation cannot undo.
+
+    Drifts, formulas in joint angles or time.
+    """
     return [
         effect
         for effect in model.effects
@@ -360,9 +405,12 @@ def centred(
     model: SensorModel, values: np.ndarray, centre: Centre
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (values, their derivative by the given ones) with columns that are measured from `centre`.
+    Return (values, their derivative by the given ones) for centred columns.
 
-    ``bias + column value = (bias + centre value) + (column - centre) value``: only the biases change.
+    The columns are measured from `centre`.
+
+    ``bias + column value = (bias + centre value) + (column - centre) value``: only the biases
+    change.
 
     Parameters
     ----------
@@ -389,7 +437,11 @@ def centred(
 def applied_values(
     model: SensorModel, values: np.ndarray, centre: Centre | None = None
 ) -> np.ndarray:
-    """Return the values with effects that compensation cannot undo at their value in the centre, which the bias contains."""
+    """
+    Return the values with effects that compensation cannot undo fixed at the centre.
+
+    These effects are at their value in the centre, which the bias contains.
+    """
     applied = centred(model, values, centre or {})[0]
     for effect in not_applied(model):
         applied[model.slices[effect.key]] = effect.prior_values()

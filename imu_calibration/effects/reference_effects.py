@@ -31,16 +31,19 @@ from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.joint_motion import with_encoder_harmonics
 
 FIRST_ORDER = tuple(zip(*reversed(np.polynomial.laguerre.laggauss(5))))
-"""(weight, delay) pairs that make an exponential lag a weighted mean of delays: int e^-x f(t - tau x) dx."""
+"""
+(weight, delay) pairs that make an exponential lag a weighted mean of delays: int e^-x f(t - tau x)
+dx.
+"""
 
 
 def _second_order():
     """
     Return (weight, delay) pairs of the maximally flat second-order filter, in units of its delay.
 
-    ``1 / (1 + d s + d^2 s^2 / 2)`` has the impulse response ``2 e^-x sin x``, x = t / d, whose moments of order k over k! follow from the
-    denominator. The weights match the first five: the error is 6e-5 where frequency times delay is 0.3 rad, and joints' noise is not
-    amplified.
+    ``1 / (1 + d s + d^2 s^2 / 2)`` has the impulse response ``2 e^-x sin x``, x = t / d, whose
+    moments of order k over k! follow from the denominator. The weights match the first five: the
+    error is 6e-5 where frequency times delay is 0.3 rad, and joints' noise is not amplified.
     """
     moments = [1.0, 1.0]
     for order in range(2, 5):
@@ -54,8 +57,10 @@ _LAG_FORMS = {
     'bandwidth': (
         'time_constant',
         FIRST_ORDER,
-        'has a first-order low-pass filter: '
-        'its output has a lag and a smaller amplitude at high frequency',
+        (
+            'has a first-order low-pass filter: '
+            'its output has a lag and a smaller amplitude at high frequency'
+        ),
     ),
     'delay': (
         'delay',
@@ -65,11 +70,16 @@ _LAG_FORMS = {
     'filter': (
         'delay',
         SECOND_ORDER,
-        'has a second-order (Butterworth) low-pass filter: its output has a lag, '
-        'and an unchanged amplitude up to near its edge',
+        (
+            'has a second-order (Butterworth) low-pass filter: its output has a lag, '
+            'and an unchanged amplitude up to near its edge'
+        ),
     ),
 }
-"""Ending of the name -> (component, (weight, delay) pairs, description). All have the same first derivative."""
+"""
+Ending of the name -> (component, (weight, delay) pairs, description). All have the same first
+derivative.
+"""
 
 
 def _lag_effect(sensor, ending):
@@ -107,7 +117,8 @@ def lag_name(sensor: str, ending: str) -> str:
 
 LAGS = tuple(_lag_effect(sensor, ending) for ending in _LAG_FORMS for sensor in SENSORS)
 """
-First-order filter, pure delay and second-order filter of each sensor; collinear where small, separable where large.
+First-order filter, pure delay and second-order filter of each sensor; collinear where small,
+separable where large.
 """
 
 CLOCK = 'time_offset'
@@ -124,7 +135,8 @@ def total_lags(
     """
     Return sensor -> (total lag of its output, standard deviation), s, of sensors with a lag.
 
-    The first derivative of all descriptions is the same, so this repeats where their names and shares do not.
+    The first derivative of all descriptions is the same, so this repeats where their names and
+    shares do not.
 
     Parameters
     ----------
@@ -162,7 +174,9 @@ ENCODER_ORDERS = (1, 2)
 
 @lru_cache(maxsize=512)
 def _changed(change, table, values):
-    """Return ``change(table, values)``, cached: each window of a recording needs the same few hundred."""
+    """
+    Return ``change(table, values)``, cached: each window of a recording needs the same few hundred.
+    """
     return change(table, np.array(values))
 
 
@@ -177,7 +191,11 @@ def _tilt_derivative(ref):
 
 
 def _zero(table, motion, values):
-    """Shift the joints between the first and the last: the first one's zero is the azimuth, the last one's belongs to the mount."""
+    """
+    Shift the joints between the first and the last.
+
+    The first one's zero is the azimuth, the last one's belongs to the mount.
+    """
     offset = np.zeros(motion.position.shape[1])
     offset[_columns(table, table.joint_names.zeros)] = values
     return table, replace(motion, position=motion.position + offset)
@@ -216,7 +234,11 @@ def _earth(effect, values, point):
 
 
 def _earth_known(table):
-    """Return why the Earth's rate cannot be tested: the table's location is unknown, or the reference includes it."""
+    """
+    Return why the Earth's rate cannot be tested.
+
+    The table's location is unknown, or the reference includes it.
+    """
     if table.latitude is None:
         return (
             'the table gives no latitude, so the rotation of the Earth is not modelled',
@@ -232,10 +254,12 @@ def _earth_known(table):
 
 def _bent(effect, values, point):
     """
-    Coefficients of a mount that turns by theta = K f with the force that it carries, to first order.
+    Coefficients of a mount that turns by theta = K f, to first order.
 
-    The frame of the sensor turns, so that ``f' = f + f x theta`` and ``w' = w + w x theta + d theta / dt`` with df/dt = f x w where gravity
-    is the load.
+    f is the force that the mount carries.
+
+    The frame of the sensor turns, so that ``f' = f + f x theta`` and ``w' = w + w x theta + d theta
+    / dt`` with df/dt = f x w where gravity is the load.
     """
     matrix, turn = values['matrix'].reshape(3, 3), values['load_compliance'].reshape(3, 3)
     force, rate = np.zeros((6, 3), turn.dtype), np.zeros((9, 3), turn.dtype)
@@ -250,7 +274,11 @@ def _bent(effect, values, point):
 
 
 def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
-    """Return the effects of a table with these joints (JointNames), of its clock, and of the sensors' lags."""
+    """
+    Return the effects of a table with these joints.
+
+    They are the effects of its joints (JointNames), of its clock, and of the sensors' lags.
+    """
     names = JointNames.of(joint_names)
     of_table: dict[str, Any] = {
         'sensor': 'reference',
@@ -268,7 +296,10 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             role=Role.TILT,
             components=('x', 'y'),
             shape=(2,),
-            explanation='The table is not level: its vertical is rotated by a small angle about the base axes.',
+            explanation=(
+                'The table is not level: its vertical is rotated by a small angle about the base'
+                ' axes.'
+            ),
             tolerance_reason='0.1 mg at 1 g, a tenth of the accelerometer bias',
             prior_sd=2e-3,
             plausible=('bench', 0.02, 'field catalogue 6.3: 1 arcsec to some arcmin'),
@@ -329,7 +360,10 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
                 for order in ENCODER_ORDERS
                 for kind in ('cos', 'sin')
             ),
-            explanation='The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of its disc).',
+            explanation=(
+                'The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of'
+                ' its disc).'
+            ),
             tolerance_reason='as the tilt',
             prior_sd=0.01,
             plausible=('bench', 0.01, 'field catalogue 6.3: 10 um on 50 mm is 41 arcsec'),
@@ -342,8 +376,10 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             name='axis_sag',
             components=names.turning[1:],
             shape=(len(names.turning[1:]),),
-            explanation='The axes sag: each bends towards the ground by an angle proportional to its horizontal component, '
-            'like a loaded shaft.',
+            explanation=(
+                'The axes sag: each bends towards the ground by an angle proportional to its'
+                ' horizontal component, like a loaded shaft.'
+            ),
             tolerance_reason='as the tilt',
             prior_sd=2e-3,
             plausible=(
@@ -365,7 +401,10 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
                 for order in WOBBLES
                 for kind in ('cos', 'sin')
             ),
-            explanation='An axis wobbles: it leans another way at every angle of its turn, as a bearing out of round makes it.',
+            explanation=(
+                'An axis wobbles: it leans another way at every angle of its turn, as a bearing out'
+                ' of round makes it.'
+            ),
             tolerance_reason='as the tilt',
             prior_sd=2e-3,
             plausible=('bench', 3e-3, 'field catalogue 6.3: arcsec; 10 arcmin of a worn bearing'),
@@ -375,11 +414,18 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
         ),
         Effect(
             **of_table
-            | {'unit': 'rad/(m/s^2)', 'against': ('force',), 'tolerance': 1e-4 / STANDARD_GRAVITY},
+            | {
+                'unit': 'rad/(m/s^2)',
+                'against': ('force',),
+                'tolerance': 1e-4 / STANDARD_GRAVITY,
+            },
             name='load_compliance',
             components=MATRIX,
             shape=(3, 3),
-            explanation='The mount bends with the load: the sensor turns a little with the force that it carries, which both sensors see.',
+            explanation=(
+                'The mount bends with the load: the sensor turns a little with the force that it'
+                ' carries, which both sensors see.'
+            ),
             tolerance_reason='0.1 mrad at 1 g',
             prior_sd=1e-3 / STANDARD_GRAVITY,
             plausible=('bench', 3e-3 / STANDARD_GRAVITY, '10 arcmin per g of a slender bracket'),
@@ -417,7 +463,10 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             unit='s/s',
             nuisance=True,
             against=('time',),
-            explanation='The clock of the IMU stamps runs at another rate than that of the joint stamps: the lag grows linearly with time.',
+            explanation=(
+                'The clock of the IMU stamps runs at another rate than that of the joint stamps:'
+                ' the lag grows linearly with time.'
+            ),
             tolerance=1e-6,
             tolerance_reason='0.6 ms in 10 min',
             prior_sd=1e-3,
@@ -436,7 +485,9 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             unit='s',
             nuisance=True,
             against=('time',),
-            explanation='The clock of the IMU stamps is set at one moment: the lag changes by a step.',
+            explanation=(
+                'The clock of the IMU stamps is set at one moment: the lag changes by a step.'
+            ),
             tolerance=1e-4,
             tolerance_reason='as the time offset',
             prior=(0.0, 60.0),

@@ -1,4 +1,8 @@
-"""Effects of the sensors themselves; accelerometer and gyroscope share the mechanisms, so each is declared for both at once."""
+"""
+Effects of the sensors themselves.
+
+Accelerometer and gyroscope share the mechanisms, so each is declared for both at once.
+"""
 
 from functools import partial
 
@@ -29,7 +33,9 @@ VIBRATION_VARIANCE = 0.05
 
 
 def _one_axis(table):
-    """Return why lags between axes cannot be tested: they show where motions about several axes mix."""
+    """
+    Return why lags between axes cannot be tested: they show where motions about several axes mix.
+    """
     if len(table.joint_names.turning) > 1:
         return None
     return (
@@ -58,9 +64,11 @@ def _pair(sensor):
             unit=unit,
             explanation=f'The {sensor} has an offset.',
             tolerance=small,
-            tolerance_reason='1 mg, which tilts a levelled attitude by 1 mrad'
-            if accel
-            else '0.01 deg/s, 0.6 deg of heading a minute',
+            tolerance_reason=(
+                '1 mg, which tilts a levelled attitude by 1 mrad'
+                if accel
+                else '0.01 deg/s, 0.6 deg of heading a minute'
+            ),
             prior_sd=2.0 if accel else 0.2,
             plausible=('consumer', 1.0 if accel else 0.1, 'field catalogue 6.1, 6.2'),
             motion=('static_poses',),
@@ -77,9 +85,11 @@ def _pair(sensor):
             title='matrix (scale factors and axis directions)',
             explanation=f'The {sensor} scale factors and axis directions differ from nominal.',
             tolerance=1e-3,
-            tolerance_reason='1 mg at 1 g, as much as the bias; 1 mrad of installation angle'
-            if accel
-            else '0.36 deg in one full turn',
+            tolerance_reason=(
+                '1 mg at 1 g, as much as the bias; 1 mrad of installation angle'
+                if accel
+                else '0.36 deg in one full turn'
+            ),
             prior=tuple(np.eye(3).ravel()),
             prior_sd=0.1,
             motion=('static_poses',) if accel else ('spin_x', 'spin_y', 'spin_z'),
@@ -91,8 +101,10 @@ def _pair(sensor):
             sensor=sensor,
             unit=f'({unit})^-1',
             against=(kind,),
-            explanation=f'The {sensor} output bends with the square of its input (K2), '
-            'so that equal inputs of opposite sign do not give opposite readings.',
+            explanation=(
+                f'The {sensor} output bends with the square of its input (K2), '
+                'so that equal inputs of opposite sign do not give opposite readings.'
+            ),
             tolerance=small / full**2,
             tolerance_reason='1 mg at 1 g' if accel else '0.01 deg/s at 100 deg/s',
             prior_sd=100 * small / full**2,
@@ -169,8 +181,10 @@ def _pair(sensor):
             unit=unit,
             against=('temperature',),
             smooth=True,
-            explanation=f'The {sensor} bias depends on the thermal branch: the branches of cooling and warming differ '
-            'by twice this.',
+            explanation=(
+                f'The {sensor} bias depends on the thermal branch: the branches of cooling and'
+                ' warming differ by twice this.'
+            ),
             tolerance=small,
             tolerance_reason='as the bias',
             prior_sd=20 * small,
@@ -191,12 +205,16 @@ def _pair(sensor):
             shape=(3,) if accel else (3, 3),
             unit=f'{unit}/(m/s^2)^2',
             against=('time',),
-            explanation=f'The {sensor} bias shifts with vibration: even terms of its response rectify it, '
+            explanation=(
+                f'The {sensor} bias shifts with vibration: even terms of its response rectify it, '
+            )
             + ('along the axis of each' if accel else 'of each direction')
             + ', by this for each variance that is left in the band.',
             tolerance=small / VIBRATION_VARIANCE,
             prior_sd=100 * small / VIBRATION_VARIANCE,
-            tolerance_reason=f'as the bias, at a vibration of {np.sqrt(VIBRATION_VARIANCE):.2g} m/s^2 rms',
+            tolerance_reason=(
+                f'as the bias, at a vibration of {np.sqrt(VIBRATION_VARIANCE):.2g} m/s^2 rms'
+            ),
             plausible=(
                 'consumer',
                 2.0 if accel else 0.1,
@@ -230,8 +248,10 @@ def _pair(sensor):
             shape=(3, 2),
             unit='s',
             against=('rate',),
-            explanation=f'Each {sensor} axis has crosstalk of the remaining axes with a different lag: '
-            'its output contains their rate of change.',
+            explanation=(
+                f'Each {sensor} axis has crosstalk of the remaining axes with a different lag: '
+                'its output contains their rate of change.'
+            ),
             tolerance=1e-5,
             tolerance_reason='1 mrad of cross coupling through a lag of 10 ms',
             prior_sd=1e-3,
@@ -251,7 +271,10 @@ def _pair(sensor):
             time_constant=True,
             smooth=True,
             against=('time',),
-            explanation=f'The {sensor} bias settles after turn-on like 1 - exp(-t / time constant), with no temperature to explain it.',
+            explanation=(
+                f'The {sensor} bias settles after turn-on like 1 - exp(-t / time constant), with no'
+                ' temperature to explain it.'
+            ),
             tolerance=small,
             tolerance_reason='as the bias',
             prior=(0.0, 0.0, 0.0, 300.0),
@@ -293,7 +316,9 @@ def _pair(sensor):
             components=('level',),
             shape=(),
             unit=unit,
-            explanation=f'The {sensor} output is clipped: it cannot follow inputs beyond its range.',
+            explanation=(
+                f'The {sensor} output is clipped: it cannot follow inputs beyond its range.'
+            ),
             tolerance=0.01 * full,
             tolerance_reason='10 mg of the range' if accel else '1 deg/s of the range',
             prior=np.inf,
@@ -311,7 +336,10 @@ ACCELEROMETER = _pair('accelerometer') + (
         sensor='accelerometer',
         unit='(m/s^2)^-2',
         against=('force',),
-        explanation='The accelerometer output bends with the cube of its input (K3), so that its scale factor changes with the input.',
+        explanation=(
+            'The accelerometer output bends with the cube of its input (K3), so that its scale'
+            ' factor changes with the input.'
+        ),
         tolerance=MILLI_G / STANDARD_GRAVITY**3,
         tolerance_reason='1 mg at 1 g',
         prior_sd=100 * MILLI_G / STANDARD_GRAVITY**3,
@@ -330,8 +358,10 @@ ACCELEROMETER = _pair('accelerometer') + (
         shape=(3, 3),
         unit='(m/s^2)^-1',
         against=('force',),
-        explanation='The accelerometers are pendulums that give way: '
-        'products of specific-force components enter the output (Avrutov 2017, eq. 4).',
+        explanation=(
+            'The accelerometers are pendulums that give way: '
+            'products of specific-force components enter the output (Avrutov 2017, eq. 4).'
+        ),
         tolerance=MILLI_G / STANDARD_GRAVITY**2,
         tolerance_reason='1 mg for 1 g on two axes',
         prior_sd=100 * MILLI_G / STANDARD_GRAVITY**2,
@@ -348,7 +378,10 @@ ACCELEROMETER = _pair('accelerometer') + (
         shape=(3, 3),
         unit='m',
         title='size effect: origin to the sensitive point of each axis',
-        explanation='The three accelerometers sit at different points: each has a lever arm of its own (Zhang 2017, eq. 11-17).',
+        explanation=(
+            'The three accelerometers sit at different points: each has a lever arm of its own'
+            ' (Zhang 2017, eq. 11-17).'
+        ),
         tolerance=1e-3,
         tolerance_reason='1 mm, 0.1 m/s^2 at 10 rad/s',
         prior_sd=0.03,
@@ -367,7 +400,10 @@ ACCELEROMETER = _pair('accelerometer') + (
         in_reference=True,
         nuisance=True,
         contained_in='accel_size_effect',
-        explanation='The whole accelerometer triad is displaced from its assumed point: one common lever arm.',
+        explanation=(
+            'The whole accelerometer triad is displaced from its assumed point: one common lever'
+            ' arm.'
+        ),
         tolerance=1e-3,
         tolerance_reason='the same arm, for the whole triad',
         prior_sd=0.5,
@@ -389,7 +425,10 @@ GYROSCOPE = _pair('gyroscope') + (
         shape=(3, 3),
         unit='(rad/s)/(m/s^2)',
         against=('force',),
-        explanation='The gyroscopes respond to specific force: their bias changes with attitude (g-sensitivity).',
+        explanation=(
+            'The gyroscopes respond to specific force: their bias changes with attitude'
+            ' (g-sensitivity).'
+        ),
         tolerance=0.01 * DEG / STANDARD_GRAVITY,
         tolerance_reason='0.01 deg/s at 1 g',
         prior_sd=1.0 * DEG / STANDARD_GRAVITY,
@@ -408,8 +447,10 @@ GYROSCOPE = _pair('gyroscope') + (
         unit='(rad/s)/(m/s^2)^2',
         against=('force',),
         title='response to the square of specific force',
-        explanation='The gyroscopes respond to squares and products of specific force: '
-        'their elements yield more along one axis than along another.',
+        explanation=(
+            'The gyroscopes respond to squares and products of specific force: '
+            'their elements yield more along one axis than along another.'
+        ),
         tolerance=0.01 * DEG / STANDARD_GRAVITY**2,
         tolerance_reason='0.01 deg/s at 1 g',
         prior_sd=0.2 * DEG / STANDARD_GRAVITY**2,
@@ -429,7 +470,9 @@ GYROSCOPE = _pair('gyroscope') + (
         shape=(3, 3),
         unit='(rad/s)^-1',
         against=('rate',),
-        explanation='Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).',
+        explanation=(
+            'Products of rate components enter the gyroscope output (Avrutov 2017, eq. 10).'
+        ),
         tolerance=1e-3,
         tolerance_reason='as the matrix at 1 rad/s',
         prior_sd=0.3,

@@ -22,7 +22,9 @@ NAMED_MODELS = {
     'rate': BASE,
     'extended_rate': (*BASE, 'gyro_rate_product'),
 }
-"""Models with a name: Avrutov 2017 eq. 1, eq. 4; Zhang 2017 eq. 11-17; Avrutov 2017 eq. 7, eq. 10."""
+"""
+Models with a name: Avrutov 2017 eq. 1, eq. 4; Zhang 2017 eq. 11-17; Avrutov 2017 eq. 7, eq. 10.
+"""
 G_SENSITIVE = (*BASE, 'gyro_g_sensitivity')
 """Gyroscope model by hand when the poses require it."""
 BARE = 'axial'
@@ -57,7 +59,8 @@ def parse_reference(text: str | None, table: Table) -> tuple[str, ...]:
     """
     Return effect names of table and clock from names joined by '+' or 'none'.
 
-    None: the tilt, the Earth's rate unless the table defines it, and errors of the joints where the table has their tolerances.
+    None: the tilt, the Earth's rate unless the table defines it, and errors of the joints where the
+    table has their tolerances.
     """
     if text is not None:
         return tuple(name for name in text.split('+') if name not in ('', 'none'))
@@ -80,13 +83,20 @@ def _is_moot(name: str, table: Table) -> bool:
 
 
 def with_common_arm(model: 'SensorModel') -> 'SensorModel':
-    """Return the model with a common lever arm beside the arms of the size effect; without a size effect unchanged."""
+    """
+    Return the model with a common lever arm beside the arms of the size effect.
+
+    Without a size effect unchanged.
+    """
     lacks = model.find('accelerometer', Role.ARMS) and not model.find('accelerometer', Role.ARM)
     return model.with_effect('accelerometer', 'lever_arm') if lacks else model
 
 
 WARP, WARP_LEVER = 'warp:', 'warp_lever:'
-"""Beginnings of the names of columns that a warp makes: its change of the true input, and of the lever-arm terms."""
+"""
+Beginnings of the names of columns that a warp makes: its change of the true input, and of the
+lever-arm terms.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +120,8 @@ class SensorModel:
     """
     Effects of accelerometer, gyroscope and reference, with a fixed order of parameters.
 
-    `point` holds values of the effects with columns that depend on their own value (delays, lags, tilts, time constants).
-    The columns are exact there; away from it they are the first derivative.
+    `point` holds values of the effects with columns that depend on their own value (delays, lags,
+    tilts, time constants). The columns are exact there; away from it they are the first derivative.
     """
 
     accelerometer: tuple = BASE
@@ -121,15 +131,18 @@ class SensorModel:
     reference: tuple = ()
     """Names of the effects of table and clock."""
     joint_names: JointNames = JOINTS  # type: ignore[assignment]   # made one at once
-    """Joints of the table; a plain sequence of names means turning joints without parallel neighbours."""
+    """
+    Joints of the table; a plain sequence of names means turning joints without parallel neighbours.
+    """
     temperature_ref_c: float = 25.0
     """Temperature at which thermal effects vanish, degrees Celsius."""
     point: dict = field(default_factory=dict)
     """Where the columns were linearised: effect name -> values."""
     folded_arms: np.ndarray | None = None
     """
-    Arms, shape (3, 3), for which the columns of a warp include its change of the lever-arm terms; None: that change has separate
-    columns. Folded, the columns are fewer and exact at these arms only, as all columns are exact at `point` only.
+    Arms, shape (3, 3), for which the columns of a warp include its change of the lever-arm terms;
+    None: that change has separate columns. Folded, the columns are fewer and exact at these arms
+    only, as all columns are exact at `point` only.
     """
     catalogue: Catalogue = CATALOGUE
     """Where the effects are declared."""
@@ -164,7 +177,11 @@ class SensorModel:
         return {effect.key: slice(a, b) for effect, a, b in zip(self.effects, ends, ends[1:])}
 
     def has_columns_of(self, other: 'SensorModel') -> bool:
-        """Return whether another model makes the very same columns: the same effects, linearised at the same point."""
+        """
+        Return whether another model makes the very same columns.
+
+        The same effects, linearised at the same point.
+        """
         same = all(
             tuple(getattr(self, name)) == tuple(getattr(other, name)) for name in SECTIONS
         ) and all(
@@ -182,18 +199,30 @@ class SensorModel:
         return next((e for e in self.effects if e.sensor == sensor and e.role is role), None)
 
     def part(self, sensor: str, role: Role) -> slice:
-        """Return the slice of the parameter vector of the effect in a place of a sensor's equation; empty where there is none."""
+        """
+        Return the slice of the parameter vector of the effect in a place of a sensor's equation.
+
+        Empty where there is none.
+        """
         effect = self.find(sensor, role)
         return slice(0, 0) if effect is None else self.slices[effect.key]
 
     def value(self, sensor: str, role: Role, values: np.ndarray) -> np.ndarray | None:
-        """Return the values of the effect in a place of a sensor's equation in its documented shape, or None."""
+        """
+        Return the values of the effect in a place of a sensor's equation in its documented shape.
+
+        Or None.
+        """
         effect = self.find(sensor, role)
         return None if effect is None else values[self.slices[effect.key]].reshape(effect.shape)
 
     @property
     def definitions(self) -> dict[str, Any]:
-        """Plain data of the effects that were added to the catalogue, by name: a document needs them in addition to the names."""
+        """
+        Plain data of the effects that were added to the catalogue, by name.
+
+        A document needs them in addition to the names.
+        """
         return self.catalogue.definitions({effect.name for effect in self.effects})
 
     @property
@@ -212,15 +241,25 @@ class SensorModel:
 
     @cached_property
     def requested(self) -> np.ndarray:
-        """Mask of the parameters of interest; table, clock and the common arm are nuisances. Shape (n_params,)."""
+        """
+        Mask of the parameters of interest; table, clock and the common arm are nuisances.
+
+        Shape (n_params,).
+        """
         return np.repeat([not e.nuisance for e in self.effects], [e.size for e in self.effects])
 
     def prior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return prior values and prior standard deviations, both shape (n_params,); the prior time of a step is that of its columns."""
+        """
+        Return prior values and prior standard deviations, both shape (n_params,).
+
+        The prior time of a step is that of its columns.
+        """
         values = [
-            np.append(e.prior_values()[:-1], self.point_of(e)[-1])
-            if e.located
-            else e.prior_values()
+            (
+                np.append(e.prior_values()[:-1], self.point_of(e)[-1])
+                if e.located
+                else e.prior_values()
+            )
             for e in self.effects
         ]
         return np.concatenate(values), np.concatenate([e.prior_sds() for e in self.effects])
@@ -252,21 +291,29 @@ class SensorModel:
     def with_sized_effect(
         self, values: np.ndarray, sensor: str, name: str, *, size: np.ndarray
     ) -> tuple['SensorModel', np.ndarray]:
-        """Return (the model extended by one effect, its parameters): `values` of this model, and the parameters `size` of the effect."""
+        """
+        Return (the model extended by one effect, its parameters).
+
+        `values` of this model, and the parameters `size` of the effect.
+        """
         model = self.with_effect(sensor, name)
         extended = model.start_from(self, values)
         extended[model.slices[sensor, name]] = size
         return model, extended
 
     def with_role(self, sensor: str, role: Role) -> 'SensorModel':
-        """Return the model extended by the catalogue's effect for a place of a sensor's equation."""
+        """
+        Return the model extended by the catalogue's effect for a place of a sensor's equation.
+        """
         effects = self.catalogue.effects(self.joint_names).values()
         return self.with_effect(
             sensor, next(e.name for e in effects if e.sensor == sensor and e.role is role)
         )
 
     def with_reference_temperature(self, temperature_c: float) -> 'SensorModel':
-        """Return the model whose thermal effects vanish at the whole degree nearest to a temperature."""
+        """
+        Return the model whose thermal effects vanish at the whole degree nearest to a temperature.
+        """
         return replace(self, temperature_ref_c=float(round(temperature_c)))
 
     def without(self, sensor: str, *names: str) -> 'SensorModel':
@@ -313,8 +360,8 @@ class SensorModel:
                 for group in effect.groups_of(sensor):
                     if groups.setdefault(group.name, group) != group:
                         raise InputError(
-                            f"effect '{effect.name}' must call its columns otherwise than '{group.name}', "
-                            'which other columns are called; rename it',
+                            f"effect '{effect.name}' must call its columns otherwise than"
+                            f" '{group.name}', which other columns are called; rename it",
                             code='column_name_taken',
                         )
                     widths[group.name] = group.width
@@ -339,14 +386,20 @@ class SensorModel:
         return {}
 
     def columns_of(self, sensor: str, role: Role) -> slice:
-        """Return the slice of the columns that the effect in a place of a sensor's equation multiplies."""
+        """
+        Return the slice of the columns that the effect in a place multiplies.
+
+        The place is one of a sensor's equation.
+        """
         effect = self.find(sensor, role)
         if effect is None:
             raise KeyError(f'the {sensor} has no {role}')
         return self.layout(sensor).rows[effect.groups[0].name]
 
     def point_of(self, effect: Effect) -> np.ndarray:
-        """Return the values at which `effect`'s columns are linearised; default: its prior values."""
+        """
+        Return the values at which `effect`'s columns are linearised; default: its prior values.
+        """
         known = self.point.get(effect.name)
         return effect.prior_values() if known is None else np.atleast_1d(np.asarray(known, float))
 

@@ -13,13 +13,19 @@ from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.window_statistics import SensorStatistics, WindowStatistics
 
 MAX_MEAN_ROWS = 4096
-"""Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind."""
+"""
+Mean rows kept one by one; beyond it the windows are thinned by joining neighbours of the same kind.
+"""
 MAX_ACCUMULATOR_BLOCKS = 48
 """
-Largest number of separate blocks of consecutive windows; beyond it neighbours are joined in pairs, to half this number at least.
+Largest number of separate blocks of consecutive windows; beyond it neighbours are joined in pairs,
+to half this number at least.
 """
 LEAST_ROWS = 16
-"""Rows that an accumulator keeps however many share the memory: neighbours of the same kind must be among them."""
+"""
+Rows that an accumulator keeps however many share the memory: neighbours of the same kind must be
+among them.
+"""
 
 
 CENTRED_FACTORS = ('within', 'slow')
@@ -82,8 +88,8 @@ class Accumulator(_CentredRows):
     """
     Sufficient statistics of any number of windows for least squares.
 
-    Mean rows remain single, because their weights are correlated through the bias process between windows. The centred rows of each kind of
-    window are one triangular factor per sensor.
+    Mean rows remain single, because their weights are correlated through the bias process between
+    windows. The centred rows of each kind of window are one triangular factor per sensor.
     """
 
     rows: list[WindowStatistics] = field(default_factory=list)
@@ -105,7 +111,10 @@ class Accumulator(_CentredRows):
     in_blocks: bool = True
     """Whether blocks are kept; without them standard deviations include noise only."""
     share: int = 1
-    """Among how many accumulators of one recording the memory is shared: each keeps so many times fewer rows."""
+    """
+    Among how many accumulators of one recording the memory is shared: each keeps so many times
+    fewer rows.
+    """
 
     def add(self, window: WindowStatistics) -> None:
         """Add one window (WindowStatistics)."""
@@ -134,7 +143,11 @@ class Accumulator(_CentredRows):
         )
 
     def merge(self, other: 'Accumulator') -> None:
-        """Add another accumulator with the same columns; its recordings follow the ones of this accumulator."""
+        """
+        Add another accumulator with the same columns.
+
+        Its recordings follow the ones of this accumulator.
+        """
         self._stack_all_of(other)
         for mine, its in (
             (self.slow_rows, other.slow_rows),
@@ -169,7 +182,11 @@ class Accumulator(_CentredRows):
             self.block_length *= 2
 
     def _thin(self):
-        """Join neighbours of one kind and recording into one row; their difference joins the centred rows of their kind."""
+        """
+        Join neighbours of one kind and recording into one row.
+
+        Their difference joins the centred rows of their kind.
+        """
         thinned, index = [], 0
         while index < len(self.rows):
             first = self.rows[index]
@@ -251,7 +268,11 @@ def _without_within(window):
 
 
 def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.ndarray]:
-    """Return sensor -> indices of the columns of `narrow`, and of the outputs, in rows made with the model `wide`."""
+    """
+    Return sensor -> indices of the columns of `narrow`, and of the outputs.
+
+    The indices are in rows made with the model `wide`.
+    """
     chosen = {}
     for sensor in SENSORS:
         place = wide.layout(sensor).rows
@@ -261,7 +282,11 @@ def selected_columns(wide: SensorModel, narrow: SensorModel) -> dict[str, np.nda
 
 
 def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -> Accumulator:
-    """Return the accumulator with only the columns that the model `narrow` needs, from one made with the model `wide`."""
+    """
+    Return the accumulator with only the columns that the model `narrow` needs.
+
+    From one made with the model `wide`.
+    """
     chosen = selected_columns(wide, narrow)
     blocks = [replace(block, **_chosen_factors(block, chosen)) for block in accumulator.blocks]
     rows = [restricted_window(row, chosen) for row in accumulator.rows]
@@ -293,14 +318,18 @@ def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -
 
 
 ONE_ATTITUDE = 0.02
-"""Specific forces have a single attitude if their rms across the main direction is below this share of the rms along it, rad."""
+"""
+Specific forces have a single attitude if their rms across the main direction is below this share of
+the rms along it, rad.
+"""
 
 
 def one_attitude(accumulators: Iterable[Accumulator], model: SensorModel) -> bool:
     """
     Return whether the reference specific force has the same direction in all windows.
 
-    Criterion: the second largest eigenvalue of ``sum f f^T`` over all samples is below `ONE_ATTITUDE` squared of the largest.
+    Criterion: the second largest eigenvalue of ``sum f f^T`` over all samples is below
+    `ONE_ATTITUDE` squared of the largest.
 
     Parameters
     ----------
@@ -322,9 +351,12 @@ def one_attitude(accumulators: Iterable[Accumulator], model: SensorModel) -> boo
 
 def not_separable(accumulator: Accumulator, model: SensorModel) -> np.ndarray:
     """
-    Return a mask of the parameters that the windows of a single attitude do not separate from bias and common arm, shape (n_params,).
+    Return a mask of the parameters that a single attitude does not separate.
 
-    The product of the matrix and constant gravity is a bias, and its product with the accelerations at a lever arm is an arm of each axis.
+    Its windows do not separate them from bias and common arm. The mask has shape (n_params,).
+
+    The product of the matrix and constant gravity is a bias, and its product with the accelerations
+    at a lever arm is an arm of each axis.
     """
     mask = np.zeros(len(model.param_names), bool)
     if one_attitude([accumulator], model):

@@ -1,9 +1,12 @@
 """
-Model error in standard deviations: residuals that differ between parts of the recording, and parameters that drift.
+Model error in standard deviations.
 
-The gradient of the cost is a sum over blocks of consecutive windows; at the estimate it is zero. Sums weighted with slow cosines of the
-block number, times the covariance, are shifts of the estimate between parts of the recording. Their covariance under noise is known;
-where the shifts exceed it significantly, the covariance grows.
+Residuals that differ between parts of the recording, and parameters that drift.
+
+The gradient of the cost is a sum over blocks of consecutive windows; at the estimate it is zero.
+Sums weighted with slow cosines of the block number, times the covariance, are shifts of the
+estimate between parts of the recording. Their covariance under noise is known; where the shifts
+exceed it significantly, the covariance grows.
 """
 
 from dataclasses import dataclass
@@ -30,9 +33,15 @@ SLOW_WAVES = 3
 CHANCE = 0.01
 """False positive rate per sensor, for a drift and for model error."""
 COMMON_ERROR_FACTOR = 1.5
-"""Factor on the excess variance of a group over noise: model error that is equal in every block causes no scatter between blocks."""
+"""
+Factor on the excess variance of a group over noise: model error that is equal in every block causes
+no scatter between blocks.
+"""
 COMMON_MEAN_FACTOR = 1.5
-"""Factor on the scatter of means in the variance of an accelerometer's bias, which absorbs an error with a mean as large as its scatter."""
+"""
+Factor on the scatter of means in the variance of an accelerometer's bias, which absorbs an error
+with a mean as large as its scatter.
+"""
 NO_BIAS = 30.0
 """Biases wander with longer correlation times than this, s."""
 LEAST_SHARE_OF_DATA = 1e-6
@@ -91,7 +100,11 @@ def model_error(
 
 
 def _scatter_of_means(noise):
-    """Return the variance of the means between windows, from offsets and from bias processes too fast for a bias."""
+    """
+    Return the variance of the means between windows.
+
+    From offsets and from bias processes too fast for a bias.
+    """
     return noise.offset_sd**2 + sum(
         process.sd**2 for process in noise.bias_processes if process.time < NO_BIAS
     )
@@ -99,7 +112,9 @@ def _scatter_of_means(noise):
 
 def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelError, set[str]]:
     """
-    Return (ModelError, sensors with significant scatter) from the shifts between parts of a recording.
+    Return (ModelError, sensors with significant scatter).
+
+    Both are from the shifts between parts of a recording.
 
     Parameters
     ----------
@@ -134,7 +149,11 @@ def _fisher(p_values):
 def _block_scores(
     system: WeightedSystem, values: np.ndarray, noises: dict[str, NoiseModel]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the information of each block of windows, shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params)."""
+    """
+    Return the information of each block of windows.
+
+    Shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params).
+    """
     blocks = system.accumulator.blocks
     information, gradient = (
         np.zeros((len(blocks),) + (len(values),) * 2),
@@ -170,10 +189,12 @@ def model_error_of_rows(
     rows: RowSet, found: RowEstimate, model: SensorModel, *, block: np.ndarray
 ) -> ModelError:
     """
-    Return the model error from the scatter of parameters between blocks of rows, beyond noise and known scatter.
+    Return the model error from the scatter of parameters between blocks of rows.
 
-    Nuisances are estimated too, so that the expected covariance of the shifts is the one of rows from which these, and the parameters,
-    have been fitted.
+    It is the scatter beyond noise and known scatter.
+
+    Nuisances are estimated too, so that the expected covariance of the shifts is the one of rows
+    from which these, and the parameters, have been fitted.
 
     Parameters
     ----------
@@ -207,7 +228,11 @@ def model_error_of_rows(
 
 
 def _waves_of_blocks(information, gradient, prior_root, free, shared=None):
-    """Return the Waves of parts with their own information and gradient; `shared`: products of their fitted nuisances with the design."""
+    """
+    Return the Waves of parts with their own information and gradient.
+
+    `shared`: products of their fitted nuisances with the design.
+    """
     information, gradient = information[:, free][:, :, free], gradient[:, free]
     covariance = inverse_normal(
         information.sum(axis=0) + prior_root[:, free].T @ prior_root[:, free]
@@ -250,21 +275,30 @@ class CosineScores:
     ):
         self.places, self.moved, self.expected = places, moved, expected
         self.walk = 1 / (np.pi * np.arange(1, len(moved) + 1)) ** 2
-        """Variance of each cosine of a random walk that has unit variance after the whole recording."""
+        """
+        Variance of each cosine of a random walk that has unit variance after the whole recording.
+        """
         self._seen = np.all(
             np.einsum('kii->ki', expected) > LEAST_SHARE_OF_DATA * np.diag(covariance), axis=0
         )
 
     def group(self, part: slice) -> np.ndarray:
-        """Return the indices among the free parameters of one effect with information from the recording."""
+        """
+        Return the indices of one effect with information from the recording.
+
+        The indices are among the free parameters.
+        """
         return np.flatnonzero((self.places >= part.start) & (self.places < part.stop) & self._seen)
 
     def drift(self, group: np.ndarray) -> tuple[float, np.ndarray]:
         """
-        Return (p-value of a slow change, variance to add for it, shape (n,)) of parameters that are independent random walks.
+        Return (p-value of a slow change, variance to add for it) of parameters.
 
-        One common variance, or a larger one for a parameter with a significant walk. The means of two recordings of equal length differ by
-        two thirds of the variance that the walk reaches in one recording, a third from each.
+        The parameters are independent random walks, and the variance has shape (n,).
+
+        One common variance, or a larger one for a parameter with a significant walk. The means of
+        two recordings of equal length differ by two thirds of the variance that the walk reaches in
+        one recording, a third from each.
         """
         p_value, common = self._walked(group)
         own = [self._walked(at) for at in group[:, None]]
@@ -279,8 +313,9 @@ class CosineScores:
         """
         Return (p-value, variance to add) by the score test of the variance of a walk.
 
-        Fast variation that is not white, such as the ripple of a motor, is part of the noise and makes the slow cosines smaller than
-        expected: where the faster ones scatter less than expected, they are the reference of the test (F instead of chi-square).
+        Fast variation that is not white, such as the ripple of a motor, is part of the noise and
+        makes the slow cosines smaller than expected: where the faster ones scatter less than
+        expected, they are the reference of the test (F instead of chi-square).
         """
         inverse, walk, moved = self._inverse(group), self.walk[:SLOW_WAVES], self.moved[:, group]
         fast = np.einsum('ki,kij,kj->k', moved, inverse, moved)[SLOW_WAVES:]

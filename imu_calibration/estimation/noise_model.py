@@ -1,4 +1,8 @@
-"""The noise of one sensor: white noise within windows, offsets of windows, bias processes, excess variance of moving windows."""
+"""
+The noise of one sensor.
+
+White noise within windows, offsets of windows, bias processes, excess variance of moving windows.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -17,16 +21,25 @@ DOF_FACTOR_MOST = 3.0
 
 @dataclass(frozen=True)
 class BiasProcess:
-    """First-order Gauss-Markov process of the bias: covariance ``sd^2 exp(-|dt| / time)``, the same on all axes, independent."""
+    """
+    First-order Gauss-Markov process of the bias.
+
+    Covariance ``sd^2 exp(-|dt| / time)``, the same on all axes, independent.
+    """
 
     sd: float
     """Standard deviation, m/s^2 or rad/s."""
     time: float
-    """Correlation time, s; a random walk if long compared with the session; several processes at spaced times approximate flicker noise."""
+    """
+    Correlation time, s; a random walk if long compared with the session; several processes at
+    spaced times approximate flicker noise.
+    """
 
     def within(self, duration: float) -> float:
         """
-        Return the standard deviation about the mean over a duration, s: the part visible in a session.
+        Return the standard deviation about the mean over a duration, s.
+
+        The part visible in a session.
 
         ``sd^2 (1 - 2 r (1 - r (1 - exp(-1 / r))))`` with r the correlation time over the duration.
         """
@@ -40,10 +53,17 @@ class BiasProcess:
 
 @dataclass(frozen=True)
 class ReferenceNoise:
-    """Contribution of the reference to the variance of window means: quantisation of the joint readings."""
+    """
+    Contribution of the reference to the variance of window means.
+
+    Quantisation of the joint readings.
+    """
 
     turn: float = 0.0
-    """Standard deviation of the turn between two readings, rad; divided by the window length, of the mean rate."""
+    """
+    Standard deviation of the turn between two readings, rad; divided by the window length, of the
+    mean rate.
+    """
     level: float = 0.0
     """Standard deviation of gravity's components at rest, m/s^2."""
 
@@ -52,8 +72,8 @@ class ReferenceNoise:
         """
         Return the reference noise of a sensor for encoders with a step, rad.
 
-        The error of a reading is ``step / sqrt(12)``, of a turn ``step / sqrt(6)``. An error of the attitude about one axis affects two
-        of the three components of gravity.
+        The error of a reading is ``step / sqrt(12)``, of a turn ``step / sqrt(6)``. An error of the
+        attitude about one axis affects two of the three components of gravity.
         """
         return (
             cls(turn=step / np.sqrt(6))
@@ -69,16 +89,25 @@ class ReferenceNoise:
 
 @dataclass(frozen=True, eq=False)
 class MovingFactors:
-    """Excess variance of moving windows of one kind over the noise at rest: factors on ``white_variance * inflation``, each shape (3,)."""
+    """
+    Excess variance of moving windows of one kind over the noise at rest.
+
+    Factors on ``white_variance * inflation``, each shape (3,).
+    """
 
     every: np.ndarray
     """On the variance of the centred rows."""
     slow: np.ndarray
-    """On the variance of their slow part, where it fits better than the fast one; otherwise as `every`."""
+    """
+    On the variance of their slow part, where it fits better than the fast one; otherwise as
+    `every`.
+    """
     means: np.ndarray = field(default_factory=lambda: np.ones(3))
     """On the variance of the window means due to the noise within windows."""
     along: float = 1.0
-    """Part of `every` due to misfit along the columns of the model, correlated in time; at least 1."""
+    """
+    Part of `every` due to misfit along the columns of the model, correlated in time; at least 1.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +115,18 @@ class NoiseModel:
     """
     Noise of one sensor.
 
-    The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with its neighbours in the same recording,
-    the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) + session_variance`` over the bias processes, evaluated at the middles of the
-    windows. The change of the bias within a window adds the variance `means_beside_middles` to its mean.
+    The mean of window k has variance ``white_variance * inflation / n_k + offset_sd^2`` and, with
+    its neighbours in the same recording, the covariance ``sum(sd^2 exp(-|t_k - t_l| / time)) +
+    session_variance`` over the bias processes, evaluated at the middles of the windows. The change
+    of the bias within a window adds the variance `means_beside_middles` to its mean.
     """
 
     white_variance: np.ndarray
     """Variance of single samples at rest, shape (3,)."""
     inflation: np.ndarray
-    """Factor by which the noise at low frequency exceeds white noise of that variance, shape (3,)."""
+    """
+    Factor by which the noise at low frequency exceeds white noise of that variance, shape (3,).
+    """
     offset_sd: float = 0.0
     """Standard deviation of an independent offset per window."""
     bias_processes: tuple[BiasProcess, ...] = ()
@@ -102,17 +134,26 @@ class NoiseModel:
     known: tuple[BiasProcess, ...] = ()
     """The ones that were measured separately, on a recording at rest."""
     middle_wander: float = 0.0
-    """Standard deviation of the bias process on the middle one of the axes, where it is large enough for a test per axis."""
+    """
+    Standard deviation of the bias process on the middle one of the axes, where it is large enough
+    for a test per axis.
+    """
     moving: dict[str, MovingFactors] = field(default_factory=dict)
     """Kind of window -> excess variance over the noise at rest."""
     session_sd: float = 0.0
-    """Standard deviation of the bias from recording to recording; zero when the recordings agree or there is one."""
+    """
+    Standard deviation of the bias from recording to recording; zero when the recordings agree or
+    there is one.
+    """
     session_variance: float = 0.0
     """Its square, increased for few recordings; used in weights and standard deviations."""
     reference: ReferenceNoise = ReferenceNoise()
     """Contribution of the reference to the window means."""
     shaken: dict[tuple[int, float], np.ndarray] = field(default_factory=dict)
-    """(recording, middle in s) of rests that vibrate -> variance of their means from their samples, shape (3,)."""
+    """
+    (recording, middle in s) of rests that vibrate -> variance of their means from their samples,
+    shape (3,).
+    """
     left_out: frozenset[tuple[int, float]] = frozenset()
     """(recording, middle in s) of outlying windows: their means have no weight."""
 
@@ -149,9 +190,13 @@ class NoiseModel:
         keys: Sequence[tuple[int, float]] = (),
     ) -> np.ndarray:
         """
-        Return the variance of means of windows of these kinds and lengths (samples; s) by the noise within and the reference, (k, 3).
+        Return the variance of means of windows of these kinds and lengths, (k, 3).
 
-        The variance of vibrating windows with `keys` (recording, middle in s) is at least the one estimated from their samples.
+        The lengths are in samples and in s. The variance is due to the noise within the windows and
+        to the reference.
+
+        The variance of vibrating windows with `keys` (recording, middle in s) is at least the one
+        estimated from their samples.
         """
         factors = {kind: moving.means for kind, moving in self.moving.items()}
         white = (
@@ -175,14 +220,22 @@ class NoiseModel:
         *,
         keys: Sequence[tuple[int, float]] = (),
     ) -> np.ndarray:
-        """Return the same relative to the bias in the middle of each window: with its change within the window, shape (k, 3)."""
+        """
+        Return the same relative to the bias in the middle of each window.
+
+        With its change within the window, shape (k, 3).
+        """
         return (
             self.mean_variance(kinds, counts, durations, keys=keys)
             + means_beside_middles(self.bias_processes, durations)[:, None]
         )
 
     def wander_within(self, offsets: np.ndarray) -> np.ndarray:
-        """Return the covariance of the bias at instants about the middle of a window, s, given its value there, shape (n, n)."""
+        """
+        Return the covariance of the bias at instants, given its value in the middle.
+
+        The instants are about the middle of a window, in s, and the result has shape (n, n).
+        """
         away, apart = np.abs(offsets), np.abs(np.subtract.outer(offsets, offsets))
         return sum(
             (
@@ -203,7 +256,9 @@ class NoiseModel:
 
     def slow_weight(self, kind: str) -> np.ndarray:
         """
-        Return the additional weight w of the slow part of centred rows, ``w^2 = 1/slow - 1/every``, shape (3,).
+        Return the additional weight w of the slow part of centred rows, ``w^2 = 1/slow - 1/every``.
+
+        Shape (3,).
 
         The sum of squares is then ``fast / every + slow / slow``, without a difference of factors.
         """
@@ -213,7 +268,11 @@ class NoiseModel:
         return np.sqrt(np.maximum(1 / factors.slow - 1 / factors.every, 0.0) / self.low_variance)
 
     def at_rest_only(self, *processes: BiasProcess) -> 'NoiseModel':
-        """Return the model of noise only: no offsets, no misfit along the columns, and only the given bias processes."""
+        """
+        Return the model of noise only.
+
+        No offsets, no misfit along the columns, and only the given bias processes.
+        """
         moving = {
             kind: replace(factors, every=factors.every / factors.along)
             for kind, factors in self.moving.items()
@@ -225,7 +284,11 @@ class NoiseModel:
         return replace(self, moving=moving, offset_sd=0.0, bias_processes=processes)
 
     def weighs_alike(self, other: 'NoiseModel') -> bool:
-        """Return whether slow parts count no more than fast ones, or the weights equal those of `other` within `SAME_VARIANCE`."""
+        """
+        Return whether slow parts count no more than fast ones, or the weights are equal.
+
+        Weights are equal if they agree with the weights of `other` within `SAME_VARIANCE`.
+        """
         for kind, mine in self.moving.items():
             if np.all(mine.slow == mine.every):
                 continue
@@ -244,10 +307,14 @@ def means_beside_middles(
     processes: Sequence[BiasProcess], durations: np.ndarray | float
 ) -> np.ndarray:
     """
-    Return the variance of the mean of a bias process over windows of these lengths (s) relative to its value in their middles.
+    Return the relative variance of the mean of a bias process over windows.
 
-    For a random walk with ``2 sd^2 / time`` per second it is ``sd^2 T / (6 time)``. It decreases in windows longer than the correlation
-    time, where the value in the middle overstates the variance of the mean.
+    The windows have these lengths (s). The variance is relative to the value of the process in
+    their middles.
+
+    For a random walk with ``2 sd^2 / time`` per second it is ``sd^2 T / (6 time)``. It decreases in
+    windows longer than the correlation time, where the value in the middle overstates the variance
+    of the mean.
     """
     total = np.zeros(np.shape(durations))
     for process in processes:
@@ -257,7 +324,11 @@ def means_beside_middles(
 
 
 def dof_factor(dof: np.ndarray | float) -> np.ndarray:
-    """Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST: factor on a variance from few data."""
+    """
+    Return dof / (dof - 2), the variance of the t distribution, at most DOF_FACTOR_MOST.
+
+    Factor on a variance from few data.
+    """
     return np.minimum(dof / np.maximum(np.subtract(dof, 2), 1e-9), DOF_FACTOR_MOST)
 
 

@@ -1,4 +1,6 @@
-"""Search for the noise of rows by restricted likelihood: grid, variance components, bias processes."""
+"""
+Search for the noise of rows by restricted likelihood: grid, variance components, bias processes.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +22,10 @@ ATTRIBUTION_STEPS = 6
 SPARE_LEAST = 0.1
 """With fewer degrees of freedom no misfit is attributed to a group."""
 WIDENING_PROBABILITY = 0.975
-"""Probability of the quantile whose ratio between Student's t and the normal distribution widens standard deviations."""
+"""
+Probability of the quantile whose ratio between Student's t and the normal distribution widens
+standard deviations.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +37,9 @@ class GroupVariances:
     dof: np.ndarray
     """Degrees of freedom from which each was estimated, shape (n_groups,)."""
     upper: np.ndarray
-    """Variance for standard deviations, which allows for the error of `variance`, shape (n_groups,)."""
+    """
+    Variance for standard deviations, which allows for the error of `variance`, shape (n_groups,).
+    """
 
     def total(self, noise: np.ndarray, group: np.ndarray, inflated: bool = False) -> np.ndarray:
         """
@@ -63,8 +70,9 @@ def estimate_group_variances(
     """
     Estimate the additional variance of each group of rows.
 
-    The rows are ``residual = design @ x + e`` with independent errors of variance ``noise + variance[group]``. Scoring on
-    the restricted likelihood, which charges for the parameters that were fitted.
+    The rows are ``residual = design @ x + e`` with independent errors of variance ``noise +
+    variance[group]``. Scoring on the restricted likelihood, which charges for the parameters that
+    were fitted.
 
     Parameters
     ----------
@@ -107,12 +115,20 @@ def estimate_group_variances(
 
 
 def student_factor(dof: np.ndarray) -> np.ndarray:
-    """Return the squared ratio of the 97.5 % quantiles of Student's t with `dof` (at least 1) degrees of freedom and of the normal law."""
+    """
+    Return the squared ratio of Student's and normal 97.5 % quantiles.
+
+    Student's t has `dof` (at least 1) degrees of freedom and is compared with the normal law.
+    """
     return (stdtrit(np.maximum(dof, 1.0), WIDENING_PROBABILITY) / ndtri(WIDENING_PROBABILITY)) ** 2
 
 
 def _attributed(problem, alone, fallback):
-    """Return the variance of one group if all misfit is its own, at least `fallback`, widened by Student's t, shape (n_groups,)."""
+    """
+    Return the variance of one group if all misfit is its own, shape (n_groups,).
+
+    It is at least `fallback` and widened by Student's t.
+    """
     least = np.where(alone, fallback, 0.0)
     current, dof = problem.step(least, np.zeros(len(alone), bool))
     for _ in range(ATTRIBUTION_STEPS if dof[alone] > SPARE_LEAST else 0):
@@ -137,7 +153,11 @@ class _Groups:
         return (self.members @ self.variance(extra)) / np.maximum(self.members.sum(1), 1)
 
     def step(self, extra, free):
-        """Return the next variances, a scoring step over the free groups that are not pinned at zero, and each one's degrees of freedom."""
+        """
+        Return the next variances and each one's degrees of freedom.
+
+        The variances follow from a scoring step over the free groups that are not pinned at zero.
+        """
         score, information = self.likelihood.scoring(self.variance(extra)[:, None], self.members)
         index, step, typical = (
             np.flatnonzero(free & ~((extra <= 0) & (score < 0))),
@@ -146,32 +166,52 @@ class _Groups:
         )
         if len(index):
             step[index] = np.linalg.solve(information[np.ix_(index, index)], score[index])
-        return np.clip(extra + step, 0.0, extra + 100 * typical), 2 * np.diag(
-            information
-        ) * typical**2
+        return (
+            np.clip(extra + step, 0.0, extra + 100 * typical),
+            2 * np.diag(information) * typical**2,
+        )
 
 
 TYPICAL_TIME, TIME_SPREAD = 100.0, 0.8
-"""Correlation times of MEMS biases: around 100 s, log-normal; a short session does not determine them (field catalogue, section 6)."""
+"""
+Correlation times of MEMS biases: around 100 s, log-normal; a short session does not determine them
+(field catalogue, section 6).
+"""
 CLEAR_GAIN = 30.0
-"""Fall of minus twice the log likelihood beyond which a bias process is significant and its maximum-likelihood estimate is used."""
+"""
+Fall of minus twice the log likelihood beyond which a bias process is significant and its
+maximum-likelihood estimate is used.
+"""
 SESSION_GAIN = 6.6
-"""The same for biases that differ between recordings: chi-square, one degree of freedom on its boundary, 0.5 %."""
+"""
+The same for biases that differ between recordings: chi-square, one degree of freedom on its
+boundary, 0.5 %.
+"""
 OFFSET_GRID = np.array([0.0, 0.3, 0.7, 1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0])
 BIAS_GRID = np.array([0.15, 0.25, 0.4, 0.63, 1.0, 1.6, 2.5, 4.0, 6.3, 10.0, 25.0, 60.0])
 TIME_GRID = np.array([40.0, 100.0, 250.0])
-"""Offset and bias process in units of the typical noise of a window mean; correlation times in s."""
+"""
+Offset and bias process in units of the typical noise of a window mean; correlation times in s.
+"""
 SESSION_GRID = 4.0 ** np.arange(-3, 8)
-"""Steps from recording to recording in the same units; the best of them is refined by factors of two and of the root of two."""
+"""
+Steps from recording to recording in the same units; the best of them is refined by factors of two
+and of the root of two.
+"""
 FLICKER_MARK, FLICKER_TIMES = 0.0, (1.0, 5.0, 25.0, 125.0, 625.0)
-"""Correlation time that denotes flicker: equal variance at spaced times, s, from the length of a window to the length of a session."""
+"""
+Correlation time that denotes flicker: equal variance at spaced times, s, from the length of a
+window to the length of a session.
+"""
 MIN_PROCESS_WINDOWS = 12
 """Fewest windows for the estimate of a bias process."""
 
 
 class NoiseLikelihood:
     """
-    Restricted likelihood of mean rows over shapes of the noise ``(offset sd, sd of the bias process, its correlation time)``.
+    Restricted likelihood of mean rows over shapes of the noise.
+
+    A shape is ``(offset sd, sd of the bias process, its correlation time)``.
 
     Standard deviations are in units of `typical`, the noise of a typical window mean.
 
@@ -215,7 +255,11 @@ class NoiseLikelihood:
     def loss(
         self, shape: tuple, used: Sequence[int] | np.ndarray | None = None, *, session: float = 0.0
     ) -> float:
-        """Return minus twice the restricted log likelihood with the parameters `used`, counted after the common ones, by default all."""
+        """
+        Return minus twice the restricted log likelihood with the parameters `used`.
+
+        The parameters are counted after the common ones and are all parameters by default.
+        """
         key = (*map(float, shape), float(session))
         if key not in self._losses:
             offset, bias, time, step = np.multiply(
@@ -236,7 +280,11 @@ class NoiseLikelihood:
         return self._profiles[choice]
 
     def of_axis(self, axis: int, shape: tuple) -> 'NoiseLikelihood':
-        """Return the likelihood of the noise of one axis, the other axes fixed at the shape; in units of the axis' own typical noise."""
+        """
+        Return the likelihood of the noise of one axis, the other axes fixed at the shape.
+
+        In units of the axis' own typical noise.
+        """
         offset, bias, time = np.multiply(shape, (self.typical, self.typical, 1.0))
         others = np.arange(self._white.shape[1]) != axis
         processes = self.processes(bias, time)
@@ -258,7 +306,11 @@ class NoiseLikelihood:
         )
 
     def processes(self, sd: float, time: float) -> tuple[BiasProcess, ...]:
-        """Return the known processes plus one more (or the flicker processes) if its standard deviation is above zero."""
+        """
+        Return the known processes plus one more (or the flicker processes).
+
+        The further one is added if its standard deviation is above zero.
+        """
         times = FLICKER_TIMES if time == FLICKER_MARK else (time,)
         return (
             (*self.known, *(BiasProcess(sd / float(np.sqrt(len(times))), each) for each in times))
@@ -278,12 +330,15 @@ def estimate_offsets(
     durations: np.ndarray | float = 0.0,
 ) -> dict:
     """
-    Return the fields of `NoiseModel` that concern offsets: offset_sd, bias_processes, session_sd, session_variance.
+    Return the fields of `NoiseModel` that concern offsets.
 
-    A short session does not determine the size of a bias process, and the sd of a bias depends on that size. So the
-    variances are averaged over the likelihood (posterior means on a grid); only a significant process is set to its best estimate.
-    With several recordings a bias per recording is included if the likelihood gains `SESSION_GAIN` over the best fit
-    with offsets and process. Where bias processes are known, a further process must be significant.
+    Offset_sd, bias_processes, session_sd, session_variance.
+
+    A short session does not determine the size of a bias process, and the sd of a bias depends on
+    that size. So the variances are averaged over the likelihood (posterior means on a grid); only a
+    significant process is set to its best estimate. With several recordings a bias per recording is
+    included if the likelihood gains `SESSION_GAIN` over the best fit with offsets and process.
+    Where bias processes are known, a further process must be significant.
 
     Parameters
     ----------
@@ -323,7 +378,11 @@ def estimate_offsets(
 
 
 class _Search:
-    """The likelihood times the prior of correlation times, on a grid of shapes, for a given sd between recordings."""
+    """
+    The likelihood times the prior of correlation times, on a grid of shapes.
+
+    For a given sd between recordings.
+    """
 
     def __init__(self, likelihood):
         self.likelihood = likelihood
@@ -337,7 +396,11 @@ class _Search:
         )
 
     def grid(self, session):
-        """Return the shapes tried, shape (k, 3), and their costs; shapes without bias process are first."""
+        """
+        Return the shapes tried, shape (k, 3), and their costs.
+
+        Shapes without bias process are first.
+        """
         trials = [(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID]
         alone = np.array([self.cost(trial, session) for trial in trials])
         offsets = np.unique(np.concatenate([[0.0], OFFSET_GRID[alone < alone.min() + 20.0]]))
@@ -349,7 +412,11 @@ class _Search:
         )
 
     def best_session(self, shape):
-        """Return the likeliest sd between recordings, over the best offsets and process, the offsets without process, and neither."""
+        """
+        Return the likeliest sd between recordings, over three choices of the noise.
+
+        The choices are the best offsets and process, the offsets without process, and neither.
+        """
         shapes = [tuple(shape), (shape[0], 0.0, TYPICAL_TIME), (0.0, 0.0, TYPICAL_TIME)]
         shapes += [(0.0, bias, TYPICAL_TIME) for bias in self.biases[::4]]
 
@@ -390,7 +457,11 @@ class _Search:
 
 
 def _posterior_mean(trials, costs):
-    """Return the roots of the mean variances, and the mean logarithm of the correlation time, over the likelihood."""
+    """
+    Return averages over the likelihood of the shapes of the noise.
+
+    They are the roots of the mean variances, and the mean logarithm of the correlation time.
+    """
     weight = np.exp(-0.5 * costs) * np.where(trials[:, 1] == 0, 1.0, 1.0 / len(TIME_GRID))
     weight /= weight.sum()
     offset, bias = np.sqrt(weight @ trials[:, :2] ** 2)
@@ -403,20 +474,32 @@ def _posterior_mean(trials, costs):
 CORRELATION_TIMES = (100.0, 300.0, 15.0, 40.0, 1000.0, FLICKER_MARK)
 """Correlation times that are tried, s, and flicker; that of the natural process first."""
 NATURAL = 0.5
-"""Least sd of every bias process over the white noise of one second, with the first of these correlation times."""
+"""
+Least sd of every bias process over the white noise of one second, with the first of these
+correlation times.
+"""
 BIAS_LOG_SD = 0.8
-"""Prior sd of the logarithm of a bias process's sd over the natural one; much larger drifts are hardly a bias process."""
+"""
+Prior sd of the logarithm of a bias process's sd over the natural one; much larger drifts are hardly
+a bias process.
+"""
 OFFSET_PRICE = 10.0
-"""Price of offsets of windows: they are no noise of a sensor, and flicker scatters means of windows beyond a wander of 15 s as they do."""
+"""
+Price of offsets of windows: they are no noise of a sensor, and flicker scatters means of windows
+beyond a wander of 15 s as they do.
+"""
 SD_RATIOS = (0.0, *2.0 ** np.arange(-2.0, 8.5, 0.5))
 """
-Standard deviations that are tried, in units of the typical noise of a window mean; between steps of two the likelihoods of other times lie.
+Standard deviations that are tried, in units of the typical noise of a window mean; between steps of
+two the likelihoods of other times lie.
 """
 
 
 class BiasProcessSearch:
     """
-    The best shape of the noise ``(offset sd, sd of the bias process, its correlation time)`` given a choice of parameters.
+    The best shape of the noise given a choice of parameters.
+
+    The shape is ``(offset sd, sd of the bias process, its correlation time)``.
 
     Parameters
     ----------
@@ -436,7 +519,11 @@ class BiasProcessSearch:
         )
 
     def best(self, used: Sequence[int]) -> tuple[tuple, float]:
-        """Return (shape, loss) of the best noise given the parameters `used`, standard deviations in units of the typical noise."""
+        """
+        Return (shape, loss) of the best noise given the parameters `used`.
+
+        The standard deviations are in units of the typical noise.
+        """
 
         def loss(shape):
             return self.likelihood.loss(shape, used) + self.price(*shape[:2])
@@ -452,13 +539,22 @@ class BiasProcessSearch:
         return shape, loss(shape)
 
     def price(self, offset: float, bias: float) -> float:
-        """Return minus twice the log prior of offsets, relative to none, and of the sd of a bias, relative to the usual one."""
+        """
+        Return minus twice the log prior of offsets and of the sd of a bias.
+
+        The prior of offsets is relative to none, and that of the sd of a bias is relative to the
+        usual one.
+        """
         return OFFSET_PRICE * (offset > 0) + (
             (np.log(max(bias / self.usual, 1.0)) / BIAS_LOG_SD) ** 2 if self.least else 0.0
         )
 
     def of_middle_axis(self, shape: tuple, used: Sequence[int]) -> float:
-        """Return the median over the axes of the likeliest sd of the bias process of each, with `shape` for the other axes."""
+        """
+        Return the median over the axes of the likeliest sd of the bias process of each.
+
+        With `shape` for the other axes.
+        """
 
         def likeliest(own):
             offset = shape[0] * self.likelihood.typical / own.typical
@@ -471,7 +567,11 @@ class BiasProcessSearch:
         )
 
     def polished(self, shape: tuple, used: Sequence[int]) -> dict:
-        """Return the fields of `NoiseModel` that concern offsets, the standard deviations of a shape refined."""
+        """
+        Return the fields of `NoiseModel` that concern offsets.
+
+        The standard deviations of a shape are refined.
+        """
         offset, bias, time = shape
         offset = _polish(lambda x: self.likelihood.loss((x, bias, time), used), offset)
         bias = max(

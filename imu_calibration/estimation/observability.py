@@ -23,7 +23,10 @@ REST, WAY = 5.0, 3.0
 """s; a rest, and the time from one rest to the next."""
 MIN_AXIS_COSINE = 0.98
 """Cosine of the angle up to which a joint lies along a sensor axis."""
-OTHER_MOUNT = 'mount the IMU at a different angle on the joint and record the same motion again, in addition to this recording'
+OTHER_MOUNT = (
+    'mount the IMU at a different angle on the joint and record the same motion again, in addition'
+    ' to this recording'
+)
 """Advice when further motions of a single joint do not help."""
 
 
@@ -62,7 +65,11 @@ def _turn(
     branch=None,
     shaking=None,
 ):
-    """Return the reference of a sensor that turns about its own `axis`; `up` is the vertical in the sensor at angle zero."""
+    """
+    Return the reference of a sensor that turns about its own `axis`.
+
+    `up` is the vertical in the sensor at angle zero.
+    """
     axis, up = (
         np.asarray(axis, float) / np.linalg.norm(axis),
         np.asarray(up, float) / np.linalg.norm(up),
@@ -174,7 +181,11 @@ def rest_with_up(up: np.ndarray) -> 'Motion':
 
 
 def _two_axis(gravity):
-    """Turn about an axis that itself turns: rates about two axes at once, with the cross term in the angular acceleration."""
+    """
+    Turn about an axis that itself turns.
+
+    Rates about two axes at once, with the cross term in the angular acceleration.
+    """
     pieces = []
     for inner, outer in ((0, 1), (1, 2), (2, 0)):
         w = 200 * DEG
@@ -269,14 +280,19 @@ MOTIONS = (
         _shaken,
     ),
 )
-"""Standard motions of the sensor; motions of table joints are named by the effects that need them."""
+"""
+Standard motions of the sensor; motions of table joints are named by the effects that need them.
+"""
 
 
 def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
     """
-    Return the motions of a table that turns the sensor about one axis only: none where that is no axis of the sensor.
+    Return the motions of a table that turns the sensor about one axis only.
 
-    Gravity has the same direction relative to the axis as on the table: for a vertical axis it is constant in the sensor frame.
+    None where that is no axis of the sensor.
+
+    Gravity has the same direction relative to the axis as on the table: for a vertical axis it is
+    constant in the sensor frame.
 
     Parameters
     ----------
@@ -293,12 +309,18 @@ def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
 
 
 TABLE_MOTIONS = {
-    'turn_about_vertical': 'turn slowly through a full circle about the vertical, resting at several headings',
-    'slow_turn': 'turn each joint slowly through full circles, with the sensor mounted at two attitudes',
+    'turn_about_vertical': (
+        'turn slowly through a full circle about the vertical, resting at several headings'
+    ),
+    'slow_turn': (
+        'turn each joint slowly through full circles, with the sensor mounted at two attitudes'
+    ),
     'oscillate_fast': 'oscillate at 1, 2 and 4 Hz about two axes, in both phases',
     'fast_spin': 'spin slowly up to the fastest rate in both senses',
 }
-"""Motions that concern the table or the clock; their gain depends on the table and is not predicted."""
+"""
+Motions that concern the table or the clock; their gain depends on the table and is not predicted.
+"""
 ALL_MOTIONS = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
 """Name -> instruction."""
 ONE_JOINT = {
@@ -306,7 +328,9 @@ ONE_JOINT = {
     'fast_spin': TABLE_MOTIONS['fast_spin'],
     'slow_turn': 'turn the joint slowly through full circles',
     'warm_up': 'rest in several places, cold and warm',
-    'warm_and_cool': 'rest in several places while it warms up by ten kelvins, and again while it cools',
+    'warm_and_cool': (
+        'rest in several places while it warms up by ten kelvins, and again while it cools'
+    ),
     'shake': 'rest in several places, quiet and while a machine shakes the table',
 }
 """The motions that a table of one joint can do; the other ones require a remounted IMU."""
@@ -321,9 +345,12 @@ def added_information(
     gravity: float,
 ) -> np.ndarray:
     """
-    Return the information matrix that one minute of a standard motion would add, shape (n_params, n_params).
+    Return the information matrix that one minute of a standard motion would add.
 
-    Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this session.
+    Shape (n_params, n_params).
+
+    Each piece counts as one window at 100 Hz with the noise and the between-window scatter of this
+    session.
     """
     total = np.zeros((len(values), len(values)))
     slopes = {sensor: coefficient_jacobian(model, sensor, values) for sensor in SENSORS}
@@ -353,7 +380,11 @@ def _piece_information(layout, dc, noise, piece):
 
 
 def _columns(layout, name, rows, piece):
-    """Return the columns of a group; zeros where the motion has no temperature or no joints, and for columns of a warp."""
+    """
+    Return the columns of a group.
+
+    Zeros where the motion has no temperature or no joints, and for columns of a warp.
+    """
     group = layout.groups.get(name)
     unknown = (
         group is None
@@ -369,9 +400,12 @@ def _columns(layout, name, rows, piece):
 
 def tolerance_scaled_singular_values(information: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
     """
-    Return the singular values of the design with parameters in units of their tolerance, descending.
+    Return the singular values of the scaled design, descending.
 
-    A value of one means that the direction is determined to one tolerance; below one it is weak. Rank is no sufficient criterion.
+    The design has its parameters in units of their tolerance.
+
+    A value of one means that the direction is determined to one tolerance; below one it is weak.
+    Rank is no sufficient criterion.
     """
     scaled = information * np.outer(tolerances, tolerances)
     return np.sqrt(np.clip(scipy.linalg.eigvalsh((scaled + scaled.T) / 2)[::-1], 0, None))
@@ -412,11 +446,13 @@ def needed_motions(
     possible: Sequence[Motion] | None = None,
 ) -> dict[str, tuple[str, float]]:
     """
-    Return for each undetermined parameter the standard motion that reduces its standard deviation most.
+    Return the most helpful standard motion for each undetermined parameter.
 
-    Every motion of the catalogue is tried: its information is added, and the predicted standard errors are compared with the
-    tolerances. A table that turns the sensor about one axis only can do few of them (`possible`): where none of these would help, the IMU
-    must be remounted.
+    It is the motion that reduces the standard deviation of the parameter most.
+
+    Every motion of the catalogue is tried: its information is added, and the predicted standard
+    errors are compared with the tolerances. A table that turns the sensor about one axis only can
+    do few of them (`possible`): where none of these would help, the IMU must be remounted.
 
     Returns
     -------
@@ -447,7 +483,11 @@ def _sd_of(information):
 
 
 def _best(solution, index, predicted, one_joint):
-    """Return (text, predicted sd) of the best motion; where none helps, another mount or the motion of the effect, and NaN."""
+    """
+    Return (text, predicted sd) of the best motion.
+
+    Where none helps, another mount or the motion of the effect, and NaN.
+    """
     motion = min(predicted, key=lambda m: predicted[m][index], default=None)
     if motion is not None and predicted[motion][index] <= 0.7 * solution.sd[index]:
         return motion.text, float(predicted[motion][index])

@@ -1,8 +1,11 @@
 """
-Estimate from rows of any reference: Gauss-Newton, scatter beyond the noise, fixed parameters, covariance.
+Estimate from rows of any reference.
 
-A reference linearises its equations at a state and moves the state by a step. States are dataclasses with `values`, the parameters; their
-other fields are nuisances (directions, drifts), which are estimated and eliminated.
+Gauss-Newton, scatter beyond the noise, fixed parameters, covariance.
+
+A reference linearises its equations at a state and moves the state by a step. States are
+dataclasses with `values`, the parameters; their other fields are nuisances (directions, drifts),
+which are estimated and eliminated.
 """
 
 from collections.abc import Mapping
@@ -23,12 +26,19 @@ from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPL
 MAX_NEWTON_STEPS = 15
 """Largest number of Gauss-Newton steps; four to six are usual."""
 FLAT_PRIOR_FACTOR = 1e4
-"""Factor on the prior sds for an estimate from the data: large enough to remove the priors, small enough for rounding."""
+"""
+Factor on the prior sds for an estimate from the data: large enough to remove the priors, small
+enough for rounding.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class RowSet:
-    """Linearised equations ``residual = nuisance @ dn + main @ dp + error``, error of variance `noise` + `component`'s."""
+    """
+    Linearised equations ``residual = nuisance @ dn + main @ dp + error``.
+
+    The error has the variance `noise` plus that of `component`.
+    """
 
     residual: np.ndarray
     """Measured minus predicted, shape (m,)."""
@@ -41,7 +51,10 @@ class RowSet:
     component: np.ndarray
     """Variance component that adds to it, or -1, shape (m,)."""
     group: np.ndarray
-    """Poses or blocks that the row belongs to, shape (m, 2): a turn belongs to the poses at both its ends."""
+    """
+    Poses or blocks that the row belongs to, shape (m, 2): a turn belongs to the poses at both its
+    ends.
+    """
 
 
 class RowReference(Protocol):
@@ -83,7 +96,9 @@ class RowEstimate:
 
 def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) -> RowEstimate:
     """
-    Estimate all parameters, the scatter of the components and the nuisances from the rows of a reference.
+    Estimate all parameters, the scatter of the components and the nuisances.
+
+    The estimates are from the rows of a reference.
 
     Parameters
     ----------
@@ -115,9 +130,12 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
 
 def _choose_held(factor, priors, asked):
     """
-    Return which of the parameters `asked` (mask) have next to no information from the data, shape (n,).
+    Return which of the parameters `asked` (mask) have next to no information from the data.
 
-    One at a time, given the parameters fixed so far, the one with the largest sd in units of its prior, while that exceeds one half.
+    Shape (n,).
+
+    One at a time, given the parameters fixed so far, the one with the largest sd in units of its
+    prior, while that exceeds one half.
     """
     held = np.zeros(len(priors), bool)
     while np.any(free := asked & ~held):
@@ -178,7 +196,11 @@ def _iterate(reference, state, free, priors, *, variance, fallback):
 
 
 def _factor(rows, scatter):
-    """Return the triangular factor of the parameters with the nuisances eliminated, at inflated variances."""
+    """
+    Return the triangular factor of the parameters with the nuisances eliminated.
+
+    The factor is at inflated variances.
+    """
     root, width = (
         np.sqrt(scatter.total(rows.noise, rows.component, inflated=True)),
         rows.nuisance.shape[1],
@@ -187,7 +209,11 @@ def _factor(rows, scatter):
 
 
 def _of_scatter(rows, scatter, free):
-    """Return the part of the covariance that is due to the scatter of the components beyond the noise, shape (n, n)."""
+    """
+    Return the part of the covariance that is due to the scatter of the components beyond the noise.
+
+    Shape (n, n).
+    """
     variance = scatter.total(rows.noise, rows.component, inflated=True)
     design = np.hstack([rows.nuisance, rows.main[:, free]]) / np.sqrt(variance)[:, None]
     factor = triangular_of_band(design)

@@ -14,7 +14,11 @@ PANEL = 4
 
 
 def triangular(rows: np.ndarray) -> np.ndarray:
-    """Return the triangular factor of `rows`, shape (min(m, n), n), by Householder reflections of one block after the other."""
+    """
+    Return the triangular factor of `rows`, shape (min(m, n), n).
+
+    By Householder reflections of one block after the other.
+    """
     count, width = rows.shape
     if count < 2 * width:
         return _r_factor(np.array(rows, order='F'))
@@ -35,9 +39,12 @@ BAND_COLUMNS = 20
 
 def triangular_of_band(rows: np.ndarray) -> np.ndarray:
     """
-    Return the triangular factor of `rows`, shape (n, n); rows that begin in the same columns are reflected together.
+    Return the triangular factor of `rows`, shape (n, n).
 
-    With the elements near a diagonal, and dense columns last, the cost is proportional to the number of rows.
+    Rows that begin in the same columns are reflected together.
+
+    With the elements near a diagonal, and dense columns last, the cost is proportional to the
+    number of rows.
     """
     band, factor, carried = (
         np.argmax(rows != 0, axis=1) // BAND_COLUMNS,
@@ -60,7 +67,11 @@ def packed(factor: np.ndarray) -> np.ndarray:
 
 
 def unpacked(factors: Sequence[np.ndarray], width: int) -> np.ndarray:
-    """Return packed factors of `width` columns as one stack, shape (n_factors, n_rows, width); rows of zeros complete the shorter ones."""
+    """
+    Return packed factors of `width` columns as one stack, shape (n_factors, n_rows, width).
+
+    Rows of zeros complete the shorter ones.
+    """
     places, longest = _places(width), max(map(len, factors))
     rows = places[longest - 1] // width + 1 if longest else 0
     found = np.zeros((len(factors), rows * width))
@@ -89,11 +100,18 @@ def _require_finite(info, values):
 
 
 JITTER = 1e-12
-"""Added to the diagonal of a scaled normal matrix: above its rounding, below the information of the data."""
+"""
+Added to the diagonal of a scaled normal matrix: above its rounding, below the information of the
+data.
+"""
 
 
 def scaled_lstsq(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the least-squares solution of ``matrix @ x = right``, its columns scaled to unit norm first."""
+    """
+    Return the least-squares solution of ``matrix @ x = right``.
+
+    The columns of the matrix are scaled to unit norm first.
+    """
     scale = np.linalg.norm(matrix, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     q, r, order = scipy.linalg.qr(matrix / scale, mode='economic', pivoting=True)
@@ -121,7 +139,11 @@ def inverse_normal(information: np.ndarray) -> np.ndarray:
 
 
 def solve_scaled(information: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the solutions of several systems, (k, n, n) and (k, n), each information matrix scaled to a unit diagonal first."""
+    """
+    Return the solutions of several systems, (k, n, n) and (k, n).
+
+    Each information matrix is scaled to a unit diagonal first.
+    """
     scale = 1 / np.sqrt(np.einsum('kii->ki', information))
     scaled = information * scale[:, :, None] * scale[:, None, :] + JITTER * np.eye(
         information.shape[1]
@@ -133,7 +155,9 @@ def solve_normal(
     normal: np.ndarray, used: np.ndarray, prior_sd: np.ndarray, *, prior_mean: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (values, covariance) of the parameters `used` that minimise the quadratic form of a normal matrix plus a prior.
+    Return (values, covariance) of the parameters `used` at the minimum.
+
+    They minimise the quadratic form of a normal matrix plus a prior.
 
     Parameters
     ----------
@@ -151,7 +175,9 @@ def solve_normal(
 
 
 def quadratic(normal: np.ndarray, used: Sequence[int] | np.ndarray, values: np.ndarray) -> float:
-    """Return the residual sum of squares of `values` of the parameters `used` under a normal matrix."""
+    """
+    Return the residual sum of squares of `values` of the parameters `used` under a normal matrix.
+    """
     used = np.asarray(used)
     return float(
         normal[-1, -1]
@@ -164,7 +190,9 @@ def covariance_with_held(
     rows: np.ndarray, free: np.ndarray, held: np.ndarray, *, prior_sd: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return (covariance of the free parameters, covariance due to those fixed at their prior), both shape (n, n); their sum is the total.
+    Return (covariance of the free parameters, covariance due to the fixed ones).
+
+    The fixed ones are at their prior. Both have shape (n, n), and their sum is the total.
 
     Parameters
     ----------

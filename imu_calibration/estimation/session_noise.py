@@ -17,11 +17,19 @@ from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
 
 MIN_VARIANCE_RATIO = 2.0
-"""The parts have separate weights above this ratio of their residual variances, fast over slow; below it all samples count alike."""
+"""
+The parts have separate weights above this ratio of their residual variances, fast over slow; below
+it all samples count alike.
+"""
 CAUTIOUS_SDS = 2.0
-"""The residual variance of the slow part is raised by this many of its standard deviations, in comparison and use."""
+"""
+The residual variance of the slow part is raised by this many of its standard deviations, in
+comparison and use.
+"""
 DESIGN_EIGENVALUE_SHARE = 1e-6
-"""Directions of a scaled design with less than this share of the largest eigenvalue do not count."""
+"""
+Directions of a scaled design with less than this share of the largest eigenvalue do not count.
+"""
 RESIDUAL_EIGENVALUE_SHARE = 1e-9
 """The same for the least residual."""
 WEIGHTLESS = 1e6
@@ -30,19 +38,28 @@ WEIGHTLESS = 1e6
 
 @dataclass(frozen=True, eq=False)
 class BandMisfit:
-    """Residual variance per row of the centred rows of one kind of window; equal in all parts for white noise."""
+    """
+    Residual variance per row of the centred rows of one kind of window.
+
+    Equal in all parts for white noise.
+    """
 
     overall: np.ndarray
     """Of all rows, shape (3,)."""
     slow: np.ndarray
-    """Of the means of short pieces, times the root of their length, shape (3,); zero when there are none."""
+    """
+    Of the means of short pieces, times the root of their length, shape (3,); zero when there are
+    none.
+    """
     fast: np.ndarray
     """Of the other rows, shape (3,)."""
     apart: np.ndarray
     """Whether slow and fast part have separate weights, shape (3,)."""
 
     def factors(self, noise: NoiseModel) -> MovingFactors:
-        """Return the excess variance of moving windows with this residual over the noise at rest."""
+        """
+        Return the excess variance of moving windows with this residual over the noise at rest.
+        """
         white, unit = noise.white_variance, noise.low_variance
         samples, pieces = (
             np.where(self.apart, self.fast, self.overall),
@@ -59,7 +76,9 @@ class BandMisfit:
 
     @property
     def noise(self) -> np.ndarray:
-        """Return the variance that replaces the one of white noise in the absence of rest, shape (3,)."""
+        """
+        Return the variance that replaces the one of white noise in the absence of rest, shape (3,).
+        """
         return np.where(self.apart, self.slow, self.overall)
 
 
@@ -69,8 +88,9 @@ def band_misfit(
     """
     Return the `BandMisfit` of centred rows.
 
-    A reference with errors at high frequency (ripple beyond the band of the joint states, an unmodelled low-pass) raises the residual of
-    the fast part. Where the slow part fits worse, its residual variance applies to all rows, because the residual is correlated in time.
+    A reference with errors at high frequency (ripple beyond the band of the joint states, an
+    unmodelled low-pass) raises the residual of the fast part. Where the slow part fits worse, its
+    residual variance applies to all rows, because the residual is correlated in time.
 
     Parameters
     ----------
@@ -91,7 +111,11 @@ def band_misfit(
 
 
 def own_misfit(rows: np.ndarray) -> np.ndarray:
-    """Return the residuals of the least-squares fit of each axis to rows ``[columns | output]``, shape (k, 3)."""
+    """
+    Return the residuals of the least-squares fit of each axis to rows ``[columns | output]``.
+
+    Shape (k, 3).
+    """
     columns, output = rows[:, :-3], rows[:, -3:]
     scale = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
@@ -102,10 +126,13 @@ def own_misfit(rows: np.ndarray) -> np.ndarray:
 
 def misfit_along(products: np.ndarray) -> tuple[float, int]:
     """
-    Return the sum of squares of residuals projected on the columns of designs, and the number of dimensions.
+    Return the sum of squares of projected residuals, and the number of dimensions.
 
-    For residual e and design A: ``e' A (A'A)^+ A' e`` and the rank of A, summed over designs. Their ratio is the variance of e when e is
-    white noise. It grows with the number of samples when the best-fit parameters differ from the given ones.
+    The residuals are projected on the columns of designs.
+
+    For residual e and design A: ``e' A (A'A)^+ A' e`` and the rank of A, summed over designs. Their
+    ratio is the variance of e when e is white noise. It grows with the number of samples when the
+    best-fit parameters differ from the given ones.
 
     Parameters
     ----------
@@ -122,7 +149,11 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
 
 
 def least_misfit(products: np.ndarray) -> tuple[float, int]:
-    """Return the residual sum of squares of the best fit from products of ``[design | output]``, shape (q + 1, q + 1), and the rank."""
+    """
+    Return the residual sum of squares of the best fit from products of ``[design | output]``.
+
+    Shape (q + 1, q + 1), and the rank.
+    """
     scale = np.append(_scales(np.diag(products)[:-1]), 1 / np.sqrt(max(products[-1, -1], 1e-300)))
     scaled = products * np.outer(scale, scale)
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
@@ -134,24 +165,37 @@ def least_misfit(products: np.ndarray) -> tuple[float, int]:
 
 
 def _scales(squares):
-    """Return the scales that give columns unit length; 0 for a column that is zero or negative through rounding."""
+    """
+    Return the scales that give columns unit length.
+
+    0 for a column that is zero or negative through rounding.
+    """
     return np.where(squares > 0, 1 / np.sqrt(np.where(squares > 0, squares, 1.0)), 0.0)
 
 
 MIN_INFLATION, MIN_SHAKEN_INFLATION = 0.8, 0.01
-"""Least noise at low frequency as a share of white noise of the same variance, at rest and under vibration."""
+"""
+Least noise at low frequency as a share of white noise of the same variance, at rest and under
+vibration.
+"""
 LEAST_NOISE = {'accelerometer': 1e-6, 'gyroscope': 1e-7}
-"""Least noise of a sample, m/s^2 and rad/s: readings of a noise-free simulator are exact except for stamps in integer ns."""
+"""
+Least noise of a sample, m/s^2 and rad/s: readings of a noise-free simulator are exact except for
+stamps in integer ns.
+"""
 VIBRATES = 4.0
 """Variance of a window over the quiet level above which the table vibrates."""
 
 
 def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
     """
-    Return (white_variance, inflation) pooled over static windows, each shape (3,), or None without static windows.
+    Return (white_variance, inflation) pooled over static windows, each shape (3,).
 
-    Windows whose variance differs from the median by more than a factor of two (clipped, knocked) are excluded. If vibration varies, the
-    reference is the quietest level instead of the median, because vibration changes the means little.
+    Or None without static windows.
+
+    Windows whose variance differs from the median by more than a factor of two (clipped, knocked)
+    are excluded. If vibration varies, the reference is the quietest level instead of the median,
+    because vibration changes the means little.
 
     Parameters
     ----------
@@ -190,7 +234,11 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
 
 
 def _usual(variances, inflations):
-    """Return (the median variance, False); for vibration above the band of the means in most windows, (the second least, True)."""
+    """
+    Return (the median variance, False).
+
+    For vibration above the band of the means in most windows, (the second least, True).
+    """
     median = float(np.median(variances))
     quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
     louder = variances > VIBRATES * quiet
@@ -201,7 +249,9 @@ def _usual(variances, inflations):
 
 
 def shaken_means(rows: Sequence, sensor: str) -> dict[tuple[int, float], np.ndarray]:
-    """Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level."""
+    """
+    Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level.
+    """
     static = [
         row
         for row in rows
@@ -226,7 +276,11 @@ def shaken_means(rows: Sequence, sensor: str) -> dict[tuple[int, float], np.ndar
 def first_noise(
     system: WeightedSystem, values: np.ndarray, known: dict[str, tuple[BiasProcess, ...]]
 ) -> dict[str, NoiseModel]:
-    """Return the initial noise without residuals; fast parts have weight zero where slow parts can be fitted better."""
+    """
+    Return the initial noise without residuals.
+
+    Fast parts have weight zero where slow parts can be fitted better.
+    """
     return {
         sensor: _with_bands(
             system, sensor, replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))
@@ -251,7 +305,11 @@ def _at_rest(system, sensor, values):
 
 
 def _with_bands(system, sensor, noise):
-    """Return the noise with weight zero for the fast parts where slow parts, fitted separately, have a smaller residual variance."""
+    """
+    Return the noise with weight zero for the fast parts where slow parts fit better.
+
+    The slow parts, fitted separately, have a smaller residual variance there.
+    """
     misfits = {kind: _misfit_of(system, sensor, kind) for kind in system.within[sensor]}
     return replace(
         noise,
@@ -266,7 +324,9 @@ def _with_bands(system, sensor, noise):
 def updated_noise(
     system: WeightedSystem, sensor: str, values: np.ndarray, *, noise: NoiseModel
 ) -> NoiseModel:
-    """Return the noise of a sensor estimated from the residuals at `values`, starting from `noise`."""
+    """
+    Return the noise of a sensor estimated from the residuals at `values`, starting from `noise`.
+    """
     if white_noise(system.accumulator.rows, sensor) is None:
         noise = replace(
             _at_rest(system, sensor, values), known=noise.known, left_out=noise.left_out
@@ -295,7 +355,11 @@ def updated_noise(
 
 
 def _judged(system, sensor, kind, values) -> BandMisfit:
-    """Return the misfit of the centred rows of a kind; of the fast part at least the misfit along the parameters."""
+    """
+    Return the misfit of the centred rows of a kind.
+
+    Of the fast part at least the misfit along the parameters.
+    """
     misfit = _misfit_of(system, sensor, kind, values)
     if not misfit.apart.any():
         return misfit
@@ -314,7 +378,11 @@ def _judged(system, sensor, kind, values) -> BandMisfit:
 
 
 def _misfit_of(system, sensor, kind, values=None) -> BandMisfit:
-    """Return the misfit of the centred rows of a kind at `values`; without them, of each part at its own best fit."""
+    """
+    Return the misfit of the centred rows of a kind at `values`.
+
+    Without them, of each part at its own best fit.
+    """
     rows, n_slow = (
         system.within[sensor][kind],
         system.accumulator.slow_rows.get(kind, 0) - system.accumulator.windows[kind],

@@ -1,4 +1,8 @@
-"""Solution of an estimation: its covariance as named terms whose sum is the total, and the status of its parameters."""
+"""
+Solution of an estimation.
+
+Its covariance as named terms whose sum is the total, and the status of its parameters.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +23,10 @@ SAMPLE_NOISE = 'noise'
 BIAS_PROCESS = 'bias_process'
 """Bias processes, offsets of windows or poses, and the bias of each recording."""
 HELD_PRIORS = 'held_parameters'
-"""The uncertainty of priors at which parameters are fixed, and the squared shift of replaced parameters."""
+"""
+The uncertainty of priors at which parameters are fixed, and the squared shift of replaced
+parameters.
+"""
 MODEL_ERROR = 'model_error'
 """Scatter between parts of the recording beyond noise."""
 DRIFT = 'drift'
@@ -56,13 +63,18 @@ def replace_weak(
     limit: np.ndarray | float = 1.0,
 ) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
     """
-    Return (values, terms, mask of the replaced parameters) with weak values replaced by their prior where that lowers the expected error.
+    Return (values, terms, mask) with weak values replaced by their prior.
 
-    A value v with prior p and standard deviation s of the fit is replaced where ``(v - p)^2 < s^2``. The parameter with the smallest ratio
-    is replaced first; all parameters correlated with it are updated with it fixed, ``x += C[:, k] / C[k, k] (p - v)``, C being the
-    posterior covariance of the fit, before the next test. The error of the result is that of the estimate and the shift d, so that
-    its covariance is the former one plus ``d d'``: at most ``1 + limit`` times the former variance. The variance of the prior itself
-    would ignore the recording, which bounds the parameter much more closely.
+    The mask is that of the replaced parameters. Values are replaced where that lowers the expected
+    error.
+
+    A value v with prior p and standard deviation s of the fit is replaced where ``(v - p)^2 <
+    s^2``. The parameter with the smallest ratio is replaced first; all parameters correlated with
+    it are updated with it fixed, ``x += C[:, k] / C[k, k] (p - v)``, C being the posterior
+    covariance of the fit, before the next test. The error of the result is that of the estimate and
+    the shift d, so that its covariance is the former one plus ``d d'``: at most ``1 + limit`` times
+    the former variance. The variance of the prior itself would ignore the recording, which bounds
+    the parameter much more closely.
 
     Parameters
     ----------
@@ -74,8 +86,9 @@ def replace_weak(
     weak : sequence of int
         Parameters under test.
     limit : array of shape (n_params,) or float
-        Largest ``(v - p)^2 / s^2`` of a replaced parameter: 1 for the smallest expected error without knowledge of the truth; the quantile
-        of chi-square for a likelihood-ratio test of the prior value.
+        Largest ``(v - p)^2 / s^2`` of a replaced parameter: 1 for the smallest expected error
+        without knowledge of the truth; the quantile of chi-square for a likelihood-ratio test of
+        the prior value.
 
     """
     moved, posterior, limits = values.copy(), of_fit(terms), np.broadcast_to(limit, values.shape)
@@ -116,11 +129,14 @@ DETERMINED, WEAK, HELD, FIXED = Status
 LACKING = (WEAK, HELD)
 """Statuses of parameters that need more data."""
 COMMON_SCALE = 'accelerometer.common_scale'
-"""Factor on all accelerometer readings by hand from an uncertain gravity; the sds of the other parameters are judged without it."""
+"""
+Factor on all accelerometer readings by hand from an uncertain gravity; the sds of the other
+parameters are judged without it.
+"""
 WEAK_DATA, LIKELIHOOD_RATIO, REPLACEMENT = 'weak data', 'likelihood ratio', 'replacement'
 """
-Reasons for which a parameter is held: its sd would exceed half the prior's; its prior is not significantly worse; the prior has the smaller
-expected error.
+Reasons for which a parameter is held: its sd would exceed half the prior's; its prior is not
+significantly worse; the prior has the smaller expected error.
 """
 
 
@@ -153,13 +169,19 @@ def reasons_held(
     *,
     tested: Collection[str] = (),
 ) -> dict[str, str]:
-    """Return held parameter -> the reason: `replaced` by its prior, for those `tested` by likelihood ratio, or too weak data."""
+    """
+    Return held parameter -> the reason.
+
+    `replaced` by its prior, for those `tested` by likelihood ratio, or too weak data.
+    """
     return {
-        name: WEAK_DATA
-        if name not in replaced
-        else LIKELIHOOD_RATIO
-        if name in tested
-        else REPLACEMENT
+        name: (
+            WEAK_DATA
+            if name not in replaced
+            else LIKELIHOOD_RATIO
+            if name in tested
+            else REPLACEMENT
+        )
         for name, flag in zip(names, held, strict=True)
         if flag
     }
@@ -189,7 +211,10 @@ class Solution:
     """Estimated parameters with covariance, noise and quality of the fit."""
 
     judged_without: ClassVar[tuple[str, ...]] = ()
-    """Terms of the covariance that have a status together, and do not count for that of each parameter."""
+    """
+    Terms of the covariance that have a status together, and do not count for that of each
+    parameter.
+    """
 
     model: SensorModel
     """The effects, linearised at the values of the columns."""
@@ -202,21 +227,31 @@ class Solution:
     noise: dict[str, NoiseModel]
     """Sensor -> its noise."""
     chi2_per_dof: dict
-    """Sensor -> {'mean', 'spin', 'dynamic'} -> weighted residual sum of squares per degree of freedom."""
+    """
+    Sensor -> {'mean', 'spin', 'dynamic'} -> weighted residual sum of squares per degree of freedom.
+    """
     information: np.ndarray
     """Information matrix of the data without the prior, shape (n_params, n_params)."""
     residual_rms: dict
-    """Sensor -> rms residual of single samples in moving windows and of window means, shape (2,)."""
+    """
+    Sensor -> rms residual of single samples in moving windows and of window means, shape (2,).
+    """
     session_biases: dict = field(default_factory=dict)
     """
-    Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs between recordings; `values` has their mean.
+    Sensor -> bias of each recording, shape (n_sessions, 3), for sensors whose bias differs between
+    recordings; `values` has their mean.
     """
 
     not_believed: dict[str, float] = field(default_factory=dict)
-    """Fixed parameter -> its estimate, which exceeds the range of known sensors and is no larger than misfit can cause."""
+    """
+    Fixed parameter -> its estimate, which exceeds the range of known sensors and is no larger than
+    misfit can cause.
+    """
 
     replaced: tuple[str, ...] = ()
-    """Held parameters that the recording determines weakly, replaced by their prior (`replace_weak`)."""
+    """
+    Held parameters that the recording determines weakly, replaced by their prior (`replace_weak`).
+    """
 
     def at(self, values: np.ndarray) -> 'Solution':
         """Return the same with other values, shape (n_params,)."""
@@ -259,7 +294,11 @@ class Solution:
 
     @property
     def replacement_limit(self) -> np.ndarray | float:
-        """Largest ``(value - prior)^2 / variance`` of a weak parameter that is replaced by its prior (`replace_weak`)."""
+        """
+        Largest ``(value - prior)^2 / variance`` of a weak parameter to replace.
+
+        Such a parameter is replaced by its prior (`replace_weak`).
+        """
         return 1.0
 
     def value(self, name: str) -> float:
@@ -276,7 +315,9 @@ AnySolution = TypeVar('AnySolution', bound=Solution)
 
 def with_weak_replaced(solution: AnySolution, tolerances: np.ndarray) -> AnySolution:
     """
-    Return the solution with weak values that compensation applies replaced by their prior where that lowers the expected error.
+    Return the solution with weak values replaced by their prior.
+
+    Values that compensation applies are replaced where that lowers the expected error.
 
     See `replace_weak`. A replaced parameter is held.
     """
@@ -300,16 +341,20 @@ def with_weak_replaced(solution: AnySolution, tolerances: np.ndarray) -> AnySolu
 
 
 CONVENTION_SHARE = 1e-9
-"""Directions of a covariance, scaled to a unit diagonal, below this share of the largest are conventions."""
+"""
+Directions of a covariance, scaled to a unit diagonal, below this share of the largest are
+conventions.
+"""
 
 
 def shrunk(solution: Solution, parts: list[slice]) -> Solution:
     """
     Return a Solution in which the values of some effects are shrunk towards their prior.
 
-    The factor is ``1 - k / chi2``, at least 0 (James and Stein), chi2 the squared distance from the prior in standard deviations, k its
-    number of directions. The other parameters are updated as if the effect were known at the shrunk value. An absent effect then hardly
-    raises the error of the other parameters, a significant effect is kept, and the standard deviations hold in both cases.
+    The factor is ``1 - k / chi2``, at least 0 (James and Stein), chi2 the squared distance from the
+    prior in standard deviations, k its number of directions. The other parameters are updated as if
+    the effect were known at the shrunk value. An absent effect then hardly raises the error of the
+    other parameters, a significant effect is kept, and the standard deviations hold in both cases.
 
     Parameters
     ----------

@@ -26,7 +26,10 @@ from imu_calibration.estimation.whitening import predict_session_offsets
 OUTLIER_P_VALUE = 1e-3
 """False positive rate per sensor and kind for a recording without outliers."""
 MAX_WINDOW_OUTLIERS = 0.15
-"""Largest share of each kind that is excluded; a more frequent deviation is a property of the recording."""
+"""
+Largest share of each kind that is excluded; a more frequent deviation is a property of the
+recording.
+"""
 MIN_WINDOW_FREEDOM = 9.0
 """Residual degrees of freedom of the other windows of the kind that the test requires."""
 OUTLIER_CANDIDATES = 8
@@ -37,13 +40,16 @@ LEAST_SEEN = 0.05
 
 def _outlier_windows(system, values, noises):
     """
-    Return sensor -> keys of the outlying windows by kind, without the ones that the noise model excludes already.
+    Return sensor -> keys of the outlying windows by kind.
 
-    Mean-shift F test, one kind of window per round (the one with the least probable outlier), because with a bias process one outlier makes
-    its neighbours look inconsistent.
+    Without the ones that the noise model excludes already.
 
-    A separate offset for one window must improve the fit of the other windows significantly (F test with Bonferroni correction). The noise
-    may be overestimated because of that window; the factor is common to all windows and cancels in the ratio.
+    Mean-shift F test, one kind of window per round (the one with the least probable outlier),
+    because with a bias process one outlier makes its neighbours look inconsistent.
+
+    A separate offset for one window must improve the fit of the other windows significantly (F test
+    with Bonferroni correction). The noise may be overestimated because of that window; the factor
+    is common to all windows and cancels in the ratio.
 
     Parameters
     ----------
@@ -69,7 +75,11 @@ def _outlier_windows(system, values, noises):
 
 
 def _of_kind(own: np.ndarray, out: np.ndarray, fit: '_Fit') -> tuple[float, list[int]]:
-    """Return (the smallest p-value, the numbers of the outliers among the windows `own`), without the windows `out`."""
+    """
+    Return (the smallest p-value, the numbers of the outliers among the windows `own`).
+
+    Without the windows `out`.
+    """
     count, kept = int(own.sum()), np.flatnonzero(own & ~out)
     allowed = max(1, int(MAX_WINDOW_OUTLIERS * count)) - (count - len(kept))
     worst = (
@@ -109,7 +119,11 @@ class _Fit:
         )
 
     def p_value(self, at: int, own: np.ndarray) -> float:
-        """Return the p-value of the improvement of the windows `own` by a separate offset for window `at`."""
+        """
+        Return the p-value of a separate offset for window `at`.
+
+        It concerns the improvement of the windows `own` by this offset.
+        """
         one = np.zeros(self.rest.shape + (1,))
         one[at] = 1.0
         one = self.whiten(one)[:, :, 0]
@@ -136,17 +150,21 @@ MAX_PRIOR_SDS = 3.0
 """Prior standard deviations beyond which an entry of a matrix needs a reason that is not misfit."""
 
 REST_NOISE_MARGIN = 1.1
-"""Residuals up to this times the variance at rest are noise: the rest used for its estimate may have been quieter."""
+"""
+Residuals up to this times the variance at rest are noise: the rest used for its estimate may have
+been quieter.
+"""
 
 
 def _implausible_estimates(system, values, *, sd, noises, free):
     """
     Return a mask of the parameters whose information may be an artefact of misfit.
 
-    The value exceeds the range of known instruments, and it is no larger than the shift that all excess misfit of moving windows causes
-    along the parameter. Example: an accelerometer's scale along an axis without gravity, determined only through arms and wrong angles.
-    A gyroscope at the wrong full-scale setting has a value larger than its misfit explains, and is kept. All parameters of an effect are
-    fixed, of a matrix single entries.
+    The value exceeds the range of known instruments, and it is no larger than the shift that all
+    excess misfit of moving windows causes along the parameter. Example: an accelerometer's scale
+    along an axis without gravity, determined only through arms and wrong angles. A gyroscope at the
+    wrong full-scale setting has a value larger than its misfit explains, and is kept. All
+    parameters of an effect are fixed, of a matrix single entries.
 
     Parameters
     ----------
@@ -187,7 +205,11 @@ def _limit(effect: Effect) -> float:
 
 
 def _feigned(system, sensor, values, noise):
-    """Return the largest shift, in sds of noise, of a parameter of the worst axis by all excess misfit of moving windows."""
+    """
+    Return the largest shift of a parameter by excess misfit, in sds of noise.
+
+    It is the shift of a parameter of the worst axis by all excess misfit of moving windows.
+    """
     rested = any(row.kind == 'static' for row in system.accumulator.rows)
     rest = (
         REST_NOISE_MARGIN * np.maximum(noise.low_variance, noise.white_variance) if rested else 0.0
@@ -219,8 +241,9 @@ def solve(
     """
     Estimate all parameters jointly from accumulated windows.
 
-    Minimises the sum of squares of whitened rows ``[columns | output] @ [coefficients(values); -1]`` over all windows and
-    axes plus the prior. Window offsets and bias processes are part of the noise (restricted maximum likelihood).
+    Minimises the sum of squares of whitened rows ``[columns | output] @ [coefficients(values);
+    -1]`` over all windows and axes plus the prior. Window offsets and bias processes are part of
+    the noise (restricted maximum likelihood).
 
     Parameters
     ----------
@@ -232,7 +255,8 @@ def solve(
     noise : dict, optional
         Sensor -> NoiseModel, if known.
     bias_processes : dict, optional
-        Sensor -> bias processes from a separate measurement; the other noise parameters are estimated.
+        Sensor -> bias processes from a separate measurement; the other noise parameters are
+        estimated.
 
     Returns
     -------
@@ -312,8 +336,9 @@ def _with_noise(system, values, noises, free):
     """
     Return (values, noise), estimated alternately.
 
-    One round usually suffices: the likelihood of the offsets is restricted, so it does not depend on the values of the parameters.
-    With separate weights of slow and fast parts, weights and parameters depend on each other.
+    One round usually suffices: the likelihood of the offsets is restricted, so it does not depend
+    on the values of the parameters. With separate weights of slow and fast parts, weights and
+    parameters depend on each other.
     """
     for _ in range(NOISE_ROUNDS):
         values = _minimised(system, values, _factors(system, noises), free, enough=0.01)
@@ -342,7 +367,11 @@ def _refuse(without, held, model, allow_holding):
 
 
 def start(system: WeightedSystem) -> np.ndarray:
-    """Return the solution for bias and matrix of each sensor, all other parameters at their prior, shape (n_params,)."""
+    """
+    Return the solution for bias and matrix of each sensor, all other parameters at their prior.
+
+    Shape (n_params,).
+    """
     model = system.model
     values = model.start()
     values = np.where(np.isfinite(values), values, 0.0)
@@ -371,7 +400,11 @@ def _factors(system, noises):
 
 
 def _minimised(system, values, factors, free, enough=1e-7):
-    """Gauss-Newton with step halving on the triangular factors, until steps are below `enough` standard deviations."""
+    """
+    Gauss-Newton with step halving on the triangular factors.
+
+    It continues until steps are below `enough` standard deviations.
+    """
     for _ in range(40):
         residual, data = (
             system.residuals(values, factors),
@@ -386,7 +419,11 @@ def _minimised(system, values, factors, free, enough=1e-7):
 
 
 def _halved(system, values, step, free, factors, cost):
-    """Return the values after the longest of the halved steps that does not raise the cost, and that cost."""
+    """
+    Return the values after the longest acceptable step, and their cost.
+
+    The step is the longest of the halved steps that does not raise the cost.
+    """
     for shrink in range(12):
         moved = values.copy()
         moved[free] += step * 0.5**shrink
@@ -400,8 +437,8 @@ def _undetermined(system, values, factors, free):
     """
     Return a mask of the parameters whose standard deviation exceeds a share of the prior's.
 
-    First the parameters that are weak even if all other parameters were known; then one at a time, given the ones fixed before:
-    of parameters of which only the sum is observable, one stays free.
+    First the parameters that are weak even if all other parameters were known; then one at a time,
+    given the ones fixed before: of parameters of which only the sum is observable, one stays free.
     """
     data, prior = system.jacobian(values, factors), system.prior
     jacobian = np.concatenate([data, prior.root])
@@ -416,7 +453,11 @@ def _undetermined(system, values, factors, free):
 
 
 def _fit_quality(system, values, noises):
-    """Return chi-square per degree of freedom by part, and rms residuals (moving samples, window means)."""
+    """
+    Return chi-square per degree of freedom by part, and rms residuals.
+
+    The residuals are for moving samples and for window means.
+    """
     chi2, rms = {}, {}
     for sensor in SENSORS:
         noise, quality, moving, count = noises[sensor], {}, 0.0, 0
@@ -437,7 +478,11 @@ def _fit_quality(system, values, noises):
 
 
 def _session_biases(system, values, noises):
-    """Return the bias of each recording for sensors with a bias of its own per recording: the best linear prediction."""
+    """
+    Return the bias of each recording for sensors with a bias of its own per recording.
+
+    The best linear prediction.
+    """
     found = {}
     for sensor in SENSORS:
         noise = noises[sensor]
@@ -456,6 +501,8 @@ def _session_biases(system, values, noises):
 
 
 def _used(system, sensor):
-    """Return how many parameters the means determine: the ones of the sensor, at most half the data."""
+    """
+    Return how many parameters the means determine: the ones of the sensor, at most half the data.
+    """
     own = sum(e.size for e in system.model.concerning(sensor))
     return min(own, system.means[sensor].shape[0] * 3 // 2)

@@ -1,4 +1,8 @@
-"""The rows of one solve: accumulated windows with the columns of a model, weighted by a noise model, and the prior."""
+"""
+The rows of one solve.
+
+Accumulated windows with the columns of a model, weighted by a noise model, and the prior.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,8 +41,8 @@ def make_prior(model: SensorModel) -> Prior:
     """
     Return the prior of a model.
 
-    When an arm for each axis and a common one are estimated, the former sum to zero: the origin is the
-    mean of the sensitive points.
+    When an arm for each axis and a common one are estimated, the former sum to zero: the origin is
+    the mean of the sensitive points.
     """
     mean, sd = model.prior()
     mean = np.where(np.isfinite(mean), mean, 0.0)
@@ -55,7 +59,11 @@ def make_prior(model: SensorModel) -> Prior:
 
 
 def fixed_parameters(model: SensorModel) -> np.ndarray:
-    """Return a mask of parameters that least squares does not estimate (saturation is censoring, not a column)."""
+    """
+    Return a mask of parameters that least squares does not estimate.
+
+    Saturation is censoring, not a column.
+    """
     return np.concatenate(
         [np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects]
     )
@@ -67,7 +75,9 @@ EXCLUDED_MEAN_SD_FACTOR = 1e3
 
 class WeightedSystem:
     """
-    Accumulated windows as rows ``[columns | output]``, with residuals and derivatives for given parameters and noise.
+    Accumulated windows as rows ``[columns | output]``.
+
+    With residuals and derivatives for given parameters and noise.
 
     Parameters
     ----------
@@ -111,9 +121,12 @@ class WeightedSystem:
 
     def mean_variance(self, noise: NoiseModel, beside_bias: bool = True) -> np.ndarray:
         """
-        Return the variance of the window means, very large for excluded windows, shape (n_windows, 3).
+        Return the variance of the window means, very large for excluded windows.
 
-        Relative to the bias in the middle of each window, or of the noise within windows and of the reference only.
+        Shape (n_windows, 3).
+
+        Relative to the bias in the middle of each window, or of the noise within windows and of the
+        reference only.
         """
         variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(
             self.kinds, self.counts, self.durations, keys=self.keys
@@ -143,8 +156,9 @@ class WeightedSystem:
         """
         Return ``A' V^-1 B V^-1 A``, shape (n_params, n_params), over the window means.
 
-        A is the design at `values`, V the covariance of the means, and B its part due to offsets of windows, bias processes and the bias of
-        each recording. With C the covariance of the estimate, ``C (A' V^-1 B V^-1 A) C`` is the part of C due to them.
+        A is the design at `values`, V the covariance of the means, and B its part due to offsets of
+        windows, bias processes and the bias of each recording. With C the covariance of the
+        estimate, ``C (A' V^-1 B V^-1 A) C`` is the part of C due to them.
         """
         total = np.zeros((len(values),) * 2)
         for sensor in SENSORS:
@@ -160,7 +174,11 @@ class WeightedSystem:
         return total
 
     def whitened_means(self, sensor: str, noise: NoiseModel) -> np.ndarray:
-        """Return the whitened mean rows ``[columns | output]`` of each axis, shape (n_windows, 3, p + 1)."""
+        """
+        Return the whitened mean rows ``[columns | output]`` of each axis.
+
+        Shape (n_windows, 3, p + 1).
+        """
         return self.whitened(
             np.stack(
                 [self.means[sensor][:, self.columns_and(sensor, axis)] for axis in range(3)], axis=1
@@ -174,7 +192,9 @@ class WeightedSystem:
         return [*range(p), p + axis]
 
     def factors(self, sensor: str, noise: NoiseModel) -> list[np.ndarray]:
-        """Return for each axis the triangular factor of all whitened rows ``[columns | output]``."""
+        """
+        Return for each axis the triangular factor of all whitened rows ``[columns | output]``.
+        """
         white, weighed = self.whitened_means(sensor, noise), list(self.weighed_rows(sensor, noise))
         return [
             triangular(
@@ -195,7 +215,9 @@ class WeightedSystem:
         self, sensor: str, noise: NoiseModel, part: Accumulator | WindowBlock | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
-        Yield (centred rows, weight of each axis (3,)): all rows of each kind, and again the slow ones where these have more weight.
+        Yield (centred rows, weight of each axis (3,)).
+
+        All rows of each kind, and again the slow ones where these have more weight.
 
         From all windows, or from one block.
         """
@@ -230,14 +252,17 @@ class WeightedSystem:
         self, sensor: str, values: np.ndarray, noise: NoiseModel
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return mean rows in coordinates of the parameters of one sensor, and the normal matrix of centred rows and prior.
+        Return mean rows of one sensor, and the normal matrix of centred rows and prior.
+
+        The mean rows are in coordinates of the parameters of the sensor.
 
         Directions fixed by the gauge are excluded: their weight would dominate the normal matrix.
 
         Returns
         -------
         tuple
-            ``[design | residual]``, shape (n_windows, 3, q + 1), and the normal matrix of centred rows and prior, shape (q + 1, q + 1).
+            ``[design | residual]``, shape (n_windows, 3, q + 1), and the normal matrix of centred
+            rows and prior, shape (q + 1, q + 1).
 
         """
         dc = coefficient_jacobian(self.model, sensor, values)

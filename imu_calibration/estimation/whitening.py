@@ -11,10 +11,13 @@ from imu_calibration.estimation.scaled_solve import JITTER, triangular_of_band
 
 class Whitening:
     """
-    Multiplication with the inverse Cholesky factor of the covariance of window means, by the innovations of a Kalman filter.
+    Multiplication with the inverse Cholesky factor of the covariance of window means.
 
-    The covariance is ``diag(variance) + sum_j sd_j^2 exp(-|dt| / time_j)`` within a session, the sum over any number of bias processes,
-    each a state of the filter. An offset of each session is then removed with ``(I + s^2 u u')^(-1/2)``, u the whitened ones.
+    By the innovations of a Kalman filter.
+
+    The covariance is ``diag(variance) + sum_j sd_j^2 exp(-|dt| / time_j)`` within a session, the
+    sum over any number of bias processes, each a state of the filter. An offset of each session is
+    then removed with ``(I + s^2 u u')^(-1/2)``, u the whitened ones.
 
     Parameters
     ----------
@@ -63,7 +66,11 @@ class Whitening:
         return self._with_session_offsets(self._filtered(values))
 
     def adjoint(self, white: np.ndarray) -> np.ndarray:
-        """Return ``W' white``, shape (n, n_axes, q), of rows whitened by W, which it overwrites: ``V^-1 values`` with V the covariance."""
+        """
+        Return ``W' white``, shape (n, n_axes, q), of rows whitened by W, which it overwrites.
+
+        ``V^-1 values`` with V the covariance.
+        """
         return self._filtered(self._with_session_offsets(white), 'adjoint')
 
     @property
@@ -78,7 +85,11 @@ class Whitening:
         return float(logs)
 
     def _chained(self, values):
-        """Return the rows of all axes and sessions one after the other, each session in order of time, shape (n_axes n, q)."""
+        """
+        Return the rows of all axes and sessions one after the other, each session in order of time.
+
+        Shape (n_axes n, q).
+        """
         return values[self._order].transpose(1, 0, 2).reshape(-1, values.shape[2])
 
     def _filtered(self, values, direction='forward'):
@@ -102,7 +113,11 @@ class Whitening:
 
 
 class _Filter:
-    """Innovations over their standard deviations of one chain of rows, in place; an infinite step begins a new series."""
+    """
+    Innovations over their standard deviations of one chain of rows, in place.
+
+    An infinite step begins a new series.
+    """
 
     def __init__(self, variance, steps, processes):
         power, times = np.array([(process.sd**2, process.time) for process in processes]).T
@@ -116,7 +131,8 @@ class _Filter:
             else _gains(variance, decay, fresh)
         )
         self._width, self._driven_by = len(power), decay[1:] * gain[:-1]
-        # the states follow s_k = F_k s_(k-1) + u_k with F_k = diag(decay) (I - gain 1'): a banded system for all of them at once
+        # the states follow s_k = F_k s_(k-1) + u_k with F_k = diag(decay) (I - gain 1'): a banded
+        # system for all of them at once
         width = self._width
         self._bands = np.zeros((2 * width, width * (len(variance) - 1)))
         self._bands[0] = 1.0
@@ -172,7 +188,8 @@ def _gains_of_one(variance, decay, fresh):
     """
     Return the same for one process, the common case (called hundreds of times).
 
-    Differences ``y_k - decay_k y_(k-1)`` have a tridiagonal covariance, whose pivots are the variances of the innovations.
+    Differences ``y_k - decay_k y_(k-1)`` have a tridiagonal covariance, whose pivots are the
+    variances of the innovations.
     """
     carried = decay[1:] * variance[:-1]
     diagonal = fresh + variance
@@ -194,7 +211,9 @@ def predict_session_offsets(
     noise: NoiseModel,
 ) -> np.ndarray:
     """
-    Return the offset of each session, shape (n_sessions, 3): the weighted mean of its residuals, drawn towards zero by its noise.
+    Return the offset of each session, shape (n_sessions, 3).
+
+    The weighted mean of its residuals, drawn towards zero by its noise.
 
     Parameters
     ----------
@@ -257,10 +276,12 @@ class RestrictedLikelihood:
         session_variance: float = 0.0,
     ) -> tuple[float, np.ndarray]:
         """
-        Return log|V| and the normal matrix of ``[design | residual]`` weighted with V^-1, `information` included.
+        Return log|V| and the normal matrix of ``[design | residual]``.
 
-        For independent variances of the rows, shape (n, n_axes), bias processes and an offset per session.
-        Minus twice the log likelihood is log|V| plus the `profile` of the matrix.
+        The matrix is weighted with V^-1, `information` included.
+
+        For independent variances of the rows, shape (n, n_axes), bias processes and an offset per
+        session. Minus twice the log likelihood is log|V| plus the `profile` of the matrix.
         """
         whitening = Whitening(
             variance,
@@ -274,7 +295,9 @@ class RestrictedLikelihood:
 
     def scoring(self, variance: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return score and information (Fisher scoring) of the variances of groups of independent rows.
+        Return score and information of the variances of groups (Fisher scoring).
+
+        The groups are of independent rows.
 
         Parameters
         ----------
@@ -286,8 +309,8 @@ class RestrictedLikelihood:
         Returns
         -------
         tuple
-            First derivative of the log likelihood by the variances, shape (n_groups,), and minus the expected second one, (n_groups,
-            n_groups).
+            First derivative of the log likelihood by the variances, shape (n_groups,), and minus
+            the expected second one, (n_groups, n_groups).
 
         """
         white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(
@@ -308,7 +331,11 @@ class RestrictedLikelihood:
 
 
 def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
-    """Return ``log|A|`` and the Schur complement ``C - B' A^-1 B`` of a normal matrix ``[[A, B], [B', C]]``, A its first `count` rows."""
+    """
+    Return ``log|A|`` and the Schur complement ``C - B' A^-1 B``.
+
+    They are of a normal matrix ``[[A, B], [B', C]]``, A its first `count` rows.
+    """
     if not count:
         return 0.0, normal
     scale = np.sqrt(np.maximum(np.diag(normal)[:count], 1e-300))

@@ -35,7 +35,11 @@ class Regime(StrEnum):
 
 
 def pieces_at_rest(mean: np.ndarray, duration: float) -> dict[str, np.ndarray]:
-    """Return {regime: rows} of a static window: its mean row ``[columns | output]``, weighed as so many pieces, and no change of input."""
+    """
+    Return {regime: rows} of a static window.
+
+    Its mean row ``[columns | output]``, weighed as so many pieces, and no change of input.
+    """
     row = np.concatenate([mean[:-N_AXES], np.zeros(N_AXES), mean[-N_AXES:]])
     return {Regime.REST: np.sqrt(count_pieces(duration)) * row[None]}
 
@@ -49,10 +53,12 @@ def moving_pieces(
     rows: np.ndarray, time: np.ndarray, true_input: np.ndarray, *, rate_s: np.ndarray
 ) -> dict[str, np.ndarray]:
     """
-    Return {regime: rows ``[columns | d(true input)/dt | output]``} of a moving window, a row for the mean over each piece.
+    Return {regime: rows} of a moving window, a row for the mean over each piece.
 
-    The mean derivative is the difference of the true input at both ends of the piece; it separates an unmodelled delay of the sensor from a
-    wrong scale.
+    The rows are ``[columns | d(true input)/dt | output]``.
+
+    The mean derivative is the difference of the true input at both ends of the piece; it separates
+    an unmodelled delay of the sensor from a wrong scale.
 
     Parameters
     ----------
@@ -94,7 +100,10 @@ def _slope(values, time, edges):
 
 
 SLOW_TIME = 0.25
-"""Length of the pieces whose means separate correlated misfit from white noise, s: longer than sensor filters, shorter than motions."""
+"""
+Length of the pieces whose means separate correlated misfit from white noise, s: longer than sensor
+filters, shorter than motions.
+"""
 BATCHES = 16
 """Pieces of a window at rest whose means determine the noise at low frequency."""
 BATCH_DOF = 2 * (BATCHES - 1) ** 2 / (3 * BATCHES - 4)
@@ -104,23 +113,35 @@ BATCH_DOF = 2 * (BATCHES - 1) ** 2 / (3 * BATCHES - 4)
 @dataclass(frozen=True, eq=False)
 class SensorStatistics:
     """
-    The rows ``[columns | output]`` of one sensor in one window, split into mean row and centred rows.
+    The rows ``[columns | output]`` of one sensor in one window.
 
-    The mean row has a random offset of the window (of its bias) in addition to the averaged noise; the centred rows have none.
-    With separate weights, the two are an exact summary for the model ``output = columns @ coefficients + window offset + noise``.
+    They are split into mean row and centred rows.
+
+    The mean row has a random offset of the window (of its bias) in addition to the averaged noise;
+    the centred rows have none. With separate weights, the two are an exact summary for the model
+    ``output = columns @ coefficients + window offset + noise``.
     """
 
     mean: np.ndarray
     """Mean of the rows, shape (n_columns + 3,)."""
     within: np.ndarray
-    """Triangular factor of the centred rows, shape (k, n_columns + 3); no rows for a static window."""
+    """
+    Triangular factor of the centred rows, shape (k, n_columns + 3); no rows for a static window.
+    """
     noise_variance: np.ndarray
-    """Variance of the output about its mean in static windows, at least that of rounding; in others that of rounding; shape (3,)."""
+    """
+    Variance of the output about its mean in static windows, at least that of rounding; in others
+    that of rounding; shape (3,).
+    """
     inflation: np.ndarray
-    """Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not static."""
+    """
+    Variance of batch means over that of white noise of the same variance, shape (3,); NaN when not
+    static.
+    """
     slow: np.ndarray | None = None
     """
-    Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; for the test of correlated misfit.
+    Triangular factor of the centred means of SLOW_TIME pieces, times the root of their length; for
+    the test of correlated misfit.
     """
     slow_rows: int = 0
     """Number of these pieces."""
@@ -145,7 +166,10 @@ class WindowStatistics:
     encoder_step: float = 0.0
     """Largest step of the encoders that shows in the readings, rad; 0 where none does."""
     pieces: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    """Sensor -> regime -> rows ``[columns | d(true input)/dt | output]`` of short pieces, where a proof is wanted (see `pieces`)."""
+    """
+    Sensor -> regime -> rows ``[columns | d(true input)/dt | output]`` of short pieces, where a
+    proof is wanted (see `pieces`).
+    """
 
 
 def references_of(windows: Sequence[Window], model: SensorModel, table: Table) -> References:
@@ -163,7 +187,9 @@ def reduce_windows(
     column_function: Callable = columns,
 ) -> list[WindowStatistics]:
     """
-    Reduce windows to their statistics without pieces; the columns of all windows are computed in one call.
+    Reduce windows to their statistics without pieces.
+
+    The columns of all windows are computed in one call.
 
     Parameters
     ----------
@@ -205,9 +231,11 @@ def _reduced(window, designs, session, inputs=None):
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
     static, length = window.kind == 'static', _piece_length(window)
     sensors = {
-        s: _reduce_static(designs[s], outputs[s])
-        if static
-        else _reduce_moving(designs[s], outputs[s], length)
+        s: (
+            _reduce_static(designs[s], outputs[s])
+            if static
+            else _reduce_moving(designs[s], outputs[s], length)
+        )
         for s in SENSORS
     }
     duration = float(window.time[-1] - window.time[0])
@@ -265,7 +293,11 @@ def _piece_length(window):
 
 
 def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
-    """Return the means of pieces of `length` rows times the root of their length, none when a piece is a single row."""
+    """
+    Return the means of pieces of `length` rows times the root of their length.
+
+    There are none when a piece is a single row.
+    """
     pieces = len(rows) // length if length > 1 else 0
     return (
         rows[: pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1))
@@ -276,10 +308,12 @@ def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
 
 def batch_statistics(output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the variance of each column and the factor by which means of it scatter more than white noise.
+    Return the variance of each column and the excess scatter of its means.
 
-    The factor is the variance of the means of `BATCHES` equal pieces, times their length, over the sample variance:
-    a sensor's low-pass filter makes it larger than one. Pieces exclude slow drift.
+    The excess is the factor by which means of the column scatter more than white noise.
+
+    The factor is the variance of the means of `BATCHES` equal pieces, times their length, over the
+    sample variance: a sensor's low-pass filter makes it larger than one. Pieces exclude slow drift.
     """
     variance = output.var(axis=0, ddof=1)
     length = len(output) // BATCHES

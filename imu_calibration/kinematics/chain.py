@@ -1,4 +1,8 @@
-"""Exact kinematics of a serial chain of joints that turn or slide, also with errors: tilt, wrong axes, sag with load, wobble."""
+"""
+Exact kinematics of a serial chain of joints that turn or slide, also with errors.
+
+Tilt, wrong axes, sag with load, wobble.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,8 @@ def with_axis_places(table: Table, errors: np.ndarray) -> Table:
     table : Table
         The nominal table.
     errors : array, shape (2 (n_turning - 1),)
-        For each of these axes its displacement along its `axis_error_directions`, m; the following chain moves with it.
+        For each of these axes its displacement along its `axis_error_directions`, m; the following
+        chain moves with it.
 
     """
     shifts, joints, first = iter(np.reshape(errors, (-1, 2))), [], True
@@ -59,9 +64,11 @@ def with_axis_angles(table: Table, errors: np.ndarray) -> Table:
     for angle, error in zip(axis_angles(table.joints), errors, strict=True):
         vectors[angle.joint] += error * angle.direction
     joints = [
-        joint
-        if not vector.any()
-        else replace(joint, axis=tuple((rotation(vector) @ np.array(joint.axis)).tolist()))
+        (
+            joint
+            if not vector.any()
+            else replace(joint, axis=tuple((rotation(vector) @ np.array(joint.axis)).tolist()))
+        )
         for joint, vector in zip(table.joints, vectors, strict=True)
     ]
     return replace(table, joints=tuple(joints))
@@ -69,10 +76,13 @@ def with_axis_angles(table: Table, errors: np.ndarray) -> Table:
 
 def tilt(table: Table, angles: np.ndarray) -> Table:
     """
-    Return the table with its true `up` turned by the rotation vector (tx, ty, 0) of the level frame.
+    Return the table with its true `up` turned.
 
-    A levelling error: ``up_true = exp((tx, ty, 0) x) up``, rad. North turns with it, so that the Earth's rate is the same
-    vector of n turned alike; `azimuth_deg` changes where the convention of n requires it.
+    It is turned by the rotation vector (tx, ty, 0) of the level frame.
+
+    A levelling error: ``up_true = exp((tx, ty, 0) x) up``, rad. North turns with it, so that the
+    Earth's rate is the same vector of n turned alike; `azimuth_deg` changes where the convention of
+    n requires it.
     """
     mat_bn = table.mat_nb.T @ rotation(np.array([angles[0], angles[1], 0.0]))
     tilted = replace(table, up=tuple(mat_bn[:, 2].tolist()))
@@ -90,7 +100,8 @@ WOBBLES = (-1, 2)
 """
 Turns of the lean for one turn of the joint: once against it, twice with it.
 
-A component that rotates once with the joint is the direction of the next axis or the mount, a constant one that of this axis.
+A component that rotates once with the joint is the direction of the next axis or the mount, a
+constant one that of this axis.
 """
 
 
@@ -98,7 +109,8 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
     """
     Return the table whose turning axes, but the first, hang towards the ground.
 
-    The load of a joint rotates by the rotation vector ``angle (up x axis)``: by the full angle if the axis is level.
+    The load of a joint rotates by the rotation vector ``angle (up x axis)``: by the full angle if
+    the axis is level.
 
     Parameters
     ----------
@@ -111,9 +123,11 @@ def with_sag(table: Table, angles: np.ndarray) -> Table:
     return replace(
         table,
         joints=tuple(
-            replace(joint, sag=of_joint[joint.source])
-            if joint.turns and of_joint.get(joint.source)
-            else joint
+            (
+                replace(joint, sag=of_joint[joint.source])
+                if joint.turns and of_joint.get(joint.source)
+                else joint
+            )
             for joint in table.joints
         ),
     )
@@ -123,8 +137,8 @@ def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
     """
     Return the table whose axes lean as they turn.
 
-    The load of a joint rotates by the rotation vector ``Re(z) u + Im(z) v`` with u, v its `axis_error_directions` and
-    ``z = sum over m of (c + i s) exp(i m q)`` at the joint angle q.
+    The load of a joint rotates by the rotation vector ``Re(z) u + Im(z) v`` with u, v its
+    `axis_error_directions` and ``z = sum over m of (c + i s) exp(i m q)`` at the joint angle q.
 
     Parameters
     ----------
@@ -190,7 +204,9 @@ class _Link(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """One step of the outward transformation of vectors: an offset, a constant matrix, then the joint."""
+    """
+    One step of the outward transformation of vectors: an offset, a constant matrix, then the joint.
+    """
 
     offset: np.ndarray
     matrix: np.ndarray
@@ -213,7 +229,8 @@ def reference_motion(
     """
     Return the readings of a perfect sensor at the reference point of the mount.
 
-    From link to link, with C the inverse of the joint's turn, a its axis, r the step to its origin and q its angle::
+    From link to link, with C the inverse of the joint's turn, a its axis, r the step to its origin
+    and q its angle::
 
         force' = C (force + alpha x r + omega x (omega x r)),   omega' = C omega + a q',
         alpha' = C alpha + a q'' + (C omega) x a q'
@@ -222,7 +239,8 @@ def reference_motion(
 
         force' = force + alpha x a q + omega x (omega x a q) + 2 omega x a q' + a q''
 
-    starting at the base with gravity (upwards) and, when latitude and azimuth are known, the Earth's rate.
+    starting at the base with gravity (upwards) and, when latitude and azimuth are known, the
+    Earth's rate.
 
     Parameters
     ----------
@@ -277,7 +295,11 @@ def reference_motion(
 
 
 def _chain_steps(constants, motion):
-    """Return the `_Step`s; joints at rest are merged into the constant matrix and the offset of the next one."""
+    """
+    Return the `_Step`s.
+
+    Joints at rest are merged into the constant matrix and the offset of the next one.
+    """
     steps, matrix, offset = [], np.eye(3), np.zeros(3)
     for link in constants.links:
         offset = offset + matrix.T @ link.xyz
@@ -310,7 +332,11 @@ def _moves(motion, column):
 
 
 def _to_coordinate_axis(axis):
-    """Return (matrix, sense, index) with ``matrix @ axis = sense * e_index``; the identity where the axis is one already."""
+    """
+    Return (matrix, sense, index) with ``matrix @ axis = sense * e_index``.
+
+    The identity where the axis is one already.
+    """
     third = int(np.argmax(np.abs(axis)))
     if np.abs(axis[third]) == 1.0:
         return np.eye(3), float(np.sign(axis[third])), third
@@ -359,7 +385,12 @@ def _constants(table):
 
 
 def _base_columns(table):
-    """Return mat_bn (three columns), rate, angular acceleration and specific force of the base, in the base frame, shape (3, 6, 1)."""
+    """
+    Return the motion of the base in the base frame, shape (3, 6, 1).
+
+    It consists of mat_bn (three columns), rate, angular acceleration and specific force of the
+    base.
+    """
     columns = np.zeros((3, 6, 1))
     mat_bn = table.mat_nb.T
     columns[:, :3, 0] = mat_bn
@@ -370,7 +401,11 @@ def _base_columns(table):
 
 
 def _run_chain(columns, motion, steps, part):
-    """Return the columns of `_base_columns`, all or the last ones, at the sensor, in its frame, shape (3, k, n)."""
+    """
+    Return the columns of `_base_columns`, all or the last ones, at the sensor, in its frame.
+
+    Shape (3, k, n).
+    """
     for step in steps:
         if step.offset.any():
             columns = columns.copy()
@@ -401,7 +436,11 @@ def _move(columns, step, motion, part):
 
 
 def _lean(columns, step, angle, rate, acceleration):
-    """Bring `columns` into the frame of a joint whose axis sags and wobbles, by two small turns across it; the joint is at `angle`."""
+    """
+    Bring `columns` into the frame of a joint whose axis sags and wobbles.
+
+    By two small turns across it; the joint is at `angle`.
+    """
     joint, first, second = step.link.joint, (step.third + 1) % 3, (step.third + 2) % 3
     vector = np.zeros((3, 3, len(angle)))  # derivative, direction, sample
     if joint.wobble:
@@ -442,7 +481,11 @@ def _slide(columns, axis, position, rate, acceleration):
 
 
 def _turn(columns, third, angle, rate, acceleration):
-    """Bring `columns` into the link that turns about coordinate axis `third` and add the joint's own motion."""
+    """
+    Bring `columns` into the link of a joint and add the joint's own motion.
+
+    The link turns about coordinate axis `third`.
+    """
     first, second = (third + 1) % 3, (third + 2) % 3
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.empty(columns.shape[:2] + (len(angle),))

@@ -10,14 +10,17 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.rotations import rotation_from_rpy
 
 MAX_TABLE_NUMBER = 1e6
-"""Largest number of a table (axis, place, angle, speed); products of larger numbers would overflow."""
+"""
+Largest number of a table (axis, place, angle, speed); products of larger numbers would overflow.
+"""
 
 
 def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
     """Refuse values that are not a mapping, and keys that are not `known`."""
     if not isinstance(mapping, Mapping):
         raise InputError(
-            f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the table description',
+            f'{what} must be a mapping with the keys {", ".join(known)}, got {mapping!r}; see the'
+            ' table description',
             code='not_a_mapping',
         )
     for key in mapping:
@@ -29,7 +32,9 @@ def require_keys(mapping: Any, known: Sequence[str], what: str) -> None:
 
 
 def unit_vector(value: Any, what: str) -> tuple[float, float, float]:
-    """Return the direction of three numbers as a unit vector; a unit vector is returned unchanged."""
+    """
+    Return the direction of three numbers as a unit vector; a unit vector is returned unchanged.
+    """
     vector = np.array(several_numbers(value, what))
     norm = np.linalg.norm(vector)
     if norm < 1e-9:
@@ -60,7 +65,9 @@ def finite_number(
     high: float = MAX_TABLE_NUMBER,
     advice: str = 'give a number',
 ) -> float:
-    """Return one finite number within [low, high], by default the limits of any number of a table."""
+    """
+    Return one finite number within [low, high], by default the limits of any number of a table.
+    """
     # YAML 1.1 reads 1e-5, without a point, as text.
     try:
         number = float('nan') if isinstance(value, bool) else float(value)
@@ -83,7 +90,11 @@ TYPES = ('revolute', 'prismatic')
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Range, speed and acceleration of a joint: rad, rad/s, rad/s^2, or m, m/s, m/s^2 of a sliding joint; None: not given."""
+    """
+    Range, speed and acceleration of a joint.
+
+    Rad, rad/s, rad/s^2, or m, m/s, m/s^2 of a sliding joint; None: not given.
+    """
 
     lower: float | None = None
     """Smallest position."""
@@ -96,12 +107,17 @@ class JointLimits:
     endless: bool = False
     """Whether the joint is declared to turn without end."""
     described: frozenset[str] = field(default=frozenset(), compare=False)
-    """Names of the fields that come from a robot description (URDF); the remaining fields are from a table file."""
+    """
+    Names of the fields that come from a robot description (URDF); the remaining fields are from a
+    table file.
+    """
 
 
 @dataclass(frozen=True)
 class Mimic:
-    """A joint that follows another one: ``position = multiplier * position of the other + offset``."""
+    """
+    A joint that follows another one: ``position = multiplier * position of the other + offset``.
+    """
 
     joint: str
     """Name of the other."""
@@ -118,11 +134,16 @@ class Joint:
     name: str
     """Name in the joint states."""
     axis: tuple[float, float, float]
-    """Unit vector in the joint's frame, that of the link it moves at joint zero (made unit here)."""
+    """
+    Unit vector in the joint's frame, that of the link it moves at joint zero (made unit here).
+    """
     xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Origin of the joint's frame, a point of the axis, in the frame of the link before it, m."""
     rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Joint's frame in the frame of the link before it: roll, pitch, yaw about fixed axes as in URDF, degrees."""
+    """
+    Joint's frame in the frame of the link before it: roll, pitch, yaw about fixed axes as in URDF,
+    degrees.
+    """
     type: str = 'revolute'
     """'revolute' (with or without an end) or 'prismatic'."""
     mimic: Mimic | None = None
@@ -130,9 +151,15 @@ class Joint:
     limits: JointLimits = field(default=JointLimits())
     """Range, speed and acceleration."""
     sag: float = 0.0
-    """Angle by which it hangs towards the ground where its axis lies level, rad (`leaning_axes`): estimated, no description holds it."""
+    """
+    Angle by which it hangs towards the ground where its axis lies level, rad (`leaning_axes`):
+    estimated, no description holds it.
+    """
     wobble: tuple[tuple[int, complex], ...] = ()
-    """How it leans as it turns: (turns of the lean for one of the joint, amplitude, rad), an estimate too."""
+    """
+    How it leans as it turns: (turns of the lean for one of the joint, amplitude, rad), an estimate
+    too.
+    """
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'axis', unit_vector(self.axis, f"axis of joint '{self.name}'"))
@@ -142,7 +169,8 @@ class Joint:
         )
         if self.type not in TYPES:
             raise InputError(
-                f"table: the type of joint '{self.name}' must be {' or '.join(TYPES)}, got {self.type!r}; correct it"
+                f"table: the type of joint '{self.name}' must be {' or '.join(TYPES)}, got"
+                f' {self.type!r}; correct it'
             )
         _require_limits(self.limits, f"joint '{self.name}'")
 
@@ -158,7 +186,9 @@ class Joint:
 
     @property
     def source(self) -> str:
-        """Name of the joint whose readings give its position: its own, or that of the followed joint."""
+        """
+        Name of the joint whose readings give its position: its own, or that of the followed joint.
+        """
         return self.name if self.mimic is None else self.mimic.joint
 
     @property
@@ -169,18 +199,28 @@ class Joint:
 
 @dataclass(frozen=True)
 class JointNames(Sequence):
-    """Names in the readings of a chain and in the parameters of its errors; as a sequence: the joints with readings."""
+    """
+    Names in the readings of a chain and in the parameters of its errors.
+
+    As a sequence: the joints with readings.
+    """
 
     read: tuple[str, ...]
     """Joints that are read, in the order of the columns of a `JointMotion`."""
     turning: tuple[str, ...]
     """The rotating joints of them."""
     zeros: tuple[str, ...]
-    """Joints whose zero is a separate error: the zero of the first is the azimuth, that of the last belongs to the mount."""
+    """
+    Joints whose zero is a separate error: the zero of the first is the azimuth, that of the last
+    belongs to the mount.
+    """
     angles: tuple[str, ...]
     """Angles between neighbouring axes."""
     places: tuple[str, ...] = ()
-    """Directions of the displacement of an axis from its nominal place; those of the first axis have no effect."""
+    """
+    Directions of the displacement of an axis from its nominal place; those of the first axis have
+    no effect.
+    """
     angle_sd: float | None = None
     """Standard deviation of zeros and angles, rad; None: not given."""
     place_sd: float | None = None
@@ -188,7 +228,11 @@ class JointNames(Sequence):
 
     @classmethod
     def of(cls, names: Sequence[str], errors: Mapping[str, Any] | None = None) -> 'JointNames':
-        """Return `names` unchanged, or, if None and `errors` is not given, the rotating joints without parallel neighbours."""
+        """
+        Return `names` unchanged, or.
+
+        If None and `errors` is not given, the rotating joints without parallel neighbours.
+        """
         if isinstance(names, cls):
             return names
         names = tuple(names)
@@ -208,7 +252,11 @@ class JointNames(Sequence):
 
     @property
     def errors(self) -> dict[str, Any] | None:
-        """Return the arguments that `of` needs in addition to the names with readings, or None if these suffice."""
+        """
+        Return the arguments that `of` needs in addition to the names with readings.
+
+        Or None if these suffice.
+        """
         if self == self.of(self.read):
             return None
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'read'}
@@ -287,7 +335,8 @@ def _require_limits(limits: JointLimits, what: str) -> None:
         lower is not None and upper is not None and lower > upper
     ):
         raise InputError(
-            f'table: the range of {what} must be a smaller and a larger number, got [{lower}, {upper}]; correct it'
+            f'table: the range of {what} must be a smaller and a larger number, got [{lower},'
+            f' {upper}]; correct it'
         )
     if limits.endless and lower is not None:
         raise InputError(
@@ -298,7 +347,8 @@ def _require_limits(limits: JointLimits, what: str) -> None:
         value = getattr(limits, name)
         if value is not None and not value > 0:
             raise InputError(
-                f'table: the largest {name} of {what} must be above zero, got {value:g}; correct or omit it'
+                f'table: the largest {name} of {what} must be above zero, got {value:g}; correct or'
+                ' omit it'
             )
 
 
@@ -311,13 +361,18 @@ def _mimic(item: Any, name: str) -> Mimic:
     }
     if not isinstance(item.get('joint'), str):
         raise InputError(
-            f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add joint: NAME"
+            f"table: mimic of joint '{name}' must name a joint, got {item.get('joint')!r}; add"
+            ' joint: NAME'
         )
     return Mimic(item['joint'], **numbers)
 
 
 def joint_to_mapping(joint: Joint) -> dict[str, Any]:
-    """Return the entry that `joint_from_mapping` turns into an equal joint; values at their default are omitted, except the place."""
+    """
+    Return the entry that `joint_from_mapping` turns into an equal joint.
+
+    Values at their default are omitted, except the place.
+    """
     item: dict[str, Any] = {'name': joint.name, 'axis': list(joint.axis), 'xyz': list(joint.xyz)}
     if any(joint.rpy_deg):
         item['rpy_deg'] = list(joint.rpy_deg)

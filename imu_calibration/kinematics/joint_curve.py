@@ -1,4 +1,8 @@
-"""Joints brought to the IMU's stamps: a smooth curve through the readings, its motion, and small errors of it."""
+"""
+Joints brought to the IMU's stamps.
+
+A smooth curve through the readings, its motion, and small errors of it.
+"""
 
 from dataclasses import dataclass
 
@@ -19,13 +23,22 @@ from imu_calibration.kinematics.smoothing import (
 )
 
 VELOCITY_SCALE = 2e-3
-"""Joint velocities are used when their scale agrees with the positions to this; filtered velocities distort the reference."""
+"""
+Joint velocities are used when their scale agrees with the positions to this; filtered velocities
+distort the reference.
+"""
 VELOCITY_LAG = 2e-4
-"""Largest lag of used velocities behind the positions, s; late ones imitate a time offset of the IMU."""
+"""
+Largest lag of used velocities behind the positions, s; late ones imitate a time offset of the IMU.
+"""
 
 
 def _with_velocity(spline, fit, position, velocity, *, knots, time, trend):
-    """Return the fit to positions and velocities; `fit`, that to the positions, if the velocities disagree or are much noisier."""
+    """
+    Return the fit to positions and velocities.
+
+    `fit`, that to the positions, if the velocities disagree or are much noisier.
+    """
     pieces = piece_coefficients(fit.coefficients[:, None])
     trend.add_to(pieces, knots)
     _, rate, acceleration = evaluate_pieces(knots, pieces, time, derivatives=2)[:, :, 0]
@@ -59,7 +72,11 @@ class Trend:
 
     @classmethod
     def through(cls, time: np.ndarray, position: np.ndarray, still: np.ndarray) -> 'Trend':
-        """Return the parabolas of least squares (of lower degree for few stamps); constants for joints that are `still`."""
+        """
+        Return the parabolas of least squares (of lower degree for few stamps).
+
+        Constants for joints that are `still`.
+        """
         centre = 0.5 * (time[0] + time[-1])
         degree = min(2, len(np.unique(time)) - 1)
         scale = max(time[-1] - centre, 1e-9) ** np.arange(degree + 1)
@@ -94,7 +111,9 @@ def check_velocity(
     velocity: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, *, dof: float
 ) -> tuple[bool, float]:
     """
-    Compare a joint's velocities with the derivative of its positions, ``velocity = offset + scale rate - lag acceleration + noise``.
+    Compare a joint's velocities with the derivative of its positions.
+
+    The equation is ``velocity = offset + scale rate - lag acceleration + noise``.
 
     Parameters
     ----------
@@ -142,13 +161,20 @@ class JointCurve:
     pieces: np.ndarray
     """Polynomials between the knots, shape (6, n_intervals, n_joints)."""
     noise_sd: np.ndarray
-    """Noise of the positions, rad, shape (n_joints,): estimated from the residuals, at least the known noise of the encoder."""
+    """
+    Noise of the positions, rad, shape (n_joints,): estimated from the residuals, at least the known
+    noise of the encoder.
+    """
     bandwidth: np.ndarray
-    """Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint at rest."""
+    """
+    Frequency that passes at half its amplitude, Hz, shape (n_joints,); zero for a joint at rest.
+    """
 
     def at(self, time: np.ndarray, derivatives: int = 3) -> JointMotion:
         """
-        Return the `JointMotion` at `time`, shape (n,); NaN outside the readings by more than three of their periods.
+        Return the `JointMotion` at `time`, shape (n,).
+
+        NaN outside the readings by more than three of their periods.
 
         Derivatives above `derivatives` are left out as zero.
         """
@@ -175,9 +201,10 @@ def fit_joint_curve(
     """
     Return the smooth curve through readings of the joints.
 
-    A penalised quintic spline per joint, one knot per reading; the penalty follows from the data (`smoothing.smooth`), so
-    that readings without noise are interpolated and those of a coarse encoder give sane accelerations. Velocities that
-    agree with the positions in scale and lag are used.
+    A penalised quintic spline per joint, one knot per reading; the penalty follows from the data
+    (`smoothing.smooth`), so that readings without noise are interpolated and those of a coarse
+    encoder give sane accelerations. Velocities that agree with the positions in scale and lag are
+    used.
 
     Parameters
     ----------
@@ -197,7 +224,8 @@ def fit_joint_curve(
     Raises
     ------
     InputError
-        When there are no readings, a position is not finite, time runs backwards or has a hole of many periods.
+        When there are no readings, a position is not finite, time runs backwards or has a hole of
+        many periods.
 
     """
     time, position = np.asarray(time, float), np.asarray(position, float)
@@ -245,25 +273,29 @@ def fit_joint_curve(
 def _check(time, position):
     if not len(time) or not np.isfinite(position).all():
         raise InputError(
-            f'joint positions must be finite, got {len(time)} readings with gaps or none; remove non-finite values',
+            f'joint positions must be finite, got {len(time)} readings with gaps or none; remove'
+            ' non-finite values',
             code='not_finite',
         )
     if np.any(np.diff(time) < 0):
         raise InputError(
-            'joint stamps must not run backwards, got a backward step; sort the readings or drop those',
+            'joint stamps must not run backwards, got a backward step; sort the readings or drop'
+            ' those',
             code='stamps_backwards',
         )
 
 
 def _place_knots(time):
-    """Return knots at the usual distance of the stamps (increasing), with a margin on both sides."""
+    """
+    Return knots at the usual distance of the stamps (increasing), with a margin on both sides.
+    """
     stride = min(8, len(time) - 1)
     step = float(np.median(time[stride:] - time[:-stride]) / stride) if stride else 1e-6
     hole = np.max(np.diff(time), initial=0.0)
     if hole > _LONGEST_HOLE * step:
         raise InputError(
-            f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of {hole:.3g} s; '
-            'split them there',
+            f'joint readings must follow each other within {_LONGEST_HOLE} periods, got a hole of'
+            f' {hole:.3g} s; split them there',
             code='gap',
         )
     return Knots(
@@ -274,7 +306,9 @@ def _place_knots(time):
 
 
 def _noise_floor(position, noise_sd):
-    """Return the lower limit of the noise of the readings: the given value, rounding, coarse steps."""
+    """
+    Return the lower limit of the noise of the readings: the given value, rounding, coarse steps.
+    """
     floor = 4 * np.finfo(float).eps * np.abs(position).max(axis=0)
     steps = np.array([encoder_step(column) for column in position.T])
     return np.maximum.reduce(

@@ -1,4 +1,8 @@
-"""The joints' motion at given instants (angles and three derivatives), errors of angle encoders, and the motion at shifted times."""
+"""
+The joints' motion at given and shifted times, and errors of angle encoders.
+
+The motion at given instants is angles and three derivatives.
+"""
 
 from dataclasses import dataclass, replace
 from math import factorial
@@ -10,7 +14,11 @@ from imu_calibration.core.samples import AlignedArrays
 
 @dataclass(frozen=True, eq=False)
 class JointMotion(AlignedArrays):
-    """Angles of the joints and their first three derivatives; columns in the order of the table's joints."""
+    """
+    Angles of the joints and their first three derivatives.
+
+    Columns in the order of the table's joints.
+    """
 
     time: np.ndarray
     """Seconds, shape (n,)."""
@@ -25,14 +33,18 @@ class JointMotion(AlignedArrays):
     thermal_branch: np.ndarray | None = None
     """Thermal branch at these instants (`kinematics.signal_history`), shape (n,); None: unknown."""
     vibration: np.ndarray | None = None
-    """Variance of vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
+    """
+    Variance of vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown.
+    """
 
 
 def with_encoder_harmonics(
     motion: JointMotion, order: int, cos_amplitude: np.ndarray, *, sin_amplitude: np.ndarray
 ) -> JointMotion:
     """
-    Return the true motion behind encoders with a harmonic error, ``q_true = q + c cos(k q) + s sin(k q)``.
+    Return the true motion for encoders with a harmonic error.
+
+    The equation is ``q_true = q + c cos(k q) + s sin(k q)``.
 
     Rates, accelerations and jerks are the exact derivatives.
 
@@ -78,8 +90,9 @@ def encoder_step(position: np.ndarray) -> float:
     """
     Return the resolution of an encoder that shows in its readings, or 0.
 
-    Looks at isolated jumps, those between readings that repeat; they are one step high. Readings that move by many steps
-    from sample to sample have none; their quantisation is white and needs no notice.
+    Looks at isolated jumps, those between readings that repeat; they are one step high. Readings
+    that move by many steps from sample to sample have none; their quantisation is white and needs
+    no notice.
     """
     change = np.diff(position)
     moved = change != 0
@@ -91,7 +104,10 @@ def encoder_step(position: np.ndarray) -> float:
 
 
 LINKED = 0.1
-"""Largest distance of stamps for interpolation, s; stamps further apart belong to different windows or rests."""
+"""
+Largest distance of stamps for interpolation, s; stamps further apart belong to different windows or
+rests.
+"""
 
 DERIVATIVE_BLOCK_ROWS = 4096
 """Rows per block, so that they fit in the processor's cache."""
@@ -99,11 +115,14 @@ DERIVATIVE_BLOCK_ROWS = 4096
 
 def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
     """
-    Return the motion at ``time - delay``, with unchanged `time`: the motion of the IMU if its stamps are `delay` late.
+    Return the motion at ``time - delay``, with unchanged `time`.
 
-    Between two stamps the polynomial of degree seven that meets position, rate, acceleration and jerk at both (Hermite), so that
-    the error does not grow with the delay: 1e-4 of the acceleration at a quarter of the stamps' frequency. Before the first of a run of
-    stamps and after the last, the Taylor series from there, with the jerk as the last derivative.
+    The motion of the IMU if its stamps are `delay` late.
+
+    Between two stamps the polynomial of degree seven that meets position, rate, acceleration and
+    jerk at both (Hermite), so that the error does not grow with the delay: 1e-4 of the acceleration
+    at a quarter of the stamps' frequency. Before the first of a run of stamps and after the last,
+    the Taylor series from there, with the jerk as the last derivative.
 
     Parameters
     ----------
@@ -116,7 +135,8 @@ def shifted(motion: JointMotion, delay: float | np.ndarray) -> JointMotion:
     if not np.any(delay) or not len(motion):
         return motion
     delay = np.broadcast_to(np.asarray(delay, float), motion.time.shape)
-    # Instants along the last axis: arithmetic along an axis of a few joints is several times slower.
+    # Instants along the last axis: arithmetic along an axis of a few joints is several times
+    # slower.
     derivatives = np.stack([motion.position.T, motion.rate.T, motion.acceleration.T, motion.jerk.T])
     step = np.diff(motion.time)
     if len(motion) < 2 or np.any(step <= 0):
@@ -172,7 +192,11 @@ _FROM_ENDS = np.linalg.inv(_POWERS)
 
 
 def _hermite(left, right, step, by):
-    """Return value and first three derivatives, shape (4, n_joints, m), at `by` from the left end of intervals of length `step`, (m,)."""
+    """
+    Return value and first three derivatives.
+
+    Shape (4, n_joints, m), at `by` from the left end of intervals of length `step`, (m,).
+    """
     scale = np.stack([step**0, step, step**2, step**3])[:, None]
     left = scale * left
     # The powers four to seven correct the error of the left-end cubic at the right end.

@@ -1,4 +1,8 @@
-"""Range, speed and acceleration of the driven joints as arrays, and points of a joint trajectory by name and time."""
+"""
+Limits of the driven joints as arrays, and points of a joint trajectory.
+
+The limits are range, speed and acceleration. The points are given by name and time.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,8 @@ class TrajectoryPoints:
     Raises
     ------
     InputError
-        When no controller would follow it: shapes or times that do not fit, numbers that are not finite, a last point with a velocity.
+        When no controller would follow it: shapes or times that do not fit, numbers that are not
+        finite, a last point with a velocity.
 
     """
 
@@ -46,18 +51,20 @@ class TrajectoryPoints:
         for name, values in self.columns().items():
             if values.shape != shape:
                 raise InputError(
-                    f'each point of a trajectory must have {shape[1]} {_WORDS[name]}, one for each joint, got shape '
-                    f'{values.shape}; give all or none',
+                    f'each point of a trajectory must have {shape[1]} {_WORDS[name]}, one for each'
+                    f' joint, got shape {values.shape}; give all or none',
                     code='position_count',
                 )
             if not np.all(np.isfinite(values)):
                 raise InputError(
-                    f'every number of a trajectory must be finite, some {_WORDS[name]} are not; correct the points',
+                    f'every number of a trajectory must be finite, some {_WORDS[name]} are not;'
+                    ' correct the points',
                     code='not_finite',
                 )
         if not np.all(np.diff(self.time, prepend=0.0) > 0):
             raise InputError(
-                'the times of a trajectory must rise from above zero, they do not; correct time_from_start',
+                'the times of a trajectory must rise from above zero, they do not; correct'
+                ' time_from_start',
                 code='times_not_rising',
             )
         if self.acceleration is not None and self.rate is None:
@@ -102,8 +109,8 @@ class TrajectoryPoints:
         own, wanted = list(self.joint_names), list(joint_names)
         if sorted(own) != sorted(wanted):
             raise InputError(
-                f'a trajectory must name exactly the joints {", ".join(wanted)}, got {", ".join(own) or "none"}; '
-                'name every joint once',
+                f'a trajectory must name exactly the joints {", ".join(wanted)}, got'
+                f' {", ".join(own) or "none"}; name every joint once',
                 code='joint_names',
             )
         order = [own.index(name) for name in wanted]
@@ -126,7 +133,10 @@ _WORDS = {'position': 'positions', 'rate': 'velocities', 'acceleration': 'accele
 
 USUAL = {True: (150.0 * DEG, 300.0 * DEG), False: (0.25, 0.5)}
 """Default speed and acceleration of rotating and of sliding joints: rad/s, rad/s^2; m/s, m/s^2."""
-NOT_CHECKED = 'only the limits of the joints are checked, not collisions of the robot with itself, its surroundings or its cables'
+NOT_CHECKED = (
+    'only the limits of the joints are checked, not collisions of the robot with itself, its'
+    ' surroundings or its cables'
+)
 """Stated wherever a plan is printed, saved or driven."""
 DEFAULT_ORIGIN, ROBOT_ORIGIN, TABLE_ORIGIN = 'default', 'robot description', 'table file'
 """Origins of limits; default: no description gives it."""
@@ -138,7 +148,11 @@ MAX_RADIAN_RANGE = 20 * np.pi
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """Limits of the joints that are driven, in the order of ``table.joint_names``: rad and m, each shape (n_joints,)."""
+    """
+    Limits of the joints that are driven, in the order of ``table.joint_names``.
+
+    Rad and m, each shape (n_joints,).
+    """
 
     lower: np.ndarray
     """Smallest positions, minus infinity where there is no end."""
@@ -162,7 +176,11 @@ class MotionLimits:
         return self.turns & ~np.isfinite(self.lower)
 
     def wound(self, position: np.ndarray, turns: float) -> 'MotionLimits':
-        """Return the limits with endless joints restricted to so many turns to either side of a position; zero turns: unrestricted."""
+        """
+        Return the limits with endless joints restricted to a number of turns.
+
+        They may turn so many turns to either side of a position. Zero turns means unrestricted.
+        """
         return (
             self.around(position, np.where(self.endless, 2 * np.pi * turns, np.inf))
             if turns
@@ -190,13 +208,17 @@ class MotionLimits:
         )
         if np.any(lower > upper):
             raise InputError(
-                f'the pose must lie within the range of every joint, joint number {int(np.argmax(lower - upper)) + 1} is '
-                'outside; choose another pose'
+                'the pose must lie within the range of every joint, joint number'
+                f' {int(np.argmax(lower - upper)) + 1} is outside; choose another pose'
             )
         return replace(self, lower=lower, upper=upper)
 
     def reached(self, position: np.ndarray, reach_deg: float) -> 'MotionLimits':
-        """Return the limits with rotating joints restricted to `reach_deg` on either side of a position; sliding joints do not change."""
+        """
+        Return the limits with rotating joints restricted to `reach_deg`.
+
+        The restriction is on either side of a position. Sliding joints do not change.
+        """
         return self.around(position, np.where(self.turns, reach_deg * DEG, 0.0))
 
 
@@ -216,8 +238,9 @@ def limits_of(table: Table) -> MotionLimits:
     """
     Return the limits of a table's joints.
 
-    A joint that other joints mimic keeps their limits as well. Defaults: `USUAL` speed and acceleration, no end for a joint that turns, no
-    motion for a joint that slides; `missing_ranges` lists the joints without a range.
+    A joint that other joints mimic keeps their limits as well. Defaults: `USUAL` speed and
+    acceleration, no end for a joint that turns, no motion for a joint that slides; `missing_ranges`
+    lists the joints without a range.
     """
     names = table.joint_names
     turns = np.ones(len(names), bool)
@@ -263,7 +286,11 @@ def _origin(joint: Joint, name: str) -> str:
 
 
 def missing_ranges(table: Table) -> tuple[str, ...]:
-    """Return the joints whose range is unknown or implausibly wide: neither a plausible range nor declared endless."""
+    """
+    Return the joints whose range is unknown or implausibly wide.
+
+    Neither a plausible range nor declared endless.
+    """
     limits = limits_of(table)
     wide = (
         limits.turns & np.isfinite(limits.lower) & (limits.upper - limits.lower > MAX_RADIAN_RANGE)
@@ -280,8 +307,9 @@ def range_warnings(table: Table) -> list[str]:
     lines, missing = [], missing_ranges(table)
     if missing:
         lines.append(
-            f'every joint must have a range to be moved, {", ".join(missing)}: none, or over ten turns; add range_deg: [a, b] '
-            '(range_m where it slides) or endless: true to the table file'
+            f'every joint must have a range to be moved, {", ".join(missing)}: none, or over ten'
+            ' turns; add range_deg: [a, b] (range_m where it slides) or endless: true to the table'
+            ' file'
         )
     for joint in table.joints:
         lower, upper = joint.limits.lower, joint.limits.upper
@@ -294,14 +322,19 @@ def range_warnings(table: Table) -> list[str]:
             ends = np.degrees((lower, upper))
             if 0 < np.max(np.abs(ends)) <= RADIANS:
                 lines.append(
-                    f"range_deg of joint '{joint.name}' must be in degrees, [{ends[0]:g}, {ends[1]:g}] looks like radians; "
-                    f'write [{np.degrees(ends[0]):.1f}, {np.degrees(ends[1]):.1f}] if it is'
+                    f"range_deg of joint '{joint.name}' must be in degrees, [{ends[0]:g},"
+                    f' {ends[1]:g}] looks like radians; write [{np.degrees(ends[0]):.1f},'
+                    f' {np.degrees(ends[1]):.1f}] if it is'
                 )
     return lines
 
 
 def limit_words(table: Table, limits: MotionLimits) -> list[str]:
-    """Return range, speed and acceleration of each joint with the origin of each limit, a line per joint."""
+    """
+    Return range, speed and acceleration of each joint, a line per joint.
+
+    Each line includes the origin of each limit.
+    """
     lines, described = [], limits_of(table)
     for k, (name, (of_range, of_speed, of_acceleration)) in enumerate(
         zip(table.joint_names, limits.origins, strict=True)

@@ -1,4 +1,8 @@
-"""Readings of a perfect sensor, rotation matrices from vectors and angles, normal gravity and the rate of the Earth."""
+"""
+Readings of a perfect sensor, rotation matrices, gravity and the Earth's rate.
+
+The rotation matrices are from vectors and angles. The gravity is normal gravity.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +26,10 @@ class Reference(AlignedArrays):
     force_s: np.ndarray
     """Specific force at the reference point, m/s^2, shape (n, 3)."""
     rate_s: np.ndarray
-    """Angular rate against inertial space, rad/s, shape (n, 3); without Earth rate when latitude or azimuth is unknown."""
+    """
+    Angular rate against inertial space, rad/s, shape (n, 3); without Earth rate when latitude or
+    azimuth is unknown.
+    """
     alpha_s: np.ndarray
     """Angular acceleration, rad/s^2, shape (n, 3)."""
     gravity: float
@@ -32,7 +39,10 @@ class Reference(AlignedArrays):
     branch: np.ndarray | None = None
     """Thermal branch at the samples (`kinematics.signal_history`), shape (n,); None: unknown."""
     shaking: np.ndarray | None = None
-    """Variance of vibration at the samples (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown."""
+    """
+    Variance of vibration at the samples (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3);
+    None: unknown.
+    """
     motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
 
@@ -60,7 +70,8 @@ class Reference(AlignedArrays):
     def _joints(self):
         if self.motion is None:
             raise InputError(
-                'an effect that depends on joints needs a table or an arm, there is none; omit the effect'
+                'an effect that depends on joints needs a table or an arm, there is none; omit the'
+                ' effect'
             )
         return self.motion
 
@@ -81,13 +92,21 @@ def unit_rows(vectors: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation closest to a matrix; of ``vectors_a.T @ vectors_b`` that of ``vectors_a = mat_ab @ vectors_b`` (Kabsch)."""
+    """
+    Return the rotation closest to a matrix.
+
+    Of ``vectors_a.T @ vectors_b`` that of ``vectors_a = mat_ab @ vectors_b`` (Kabsch).
+    """
     left, _, right = np.linalg.svd(matrix)
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
 def cross(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the cross products of vectors along the last axis but one, shapes (..., 3, n) and (3, n) or (3, 1)."""
+    """
+    Return the cross products of vectors along the last axis but one.
+
+    Shapes (..., 3, n) and (3, n) or (3, 1).
+    """
     (x, y, z), a, b, c = right, left[..., 0, :], left[..., 1, :], left[..., 2, :]
     return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-2)
 
@@ -108,16 +127,20 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 
 def rotation_from_rpy(rpy: np.ndarray) -> np.ndarray:
-    """Return ``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3): turns about fixed axes as in URDF, rad."""
+    """
+    Return ``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3): turns about fixed axes as in URDF, rad.
+    """
     return Rotation.from_euler('xyz', rpy).as_matrix()
 
 
 def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
     """
-    Return roll, pitch and yaw of a rotation matrix, rad, shape (3,): ``rotation_from_rpy`` gives the matrix back to rounding.
+    Return roll, pitch and yaw of a rotation matrix, rad, shape (3,).
 
-    At a pitch of a quarter turn only one combination of roll and yaw is defined; yaw follows from the remainder (Shoemake), so
-    that their errors cancel there.
+    ``rotation_from_rpy`` gives the matrix back to rounding.
+
+    At a pitch of a quarter turn only one combination of roll and yaw is defined; yaw follows from
+    the remainder (Shoemake), so that their errors cancel there.
     """
     roll = np.arctan2(matrix[2, 1], matrix[2, 2])
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
@@ -134,7 +157,11 @@ def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def align(direction: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation from the unit vector `direction` to z, shape (3, 3); half a turn about x from -z."""
+    """
+    Return the smallest rotation from the unit vector `direction` to z, shape (3, 3).
+
+    Half a turn about x from -z.
+    """
     x, y, z = direction
     across = x * x + y * y
     if z < 0 and across < 1e-24:
@@ -148,7 +175,10 @@ EARTH_RATE = 7.292115e-5
 """Rate of the Earth against inertial space, rad/s (WGS 84)."""
 
 NORMAL_GRAVITY_ACCURACY = 1e-4
-"""Relative standard deviation of the normal gravity of a place: gravity anomalies and an inexact height."""
+"""
+Relative standard deviation of the normal gravity of a place: gravity anomalies and an inexact
+height.
+"""
 
 _SEMI_MAJOR_AXIS = 6378137.0
 _FLATTENING = 1 / 298.257223563
@@ -162,8 +192,9 @@ def normal_gravity(latitude_deg: float, height: float = 0.0) -> float:
     """
     Return the normal gravity of the WGS 84 ellipsoid, m/s^2.
 
-    Somigliana's closed form on the ellipsoid, ``g_e (1 + k sin^2) / sqrt(1 - e^2 sin^2)``, with the height correction
-    of second order (NIMA TR8350.2, eq. 4-1 and 4-3). The local anomaly, up to 5e-4 m/s^2 in mountains, is not in it.
+    Somigliana's closed form on the ellipsoid, ``g_e (1 + k sin^2) / sqrt(1 - e^2 sin^2)``, with the
+    height correction of second order (NIMA TR8350.2, eq. 4-1 and 4-3). The local anomaly, up to
+    5e-4 m/s^2 in mountains, is not in it.
 
     Parameters
     ----------
@@ -188,7 +219,9 @@ def local_gravity(
     gravity: float | None, latitude_deg: float | None = None, height: float | None = None
 ) -> tuple[float | None, float]:
     """
-    Return (gravity, its standard deviation), m/s^2: as given, else the normal gravity of the place; (None, 0.0) without either.
+    Return (gravity, its standard deviation), m/s^2: as given, else the normal gravity of the place.
+
+    (None, 0.0) without either.
 
     Parameters
     ----------
@@ -202,27 +235,30 @@ def local_gravity(
     Raises
     ------
     InputError
-        If gravity and latitude are both given, a height has no latitude, or the place is not on the Earth.
+        If gravity and latitude are both given, a height has no latitude, or the place is not on the
+        Earth.
 
     """
     if latitude_deg is None:
         if height is not None:
             raise InputError(
-                f'height must come with a latitude, got height {height:g} m alone; give both, or gravity in m/s^2',
+                f'height must come with a latitude, got height {height:g} m alone; give both, or'
+                ' gravity in m/s^2',
                 key='latitude',
                 code='latitude_missing',
             )
         return gravity, 0.0
     if gravity is not None:
         raise InputError(
-            f'the place or gravity must be given, got latitude {latitude_deg:g} deg and gravity {gravity:g} m/s^2; omit one',
+            f'the place or gravity must be given, got latitude {latitude_deg:g} deg and gravity'
+            f' {gravity:g} m/s^2; omit one',
             key='latitude',
             code='gravity_twice',
         )
     if not (abs(latitude_deg) <= 90 and -500 <= (height or 0.0) <= 9000):
         raise InputError(
-            f'the place must have a latitude of -90 to 90 deg and a height of -500 to 9000 m, got {latitude_deg:g} deg and '
-            f'{height or 0.0:g} m; correct them',
+            'the place must have a latitude of -90 to 90 deg and a height of -500 to 9000 m, got'
+            f' {latitude_deg:g} deg and {height or 0.0:g} m; correct them',
             key='latitude',
             code='place_impossible',
         )
@@ -234,7 +270,8 @@ def earth_rate_n(latitude_deg: float, azimuth_deg: float) -> np.ndarray:
     """
     Return the Earth's rate in the level frame n, rad/s, shape (3,).
 
-    North lies `azimuth_deg` counter-clockwise of x: ``omega_e (cos(lat) cos(az), cos(lat) sin(az), sin(lat))``.
+    North lies `azimuth_deg` counter-clockwise of x: ``omega_e (cos(lat) cos(az), cos(lat) sin(az),
+    sin(lat))``.
 
     Parameters
     ----------

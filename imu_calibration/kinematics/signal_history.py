@@ -1,4 +1,8 @@
-"""Inputs of effects that depend on past samples: the branch of a thermal hysteresis, and the running variance of vibration."""
+"""
+Inputs of effects that depend on past samples.
+
+The branch of a thermal hysteresis, and the running variance of vibration.
+"""
 
 import math
 
@@ -7,8 +11,8 @@ from numpy.typing import ArrayLike
 
 CORNER = 5.0
 """
-Frequency of a triple high pass, whose output is vibration, Hz: gravity rotating at 200 deg/s contributes 0.02 m/s^2,
-slow oscillation of joints zero.
+Frequency of a triple high pass, whose output is vibration, Hz: gravity rotating at 200 deg/s
+contributes 0.02 m/s^2, slow oscillation of joints zero.
 """
 MEAN_SQUARE_SECONDS = 0.5
 """Time constant of the running mean of its square, s: as long as a table settles."""
@@ -19,9 +23,10 @@ class BandVariance:
     """
     Running variance of specific force above `CORNER`, for each axis.
 
-    ``y = h * h * h * x`` with ``h_k: y_k = a y_(k-1) + (1 + a) / 2 (x_k - x_(k-1))``, ``a = exp(-2 pi corner dt)``, and
-    ``v_k = b v_(k-1) + (1 - b) y_k^2``, ``b = exp(-dt / memory)``. It is causal, uses the measured force sample by sample, and
-    has fifteen state variables; vibration above half the sample rate is aliased.
+    ``y = h * h * h * x`` with ``h_k: y_k = a y_(k-1) + (1 + a) / 2 (x_k - x_(k-1))``, ``a = exp(-2
+    pi corner dt)``, and ``v_k = b v_(k-1) + (1 - b) y_k^2``, ``b = exp(-dt / memory)``. It is
+    causal, uses the measured force sample by sample, and has fifteen state variables; vibration
+    above half the sample rate is aliased.
     """
 
     def __init__(self) -> None:
@@ -31,7 +36,9 @@ class BandVariance:
         """At the last sample, (m/s^2)^2."""
 
     def push(self, period: float, force: tuple[float, float, float]) -> tuple[float, ...]:
-        """Process the next sample, `period` s after the last one, and return the variances, (m/s^2)^2."""
+        """
+        Process the next sample, `period` s after the last one, and return the variances, (m/s^2)^2.
+        """
         if not self._inputs:
             self._begin(force)
         keep, forget = _decays(period)
@@ -46,7 +53,11 @@ class BandVariance:
         return self.now
 
     def of(self, period: float, force_s: np.ndarray) -> np.ndarray:
-        """Return the variances after each of the next samples, shape (n, 3): the same as `push` one by one."""
+        """
+        Return the variances after each of the next samples, shape (n, 3).
+
+        The same as `push` one by one.
+        """
         if not len(force_s):
             return np.zeros((0, 3))
         if not self._inputs:
@@ -70,7 +81,8 @@ def autoregressive(drive: np.ndarray, decay: float, before: ArrayLike) -> np.nda
     """
     Return ``y_k = decay y_(k-1) + drive_k``, shape (n, m), from ``y_(-1) = before``, shape (m,).
 
-    A unit triangular system with one band below the diagonal, as the import of scipy.signal is slow.
+    A unit triangular system with one band below the diagonal, as the import of scipy.signal is
+    slow.
     """
     from scipy.linalg.blas import dtbsv
 
@@ -85,8 +97,9 @@ def _decays(period):
 
 HALF_WIDTH = 1.0
 """
-Half of the play between the branches, K: the temperature reverses by twice this from one branch to the other. A
-package needs some kelvins to strain its element in the other direction; the noise and the steps of thermometers are much smaller.
+Half of the play between the branches, K: the temperature reverses by twice this from one branch to
+the other. A package needs some kelvins to strain its element in the other direction; the noise and
+the steps of thermometers are much smaller.
 """
 
 
@@ -94,9 +107,10 @@ class ThermalBranch:
     """
     Play operator (Prandtl-Ishlinskii's element) on the temperature.
 
-    With T the reading and p the middle that is dragged along, ``p <- min(max(p, T - w), T + w)``, and the branch is ``(T - p) / w``: 1
-    during warming, -1 during cooling, between them until it has reversed by 2 w. It starts at 0, as the earlier temperature is unknown. It
-    does not depend on the rate of the temperature, has one state variable, and is causal.
+    With T the reading and p the middle that is dragged along, ``p <- min(max(p, T - w), T + w)``,
+    and the branch is ``(T - p) / w``: 1 during warming, -1 during cooling, between them until it
+    has reversed by 2 w. It starts at 0, as the earlier temperature is unknown. It does not depend
+    on the rate of the temperature, has one state variable, and is causal.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,8 @@
-"""Quintic splines on uniform knots with a third-difference penalty, and the penalty that suits the noise and the resolution of encoders."""
+"""
+Quintic splines on uniform knots with a third-difference penalty.
+
+The penalty that suits the noise and the resolution of encoders is included.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +22,11 @@ _SPLINE_BLOCK_SAMPLES = 8192  # instants whose intermediates fit in the processo
 
 
 def _piece_matrix():
-    """Return M with ``basis a on its interval = sum_k M[k, a] u^k``; basis a belongs to coefficient ``interval + a``."""
+    """
+    Return M with ``basis a on its interval = sum_k M[k, a] u^k``.
+
+    Basis a belongs to coefficient ``interval + a``.
+    """
     matrix = np.zeros((SPLINE_ORDER, SPLINE_ORDER))
     for basis in range(SPLINE_ORDER):
         piece = DEGREE - basis
@@ -61,7 +69,11 @@ class Knots:
 def design_values(
     knots: Knots, time: np.ndarray, derivative: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (interval, values): the six basis functions that are not zero at each instant, shape (6, n), or their derivative."""
+    """
+    Return (interval, values).
+
+    The six basis functions that are not zero at each instant, shape (6, n), or their derivative.
+    """
     interval, place = knots.locate(time)
     matrix = PIECES
     for _ in range(derivative):
@@ -86,7 +98,11 @@ def design_matrix(knots: Knots, interval: np.ndarray, values: np.ndarray) -> Any
 
 
 def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the lower bands of design.T @ design, shape (6, n_coefficients), in the format of `scipy.linalg.solveh_banded`."""
+    """
+    Return the lower bands of design.T @ design.
+
+    Shape (6, n_coefficients), in the format of `scipy.linalg.solveh_banded`.
+    """
     size = knots.n_coefficients
     bands = np.zeros((SPLINE_ORDER, size))
     for first in range(SPLINE_ORDER):
@@ -98,7 +114,11 @@ def normal_bands(knots: Knots, interval: np.ndarray, values: np.ndarray) -> np.n
 
 
 def penalty_bands(weights: np.ndarray) -> np.ndarray:
-    """Return the lower bands of D.T @ diag(weights) @ D with D the third differences of the coefficients, shape (6, n_weights + 3)."""
+    """
+    Return the lower bands of D.T @ diag(weights) @ D, shape (6, n_weights + 3).
+
+    D is the matrix of the third differences of the coefficients.
+    """
     bands = np.zeros((SPLINE_ORDER, len(weights) + 3))
     for first in range(4):
         for second in range(first, 4):
@@ -109,7 +129,9 @@ def penalty_bands(weights: np.ndarray) -> np.ndarray:
 
 
 def piece_coefficients(coefficients: np.ndarray) -> np.ndarray:
-    """Return the polynomial of each interval in its place u, shape (6 powers, n_intervals, n_joints)."""
+    """
+    Return the polynomial of each interval in its place u, shape (6 powers, n_intervals, n_joints).
+    """
     windows = np.lib.stride_tricks.sliding_window_view(coefficients, SPLINE_ORDER, axis=0)
     return np.ascontiguousarray(np.moveaxis(windows @ PIECES.T, -1, 0))
 
@@ -117,7 +139,11 @@ def piece_coefficients(coefficients: np.ndarray) -> np.ndarray:
 def evaluate_pieces(
     knots: Knots, pieces: np.ndarray, time: np.ndarray, *, derivatives: int
 ) -> np.ndarray:
-    """Return the values and the first `derivatives` derivatives at `time`, shape (derivatives + 1, n, n_joints)."""
+    """
+    Return the values and the first `derivatives` derivatives at `time`.
+
+    Shape (derivatives + 1, n, n_joints).
+    """
     n_joints = pieces.shape[2]
     result = np.zeros((derivatives + 1, len(time), n_joints))
     for start in range(0, len(time), _SPLINE_BLOCK_SAMPLES):
@@ -130,7 +156,11 @@ def evaluate_pieces(
 
 
 def _horner(pieces, interval, place, taylor):
-    """Fill `taylor`, zeros, with the Taylor coefficients of the polynomials at `place` (repeated synthetic division)."""
+    """
+    Fill `taylor`, zeros.
+
+    With the Taylor coefficients of the polynomials at `place` (repeated synthetic division).
+    """
     for power in range(DEGREE, -1, -1):
         for order in range(min(DEGREE - power, len(taylor) - 1), 0, -1):
             taylor[order] *= place
@@ -139,10 +169,14 @@ def _horner(pieces, interval, place, taylor):
         taylor[0] += pieces[power].take(interval, axis=0)
 
 
-# Decades of the penalty relative to the rows per knot: from interpolation to a bandwidth of 1/100 of Nyquist's.
+# Decades of the penalty relative to the rows per knot: from interpolation to a bandwidth of 1/100
+# of Nyquist's.
 _COARSE = (-6.0, -3.0, 0.0, 3.0, 6.0, 9.0)
 ROBUSTNESS = 0.7
-"""Parameter gamma of the robust criterion: 1 for plain cross-validation, less for fits that round sharp ramps more."""
+"""
+Parameter gamma of the robust criterion: 1 for plain cross-validation, less for fits that round
+sharp ramps more.
+"""
 _PILOT = -2.0  # rough, but tame where readings lie close together
 _TAPER = 0.2  # share of a record in which the weight of the ends rises
 _LONG = 1000  # rows from which on the spectrum gives the residuals
@@ -164,15 +198,19 @@ class Smooth:
 
 class PenalisedSpline:
     """
-    Least squares on rows ``design @ coefficients = values`` with the penalty ``lambda |third differences|^2``.
+    Least squares on rows ``design @ coefficients = values`` with a penalty.
 
-    Eilers and Marx 1996. Degrees of freedom come from the mean bands of the normal matrix, as for a long uniform
-    record: the gain of the fit at the frequency theta is ``N / (N + lambda p)`` with ``p = (2 - 2 cos theta)^3``.
+    The penalty is ``lambda |third differences|^2``.
+
+    Eilers and Marx 1996. Degrees of freedom come from the mean bands of the normal matrix, as for a
+    long uniform record: the gain of the fit at the frequency theta is ``N / (N + lambda p)`` with
+    ``p = (2 - 2 cos theta)^3``.
 
     Parameters
     ----------
     design : sparse array, shape (n_rows, n_coefficients)
-        One row per reading; with readings of several kinds, each kind in the order of time, one kind after the other.
+        One row per reading; with readings of several kinds, each kind in the order of time, one
+        kind after the other.
     bands : array, shape (6, n_coefficients)
         Lower bands of ``design.T @ design``.
     n_kinds : int
@@ -187,7 +225,8 @@ class PenalisedSpline:
             penalty_bands(np.ones(design.shape[1] - 3)),
         )
         self.n_rows, self.n_coefficients = design.shape
-        # Splines are worst at the ends, which callers keep out: the ends have weight zero in the noise and the penalty.
+        # Splines are worst at the ends, which callers keep out: the ends have weight zero in the
+        # noise and the penalty.
         interior = np.tile(_taper(self.n_rows // n_kinds) ** 2, n_kinds)
         self._interior = interior / interior.sum()
         self.density = self.n_rows / self.n_coefficients
@@ -196,7 +235,8 @@ class PenalisedSpline:
             / self.n_coefficients
             * np.where(np.arange(SPLINE_ORDER) == 0, 1.0, 2.0)
         )
-        # The smallest penalty for which the factor exists: holes of m knots give it eigenvalues of about (pi / m)^6.
+        # The smallest penalty for which the factor exists: holes of m knots give it eigenvalues of
+        # about (pi / m)^6.
         empty = self.bands[0] < 1e-9 * self.density
         hole = np.max(np.diff(runs_of(empty)), initial=0) + SPLINE_ORDER
         self.least_decade = max(_COARSE[0], 6 * np.log10(hole / np.pi) - 13)
@@ -205,14 +245,20 @@ class PenalisedSpline:
         self._symbols = self.symbols(self._theta)
 
     def symbols(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return N and p, the normal matrix and the penalty at the frequencies `theta`, rad per knot."""
+        """
+        Return N and p, the normal matrix and the penalty at the frequencies `theta`, rad per knot.
+        """
         normal = np.cos(theta[:, None] * np.arange(SPLINE_ORDER)) @ self._mean_bands
         return np.maximum(normal, 1e-6 * self.density), (2 - 2 * np.cos(theta)) ** 3
 
     def fit(
         self, values: np.ndarray, penalty: float, with_ends: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coefficients for columns of `values`, and the mean squared residuals away from the ends."""
+        """
+        Return the coefficients for columns of `values`, and mean squared residuals.
+
+        The mean squared residuals are away from the ends.
+        """
         unit = penalty_bands(self._end_weights(penalty)) if with_ends else self.penalty
         coefficients = solveh_banded(
             self.bands + penalty * unit,
@@ -229,9 +275,10 @@ class PenalisedSpline:
         """
         Return weights of the penalty that fall towards both ends, shape (n_coefficients - 3,).
 
-        A penalty reduces the third and higher derivatives towards zero at the ends. Weights that decrease with the cube of the
-        distance, over a period of the bandwidth, remove this bias for some more noise: the error of the
-        acceleration in the last hundredths of a second falls to a third and less.
+        A penalty reduces the third and higher derivatives towards zero at the ends. Weights that
+        decrease with the cube of the distance, over a period of the bandwidth, remove this bias for
+        some more noise: the error of the acceleration in the last hundredths of a second falls to a
+        third and less.
         """
         distance = (
             np.minimum(np.arange(self.n_coefficients - 3), np.arange(self.n_coefficients - 3)[::-1])
@@ -240,7 +287,11 @@ class PenalisedSpline:
         return np.clip(distance * self.bandwidth(penalty) / 6, 0.1, 1.0) ** 3
 
     def gains(self, penalty: float) -> tuple[float, float]:
-        """Return the mean gain of the fit over all frequencies (degrees of freedom per row), and of its square."""
+        """
+        Return the mean gain of the fit over all frequencies, and of its square.
+
+        The mean gain is the degrees of freedom per row.
+        """
         if penalty not in self._gains:
             normal, damping = self._symbols
             gain = normal / (normal + penalty * damping)
@@ -263,8 +314,9 @@ def smooth(
     """
     Return a `Smooth` per column of `values`, with the penalty that predicts best.
 
-    The larger one of two penalties: that of robust generalised cross-validation (Lukas 2006), which needs no
-    noise, and that of Mallows' Cp for `noise_floor`, which holds where the noise is not white (coarse encoders).
+    The larger one of two penalties: that of robust generalised cross-validation (Lukas 2006), which
+    needs no noise, and that of Mallows' Cp for `noise_floor`, which holds where the noise is not
+    white (coarse encoders).
 
     Parameters
     ----------
@@ -312,7 +364,8 @@ def _squares_by_spectrum(spline, values):
     Return the function decade -> mean squared residuals, from one rough fit.
 
     With d the third differences of the unpenalised coefficients, the residuals have the power
-    ``N lambda^2 p / (N + lambda p)^2 |d|^2``; the error of approximation by splines with these knots is added.
+    ``N lambda^2 p / (N + lambda p)^2 |d|^2``; the error of approximation by splines with these
+    knots is added.
     """
     pilot = _penalty(spline, _PILOT)
     coefficients, floor = spline.fit(values, pilot)
@@ -364,7 +417,9 @@ def _mallows(spline, decade, squares, noise_sd):
 
 
 def _best_decade(scores):
-    """Return the largest of the scores' minima: in coarse steps, then one decade, then half a one."""
+    """
+    Return the largest of the scores' minima: in coarse steps, then one decade, then half a one.
+    """
     coarse = [min(_COARSE, key=score) for score in scores]
     return max(
         _refine(score, start)

@@ -1,8 +1,11 @@
 """
-Strapdown dead reckoning near one place, the growth of errors in it, and the rotation between two instants with its derivative.
+Strapdown dead reckoning near one place, and the growth of errors in it.
 
-Attitude, velocity and position in the level frame ``n``; the table is at rest, so Coriolis terms and the change of gravity with
-position are left out: over 50 s they are below 1e-3 of the errors that are compared. All sums over samples are array operations.
+The rotation between two instants with its derivative is included.
+
+Attitude, velocity and position in the level frame ``n``; the table is at rest, so Coriolis terms
+and the change of gravity with position are left out: over 50 s they are below 1e-3 of the errors
+that are compared. All sums over samples are array operations.
 """
 
 from dataclasses import dataclass
@@ -14,7 +17,10 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.rotations import Reference, cross, skew
 
 MAGNUS_SECOND = 1.0 / 12.0
-"""Weight of ``dt^2 rate_k x rate_{k+1}`` and of ``-dt^2 (slope_{k+1} - slope_k)`` in the rotation vector of a step."""
+"""
+Weight of ``dt^2 rate_k x rate_{k+1}`` and of ``-dt^2 (slope_{k+1} - slope_k)`` in the rotation
+vector of a step.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +28,10 @@ class Turn:
     """Rotation from the first sample of a stretch to its last one."""
 
     mat_ji: np.ndarray
-    """Vector coordinates in the sensor at the first sample (i) to those at the last one (j), shape (3, 3)."""
+    """
+    Vector coordinates in the sensor at the first sample (i) to those at the last one (j), shape (3,
+    3).
+    """
     by_bias: np.ndarray
     """Derivative of psi by the bias, ``delta mat_ji = -[psi x] mat_ji``, shape (3, 3), s."""
     by_matrix: np.ndarray
@@ -48,9 +57,10 @@ def integrate_turn(
     """
     Integrate ``rate = matrix^-1 (measured - bias - further effects)`` over one stretch of samples.
 
-    The rotation vector of each step is the Magnus series to second order, ``h/2 (w0 + w1) - h^2/12 (w1' - w0') + h^2/12 w0 x w1``
-    with slopes by central differences: fourth order in the step, third at the ends of the stretch. The steps are multiplied by
-    a prefix product. All arrays have the samples along their last axis.
+    The rotation vector of each step is the Magnus series to second order, ``h/2 (w0 + w1) - h^2/12
+    (w1' - w0') + h^2/12 w0 x w1`` with slopes by central differences: fourth order in the step,
+    third at the ends of the stretch. The steps are multiplied by a prefix product. All arrays have
+    the samples along their last axis.
 
     Parameters
     ----------
@@ -61,7 +71,8 @@ def integrate_turn(
     bias, matrix : arrays, shape (3,) and (3, 3)
         Forward model ``measured = bias + matrix @ rate + further effects``.
     further : tuple, optional
-        Contribution of further effects to the readings, shape (n, 3), and its derivative by their p parameters, shape (n, 3, p).
+        Contribution of further effects to the readings, shape (n, 3), and its derivative by their p
+        parameters, shape (n, 3, p).
 
     Returns
     -------
@@ -100,7 +111,11 @@ def integrate_turn(
 
 
 def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Return `Turn.mat_ji` of true rates, rad/s, shape (n, 3), without the derivatives, which take most of the time."""
+    """
+    Return `Turn.mat_ji` of true rates, rad/s, shape (n, 3).
+
+    Without the derivatives, which take most of the time.
+    """
     vectors = _rotation_vectors(rate.T.copy(), np.diff(time), _slope_weights(time))
     return Rotation.from_quat(_prefix_product(vectors)[:, -1]).inv().as_matrix()
 
@@ -123,7 +138,11 @@ def small_rotation(vector: np.ndarray) -> np.ndarray:
 
 
 def _slope_weights(time):
-    """Return weights of the sample before, the sample and the one after in its slope, shape (3, n), 1/s; one-sided at the ends."""
+    """
+    Return weights of the sample before, the sample and the one after in its slope.
+
+    Shape (3, n), 1/s; one-sided at the ends.
+    """
     step = np.diff(time)
     before, after = step[:-1], step[1:]
     weights = np.zeros((3, len(time)))
@@ -140,8 +159,9 @@ def _per_sample(gain, step, rate, slopes):
     """
     Return H with ``psi = sum_m H_m @ delta rate_m``, shape (3, 3, n).
 
-    Each sample ends one step, begins the next, and enters its neighbours' slopes. The rows of `gain`, shape (3, 3, n - 1), are multiplied
-    from the right by a cross-product matrix: ``r^T [w x] = (r x w)^T``.
+    Each sample ends one step, begins the next, and enters its neighbours' slopes. The rows of
+    `gain`, shape (3, 3, n - 1), are multiplied from the right by a cross-product matrix: ``r^T [w
+    x] = (r x w)^T``.
     """
     half, by_vector = 0.5 * step * gain, MAGNUS_SECOND * step**2 * gain
     weight, by_slope = np.zeros((2, 3, 3, len(step) + 1))
@@ -168,12 +188,20 @@ def _multiply(left, right):
 
 
 def _prefix_product(vectors):
-    """Return q_0, q_0 q_1, q_0 q_1 q_2, ... of rotation vectors, shape (3, n), as rows x, y, z, w, shape (4, n)."""
+    """
+    Return q_0, q_0 q_1, q_0 q_1 q_2, ... of rotation vectors, shape (3, n), as rows x, y, z, w.
+
+    Shape (4, n).
+    """
     return _running_quaternion(np.ascontiguousarray(Rotation.from_rotvec(vectors.T).as_quat().T))
 
 
 def _running_quaternion(factors):
-    """Return the products of all factors up to each, shape (4, n): those of the pairs, then between the pairs; 2 n multiplications."""
+    """
+    Return the products of all factors up to each, shape (4, n).
+
+    Those of the pairs, then between the pairs; 2 n multiplications.
+    """
     if factors.shape[1] < 2:
         return factors
     pairs = _running_quaternion(_multiply(factors[:, :-1:2], factors[:, 1::2]))
@@ -184,7 +212,11 @@ def _running_quaternion(factors):
 
 
 def _times_jacobian(rows, vectors):
-    """Return ``rows J`` with ``exp(v + d) = exp(v) exp(J d)`` to first order, ``J = 1 - one [v x] + two [v x]^2``, shape (3, 3, n)."""
+    """
+    Return ``rows J`` with ``exp(v + d) = exp(v) exp(J d)`` to first order.
+
+    The equation of J is ``J = 1 - one [v x] + two [v x]^2``, shape (3, 3, n).
+    """
     angle = np.linalg.norm(vectors, axis=0)
     small = angle < 1e-3
     safe = np.where(small, 1.0, angle)
@@ -200,7 +232,8 @@ def integrate_attitude(
     """
     Integrate the rate into the attitude, sensor frame to level frame, shape (n, 3, 3).
 
-    Each step turns by the mean of two neighbouring rates times the step, with the two-sample coning term ``rate_k x rate_(k+1) dt^2/12``.
+    Each step turns by the mean of two neighbouring rates times the step, with the two-sample coning
+    term ``rate_k x rate_(k+1) dt^2/12``.
 
     Parameters
     ----------
@@ -249,7 +282,9 @@ def strapdown(
     mat_ns0: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return velocity and position in n, m/s and m, each shape (n, 3), by accelerometers and gyroscopes only, from rest at the origin.
+    Return velocity and position in n, m/s and m, each shape (n, 3).
+
+    By accelerometers and gyroscopes only, from rest at the origin.
 
     Parameters
     ----------
@@ -271,10 +306,13 @@ def error_growth(
     time: np.ndarray, force_error_s: np.ndarray, mat_ns: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return velocity and position errors that a specific-force error causes, attitude being known, each of shape (n, 3).
+    Return velocity and position errors that a specific-force error causes.
 
-    With ``mat_ns=None`` the components are summed in the turning body frame, which is no navigation: an error that turns with the body
-    then appears as a steady drift (the reading behind Zhang's "3 m/s and 150 m").
+    The attitude is known. Each result has shape (n, 3).
+
+    With ``mat_ns=None`` the components are summed in the turning body frame, which is no
+    navigation: an error that turns with the body then appears as a steady drift (the reading behind
+    Zhang's "3 m/s and 150 m").
 
     """
     force_error = np.asarray(force_error_s, float)
@@ -286,7 +324,11 @@ def error_growth(
 def constant_error_growth(
     force_error: np.ndarray | float, seconds: float
 ) -> tuple[np.ndarray | float, np.ndarray | float]:
-    """Return the velocity and position error, m/s and m, of a constant error in m/s^2 along one axis of a body that does not turn."""
+    """
+    Return the velocity and position error, m/s and m, of a constant error.
+
+    The error is in m/s^2 along one axis of a body that does not turn.
+    """
     return force_error * seconds, force_error * seconds**2 / 2
 
 
@@ -299,10 +341,12 @@ def dead_reckoning_errors(
     reference: Reference, force_s: np.ndarray, rate_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the errors of velocity and position in n of measured or compensated samples, m/s and m, each shape (n, 3).
+    Return the errors of velocity and position in n, m/s and m, each shape (n, 3).
 
-    Navigation starts at rest from the true attitude. The reference's own samples are integrated by the same rule and subtracted, so
-    that only sensor errors remain.
+    They are the errors of measured or compensated samples.
+
+    Navigation starts at rest from the true attitude. The reference's own samples are integrated by
+    the same rule and subtracted, so that only sensor errors remain.
 
     Parameters
     ----------
@@ -325,7 +369,8 @@ def _checked(time, rate_s):
     time, rate_s = np.asarray(time, float), np.asarray(rate_s, float)
     if rate_s.shape != (len(time), 3) or np.any(np.diff(time) <= 0):
         raise InputError(
-            f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort the samples',
+            f'rates must have shape ({len(time)}, 3) at increasing times, got {rate_s.shape}; sort'
+            ' the samples',
             code='shape_and_times',
         )
     return time, rate_s

@@ -29,7 +29,10 @@ from imu_calibration.kinematics.rotations import (
 )
 
 PARALLEL = 0.02
-"""Sine of the angle up to which two axes count as parallel: their common perpendicular is undefined there."""
+"""
+Sine of the angle up to which two axes count as parallel: their common perpendicular is undefined
+there.
+"""
 
 
 class AxisAngle(NamedTuple):
@@ -48,13 +51,15 @@ def axis_angles(joints: tuple[Joint, ...]) -> tuple[AxisAngle, ...]:
     """
     Return the angles between each turning axis and the one before it.
 
-    Two axes enclose one angle, about their common perpendicular; the other direction in which the second may stand wrong is the zero
-    of the first joint. Parallel axes have no such perpendicular: there are two angles, about `axis_error_directions`, and the zeros
-    of their joints are one (Hayati and Mirmirani 1985).
+    Two axes enclose one angle, about their common perpendicular; the other direction in which the
+    second may stand wrong is the zero of the first joint. Parallel axes have no such perpendicular:
+    there are two angles, about `axis_error_directions`, and the zeros of their joints are one
+    (Hayati and Mirmirani 1985).
     """
     found, before, name = [], None, ''
     for index, joint in enumerate(joints):
-        # The axis of the turning joint before, brought along from frame to frame with all joints at zero.
+        # The axis of the turning joint before, brought along from frame to frame with all joints at
+        # zero.
         before = None if before is None else joint.mat_before.T @ before
         if not joint.turns:
             continue
@@ -80,7 +85,8 @@ def axis_error_directions(axis: np.ndarray) -> np.ndarray:
     """
     Return two unit vectors u, v that form a right-handed triad u, v, axis; shape (2, 3).
 
-    u is the coordinate axis that lies farthest from `axis` (the first of equals), made orthogonal to it; v = axis x u.
+    u is the coordinate axis that lies farthest from `axis` (the first of equals), made orthogonal
+    to it; v = axis x u.
     """
     axis = np.asarray(axis, float)
     start = np.eye(3)[np.argmin(np.round(np.abs(axis), 6))]
@@ -97,8 +103,8 @@ class Table:
     """
     A chain of joints that carries the sensor, and its site.
 
-    The level frame n is the base frame turned by the smallest rotation that makes `up` its z axis (half a turn about
-    the base x axis when the base hangs upside down).
+    The level frame n is the base frame turned by the smallest rotation that makes `up` its z axis
+    (half a turn about the base x axis when the base hangs upside down).
     """
 
     joints: tuple[Joint, ...]
@@ -114,11 +120,17 @@ class Table:
     height: float | None = None
     """Height, m; None counts as zero."""
     azimuth_deg: float | None = None
-    """Heading of the base x axis in the horizontal, clockwise from true north (of the x axis of n when base x is vertical)."""
+    """
+    Heading of the base x axis in the horizontal, clockwise from true north (of the x axis of n when
+    base x is vertical).
+    """
     joint_noise_rad: float | None = None
     """Noise or resolution of the encoders, rad; None: estimated from the data."""
     joint_error_rad: float | None = None
-    """Standard deviation of zeros and axes of the joints, rad; None: exact unless their errors are requested."""
+    """
+    Standard deviation of zeros and axes of the joints, rad; None: exact unless their errors are
+    requested.
+    """
     joint_error_m: float | None = None
     """Standard deviation of the places of the axes, m; None: exact."""
     mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -185,8 +197,9 @@ class Table:
     def joint_names(self) -> JointNames:
         """Names of the joints with readings, from the base outwards, and of their errors."""
         turning = [joint.source for joint in self.joints if joint.turns]
-        # A zero that affects only the first or the last axis is the azimuth, or belongs to the mount.
-        apart = [name for name in (turning[:1] + turning[-1:]) if turning.count(name) == 1]
+        # A zero that affects only the first or the last axis is the azimuth, or belongs to the
+        # mount.
+        apart = [name for name in turning[:1] + turning[-1:] if turning.count(name) == 1]
         read, turning = (
             tuple(dict.fromkeys(names))
             for names in ((joint.source for joint in self.joints), turning)
@@ -214,7 +227,11 @@ class Table:
 
     @property
     def gravity_sd_value(self) -> float:
-        """Standard deviation of `gravity_value`, m/s^2: as given; zero for a given gravity, else the accuracy of normal gravity."""
+        """
+        Standard deviation of `gravity_value`, m/s^2: as given.
+
+        Zero for a given gravity, else the accuracy of normal gravity.
+        """
         if self.gravity_sd is not None:
             return self.gravity_sd
         return 0.0 if self.gravity is not None else NORMAL_GRAVITY_ACCURACY * self.gravity_value
@@ -226,7 +243,11 @@ class Table:
 
     @property
     def mat_sl(self) -> np.ndarray:
-        """Frame of the last link to sensor frame, shape (3, 3): inverse of ``Rz(yaw) Ry(pitch) Rx(roll)``."""
+        """
+        Frame of the last link to sensor frame, shape (3, 3).
+
+        Inverse of ``Rz(yaw) Ry(pitch) Rx(roll)``.
+        """
         return rotation_from_rpy(np.radians(self.mount_rpy_deg)).T
 
     @property
@@ -273,7 +294,12 @@ def site_from_mapping(mapping: Any) -> dict[str, Any]:
 
 
 def base_heading_deg(mat_nb: np.ndarray) -> float:
-    """Return where the base x axis points in the level frame, degrees counter-clockwise from its x axis; zero when it is vertical."""
+    """
+    Return where the base x axis points in the level frame, in degrees.
+
+    The angle is counter-clockwise from the x axis of the level frame. It is zero when the base x
+    axis is vertical.
+    """
     x, y, _ = mat_nb[:, 0]
     return float(np.degrees(np.arctan2(y, x))) if np.hypot(x, y) > 1e-9 else 0.0
 
@@ -281,20 +307,22 @@ def base_heading_deg(mat_nb: np.ndarray) -> float:
 def _require_joints(joints):
     if not joints:
         raise InputError(
-            'table: joints must list at least one joint, got none; describe them from the base outwards',
+            'table: joints must list at least one joint, got none; describe them from the base'
+            ' outwards',
             code='no_joint',
         )
     names = [joint.name for joint in joints]
     for name in names:
         if not isinstance(name, str) or not name or names.count(name) > 1:
             raise InputError(
-                f'table: joint names must be different and not empty, got {names}; use the names of the joint states',
+                f'table: joint names must be different and not empty, got {names}; use the names of'
+                ' the joint states',
                 code='joint_names',
             )
     followers = {joint.name for joint in joints if joint.mimic is not None}
     for joint in joints:
         if joint.source in followers:
             raise InputError(
-                f"table: joint '{joint.name}' must follow a joint that moves by itself, '{joint.source}' follows another one; "
-                'name that one'
+                f"table: joint '{joint.name}' must follow a joint that moves by itself,"
+                f" '{joint.source}' follows another one; name that one"
             )

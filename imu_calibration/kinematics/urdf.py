@@ -1,4 +1,8 @@
-"""A robot description (URDF) becomes the chain of joints that carries the sensor; the tree of static transforms, and poses through it."""
+"""
+A robot description (URDF) becomes the chain of joints that carries the sensor.
+
+The tree of static transforms, and poses through it.
+"""
 
 from __future__ import annotations
 
@@ -91,14 +95,21 @@ class StaticTransforms:
         absent = [f"'{name}'" for name in (target, source) if name not in known]
         names = ', '.join(sorted(known)[:NAMED]) + (', ...' if len(known) > NAMED else '')
         return (
-            f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came (frames: {names})'
+            f'{" and ".join(absent)} {"is" if len(absent) == 1 else "are"} in none that came'
+            f' (frames: {names})'
             if absent
-            else f"'{target}' and '{source}' are in trees without a static connection (roots: {self._to_root(target)[-1][0]}, "
-            f'{self._to_root(source)[-1][0]})'
+            else (
+                f"'{target}' and '{source}' are in trees without a static connection (roots:"
+                f' {self._to_root(target)[-1][0]}, {self._to_root(source)[-1][0]})'
+            )
         )
 
     def _to_root(self, frame):
-        """Return (ancestor, origin of `frame` in it, matrix from `frame` to it) from the frame up to its root; a ring ends once closed."""
+        """
+        Return (ancestor, origin of `frame` in it, matrix from `frame` to it).
+
+        The ancestors run from the frame up to its root. A ring ends once closed.
+        """
         steps, seen = [(frame, np.zeros(3), np.eye(3))], {frame}
         while (step := self._parents.get(steps[-1][0])) is not None and step[0] not in seen:
             parent, xyz, mat = step
@@ -112,7 +123,9 @@ def up_of(
     root: str, transforms: Iterable[tuple[str, str, np.ndarray]]
 ) -> tuple[float, float, float]:
     """
-    Return the z axis of the outermost frame in the frame `root`: up, where that frame is the world or a map.
+    Return the z axis of the outermost frame in the frame `root`.
+
+    Up, where that frame is the world or a map.
 
     Parameters
     ----------
@@ -133,7 +146,8 @@ def up_of(
     frame, _, mat = tree._to_root(root)[-1]
     if frame in tree._parents:
         raise InputError(
-            f"static transforms must form a tree, those around '{frame}' form a circle; correct them, or give `up`",
+            f"static transforms must form a tree, those around '{frame}' form a circle; correct"
+            ' them, or give `up`',
             key='up',
             code='frame_circle',
         )
@@ -145,15 +159,18 @@ JOINT_ERRORS = {'joint_error_rad': 1e-3, 'joint_error_m': 1e-3}
 
 _MOVING = {'revolute': 'revolute', 'continuous': 'revolute', 'prismatic': 'prismatic'}
 _READ = {'link': (), 'joint': ('origin', 'parent', 'child', 'axis', 'limit', 'mimic')}
-"""Elements that describe the kinematics, with their children; meshes, materials, controllers and simulators' tags are ignored."""
+"""
+Elements that describe the kinematics, with their children; meshes, materials, controllers and
+simulators' tags are ignored.
+"""
 
 
 def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None = None) -> Table:
     """
     Return the chain of joints from the root of a robot to one of its links.
 
-    Fixed joints are folded into their neighbours; a joint that mimics another one is moved by the readings of that one. The root's
-    z axis points up unless the site differs.
+    Fixed joints are folded into their neighbours; a joint that mimics another one is moved by the
+    readings of that one. The root's z axis points up unless the site differs.
 
     Parameters
     ----------
@@ -162,14 +179,15 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
     link : str
         Link whose frame is the sensor's: the frame_id of its messages.
     site : mapping, optional
-        Entries of a table description except the joints (up, gravity, latitude, mount, ...); its joints may give limits, by name.
-        Without gravity and latitude the standard gravity is used, with the standard deviation of an unknown site.
+        Entries of a table description except the joints (up, gravity, latitude, mount, ...); its
+        joints may give limits, by name. Without gravity and latitude the standard gravity is used,
+        with the standard deviation of an unknown site.
 
     Raises
     ------
     InputError
-        When the text is no robot description, the link is not in it or does not move, a joint on the way has several degrees of
-        freedom, or the site names a joint that is not on the way.
+        When the text is no robot description, the link is not in it or does not move, a joint on
+        the way has several degrees of freedom, or the site names a joint that is not on the way.
 
     """
     robot = _read(text)
@@ -197,7 +215,8 @@ def root_of(text: str | bytes) -> str:
     roots = [link for link in robot.link_map if link not in robot.parent_map]
     if len(roots) != 1:
         raise InputError(
-            f'a robot description must have one root link, it has {_listed(roots) or "none"}; correct it'
+            f'a robot description must have one root link, it has {_listed(roots) or "none"};'
+            ' correct it'
         )
     return roots[0]
 
@@ -230,7 +249,8 @@ def _read(text):
         from urdf_parser_py.urdf import Robot
     except ImportError as error:
         raise InputError(
-            "a robot description needs the package urdfdom-py, it is not installed; install 'imu_calibration[arm]'",
+            'a robot description needs the package urdfdom-py, it is not installed; install'
+            " 'imu_calibration[arm]'",
             code='package_missing',
         ) from error
     try:
@@ -251,17 +271,21 @@ def _read(text):
         return Robot.from_xml_string(ElementTree.tostring(bare))
     except Exception as error:  # the parsers raise many kinds
         raise InputError(
-            f'a robot description must be a URDF, this is not: {shortened(str(error), 200)}; give the .urdf or .xacro of '
-            'the robot'
+            f'a robot description must be a URDF, this is not: {shortened(str(error), 200)}; give'
+            ' the .urdf or .xacro of the robot'
         ) from error
 
 
 def _chain(robot, link):
-    """Return the moving joints from the root to `link`, and the placement of the link after the last of them."""
+    """
+    Return the moving joints from the root to `link`, and the link's placement.
+
+    The placement of the link is after the last of these joints.
+    """
     if link not in robot.link_map:
         raise InputError(
-            f"the robot description must hold the link '{link}' that carries the IMU, it holds {_listed(robot.link_map)}; "
-            'name one of these',
+            f"the robot description must hold the link '{link}' that carries the IMU, it holds"
+            f' {_listed(robot.link_map)}; name one of these',
             key='imu_link',
             code='link_unknown',
         )
@@ -271,7 +295,8 @@ def _chain(robot, link):
         on_the_way.append(robot.joint_map[name])
         if len(on_the_way) > len(robot.joint_map):
             raise InputError(
-                f"the links of a robot description must form a tree, those around '{link}' form a circle; correct it"
+                f"the links of a robot description must form a tree, those around '{link}' form a"
+                ' circle; correct it'
             )
     joints, placement = [], _Placement(np.zeros(3), np.eye(3))
     for joint in reversed(on_the_way):
@@ -280,8 +305,8 @@ def _chain(robot, link):
             continue
         if joint.type not in _MOVING:
             raise InputError(
-                f"joints on the way to the IMU must be revolute, continuous, prismatic or fixed, '{joint.name}' is "
-                f'{joint.type}; use a description that begins after it'
+                'joints on the way to the IMU must be revolute, continuous, prismatic or fixed,'
+                f" '{joint.name}' is {joint.type}; use a description that begins after it"
             )
         joints.append(
             Joint(
@@ -296,8 +321,9 @@ def _chain(robot, link):
         placement = _Placement(np.zeros(3), np.eye(3))
     if not joints:
         raise InputError(
-            f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least one joint, it is fixed to "
-            f"the root '{link}'; name the link that carries the IMU, or calibrate by hand"
+            f"the link '{on_the_way[0].child if on_the_way else link}' must be moved by at least"
+            f" one joint, it is fixed to the root '{link}'; name the link that carries the IMU, or"
+            ' calibrate by hand'
         )
     return joints, placement
 
@@ -324,13 +350,18 @@ def _mimic(robot, joint):
         name = mimic.joint
         if name not in robot.joint_map or name in seen:
             raise InputError(
-                f"joint '{joint.name}' must mimic another joint of the robot, it mimics '{name}'; correct the description"
+                f"joint '{joint.name}' must mimic another joint of the robot, it mimics '{name}';"
+                ' correct the description'
             )
     return None if name == joint.name else Mimic(name, multiplier, offset)
 
 
 def _limits(joint):
-    """Return the limits in the description: a continuous joint is endless, placeholders (zero, infinite) count as not given."""
+    """
+    Return the limits in the description.
+
+    A continuous joint is endless, placeholders (zero, infinite) count as not given.
+    """
     limit, endless = joint.limit, joint.type == 'continuous'
     ends = (0.0, 0.0) if limit is None else (limit.lower or 0.0, limit.upper or 0.0)
     ends = (
@@ -353,7 +384,8 @@ def _with_limits(joints, entries, link):
         name = entry.get('name') if isinstance(entry, Mapping) else None
         if name not in by_name:
             raise InputError(
-                f"joints of the site must be on the way to '{link}': {_listed(by_name)}; got {name!r}",
+                f"joints of the site must be on the way to '{link}': {_listed(by_name)}; got"
+                f' {name!r}',
                 code='joint_unknown',
             )
         known = by_name[name]

@@ -21,8 +21,9 @@ FROM_FILE, FROM_TOPIC, FILE_THEN_TOPIC = 'file', 'topic', 'file_then_topic'
 """
 Source of the calibrations.
 
-By default a given file remains in force and the topic is ignored; without a file the topic is used. A user who gives a file does not want
-another session to replace it, and without a file the node has no other source.
+By default a given file remains in force and the topic is ignored; without a file the topic is used.
+A user who gives a file does not want another session to replace it, and without a file the node has
+no other source.
 """
 
 
@@ -57,7 +58,8 @@ class CompensatorSettings:
     anyway: bool = setting(
         False,
         '',
-        'also correct a sensor whose decision is unproven; one whose decision is harms is never corrected',
+        'also correct a sensor whose decision is unproven; one whose decision is harms is never'
+        ' corrected',
         symptom='the correction may increase the error of the readings',
         live=True,
     )
@@ -98,8 +100,10 @@ class CompensatorSettings:
         True,
         '',
         'correct only messages that carry the frame_id of the calibration',
-        symptom='no messages are published, diagnostics name both frames; '
-        'if false, messages of a different sensor are corrected',
+        symptom=(
+            'no messages are published, diagnostics name both frames; '
+            'if false, messages of a different sensor are corrected'
+        ),
         live=True,
     )
     correct_stamps: bool = setting(
@@ -137,8 +141,8 @@ class CompensatorSettings:
     gravity: float = setting(
         0.0,
         'm/s^2',
-        'gravity at the site of the robot, for the test of the calibration at stops; 0: that of the '
-        'calibration, within the half per cent of variation between sites',
+        'gravity at the site of the robot, for the test of the calibration at stops; 0: that of the'
+        ' calibration, within the half per cent of variation between sites',
         (0.0, 20.0),
         'an error of a scale below half a per cent is not detected',
         live=True,
@@ -147,8 +151,10 @@ class CompensatorSettings:
         False,
         '',
         'correct the residual bias of the gyroscope measured at stops',
-        symptom='headings drift as the sensor warms up; if true where the robot turns slowly and steadily at '
-        '"rest", that rotation counts as a bias',
+        symptom=(
+            'headings drift as the sensor warms up; if true where the robot turns slowly and'
+            ' steadily at "rest", that rotation counts as a bias'
+        ),
         live=True,
     )
     gyro_bias_time: float = setting(
@@ -197,15 +203,27 @@ class Adopted:
 
     @property
     def caveats(self) -> list[str]:
-        """Sensors that are not corrected or corrected with caution, and parameters that are not determined."""
+        """
+        Sensors with no or cautious correction, and undetermined parameters.
+
+        The sensors are not corrected or are corrected with caution. The parameters are not
+        determined.
+        """
         return [*self.used.lines, *trust.caveats(self.calibration)]
 
     def line(self) -> str:
         """Return one line that describes the calibration in force."""
-        return f'calibration {self.version} from {self.source} ({decisions_text(self.calibration.decisions)}) adopted'
+        return (
+            f'calibration {self.version} from {self.source}'
+            f' ({decisions_text(self.calibration.decisions)}) adopted'
+        )
 
     def says_more_than(self, other: 'Adopted | None') -> bool:
-        """Return whether the change from `other` must be reported: its source, decisions or values differ."""
+        """
+        Return whether the change from `other` must be reported.
+
+        Its source, decisions or values differ.
+        """
         if other is None or self.calibration.decisions != other.calibration.decisions:
             return True
         if self.source != other.source or self.used.refused.keys() != other.used.refused.keys():
@@ -229,7 +247,8 @@ def adopt(
     Awaited
         While the transform into the target frame has not been received.
     ImuCalibrationError
-        When the document is invalid, not usable, or for another sensor; any other exception is converted to this type.
+        When the document is invalid, not usable, or for another sensor; any other exception is
+        converted to this type.
 
     """
     try:
@@ -268,14 +287,18 @@ def has_moved(adopted: Adopted, settings: CompensatorSettings, frames: StaticFra
 def _transfer(
     calibration: Calibration, settings: CompensatorSettings, frames: StaticFrames
 ) -> Transfer | None:
-    """Return where the readings are to be moved: by the pose in the parameters, without one by the static transforms."""
+    """
+    Return where the readings are to be moved.
+
+    By the pose in the parameters, without one by the static transforms.
+    """
     target, given = settings.target_frame, any(settings.target_xyz) or any(settings.target_rpy)
     if not target or given or target == calibration.frame_id:
         return requested_transfer(target, settings.target_xyz, settings.target_rpy)
     if not calibration.frame_id:
         raise DocumentError(
-            f"to move readings to '{target}' by {TF_STATIC} the calibration must name the frame of the sensor, it names "
-            'none; give target_xyz and target_rpy'
+            f"to move readings to '{target}' by {TF_STATIC} the calibration must name the frame of"
+            ' the sensor, it names none; give target_xyz and target_rpy'
         )
     pose = frames.pose(target, calibration.frame_id)
     if pose is None:
@@ -332,7 +355,7 @@ def _require_same_frame(calibration: Calibration, before: Adopted | None) -> Non
     known = '' if before is None else before.compensation.frame_id
     if known and calibration.frame_id and calibration.frame_id != known:
         raise DocumentError(
-            f"a new calibration must be for the same sensor, '{known}', this one is for '{calibration.frame_id}'; "
-            'restart the node for another sensor',
+            f"a new calibration must be for the same sensor, '{known}', this one is for"
+            f" '{calibration.frame_id}'; restart the node for another sensor",
             code='other_sensor',
         )

@@ -16,7 +16,10 @@ from imu_calibration.nodes.playback import PLAYBACK_DEPTH, Batch, Pace, Playback
 from msg_adapters.rosbag2 import Rosbag2
 
 PAUSE = 0.01
-"""Seconds between the last message of a round and the first of the next, when the bag is played again and again."""
+"""
+Seconds between the last message of a round and the first of the next, when the bag is played again
+and again.
+"""
 
 
 @dataclass(frozen=True)
@@ -102,8 +105,8 @@ class BagPlayerNode(Node):
         )
         self._playback.start()
         self.get_logger().info(
-            f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed: '
-            f'{", ".join(self._topics)}'
+            f'plays {files.user_path(self.settings.bag)} at {self.settings.rate:g} times its speed:'
+            f' {", ".join(self._topics)}'
         )
 
     def close(self) -> str:
@@ -121,13 +124,15 @@ class BagPlayerNode(Node):
         path = self.settings.bag
         if not path:
             raise InputError(
-                "parameter 'bag' must name a rosbag2 recording, none was given; start with --ros-args -p bag:=/path/to/bag"
+                "parameter 'bag' must name a rosbag2 recording, none was given; start with"
+                ' --ros-args -p bag:=/path/to/bag'
             )
         try:
             return Rosbag2(files.user_path(path))
         except Exception as error:  # rosbag2 files raise many kinds
             raise InputError(
-                f'{path} must be a readable rosbag2 recording, got: {" ".join(str(error).split())}; check the path'
+                f'{path} must be a readable rosbag2 recording, got: {" ".join(str(error).split())};'
+                ' check the path'
             ) from error
 
     def _choose(self):
@@ -135,8 +140,8 @@ class BagPlayerNode(Node):
         unknown = [name for name in asked if name not in self._bag.types]
         if unknown:
             raise InputError(
-                f'{self.settings.bag} must contain the requested topics, it has no {", ".join(unknown)}; '
-                f'it contains {", ".join(sorted(self._bag.types))}'
+                f'{self.settings.bag} must contain the requested topics, it has no'
+                f' {", ".join(unknown)}; it contains {", ".join(sorted(self._bag.types))}'
             )
         chosen = []
         for name in asked or sorted(self._bag.types):
@@ -144,7 +149,8 @@ class BagPlayerNode(Node):
                 chosen.append(name)
             elif asked:
                 raise InputError(
-                    f'the type {self._bag.types[name]} of {name} must be installed to be played, it is not; omit the topic'
+                    f'the type {self._bag.types[name]} of {name} must be installed to be played, it'
+                    ' is not; omit the topic'
                 )
             else:
                 self.get_logger().warning(
@@ -152,7 +158,8 @@ class BagPlayerNode(Node):
                 )
         if not chosen:
             raise InputError(
-                f'{self.settings.bag} must contain a topic whose type is installed, it has none; check the bag'
+                f'{self.settings.bag} must contain a topic whose type is installed, it has none;'
+                ' check the bag'
             )
         return chosen
 

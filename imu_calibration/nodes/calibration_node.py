@@ -1,10 +1,14 @@
 """
-calibration_node: calibrates an IMU on a table while the table moves, or by hand while it is turned from pose to pose.
+calibration_node.
 
-in: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState, on a table), imu/temperature (sensor_msgs/Temperature, for thermal
-effects). out: imu/calibration (std_msgs/String, the calibration document, latched), imu/residual (sensor_msgs/Imu),
-imu/coverage (visualization_msgs/MarkerArray, latched: the gain of each attitude, and the next motion), /diagnostics.
-services: ~/solve, ~/diagnose (returns at once; the result is published on /diagnostics), ~/save, ~/reset.
+Calibrates an IMU on a table while the table moves, or by hand while it is turned from pose to pose.
+
+in: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState, on a table),
+imu/temperature (sensor_msgs/Temperature, for thermal effects). out: imu/calibration
+(std_msgs/String, the calibration document, latched), imu/residual (sensor_msgs/Imu), imu/coverage
+(visualization_msgs/MarkerArray, latched: the gain of each attitude, and the next motion),
+/diagnostics. services: ~/solve, ~/diagnose (returns at once; the result is published on
+/diagnostics), ~/save, ~/reset.
 """
 
 import sys
@@ -47,7 +51,10 @@ from msg_adapters.write import encode_imu
 INPUT_DEPTH = 5000
 """Messages that may wait: 2.5 s at 2 kHz, while numpy holds the interpreter."""
 MOST_WAITING = 200_000
-"""Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and counted."""
+"""
+Messages of a kind that wait for the worker at most, 100 s at 2 kHz; then the oldest are dropped and
+counted.
+"""
 DOCUMENTED = (
     'accelerometer_model',
     'gyroscope_model',
@@ -68,8 +75,8 @@ class CalibrationNodeSettings:
     table_file: str = setting(
         '',
         '',
-        'table description, path; empty or none: no table, calibrate by hand from poses held still and the '
-        'turns between them',
+        'table description, path; empty or none: no table, calibrate by hand from poses held still'
+        ' and the turns between them',
         symptom='joint states are not listened to',
         session=True,
         path=True,
@@ -78,7 +85,8 @@ class CalibrationNodeSettings:
     frame_id: str = setting(
         '',
         '',
-        'frame of the Imu messages to use, all other messages are dropped; empty: that of the first message',
+        'frame of the Imu messages to use, all other messages are dropped; empty: that of the first'
+        ' message',
         symptom='every Imu message is dropped, see diagnostics',
         session=True,
         fixed='all motion gathered so far is that of one sensor',
@@ -86,8 +94,8 @@ class CalibrationNodeSettings:
     accelerometer_model: str = setting(
         '',
         '',
-        'named model or effect names joined by +; empty: bias+matrix, and with a table accel_size_effect '
-        'when the rotation shows it',
+        'named model or effect names joined by +; empty: bias+matrix, and with a table'
+        ' accel_size_effect when the rotation shows it',
         symptom='an effect of the sensor remains in the residuals',
         fixed='motion is gathered for the model',
     )
@@ -101,8 +109,8 @@ class CalibrationNodeSettings:
     reference_model: str = setting(
         '',
         '',
-        'effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when latitude or '
-        'azimuth is unknown',
+        'effects of table and clock joined by +, or none; empty: table_tilt, and earth_rate when'
+        ' latitude or azimuth is unknown',
         symptom='a tilted table shows as accelerometer bias',
         fixed='motion is gathered for the model',
     )
@@ -124,8 +132,8 @@ class CalibrationNodeSettings:
     effects_file: str = setting(
         '',
         '',
-        'own effects in addition to the catalogue, path: YAML with effects: NAME: {sensor, column, unit, '
-        'tolerance, text}, or a calibration with own effects; a model may then name them',
+        'own effects in addition to the catalogue, path: YAML with effects: NAME: {sensor, column,'
+        ' unit, tolerance, text}, or a calibration with own effects; a model may then name them',
         symptom='the node refuses a model that names them',
         session=True,
         path=True,
@@ -134,8 +142,8 @@ class CalibrationNodeSettings:
     noise_file: str = setting(
         '',
         '',
-        'noise.yaml of this IMU, from the verb noise: motion of its biases between windows, on a table; '
-        'empty: estimated from the windows',
+        'noise.yaml of this IMU, from the verb noise: motion of its biases between windows, on a'
+        ' table; empty: estimated from the windows',
         symptom='standard deviations of the biases are too large or too small',
         session=True,
         path=True,
@@ -144,9 +152,9 @@ class CalibrationNodeSettings:
     save_file: str = setting(
         '',
         '',
-        'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same folder, '
-        'written also when the node ends with unsaved motion; empty: calibration.yaml in the working directory, by '
-        '~/save only',
+        'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same'
+        ' folder, written also when the node ends with unsaved motion; empty: calibration.yaml in'
+        ' the working directory, by ~/save only',
         symptom='the node reports at its start that the folder is not writable',
         session=True,
         path=True,
@@ -243,10 +251,13 @@ class CalibrationNode(Node):
         self._complaints, self._started = Complaints(self.get_logger()), time.monotonic()
         self._listen()
         reference = (
-            "by hand, since neither 'table_file' nor 'urdf_file' was given: hold the IMU still in 12 different attitudes and turn "
-            'it in between'
+            "by hand, since neither 'table_file' nor 'urdf_file' was given: hold the IMU still in"
+            ' 12 different attitudes and turn it in between'
             if joint_names is None
-            else f'on {words_of(robot, self.settings.table_file)} with the joints {", ".join(joint_names)}'
+            else (
+                f'on {words_of(robot, self.settings.table_file)} with the joints'
+                f' {", ".join(joint_names)}'
+            )
         )
         self.get_logger().info(f'calibrates {reference}; ~/save writes {place.calibration}')
         self._guide = CalibrationGuide(
@@ -339,7 +350,8 @@ class CalibrationNode(Node):
         self._diagnostics.publish_now()
         return response
 
-    # Changed parameters: the period of saving is applied at once, the remaining ones by the worker between two steps.
+    # Changed parameters: the period of saving is applied at once, the remaining ones by the worker
+    # between two steps.
 
     def _change_files(self, group: CalibrationNodeSettings) -> None:
         self.worker.autosave_period, self.settings = group.autosave_period, group

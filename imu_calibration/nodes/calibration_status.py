@@ -1,4 +1,6 @@
-"""State of a calibration node, its diagnostics, the next step for the user, markers of the coverage."""
+"""
+State of a calibration node, its diagnostics, the next step for the user, markers of the coverage.
+"""
 
 import math
 import time
@@ -195,7 +197,11 @@ STATUS_LEVELS = {
 
 
 def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
-    """Return the DiagnosticStatus messages of a WorkerState; `stream_faults` are lines about its topics."""
+    """
+    Return the DiagnosticStatus messages of a WorkerState.
+
+    `stream_faults` are lines about its topics.
+    """
     found = []
     if state.streams is not None:
         level = max(STATUS_LEVELS[state.streams.word], WARN if stream_faults else OK)
@@ -272,8 +278,9 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     """
     Return the picture, in the frame of the sensor; each message replaces the one before.
 
-    Cells: orange and large where another rest is informative, green and small elsewhere. An arrow from the present up direction to the
-    next one, a ring of the turn between them; blue points: earlier up directions; the arms of the three sensitive points; one line of text.
+    Cells: orange and large where another rest is informative, green and small elsewhere. An arrow
+    from the present up direction to the next one, a ring of the turn between them; blue points:
+    earlier up directions; the arms of the three sensitive points; one line of text.
     """
     made = [Marker(ns='all', action=Marker.DELETEALL)]
     made += [
@@ -315,7 +322,11 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
 
 
 def driven_markers(up: np.ndarray, text: str, *, frame_id: str, stamp: Time) -> MarkerArray:
-    """Return the planner's markers: an arrow to the up direction after the driven motion, and a description of that motion."""
+    """
+    Return the planner's markers.
+
+    An arrow to the up direction after the driven motion, and a description of that motion.
+    """
     return _stamped(
         [
             _arrow('driven', np.zeros(3), 1.25 * RADIUS * up, ARROW),

@@ -1,5 +1,7 @@
 """
-The worker thread of calibration_node: it processes received messages, solves at intervals and saves; the main thread only receives.
+The worker thread of calibration_node.
+
+It processes received messages, solves at intervals and saves; the main thread only receives.
 
 The file has the files of a session, and all steps of this thread in their order.
 """
@@ -46,7 +48,8 @@ class SessionFiles:
     Parameters
     ----------
     save_file : str
-        Path of the calibration; '': `DEFAULT_FILE` in the working directory, and files are saved on request only.
+        Path of the calibration; '': `DEFAULT_FILE` in the working directory, and files are saved on
+        request only.
 
     """
 
@@ -89,7 +92,9 @@ class SessionFiles:
 
     def put_aside(self) -> Path:
         """
-        Rename the accumulator of an earlier session, so that it is not overwritten; return the new name.
+        Rename the accumulator of an earlier session, so that it is not overwritten.
+
+        Return the new name.
 
         Raises
         ------
@@ -129,7 +134,8 @@ class SessionFiles:
                 done.append(str(path))
             except ImuCalibrationError as error:
                 failed.append(
-                    f'{error}; {"the earlier file is unchanged" if existed else "no earlier file existed"}'
+                    f'{error};'
+                    f' {"the earlier file is unchanged" if existed else "no earlier file existed"}'
                 )
         if not failed:
             self.note_saved(live.n_windows)
@@ -139,7 +145,11 @@ class SessionFiles:
         return not failed, '; '.join(lines)
 
     def autosave(self, live: LiveSession, period: float) -> bool:
-        """Save the accumulator when that is due; return whether it was. Raises an InputError when it cannot be written."""
+        """
+        Save the accumulator when that is due; return whether it was.
+
+        Raises an InputError when it cannot be written.
+        """
         if not period or time.monotonic() - self.saved_at < period or not self.unsaved(live):
             return False
         self.saved_at, n_windows = (
@@ -151,7 +161,11 @@ class SessionFiles:
         return True
 
     def keep(self, live: LiveSession, noun: str) -> str:
-        """Save unsaved data at the end of a session where a path was given; return the outcome, '' when all was saved."""
+        """
+        Save unsaved data at the end of a session where a path was given.
+
+        Return the outcome, '' when all was saved.
+        """
         unsaved = self.unsaved(live)
         if not unsaved:
             return ''
@@ -177,7 +191,8 @@ class CalibrationWorker(threading.Thread):
     """
     Runs a session.
 
-    A step that fails is reported and skipped, and the session continues: no error of a message, a solution or a disk ends it.
+    A step that fails is reported and skipped, and the session continues: no error of a message, a
+    solution or a disk ends it.
 
     Parameters
     ----------
@@ -240,14 +255,22 @@ class CalibrationWorker(threading.Thread):
         return self.live.settings.diagnosis_period if self.live.on_table is not None else 0.0
 
     def ask(self, what: str | Callable[[], tuple[bool, str]]) -> Future:
-        """Queue 'solve', 'diagnose', 'save', 'reset' or a function; return the future of its (success, message)."""
+        """
+        Queue 'solve', 'diagnose', 'save', 'reset' or a function.
+
+        Return the future of its (success, message).
+        """
         answer: Future = Future()
         self._asked.put((getattr(self, f'_{what}') if isinstance(what, str) else what, answer))
         self._wake.set()
         return answer
 
     def end(self, timeout: float = 20.0) -> str:
-        """Wait for the end of the present step, save unsaved windows, and return a line about them; '' for no unsaved windows."""
+        """
+        Wait for the end of the present step, save unsaved windows, and return a line about them.
+
+        '' for no unsaved windows.
+        """
         self._ending = True
         self._wake.set()
         self._diagnosis.end()
@@ -293,13 +316,15 @@ class CalibrationWorker(threading.Thread):
             self._faults[name] = error.with_hint(self.hints)
         except Exception as error:
             self._faults[name] = (
-                f'{name.replace("_", " ")} failed and is left out: {shortened(f"{type(error).__name__}: {error}", 200)}'
+                f'{name.replace("_", " ")} failed and is left out:'
+                f' {shortened(f"{type(error).__name__}: {error}", 200)}'
             )
         else:
             self._faults[name] = ''
 
     def _take(self) -> None:
-        # Silence is measured from the last call: messages that arrived during a solution are processed in the next one.
+        # Silence is measured from the last call: messages that arrived during a solution are
+        # processed in the next one.
         self._looked = time.monotonic()
         block = self.gatherer.flush()
         self._watch.note(block, self._looked)
@@ -359,7 +384,11 @@ class CalibrationWorker(threading.Thread):
         return extension is not None and session is not None and session.adopt(extension)
 
     def _settled_solution(self) -> tuple[CalibrationResult, str]:
-        """Publish the solution of all messages with the model that the diagnosis requires: the result of `calibrate` for these messages."""
+        """
+        Publish the solution of all messages with the model that the diagnosis requires.
+
+        The result of `calibrate` for these messages.
+        """
         published = self._publish_solution(pending=True)
         if not self._diagnosis_period:
             return published
@@ -394,20 +423,29 @@ class CalibrationWorker(threading.Thread):
         if not self._diagnosis_period:
             return (
                 False,
-                "a diagnosis is not available by hand, and not if parameter 'diagnosis_period' is 0",
+                (
+                    "a diagnosis is not available by hand, and not if parameter 'diagnosis_period'"
+                    ' is 0'
+                ),
             )
         self._publish_solution(pending=True)
         self._diagnosis.want(urgent=True)
         return (
             True,
-            f'diagnosis of {self.live.n_windows} windows started; its result is published on /diagnostics and in the calibration',
+            (
+                f'diagnosis of {self.live.n_windows} windows started; its result is published on'
+                ' /diagnostics and in the calibration'
+            ),
         )
 
     def _save(self) -> tuple[bool, str]:
         text, what = None, ''
         try:
             result, text = self._settled_solution()
-            what = f'{result.verdict.text}: {missing(result.calibration) or "every parameter is determined"}'
+            what = (
+                f'{result.verdict.text}:'
+                f' {missing(result.calibration) or "every parameter is determined"}'
+            )
         except ImuCalibrationError as error:
             what = f'no calibration yet: {error.with_hint(self.hints)}'
         if text is None and not self.live.n_windows:
@@ -423,9 +461,11 @@ class CalibrationWorker(threading.Thread):
         self.place.note_saved(0)
         self._trouble = ''
         self._diagnosis.forget()
-        return True, (
-            f'restarted, {lost} unsaved {self.gathered} were deleted; ' if lost else 'restarted; '
-        ) + 'the last calibration remains published until the next one'
+        return (
+            True,
+            (f'restarted, {lost} unsaved {self.gathered} were deleted; ' if lost else 'restarted; ')
+            + 'the last calibration remains published until the next one',
+        )
 
     def change(
         self, settings: LiveSettings | WindowSettings | LiveByHandSettings
@@ -464,8 +504,10 @@ class CalibrationWorker(threading.Thread):
         if self.live.needs_linearising:
             lines = [
                 *lines,
-                'an effect is outside the range of its linearisation and the stored windows are no longer available: '
-                'calibrate the recording offline',
+                (
+                    'an effect is outside the range of its linearisation and the stored windows are'
+                    ' no longer available: calibrate the recording offline'
+                ),
             ]
         stale = (
             self.state.solution != self._n_solutions or self.state.groups == [] or result is None

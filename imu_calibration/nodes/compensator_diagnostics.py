@@ -32,12 +32,23 @@ COLD = 10.0
 """Seconds without a temperature after which diagnostics report it; drivers send one per second."""
 HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
 TEXT_OF_REASON = {
-    'no temperature yet': 'the calibration has thermal effects and no temperature was received: no messages are published',
+    'no temperature yet': (
+        'the calibration has thermal effects and no temperature was received: no messages are'
+        ' published'
+    ),
     'saturated': 'readings are saturated: they are marked by a covariance of the size of the range',
     'not finite': 'readings are not finite: these messages are not published',
-    'covariance not finite': "received covariances are invalid (not finite, or a variance below zero): the calibration's noise is used",
-    'zero stamp': 'the stamps of the driver are zero: times of arrival are used for the angular acceleration',
-    'outside the invertible range': 'readings are outside the range in which the non-linear effects can be inverted: not published',
+    'covariance not finite': (
+        "received covariances are invalid (not finite, or a variance below zero): the calibration's"
+        ' noise is used'
+    ),
+    'zero stamp': (
+        'the stamps of the driver are zero: times of arrival are used for the angular acceleration'
+    ),
+    'outside the invertible range': (
+        'readings are outside the range in which the non-linear effects can be inverted: not'
+        ' published'
+    ),
 }
 
 
@@ -62,7 +73,11 @@ class CompensatorDiagnostics:
         self._publisher.publish_now()
 
     def note_temperature(self, temperature_c: float) -> bool:
-        """Record a temperature; return whether it is usable: finite, and by its magnitude in degrees Celsius."""
+        """
+        Record a temperature.
+
+        Return whether it is usable: finite, and by its magnitude in degrees Celsius.
+        """
         if not np.isfinite(temperature_c) or temperature_c > HOTTEST_C:
             self._unusable_temperatures = (
                 f'in degrees Celsius, {temperature_c:.1f} is kelvin'
@@ -97,7 +112,10 @@ class CompensatorDiagnostics:
         good = (
             ''
             if adopted is None
-            else f'corrected with calibration {adopted.version} ({decisions_text(adopted.calibration.decisions)})'
+            else (
+                f'corrected with calibration {adopted.version}'
+                f' ({decisions_text(adopted.calibration.decisions)})'
+            )
         )
         frame_id = '' if adopted is None else adopted.calibration.frame_id
         return [
@@ -195,7 +213,11 @@ class CompensatorDiagnostics:
         return serious, notes + self._outside(compensation) + self._warmth(compensation)
 
     def _new_counts(self, compensation):
-        """Return the reasons whose counts exceed their earlier maximum: the counts of a new compensation start at zero."""
+        """
+        Return the reasons whose counts exceed their earlier maximum.
+
+        The counts of a new compensation start at zero.
+        """
         counts = dict(compensation.counts)
         new = {
             reason: count for reason, count in counts.items() if count > self._counts.get(reason, 0)
@@ -205,7 +227,10 @@ class CompensatorDiagnostics:
 
     def _line(self, reason, compensation):
         if reason.startswith('frame_id'):
-            return f"messages carry {reason}, the calibration is for '{compensation.frame_id}': they are not corrected"
+            return (
+                f"messages carry {reason}, the calibration is for '{compensation.frame_id}': they"
+                ' are not corrected'
+            )
         return TEXT_OF_REASON.get(reason, f'{reason}: these messages are not published')
 
     def _outside(self, compensation):
@@ -225,8 +250,8 @@ class CompensatorDiagnostics:
         lines = []
         if self._unusable_temperatures:
             lines.append(
-                f'temperatures on {node.temperature.topic_name} must be {self._unusable_temperatures}: they are ignored; correct '
-                'the driver'
+                f'temperatures on {node.temperature.topic_name} must be'
+                f' {self._unusable_temperatures}: they are ignored; correct the driver'
             )
             self._unusable_temperatures = ''
         if monotonic() - self._temperature_at > COLD:

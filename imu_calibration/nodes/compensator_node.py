@@ -1,8 +1,9 @@
 """
 compensator_node: Imu in, corrected Imu out.
 
-in: imu/data_raw (sensor_msgs/Imu), imu/calibration (std_msgs/String, a calibration document), imu/temperature (sensor_msgs/Temperature,
-where the calibration has thermal effects). out: imu/data_corrected (sensor_msgs/Imu), /diagnostics. services: ~/reload (the file again).
+in: imu/data_raw (sensor_msgs/Imu), imu/calibration (std_msgs/String, a calibration document),
+imu/temperature (sensor_msgs/Temperature, where the calibration has thermal effects). out:
+imu/data_corrected (sensor_msgs/Imu), /diagnostics. services: ~/reload (the file again).
 """
 
 import sys
@@ -53,15 +54,19 @@ from imu_calibration.nodes.robot_stand import StaticFrames
 LOOK_FOR_FILE = 1.0
 """Seconds between two attempts to find a calibration file that is waited for."""
 MARK = '/correction'
-"""Suffix of a corrected topic's name: a latched topic that marks it as corrected and names the calibration."""
+"""
+Suffix of a corrected topic's name: a latched topic that marks it as corrected and names the
+calibration.
+"""
 
 
 class CompensatorNode(Node):
     """
     Corrects serialized messages with the calibration at hand.
 
-    Two threads: one receives, corrects and publishes messages; documents, temperature, services, parameters and diagnostics run in
-    the second, which prepares a new compensation; the first switches to it between two messages.
+    Two threads: one receives, corrects and publishes messages; documents, temperature, services,
+    parameters and diagnostics run in the second, which prepares a new compensation; the first
+    switches to it between two messages.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -95,7 +100,8 @@ class CompensatorNode(Node):
         self.imu = MatchedInput(self, Imu, 'imu/data_raw', callback=self._on_imu, group=group)
         if self.imu.topic_name == self._publisher.topic_name:
             raise InputError(
-                f'input and output must be two topics, both are {self.imu.topic_name}; correct the remapping'
+                f'input and output must be two topics, both are {self.imu.topic_name}; correct the'
+                ' remapping'
             )
         refuse_corrected(self.imu.topic_name)
         self.documents = MatchedInput(
@@ -122,8 +128,8 @@ class CompensatorNode(Node):
         ):
             if not self.settings.wait_for_file:
                 raise InputError(
-                    f"parameter 'calibration_file' must name an existing file, {path} is missing; correct it, or "
-                    'wait for it with wait_for_file:=true',
+                    f"parameter 'calibration_file' must name an existing file, {path} is missing;"
+                    ' correct it, or wait for it with wait_for_file:=true',
                     code='calibration_missing',
                 )
             self._waiting = every(self, LOOK_FOR_FILE, self._guarded(self._look_for_file))
@@ -200,8 +206,9 @@ class CompensatorNode(Node):
         self.documents.look()
         if self.documents.mixed:
             self.complaints.event(
-                f'{self.documents.topic_name} has the publishers {", ".join(sorted(self.documents.names()))}: '
-                'no calibration is adopted; stop all but one'
+                f'{self.documents.topic_name} has the publishers'
+                f' {", ".join(sorted(self.documents.names()))}: no calibration is adopted; stop all'
+                ' but one'
             )
             return
         self._heard = message.data
@@ -209,12 +216,17 @@ class CompensatorNode(Node):
             self._try(self._topic, self._take_topic)
         else:
             self.complaints.event(
-                f"a calibration on {self.documents.topic_name} was not adopted: parameter 'adopt' is "
-                f"'{self.settings.adopt}' and 'calibration_file' is '{self.settings.calibration_file}'"
+                f"a calibration on {self.documents.topic_name} was not adopted: parameter 'adopt'"
+                f" is '{self.settings.adopt}' and 'calibration_file' is"
+                f" '{self.settings.calibration_file}'"
             )
 
     def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
-        """Put the calibration in a document in force; raises an ImuCalibrationError and keeps the one there is."""
+        """
+        Put the calibration in a document in force.
+
+        Raises an ImuCalibrationError and keeps the one there is.
+        """
         adopted = adopt(text, source, settings, frames=self._frames, before=self.adopted)
         self._put_in_force(adopted)
         if adopted.says_more_than(self._reported):
@@ -224,14 +236,18 @@ class CompensatorNode(Node):
                 self.get_logger().warning(f'calibration {adopted.version}: {line}')
 
     def return_from_harm(self) -> None:
-        """Return to the previous calibration where a stop shows that the present one increases the error."""
+        """
+        Return to the previous calibration where the present one increases the error.
+
+        A stop shows the increase.
+        """
         harmful, previous = self.adopted, self._previous
         watch = None if harmful is None else harmful.compensation.watch
         if harmful is None or previous is None or watch is None or watch.health.state.word != HARMS:
             return
         self.complaints.event(
-            f'calibration {harmful.version} harms, the previous calibration {previous.version} is used again: '
-            f'{watch.health.state.message}',
+            f'calibration {harmful.version} harms, the previous calibration {previous.version} is'
+            f' used again: {watch.health.state.message}',
             LOG_ERROR,
         )
         self._harmful, self._previous, self.adopted = harmful.version, None, None
@@ -278,7 +294,11 @@ class CompensatorNode(Node):
         return self._try("parameter 'calibration_file'", self._load_file)
 
     def _try(self, source: str, action: Callable[[CompensatorSettings], None]) -> str:
-        """Adopt a calibration with the present settings; return the reason of its refusal, '' when it succeeded."""
+        """
+        Adopt a calibration with the present settings.
+
+        Return the reason of its refusal, '' when it succeeded.
+        """
         try:
             action(self.settings)
             return ''
@@ -301,7 +321,8 @@ class CompensatorNode(Node):
         elif self.adopted is not None and has_moved(self.adopted, self.settings, self._frames):
             self._put_in_force(again(self.adopted, self.settings, self._frames))
             self.get_logger().warning(
-                f"the static transform to '{self.settings.target_frame}' has moved: readings follow it"
+                f"the static transform to '{self.settings.target_frame}' has moved: readings"
+                ' follow it'
             )
 
     def _retry(self) -> None:
@@ -357,10 +378,8 @@ class CompensatorNode(Node):
         """Notice when another compensator publishes the input, and when it no longer does."""
         topic = self.imu.topic_name
         self.corrected_already = (
-            (
-                f'{topic} is corrected already ({topic + MARK} has a publisher): no messages are published; '
-                'remap imu/data_raw to the raw topic'
-            )
+            f'{topic} is corrected already ({topic + MARK} has a publisher): no messages are'
+            ' published; remap imu/data_raw to the raw topic'
             if self.count_publishers(topic + MARK)
             else ''
         )

@@ -20,8 +20,11 @@ from imu_calibration.core.progress import LiveState, listening
 from imu_calibration.selection.reduced_recording import REDUCING
 
 THRESHOLD = 256 * 1024
-"""Bytes from which an array has separate pages, which are returned when it is freed; glibc raises its threshold to 32 MB, so that arrays
-remain in a fragmented heap: 265 MB instead of 128 MB after a diagnosis."""
+"""
+Bytes from which an array has separate pages, which are returned when it is freed; glibc raises its
+threshold to 32 MB, so that arrays remain in a fragmented heap: 265 MB instead of 128 MB after a
+diagnosis.
+"""
 _M_MMAP_THRESHOLD = -3
 
 
@@ -80,7 +83,9 @@ class DiagnosisThread:
         self.state = NOT_YET if period else LiveState(OFF, OFF_WHY)
         self.n_answers, self._session = 0, 0
         self._answered: dict | None = (
-            None  # numbers of samples of the last question; the question itself keeps all windows in memory
+            # Numbers of samples of the last question; the question itself keeps all windows in
+            # memory
+            None
         )
         self._extension: ModelExtension | None = None
 
@@ -96,7 +101,11 @@ class DiagnosisThread:
         return self._thread is not None and self._thread.is_alive()
 
     def want(self, urgent: bool = False) -> None:
-        """Request a diagnosis before the period is over, as soon as `MAX_DIAGNOSIS_SHARE` allows; at once when it is urgent."""
+        """
+        Request a diagnosis before the period is over, as soon as `MAX_DIAGNOSIS_SHARE` allows.
+
+        At once when it is urgent.
+        """
         self._wanted, self._urgent = bool(self.period), urgent and bool(self.period)
 
     def forget(self) -> None:
@@ -112,7 +121,11 @@ class DiagnosisThread:
     def ask_when_due(
         self, make_question: Callable[[], DiagnosisQuestion | None], is_news: bool
     ) -> None:
-        """Start the diagnosis `make_question()` (None: no diagnosis) when it is requested, or when the period is over and there is news."""
+        """
+        Start the diagnosis `make_question()` (None: no diagnosis) when it is due.
+
+        It is due when it is requested, or when the period is over and there is news.
+        """
         now = time.monotonic()
         due = self._urgent or (
             (self._wanted or (bool(self.period) and is_news and now >= self._next))
@@ -154,7 +167,11 @@ class DiagnosisThread:
         return extension
 
     def settle(self, question: DiagnosisQuestion | None) -> None:
-        """Run a diagnosis and wait for it; one of the same windows that was completed already is not repeated."""
+        """
+        Run a diagnosis and wait for it.
+
+        One of the same windows that was completed already is not repeated.
+        """
         self._join()
         if question is not None and self.period and question.samples != self._answered:
             self._urgent = True
@@ -166,7 +183,9 @@ class DiagnosisThread:
             self._thread.join(timeout)
 
     def _go_on(self, session, phase):
-        """End a diagnosis that nobody waits for; otherwise return the memory that its last step freed."""
+        """
+        End a diagnosis that nobody waits for; otherwise return the memory that its last step freed.
+        """
         if self._ending or session != self._session:
             raise _Ended
         if phase == REDUCING:

@@ -1,8 +1,8 @@
 """
 Diagnostics: the state of a node, once per second on /diagnostics and at once when it changes.
 
-Levels by convention: OK: works as intended, including the start; WARN: works and needs attention; ERROR: does not fulfil its purpose. STALE
-is set by the receiver when messages are missing.
+Levels by convention: OK: works as intended, including the start; WARN: works and needs attention;
+ERROR: does not fulfil its purpose. STALE is set by the receiver when messages are missing.
 """
 
 import re
@@ -57,7 +57,9 @@ def make_status(
 
 class DiagnosticsPublisher:
     """
-    Publishes the list of DiagnosticStatus that `collect` returns every `DIAGNOSTICS_SECONDS`, and on `publish_now`.
+    Publishes the list of DiagnosticStatus that `collect` returns.
+
+    It publishes every `DIAGNOSTICS_SECONDS`, and on `publish_now`.
 
     The timer runs on the steady clock, so that diagnostics continue while simulated time is paused.
     """
@@ -101,7 +103,11 @@ MOST_KINDS = 1000
 
 
 def say(logger: Any, level: str, line: str) -> None:
-    """Log a line without control characters; one call per severity, because rclpy allows one severity per line of code."""
+    """
+    Log a line without control characters.
+
+    One call per severity, because rclpy allows one severity per line of code.
+    """
     line = printable(line)
     if level == LOG_ERROR:
         logger.error(line)
@@ -115,8 +121,8 @@ class Complaints:
     """
     Logs lines for a node.
 
-    Two lines are of the same kind when they differ in their numbers only, or have the same ``subject: ``, where the subject ends with a
-    topic in brackets (see `kind_of`).
+    Two lines are of the same kind when they differ in their numbers only, or have the same
+    ``subject: ``, where the subject ends with a topic in brackets (see `kind_of`).
 
     Parameters
     ----------
@@ -139,7 +145,11 @@ class Complaints:
         *,
         patience: float = REPEAT_SECONDS,
     ) -> None:
-        """Log the present faults of `source` and the end of earlier ones; an ended one is repeated after `patience` seconds at least."""
+        """
+        Log the present faults of `source` and the end of earlier ones.
+
+        An ended one is repeated after `patience` seconds at least.
+        """
         present = {
             kind_of(source, line): (level, line)
             for level, lines in ((LOG_WARN, warnings), (LOG_ERROR, errors))

@@ -1,4 +1,9 @@
-"""``ros2 doctor``: the Imu topics of the running system, their type, quality of service, stamps, units, frames and covariances."""
+"""
+``ros2 doctor``.
+
+The Imu topics of the running system, their type, quality of service, stamps, units, frames and
+covariances.
+"""
 
 import time
 from collections import deque
@@ -30,9 +35,14 @@ from msg_adapters.live import LiveGatherer
 
 TYPE = 'sensor_msgs/msg/Imu'
 LISTEN_SECONDS = 3.0
-"""Seconds of recording, up to `RETRIES` times as many if fewer than `ENOUGH_MESSAGES` messages were received."""
+"""
+Seconds of recording, up to `RETRIES` times as many if fewer than `ENOUGH_MESSAGES` messages were
+received.
+"""
 DISCOVERY = 2.0
-"""Seconds in which the nodes of the system are found, up to `RETRIES` times where no Imu topic was."""
+"""
+Seconds in which the nodes of the system are found, up to `RETRIES` times where no Imu topic was.
+"""
 RETRIES = 3
 ENOUGH_MESSAGES = 100
 """Messages that suffice to check a topic."""
@@ -113,7 +123,11 @@ class _Stream:
         self.heads, self.gatherer, self.count = ImuHeads(), LiveGatherer(), 0
 
     def ask_for_what_is_offered(self):
-        """Subscribe with the QoS of the publishers; start again, because messages queued for the first subscription are received twice."""
+        """
+        Subscribe with the QoS of the publishers.
+
+        Start again, because messages queued for the first subscription are received twice.
+        """
         self.input.look()
         self._begin()
 
@@ -140,8 +154,8 @@ class _Stream:
             yield CheckFinding(
                 'type',
                 REFUSE,
-                f'a topic must have one type, {other.node_name} publishes {other.topic_type} here instead '
-                f'of {TYPE}; rename its topic',
+                f'a topic must have one type, {other.node_name} publishes {other.topic_type} here'
+                f' instead of {TYPE}; rename its topic',
             )
         names = sorted(self.input.names())
         if len(names) > 1:
@@ -155,7 +169,8 @@ class _Stream:
             yield CheckFinding(
                 'silence',
                 WARNING,
-                f'messages are required, none came in {RETRIES * LISTEN_SECONDS:g} s; check the driver',
+                f'messages are required, none came in {RETRIES * LISTEN_SECONDS:g} s; check the'
+                ' driver',
             )
 
     def _listeners(self):
@@ -168,8 +183,9 @@ class _Stream:
                     yield CheckFinding(
                         'qos',
                         REFUSE,
-                        f'a subscriber must request at most the offered QoS, {listener.node_name} receives '
-                        f'nothing from {publisher.node_name}: {why.partition(": ")[2].rstrip(";") or why}',
+                        f'a subscriber must request at most the offered QoS, {listener.node_name}'
+                        f' receives nothing from {publisher.node_name}:'
+                        f' {why.partition(": ")[2].rstrip(";") or why}',
                     )
         if self.input.publishers and not wrong:
             reliable = (

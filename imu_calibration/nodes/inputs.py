@@ -1,4 +1,8 @@
-"""Inputs: subscriptions that connect to any publisher, lose no message of a reliable one, and report faults of their topic."""
+"""
+Inputs: subscriptions that connect to any publisher.
+
+They lose no message of a reliable publisher, and report faults of their topic.
+"""
 
 import time
 from collections.abc import Callable
@@ -18,7 +22,11 @@ QUEUE_DEPTH = 1000
 
 
 def input_qos(reliable: bool = False, depth: int = QUEUE_DEPTH) -> QoSProfile:
-    """Return the profile of an input (`inputs.MatchedInput`): `reliable` repeats lost messages, best effort accepts any publisher."""
+    """
+    Return the profile of an input (`inputs.MatchedInput`).
+
+    `reliable` repeats lost messages, best effort accepts any publisher.
+    """
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
@@ -26,12 +34,18 @@ def input_qos(reliable: bool = False, depth: int = QUEUE_DEPTH) -> QoSProfile:
 
 
 def output_qos(depth: int = QUEUE_DEPTH) -> QoSProfile:
-    """Return the profile of an output: that of rclpy, which is reliable, so that every subscriber connects."""
+    """
+    Return the profile of an output.
+
+    That of rclpy, which is reliable, so that every subscriber connects.
+    """
     return QoSProfile(depth=depth)
 
 
 def latched_qos(depth: int = 1) -> QoSProfile:
-    """Return the profile of the calibration document: a late subscriber receives the last messages."""
+    """
+    Return the profile of the calibration document: a late subscriber receives the last messages.
+    """
     return QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -40,9 +54,15 @@ PUBLISHER_CHECK_SECONDS = 0.25
 SEVERAL_AFTER = 3.0
 """Seconds after which several publishers of one topic are reported."""
 DEAD_AFTER = 30.0
-"""The same when they have one name: for so long discovery may still list a killed node in addition to its replacement."""
+"""
+The same when they have one name: for so long discovery may still list a killed node in addition to
+its replacement.
+"""
 NAP = 0.004
-"""Seconds a callback sleeps after it has read all messages: at 2 kHz the executor then wakes once for eight messages."""
+"""
+Seconds a callback sleeps after it has read all messages: at 2 kHz the executor then wakes once for
+eight messages.
+"""
 NOT_RAW = ('_corrected', '/residual', '/truth')
 """Suffixes of topics that this package publishes, which are not suggested as replacements."""
 MAX_NAMED_TOPICS = 3
@@ -58,8 +78,9 @@ class MatchedInput:
     """
     A subscription as reliable as the publishers of its topic.
 
-    It requests reliability, so that no message of a reliable publisher is lost, until a best-effort publisher appears: that
-    publisher would never connect. When the last best-effort publisher has disappeared it requests reliability again.
+    It requests reliability, so that no message of a reliable publisher is lost, until a best-effort
+    publisher appears: that publisher would never connect. When the last best-effort publisher has
+    disappeared it requests reliability again.
 
     Parameters
     ----------
@@ -68,7 +89,8 @@ class MatchedInput:
     topic : str
         Relative name, as in a remapping.
     callback : callable
-        Called with each message, and with the middleware's message information if it has two parameters.
+        Called with each message, and with the middleware's message information if it has two
+        parameters.
     depth : int
         Messages that may wait.
     group : CallbackGroup, optional
@@ -116,7 +138,8 @@ class MatchedInput:
         return self.subscription.topic_name
 
     def _subscribe(self) -> Subscription:
-        # With its default callbacks rclpy warns of every publisher that offers less than requested, before we request less.
+        # With its default callbacks rclpy warns of every publisher that offers less than requested,
+        # before we request less.
         silent = SubscriptionEventCallbacks(use_default_callbacks=False)
         qos = latched_qos() if self._latched else input_qos(self.reliable, self._depth)
         return self.node.create_subscription(
@@ -169,8 +192,8 @@ class MatchedInput:
         ):
             return []
         return [
-            f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): their messages mix; stop all but one, '
-            f'or remap {self.topic}'
+            f'{len(names)} publishers on {self.topic_name} ({", ".join(sorted(names))}): their'
+            f' messages mix; stop all but one, or remap {self.topic}'
         ]
 
     def source(self) -> str:
@@ -181,7 +204,11 @@ class MatchedInput:
         )
 
     def silence(self, unusable: str = '') -> str:
-        """Return the likely reason of a silent topic, and a similar topic; `unusable` describes received messages that were dropped."""
+        """
+        Return the likely reason of a silent topic, and a similar topic.
+
+        `unusable` describes received messages that were dropped.
+        """
         if unusable:
             return f'no message on {self.topic_name} is usable: {unusable}'
         what = f'no messages on {self.topic_name} ({self.type_name})'
@@ -190,7 +217,10 @@ class MatchedInput:
                 f'{what}: {", ".join(sorted(set(self.names())))} is a publisher but does not send'
             )
         if self.others:
-            return f'{what}: {self.others[0].node_name} publishes {self.others[0].topic_type} there; remap {self.topic} to another topic'
+            return (
+                f'{what}: {self.others[0].node_name} publishes {self.others[0].topic_type} there;'
+                f' remap {self.topic} to another topic'
+            )
         return f'{what}: {self._elsewhere()}'
 
     def _elsewhere(self) -> str:
@@ -211,10 +241,13 @@ class MatchedInput:
 
 class BatchInput(MatchedInput):
     """
-    An input whose callback passes on all waiting messages at once, which is efficient for thousands per second.
+    An input with a callback that passes on all waiting messages at once.
 
-    The public executor calls it for the first one; the following ones are read through the subscription's handle. Where rclpy has no such
-    handle every message has its own call, which is slower with the same result.
+    This is efficient for thousands of messages per second.
+
+    The public executor calls it for the first one; the following ones are read through the
+    subscription's handle. Where rclpy has no such handle every message has its own call, which is
+    slower with the same result.
 
     Parameters
     ----------
@@ -251,7 +284,11 @@ class BatchInput(MatchedInput):
 
 
 def sent_ns(information: dict) -> int:
-    """Return the time of sending of a message, ns; the time of reception where the middleware has none."""
+    """
+    Return the time of sending of a message, ns.
+
+    The time of reception where the middleware has none.
+    """
     return information['source_timestamp'] or information['received_timestamp']
 
 

@@ -1,7 +1,8 @@
 """
 Interfaces to command a controller: its topic, or its action where control_msgs is installed.
 
-The topic has no feedback: the result of a trajectory shows only in the joint states. The action returns the reason of a refusal.
+The topic has no feedback: the result of a trajectory shows only in the joint states. The action
+returns the reason of a refusal.
 """
 
 from __future__ import annotations
@@ -21,7 +22,10 @@ from imu_calibration.nodes.lifecycle import guarded
 from msg_adapters.joint_state import encode_trajectory
 
 COMMANDS = ('topic', 'action', 'auto')
-"""How trajectories are sent; 'auto': by the action where control_msgs is installed and a server is there."""
+"""
+How trajectories are sent; 'auto': by the action where control_msgs is installed and a server is
+there.
+"""
 COMMAND_DEPTH = 10
 RESULTS = {
     -1: 'the goal is invalid',
@@ -65,7 +69,9 @@ class TopicCommand:
 
 class ActionCommand:
     """
-    Sends trajectories as goals of FollowJointTrajectory; a stop cancels the goal, and is sent to the topic as well.
+    Sends trajectories as goals of FollowJointTrajectory.
+
+    A stop cancels the goal, and is sent to the topic as well.
 
     Parameters
     ----------
@@ -114,7 +120,11 @@ class ActionCommand:
         )
 
     def stop(self, joint_names: tuple[str, ...]) -> None:
-        """Cancel the goal, and send the trajectory without points: the first to arrive stops the joints."""
+        """
+        Cancel the goal, and send the trajectory without points.
+
+        The first to arrive stops the joints.
+        """
         self._number += 1  # the result of the goal is not reported any more
         handle, self._handle = self._handle, None
         self._topic.stop(joint_names)
@@ -136,7 +146,11 @@ class ActionCommand:
         )
 
     def _guarded(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return a callback of a future whose exceptions count as a refusal: in an executor they would end the node."""
+        """
+        Return a callback of a future whose exceptions count as a refusal.
+
+        In an executor they would end the node.
+        """
         return guarded(callback, lambda error: self._refused(f'{type(error).__name__}: {error}'))
 
     def _ended(self, number: int, result: Any) -> None:
@@ -170,8 +184,8 @@ def make_command(
     except ImportError:
         if how == 'action':
             raise InputError(
-                "parameter 'command' is action, and control_msgs is not installed: install ros-jazzy-control-msgs, "
-                'or use topic',
+                "parameter 'command' is action, and control_msgs is not installed: install"
+                ' ros-jazzy-control-msgs, or use topic',
                 code='package_missing',
             ) from None
         return TopicCommand(node)
@@ -224,12 +238,15 @@ class OtherDrivers:
             names.remove(own)
         if names:
             return (
-                f'{topic} must have no other publisher, there is {", ".join(names)}; stop it (after a crash its name remains for half '
-                'a minute)'
+                f'{topic} must have no other publisher, there is {", ".join(names)}; stop it (after'
+                ' a crash its name remains for half a minute)'
             )
         # The last status of a controller that has ended is not valid any more.
         if self._active - self._command.goals and self._node.count_publishers(
             self._status.topic_name
         ):
-            return f'{self._command.action_name} must have no active goal, another client has one; wait until it has ended, or cancel it'
+            return (
+                f'{self._command.action_name} must have no active goal, another client has one;'
+                ' wait until it has ended, or cancel it'
+            )
         return ''

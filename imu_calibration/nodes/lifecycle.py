@@ -1,4 +1,8 @@
-"""A node's process: parameters from settings, help, first line, callbacks and timers; exit code 0 after SIGINT and SIGTERM, else 1."""
+"""
+A node's process: parameters from settings, help, first line, callbacks and timers.
+
+Exit code 0 after SIGINT and SIGTERM, else 1.
+"""
 
 import ast
 import importlib
@@ -58,10 +62,12 @@ def declare_parameters(
     hints: dict[str, str] | None = None,
 ) -> Any:
     """
-    Declare every field of the settings `group` as a parameter of `node` and return the settings with the given values.
+    Declare the fields of the settings `group` as parameters and return the settings.
 
-    Tuples become arrays. From then on requests to change a parameter are handled: a setting declared `live` changes, of any other setting
-    the request is rejected with the reason.
+    Every field becomes a parameter of `node`, and the returned settings have the given values.
+
+    Tuples become arrays. From then on requests to change a parameter are handled: a setting
+    declared `live` changes, of any other setting the request is rejected with the reason.
 
     Parameters
     ----------
@@ -99,7 +105,11 @@ def declare_parameters(
 
 
 def parameter_descriptor(item: Setting) -> ParameterDescriptor:
-    """Return the descriptor of one setting: type, meaning, unit, range, symptom of a wrong value, reason why it is fixed."""
+    """
+    Return the descriptor of one setting.
+
+    Type, meaning, unit, range, symptom of a wrong value, reason why it is fixed.
+    """
     text = f'{item.text} [{item.unit}]' if item.unit else item.text
     descriptor = ParameterDescriptor(name=item.name, description=text, read_only=item.path)
     notes = [f'When wrong: {item.symptom}.'] * bool(item.symptom) + [
@@ -129,7 +139,9 @@ class _Group:
 
 
 def _watch(node: Node, group: _Group) -> None:
-    """Handle requests to change the parameters of a group: one callback per node, for all its groups."""
+    """
+    Handle requests to change the parameters of a group: one callback per node, for all its groups.
+    """
     groups = getattr(node, _GROUPS, None)
     if groups is None:
         groups = []
@@ -168,8 +180,8 @@ def _change(groups: list, parameter: Any) -> None:
             return
         if not item.live:
             raise InputError(
-                f"parameter '{item.name}' cannot be changed while the node runs: {item.fixed}; start the node with "
-                f'-p {item.name}:={parameter.value}'
+                f"parameter '{item.name}' cannot be changed while the node runs: {item.fixed};"
+                f' start the node with -p {item.name}:={parameter.value}'
             )
         groups[place] = override(group, {item.name: value})
 
@@ -217,7 +229,9 @@ HINTS = {
         'joint_topic': 'remap joint_states',
         'temperature_topic': 'remap imu/temperature',
         'inspect': "record a bag and run 'imu_calibration inspect BAG' to {}",
-        'diagnose': "call ~/diagnose, by hand record a bag and run 'imu_calibration diagnose BAG', to {}",
+        'diagnose': (
+            "call ~/diagnose, by hand record a bag and run 'imu_calibration diagnose BAG', to {}"
+        ),
     },
     'compensator_node': {
         'anyway': "parameter 'anyway'",
@@ -237,7 +251,10 @@ HINTS = {
         'table': "parameter 'table_file'",
     },
 }
-"""Node -> {key of `errors.ERROR_KEYS`: its name in the node}; a node without an entry receives no such error."""
+"""
+Node -> {key of `errors.ERROR_KEYS`: its name in the node}; a node without an entry receives no such
+error.
+"""
 
 
 def settings_of(node: str) -> list[type]:
@@ -290,11 +307,16 @@ HELP_WIDTH = 118
 
 
 def help_text(node_class: Callable[[], Any]) -> str:
-    """Return the help of a node, from the docstring of its module and the settings that it declares."""
+    """
+    Return the help of a node, from the docstring of its module and the settings that it declares.
+    """
     module = sys.modules[node_class.__module__]
     name = Path(inspect.getfile(module)).stem
     lines = [
-        f'usage: ros2 run imu_calibration {name} --ros-args [-p NAME:=VALUE ...] [-r FROM:=TO ...] [--params-file FILE]',
+        (
+            f'usage: ros2 run imu_calibration {name} --ros-args [-p NAME:=VALUE ...] [-r FROM:=TO'
+            ' ...] [--params-file FILE]'
+        ),
         '',
         inspect.getdoc(module) or '',
         '',
@@ -316,7 +338,9 @@ def every(node: Node, seconds: float, callback: Callable[[], Any]) -> Any:
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 HEARD = 0.1
-"""Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context."""
+"""
+Seconds within which the interpreter has heard of a signal; rclpy hears first, and ends the context.
+"""
 LOOK_AGAIN = 0.5
 """Interval at which an idle node checks whether its end was requested, s."""
 
@@ -334,13 +358,15 @@ def run_node(
     Parameters
     ----------
     make_node : callable
-        Returns the node; its class gives the text of ``--help``. A method `close` of the node is called before it is destroyed, and
-        its result is printed; a method `halt` is called at the first signal, while the context is still valid and messages
-        can be sent; an attribute `failed` is true when the node ended because it could not continue, and has reported it.
+        Returns the node; its class gives the text of ``--help``. A method `close` of the node is
+        called before it is destroyed, and its result is printed; a method `halt` is called at the
+        first signal, while the context is still valid and messages can be sent; an attribute
+        `failed` is true when the node ended because it could not continue, and has reported it.
     arguments : list of str, optional
         Command line without the program's name; default ``sys.argv[1:]``.
     spin : callable, optional
-        Called with the node, returns or raises ExternalShutdownException when the context ends; default ``rclpy.spin``.
+        Called with the node, returns or raises ExternalShutdownException when the context ends;
+        default ``rclpy.spin``.
     hints : dict, optional
         As for `errors.with_hint`.
 
@@ -353,12 +379,13 @@ def run_node(
         return 0
     if own:
         print(
-            f"error: arguments of the node follow --ros-args, got '{shortened(own[0])}' before it; write --ros-args -p NAME:=VALUE, "
-            'and see --help',
+            f"error: arguments of the node follow --ros-args, got '{shortened(own[0])}' before it;"
+            ' write --ros-args -p NAME:=VALUE, and see --help',
             file=sys.stderr,
         )
         return 1
-    # rclpy's handlers, installed by init, end the wait and call these; without them Python would also raise KeyboardInterrupt in mid-write.
+    # rclpy's handlers, installed by init, end the wait and call these; without them Python would
+    # also raise KeyboardInterrupt in mid-write.
     asked_to_end, node, halts = [], None, hasattr(make_node, 'halt')
 
     def asked(number, _):
@@ -384,7 +411,8 @@ def run_node(
         node = make_node()
         for line in unknown_parameters(node):
             node.get_logger().warning(line)
-        # At a signal rclpy wakes the executor before it ends the context: an executor that checks the context in between waits again.
+        # At a signal rclpy wakes the executor before it ends the context: an executor that checks
+        # the context in between waits again.
         every(node, LOOK_AGAIN, lambda: None)
         if not asked_to_end:  # an executor cannot be made any more
             (spin or rclpy.spin)(node)
@@ -393,7 +421,8 @@ def run_node(
     except ImuCalibrationError as error:
         return _failed(error.with_hint(hints or {}))
     except Exception as error:
-        # A context that ends while something is being made or published fails in many ways; none of them is news.
+        # A context that ends while something is being made or published fails in many ways; none of
+        # them is news.
         time.sleep(HEARD)
         if not asked_to_end:
             return _failed(
@@ -410,7 +439,8 @@ def _failed(line: str) -> int:
 
 
 def _end(node: Any) -> None:
-    _ignore_signals()  # `ros2 launch` sends every signal twice, and the second must not interrupt saving
+    # `ros2 launch` sends every signal twice, and the second must not interrupt saving
+    _ignore_signals()
     if node is not None:
         last_words = node.close() if hasattr(node, 'close') else ''
         if last_words:  # a logger would also publish, and complain that it cannot any more

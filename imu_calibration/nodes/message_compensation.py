@@ -1,4 +1,8 @@
-"""Serialized Imu message in, corrected serialized message out, with one calibration; independent of ROS."""
+"""
+Serialized Imu message in, corrected serialized message out, with one calibration.
+
+Independent of ROS.
+"""
 
 import numpy as np
 
@@ -62,7 +66,9 @@ class LiveCompensation(SampleCompensation):
 
     def __call__(self, data: bytes, sent_ns: int = 0) -> bytes | None:
         """
-        Return the corrected message as bytes, or None when there is no message to publish; the reason is counted in `counts`.
+        Return the corrected message as bytes, or None when there is no message to publish.
+
+        The reason is counted in `counts`.
 
         Parameters
         ----------
@@ -145,13 +151,21 @@ class LiveCompensation(SampleCompensation):
         )
 
     def _mixed(self, of_absent, of_present):
-        """Return six readings: of an absent sensor from the first, of the present sensor from the second."""
+        """
+        Return six readings.
+
+        Of an absent sensor from the first, of the present sensor from the second.
+        """
         return (of_absent if self._no_rate else of_present)[:3] + (
             of_absent if self._no_force else of_present
         )[3:]
 
     def _marked(self, readings):
-        """Return the covariances, of the size of the range where a sensor is saturated: the true value is not known better."""
+        """
+        Return the covariances, of the size of the range where a sensor is saturated.
+
+        The true value is not known better.
+        """
         force_level, rate_level = self.levels
         rate, force = (
             max(map(abs, readings[:3])) >= rate_level,
@@ -167,7 +181,9 @@ class LiveCompensation(SampleCompensation):
         return self._message.packed(np.eye(3) * level**2)
 
     def _orientation(self, data):
-        """Return the orientation turned into the target frame: quaternion and bytes of the covariance."""
+        """
+        Return the orientation turned into the target frame: quaternion and bytes of the covariance.
+        """
         quaternion, covariance = self._message.orientation(data)
         if covariance != self._orientation_in:
             given = self._message.unpacked(covariance)

@@ -1,10 +1,14 @@
 """
-planner_node: moves a table or an arm so that calibration_node can determine every parameter, and no further.
+planner_node: moves a table or an arm to serve calibration_node.
 
-in: joint_states (sensor_msgs/JointState), imu/calibration (std_msgs/String, from calibration_node), /diagnostics (its diagnosis).
-out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action follow_joint_trajectory where control_msgs is installed;
-/diagnostics; imu/coverage (visualization_msgs/MarkerArray): the motion that is driven, beside calibration_node's picture. services: ~/start
-(all motions that are needed), ~/next (one motion), ~/stop (at any moment). Nothing moves before ~/start or ~/next.
+It moves so that calibration_node can determine every parameter, and no further.
+
+in: joint_states (sensor_msgs/JointState), imu/calibration (std_msgs/String, from calibration_node),
+/diagnostics (its diagnosis). out: joint_trajectory (trajectory_msgs/JointTrajectory), or the action
+follow_joint_trajectory where control_msgs is installed; /diagnostics; imu/coverage
+(visualization_msgs/MarkerArray): the motion that is driven, beside calibration_node's picture.
+services: ~/start (all motions that are needed), ~/next (one motion), ~/stop (at any moment).
+Nothing moves before ~/start or ~/next.
 """
 
 import sys
@@ -78,7 +82,8 @@ class PlannerNodeSettings:
     table_file: str = setting(
         '',
         '',
-        'description of the table with the limits of its joints, path; empty: urdf_file describes the arm',
+        'description of the table with the limits of its joints, path; empty: urdf_file describes'
+        ' the arm',
         symptom='other joints, or limits that are not theirs',
         session=True,
         path=True,
@@ -125,16 +130,16 @@ class PlannerNodeSettings:
     command: str = setting(
         'topic',
         '',
-        'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory, needs '
-        'control_msgs) or auto (the action where there is one)',
+        'how trajectories are sent: topic (joint_trajectory), action (follow_joint_trajectory,'
+        ' needs control_msgs) or auto (the action where there is one)',
         symptom='nothing moves',
         choices=COMMANDS,
     )
     max_turns: float = setting(
         1.0,
         '1',
-        'turns of an endless joint to either side of its position at the first start, unwound at the end; '
-        '0: unlimited, for slip rings',
+        'turns of an endless joint to either side of its position at the first start, unwound at'
+        ' the end; 0: unlimited, for slip rings',
         (0.0, 1e4),
         'too large: cables are wound up; too small: slow plans',
         fixed='the range of every joint is set at the first start',
@@ -183,7 +188,8 @@ class PlannerNode(Node):
         table = chain_of(self, robot, settings.table_file)
         if table is None:
             raise InputError(
-                "planner_node requires the joints that it moves, got neither 'table_file' nor 'urdf_file'; give one of them",
+                "planner_node requires the joints that it moves, got neither 'table_file' nor"
+                " 'urdf_file'; give one of them",
                 code='table_missing',
             )
         self._table = table
@@ -196,9 +202,11 @@ class PlannerNode(Node):
             settings.gyroscope_model or None,
             settings.reference_model or None,
             tolerances,
-            noise=files.read_noise(files.user_path(settings.noise_file))
-            if settings.noise_file
-            else None,
+            noise=(
+                files.read_noise(files.user_path(settings.noise_file))
+                if settings.noise_file
+                else None
+            ),
         )
         self._lock, self._stamp, self._status = threading.RLock(), 0.0, {}
         self._newest: str | None = None
@@ -227,7 +235,8 @@ class PlannerNode(Node):
             lock=self._lock,
         )
         self.worker.stamp = lambda: self._stamp
-        # All that wait at once: one by one they would wait in line while a plan is made, and the motion begin where the joints were before.
+        # All that wait at once: one by one they would wait in line while a plan is made, and the
+        # motion begin where the joints were before.
         self._joints = BatchInput(
             self, JointState, 'joint_states', add=self._guarded(self._joint_state), single=False
         )
@@ -317,7 +326,8 @@ class PlannerNode(Node):
         calibration = self._latest()
         if calibration is None:
             raise InputError(
-                'a calibration is required before causes can be separated, none was received; publish imu/calibration'
+                'a calibration is required before causes can be separated, none was received;'
+                ' publish imu/calibration'
             )
         return separator_of(
             self._table,
@@ -359,7 +369,8 @@ class PlannerNode(Node):
             )
         if self.driver.ignored != ignored:
             self._complaints.event(
-                f'joint_states: positions must be finite{self.driver.ignored_words()}; see the driver of that joint'
+                f'joint_states: positions must be finite{self.driver.ignored_words()}; see the'
+                ' driver of that joint'
             )
         if must_stop:
             self._stopped()
@@ -430,8 +441,8 @@ class PlannerNode(Node):
         answer = self._ask('solve')
         if answer is None:
             raise InputError(
-                f"calibration must answer ~/solve within {ANSWER_PATIENCE:g} s, '{self.settings.calibration_node}' did not; "
-                'check that it runs'
+                f'calibration must answer ~/solve within {ANSWER_PATIENCE:g} s,'
+                f" '{self.settings.calibration_node}' did not; check that it runs"
             )
         if not answer.success:
             self._say(LOG_INFO, f'no calibration yet: {answer.message}')
@@ -463,7 +474,10 @@ class PlannerNode(Node):
         if self.driver.is_driving or self.worker.doing:
             return (
                 False,
-                f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop stops it',
+                (
+                    f'it is at work already: {self.worker.doing or self.driver.reason}; ~/stop'
+                    ' stops it'
+                ),
             )
         if missing_ranges(self._table):
             return False, range_warnings(self._table)[0]
@@ -474,14 +488,20 @@ class PlannerNode(Node):
         if not self._command.is_heard:
             return (
                 False,
-                f'{self._command.name} has no subscriber: start the controller, or remap joint_trajectory',
+                (
+                    f'{self._command.name} has no subscriber: start the controller, or remap'
+                    ' joint_trajectory'
+                ),
             )
         if other := self._others.found():
             return False, other
         if not self._calibrator['solve'].service_is_ready():
             return (
                 False,
-                f'service {self._calibrator["solve"].srv_name} does not exist; start calibration_node, which collects the windows',
+                (
+                    f'service {self._calibrator["solve"].srv_name} does not exist; start'
+                    ' calibration_node, which collects the windows'
+                ),
             )
         if not self._is_placed:
             limits, reach = (
@@ -496,7 +516,10 @@ class PlannerNode(Node):
         what = (
             'one motion, then it rests'
             if motions > 0
-            else 'plans and moves until every parameter is within its tolerance; the first motion is small, the first large one slow'
+            else (
+                'plans and moves until every parameter is within its tolerance; the first motion is'
+                ' small, the first large one slow'
+            )
         )
         return True, f'{what}; limits: {self._limit_words()}'
 

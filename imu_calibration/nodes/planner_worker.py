@@ -170,7 +170,11 @@ class PlannerWorker(threading.Thread):
             self._carry_out(decision)
 
     def _wait_for_rest(self):
-        """A motion is planned from where the joints rest: after a stop they need a while, and a person may turn them."""
+        """
+        A motion is planned from where the joints rest.
+
+        After a stop they need a while, and a person may turn them.
+        """
         patience = self.driver.settings.settling_patience
         end = time.monotonic() + patience
         while self._wanted and not self._ending and not self.driver.rests:
@@ -183,7 +187,8 @@ class PlannerWorker(threading.Thread):
                 self.doing, end = Activity.AWAITING_STOP, time.monotonic() + patience
             if time.monotonic() > end:
                 raise InputError(
-                    f'the joints must rest before a motion begins, they moved for {patience:g} s; find the cause'
+                    f'the joints must rest before a motion begins, they moved for {patience:g} s;'
+                    ' find the cause'
                 )
             self._wake.wait(DRIVER_CHECK_SECONDS)
             self._wake.clear()
@@ -234,12 +239,17 @@ class PlannerWorker(threading.Thread):
             self._peers.send(points)
         self._peers.say(
             LOG_INFO,
-            f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words}; {decision.why}',
+            f'motion {self.driver.motions}, {points.duration:.0f} s: {decision.motion.words};'
+            f' {decision.why}',
         )
 
 
 def findings_from(values: dict[str, str]) -> list[Suspect]:
-    """Return the model errors in the values of calibration_node's status 'diagnosis', the strongest first."""
+    """
+    Return the model errors in the status 'diagnosis', the strongest first.
+
+    They are in the values of this status of calibration_node.
+    """
     if values.get('outcome') != FOUND:
         return []
     found = [

@@ -1,4 +1,8 @@
-"""Publishing serialized messages at their times: in real time, faster, or as fast as subscribers receive them."""
+"""
+Publishing serialized messages at their times.
+
+In real time, faster, or as fast as subscribers receive them.
+"""
 
 import threading
 import time
@@ -175,7 +179,11 @@ class Playback(threading.Thread):
         self._clock.publish(message)
 
     def _settle(self):
-        """Wait until reliable subscribers have received all messages; acknowledgements arrive with heartbeats, every three seconds."""
+        """
+        Wait until reliable subscribers have received all messages.
+
+        Acknowledgements arrive with heartbeats, every three seconds.
+        """
         for publisher in self._publishers:
             publisher.wait_for_all_acked(Duration(seconds=10.0))
         self._ending.wait(0.5)

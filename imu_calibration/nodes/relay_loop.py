@@ -1,8 +1,8 @@
 """
 From a subscription to a publisher as serialized bytes, without the executor in between.
 
-The wait set and the handles are internals of rclpy; `available` returns whether they exist. All other callbacks of the
-node run in a second thread with the public executor.
+The wait set and the handles are internals of rclpy; `available` returns whether they exist. All
+other callbacks of the node run in a second thread with the public executor.
 """
 
 import sys
@@ -75,7 +75,8 @@ def relay(
         In a callback group `OutsideExecutor`; its subscription may change.
     publisher : rclpy.publisher.Publisher
     convert : callable
-        (Serialized message, message information of the middleware) -> serialized message, or None for no publication.
+        (Serialized message, message information of the middleware) -> serialized message, or None
+        for no publication.
 
     """
     executor = SingleThreadedExecutor(context=node.context)

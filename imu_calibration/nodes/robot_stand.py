@@ -43,14 +43,19 @@ class StaticFrames:
         self.transforms, self.n_unusable = StaticTransforms(), 0
 
     def pose(self, target: str, source: str) -> Any:
-        """Return the pose of a frame in another one (see `StaticTransforms.pose`), None while it is not known."""
+        """
+        Return the pose of a frame in another one (see `StaticTransforms.pose`).
+
+        None while it is not known.
+        """
         self._listen()
         return self.transforms.pose(target, source)
 
     def waits_for(self, target: str, source: str) -> str:
         """Return a readable description of the awaited transform."""
         return (
-            f"the transform from '{target}' to '{source}' on {TF_STATIC}: {self.transforms.why_not(target, source)}"
+            f"the transform from '{target}' to '{source}' on {TF_STATIC}:"
+            f' {self.transforms.why_not(target, source)}'
             + (
                 f'; {self.n_unusable} received transforms are unusable (not finite)'
                 if self.n_unusable
@@ -79,8 +84,8 @@ class StaticFrames:
                 from tf2_msgs.msg import TFMessage
             except ImportError as error:
                 raise InputError(
-                    f'{TF_STATIC} needs the messages of the package tf2_msgs, which is not installed; '
-                    'install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy',
+                    f'{TF_STATIC} needs the messages of the package tf2_msgs, which is not'
+                    ' installed; install ros-jazzy-tf2-msgs, or give target_xyz and target_rpy',
                     code='package_missing',
                 ) from error
             self._subscription = self._node.create_subscription(
@@ -104,9 +109,9 @@ class RobotSettings:
     urdf_file: str = setting(
         '',
         '',
-        'description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path; '
-        f'{URDF_FROM_TOPIC}: the topic robot_description; empty: table_file only. With an arm, table_file describes '
-        'the site: up, gravity, latitude, limits of joints by name',
+        'description (.urdf, or .xacro with allow_xacro) of the arm that carries the IMU, path;'
+        f' {URDF_FROM_TOPIC}: the topic robot_description; empty: table_file only. With an arm,'
+        ' table_file describes the site: up, gravity, latitude, limits of joints by name',
         symptom='the node waits for the missing input',
         session=True,
         path=True,
@@ -228,7 +233,8 @@ def _message(
             node,
             lambda: came[0] if came else None,
             lambda: (
-                f'a message on {node.resolve_topic_name(topic)} ({kind.__module__.split(".")[0]}/{kind.__name__})'
+                f'a message on {node.resolve_topic_name(topic)}'
+                f' ({kind.__module__.split(".")[0]}/{kind.__name__})'
             ),
         )
     finally:
@@ -236,7 +242,11 @@ def _message(
 
 
 def _waited_for(node: Node, look: Callable[[], Found | None], what: Callable[[], str]) -> Found:
-    """Return the first result of `look` that is not None; raises an ExternalShutdownException when the context ends before."""
+    """
+    Return the first result of `look` that is not None.
+
+    Raises an ExternalShutdownException when the context ends before.
+    """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
     said = time.monotonic() - WAIT_LOG_SECONDS + 1.0

@@ -1,9 +1,10 @@
 """
 simulator_node: a turntable that carries an IMU, live.
 
-in: joint_trajectory (trajectory_msgs/JointTrajectory, as joint_trajectory_controller takes it; without points the table stops).
-out: imu/data_raw (sensor_msgs/Imu), joint_states (sensor_msgs/JointState), when asked for imu/temperature (sensor_msgs/Temperature),
-imu/truth (sensor_msgs/Imu) and /clock, ~/truth (std_msgs/String, the true parameters, latched), /diagnostics.
+in: joint_trajectory (trajectory_msgs/JointTrajectory, as joint_trajectory_controller takes it;
+without points the table stops). out: imu/data_raw (sensor_msgs/Imu), joint_states
+(sensor_msgs/JointState), when asked for imu/temperature (sensor_msgs/Temperature), imu/truth
+(sensor_msgs/Imu) and /clock, ~/truth (std_msgs/String, the true parameters, latched), /diagnostics.
 """
 
 import queue
@@ -40,8 +41,10 @@ from msg_adapters.layout import Packed
 from msg_adapters.write import encode_imu, encode_joints, encode_temperature
 
 STRETCH_SECONDS = 0.1
-"""Seconds of simulated time that are computed together, times the time factor; as playback makes some such stretches ahead, a
-trajectory is effective about half a second later."""
+"""
+Seconds of simulated time that are computed together, times the time factor; as playback makes some
+such stretches ahead, a trajectory is effective about half a second later.
+"""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,8 @@ class SimulatorSettings:
     table_file: str = setting(
         '',
         '',
-        'table description, path; empty: the installed config/table_simulated.yaml, or none with urdf_file',
+        'table description, path; empty: the installed config/table_simulated.yaml, or none with'
+        ' urdf_file',
         symptom='joint names differ from the expected ones',
         session=True,
         path=True,
@@ -59,8 +63,8 @@ class SimulatorSettings:
     profile: str = setting(
         'quick',
         '',
-        "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until "
-        'a trajectory is received on joint_trajectory',
+        "motion of the table, a name that 'imu_calibration simulate --help' lists; none: rest until"
+        ' a trajectory is received on joint_trajectory',
         symptom='the node refuses and lists the names',
         session=True,
     )

@@ -57,8 +57,8 @@ def make_separator(
     options : CalibrationOptions
         Its tolerances and catalogue.
     sizes : mapping, optional
-        Parameter -> value, SI, of the alternatives as estimated in the diagnosis in place of the first; without an estimate, as
-        large as they must be to pass for it on a usual session.
+        Parameter -> value, SI, of the alternatives as estimated in the diagnosis in place of the
+        first; without an estimate, as large as they must be to pass for it on a usual session.
     limits : MotionLimits, optional
         Default: the limits of the table.
 
@@ -71,7 +71,8 @@ def make_separator(
     first, *mates = causes
     if first not in calibration.model.slices:
         raise InputError(
-            f"the calibration must contain '{first[1]}', which is to be separated; give that of the diagnosis",
+            f"the calibration must contain '{first[1]}', which is to be separated; give that of the"
+            ' diagnosis',
             key='calibration',
         )
     model = calibration.model
@@ -82,8 +83,8 @@ def make_separator(
         effect = model.catalogue.find(*key, model.joint_names)
         if special(effect) or effect.smooth or 'temperature' in effect.needs:
             raise InputError(
-                f"effects that motion separates must depend on it, '{key[1]}' depends on time, temperature or range; "
-                'omit it'
+                f"effects that motion separates must depend on it, '{key[1]}' depends on time,"
+                ' temperature or range; omit it'
             )
     values = model.start_from(calibration.model, calibration.values)
     coordinates = Coordinates(model, tolerances_of(model, options.tolerances), values)
@@ -109,10 +110,12 @@ def suspected(
     sizes: Mapping[str, float],
 ) -> list[Cause]:
     """
-    Return the causes with their sizes: the first as estimated, the mates with the size that imitates it.
+    Return the causes with their sizes.
 
-    If `sizes` lacks a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra] theta_a``, M the
-    information of a usual session, r the baseline.
+    The first as estimated, the mates with the size that imitates it.
+
+    If `sizes` lacks a mate, ``theta_b = [M_bb - M_br M_rr^-1 M_rb]^-1 [M_ba - M_br M_rr^-1 M_ra]
+    theta_a``, M the information of a usual session, r the baseline.
     """
     coordinates = problem.coordinates
     found = []
@@ -134,7 +137,9 @@ def suspected(
 
 
 def _imitating(problem, causes, unknown, table):
-    """Return the sizes that causes must have to pass for the first one on a usual session, by key."""
+    """
+    Return the sizes that causes must have to pass for the first one on a usual session, by key.
+    """
     windows = problem.predictor.predict([make_profile(SESSION, 0, table).segments])[0]
     times = np.array([window.middle for window in windows])
     information = problem.coordinates.prior_information + exact_information(
@@ -175,7 +180,10 @@ IN_VAIN = 'motions no longer reduce the standard deviations as planned: the limi
 STALL_MOTIONS = 6
 """Motions after which the standard deviations must have decreased."""
 MAX_REMAINING_SHARE = 0.93
-"""Largest share of the logarithms of excess over tolerance that may remain after them; otherwise further motions do not pay."""
+"""
+Largest share of the logarithms of excess over tolerance that may remain after them; otherwise
+further motions do not pay.
+"""
 
 
 @dataclass(frozen=True)
@@ -193,8 +201,8 @@ class CampaignSettings:
     separations: int = setting(
         2,
         '1',
-        'largest number of extra motions that separate collinear causes of the diagnosis; 0: none, and '
-        'no diagnosis at the end',
+        'largest number of extra motions that separate collinear causes of the diagnosis; 0: none,'
+        ' and no diagnosis at the end',
         (0, 20),
         'too small: a finding remains collinear with other effects',
         live=True,
@@ -222,11 +230,13 @@ class Campaign:
     planner : Planner
     settings : CampaignSettings
     make_separator : callable, optional
-        Returns a planner of motions that separate a Suspect from its mates, or raises an ImuCalibrationError if none exists.
+        Returns a planner of motions that separate a Suspect from its mates, or raises an
+        ImuCalibrationError if none exists.
     first : callable, optional
         Returns the first motion from a position, None for none.
     unwind : callable, optional
-        Returns the motion that turns wound joints back from a position, None if none is needed; driven before the campaign ends.
+        Returns the motion that turns wound joints back from a position, None if none is needed;
+        driven before the campaign ends.
 
     """
 
@@ -257,7 +267,9 @@ class Campaign:
 
     @property
     def worst(self) -> tuple[str, float]:
-        """The parameter furthest outside its tolerance, and its standard deviation over tolerance."""
+        """
+        The parameter furthest outside its tolerance, and its standard deviation over tolerance.
+        """
         excess = self.planner.excess
         return max(excess.items(), key=lambda item: item[1]) if excess else ('', 0.0)
 
@@ -269,7 +281,11 @@ class Campaign:
         )
 
     def take_findings(self, findings: list[Suspect] | None) -> str:
-        """Store the findings of a diagnosis, None if it failed; return the resulting action as text, '' for none."""
+        """
+        Store the findings of a diagnosis, None if it failed.
+
+        Return the resulting action as text, '' for none.
+        """
         self._is_asked = True
         self.findings = self.findings if findings is None else findings
         for finding in findings or []:
@@ -278,7 +294,10 @@ class Campaign:
                 and self.separations < self.settings.separations
                 and self._make_separator is not None
             ):
-                what = f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion so far'
+                what = (
+                    f'{finding.effect} is collinear with {", ".join(finding.mates)} in the motion'
+                    ' so far'
+                )
                 try:
                     self._separator = self._make_separator(finding)
                 except ImuCalibrationError as error:
@@ -376,7 +395,9 @@ class Campaign:
 
 
 LONGEST_SEPARATION = 180.0
-"""Longest plan that separates causes, s; causes that need more count as one cause for this table."""
+"""
+Longest plan that separates causes, s; causes that need more count as one cause for this table.
+"""
 
 
 def separator_of(
@@ -434,7 +455,9 @@ def separator_of(
 def with_suspect(
     calibration: Calibration, cause: tuple[str, str], sizes: dict[str, float]
 ) -> Calibration:
-    """Return the calibration with an effect at its estimated size; the other parameters do not change."""
+    """
+    Return the calibration with an effect at its estimated size; the other parameters do not change.
+    """
     if cause in calibration.model.slices:
         return calibration
     model = calibration.model.with_effect(*cause)

@@ -1,4 +1,8 @@
-"""Parameters in units of their tolerances, and goals of a plan as a number: every tolerance met, or causes separated."""
+"""
+Parameters in units of their tolerances, and goals of a plan as a number.
+
+Every tolerance met, or causes separated.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +45,8 @@ class Coordinates:
         start = model.start() if values is None else np.asarray(values, float)
         self.values = np.where(np.isfinite(start), start, 0.0)
         self.model, self.tolerances = model.at(self.values), np.asarray(tolerances, float)
-        # At a fixed point the derivative of a lag needs no columns for each arm: a third of the columns of an arm with seven joints.
+        # At a fixed point the derivative of a lag needs no columns for each arm: a third of the
+        # columns of an arm with seven joints.
         self.folded = replace(self.model, folded_arms=all_arms(self.model, self.values))
         prior = make_prior(model)
         self.prior_sd = prior.sd
@@ -53,7 +58,11 @@ class Coordinates:
         """Of z, shape (n, n)."""
 
     def excess(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the standard deviations of the requested parameters, in tolerances, shape (p,); leading axes are kept."""
+        """
+        Return the standard deviations of the requested parameters, in tolerances, shape (p,).
+
+        Leading axes are kept.
+        """
         variance = np.einsum('pn,...nm,pm->...p', self.asked, covariance, self.asked, optimize=True)
         return np.sqrt(np.maximum(variance, 1e-300))
 
@@ -111,7 +120,8 @@ class Coordinates:
         scaled = covariance[np.ix_(theirs, theirs)] / np.outer(self.units[own], self.units[own])
         basis = self.basis[own]
         values, vectors = scipy.linalg.eigh((scaled + scaled.T) / 2)
-        # Directions that the gauge fixes have no variance and no component in the basis; KNOWN_SHARE is as good as certain.
+        # Directions that the gauge fixes have no variance and no component in the basis;
+        # KNOWN_SHARE is as good as certain.
         rows = (vectors.T @ basis) / np.sqrt(
             np.maximum(values, max(1e-13 * values.max(), KNOWN_SHARE**2))
         )[:, None]
@@ -121,7 +131,11 @@ class Coordinates:
 
 
 def _basis(gauge):
-    """Return orthonormal directions that a gauge leaves free; unaffected parameters are separate coordinates."""
+    """
+    Return orthonormal directions that a gauge leaves free.
+
+    Unaffected parameters are separate coordinates.
+    """
     concerned = np.any(gauge != 0, axis=0)
     inner = (
         scipy.linalg.null_space(gauge[:, concerned] / np.abs(gauge).max())
@@ -140,7 +154,11 @@ SEPARATION_PROBABILITY = 0.95
 
 
 class WithinTolerances:
-    """Every requested parameter within its tolerance: ``sum_i w_i max(0, ln(sd_i / tolerance_i))``, all weights 1 unless given."""
+    """
+    Every requested parameter within its tolerance.
+
+    ``sum_i w_i max(0, ln(sd_i / tolerance_i))``, all weights 1 unless given.
+    """
 
     words = ''
 
@@ -177,10 +195,13 @@ class Cause:
 
 class ToldApart:
     """
-    Each cause of a class with its assumed size, with another member of the class in the model instead.
+    Each cause of a class with its assumed size.
 
-    The noncentrality of cause a with cause b is ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra] theta_a`` with r the baseline and b
-    (Atkinson and Fedorov 1975); other members of the class are omitted. A pair is separated when both noncentralities suffice.
+    With another member of the class in the model instead.
+
+    The noncentrality of cause a with cause b is ``lambda = theta_a' [M_aa - M_ar M_rr^-1 M_ra]
+    theta_a`` with r the baseline and b (Atkinson and Fedorov 1975); other members of the class are
+    omitted. A pair is separated when both noncentralities suffice.
 
     Parameters
     ----------
@@ -198,7 +219,10 @@ class ToldApart:
         self.words = ' and '.join(cause.key[1] for cause in causes)
         self.enough = {cause.key: enough(len(cause.places), questions) for cause in self.causes}
         self.reachable = np.ones(len(self.pairs), bool)
-        """Pairs that some motion separates: no time is planned for the remaining pairs, which are reported."""
+        """
+        Pairs that some motion separates: no time is planned for the remaining pairs, which are
+        reported.
+        """
 
     def noncentrality(self, covariance: np.ndarray) -> np.ndarray:
         """Return lambda of each pair in units of the sufficient value, shape (k, n_pairs)."""
@@ -220,14 +244,22 @@ class ToldApart:
         return np.maximum(found, 1e-12)
 
     def left(self, covariance: np.ndarray, margin: float = 1.0) -> np.ndarray:
-        """Return half the sum of the logarithms of the shortfall of separable pairs, the worst weighted three times."""
+        """
+        Return half the sum of the logarithms of the shortfall of separable pairs.
+
+        The worst is weighted three times.
+        """
         lacking = np.maximum(
             -0.5 * np.log(self.noncentrality(covariance)[:, self.reachable] / margin**2), 0.0
         )
         return lacking.sum(axis=1) + 2.0 * lacking.max(axis=1, initial=0.0)
 
     def leave_out_of_reach(self, covariance: np.ndarray) -> None:
-        """Drop pairs, in either order, that this covariance, (n, n), a lower bound of all plans, does not separate."""
+        """
+        Drop pairs, in either order, that this covariance, (n, n), does not separate.
+
+        The covariance is a lower bound of all plans.
+        """
         enough_left = self.noncentrality(covariance[None])[0] >= 1.0
         apart = {
             (a.key, b.key)
@@ -256,10 +288,14 @@ Goal = WithinTolerances | ToldApart
 
 def enough(size: int, questions: int) -> float:
     """
-    Return the noncentrality that identifies and prefers an effect of this number of parameters with SEPARATION_PROBABILITY.
+    Return the noncentrality that identifies and prefers an effect.
 
-    Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two models of which one is right the
-    logarithm of the likelihood ratio is normal with mean ``lambda / 2`` and variance ``lambda``; it must exceed the search's TIE.
+    The effect has this number of parameters and is identified and preferred with
+    SEPARATION_PROBABILITY.
+
+    Named: its chi-square beyond the search's threshold for so many questions. Preferred: of two
+    models of which one is right the logarithm of the likelihood ratio is normal with mean ``lambda
+    / 2`` and variance ``lambda``; it must exceed the search's TIE.
     """
     from scipy.stats import ncx2  # here, because its import is slow
 

@@ -1,4 +1,8 @@
-"""The driver: one motion after another, monitored by the measured joint states; each fault stops all joints with one sentence."""
+"""
+The driver: one motion after another, monitored by the measured joint states.
+
+Each fault stops all joints with one sentence.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,10 @@ from imu_calibration.planning.path_watch import PathWatch
 from imu_calibration.simulation.table_controller import LIMIT_ROUNDING, excess, trajectory_from
 
 OVERSPEED = 1.25
-"""Measured speed in units of the limit from which the joints are stopped; rates from encoders are noisy."""
+"""
+Measured speed in units of the limit from which the joints are stopped; rates from encoders are
+noisy.
+"""
 MAX_REST_MOVEMENT = 0.1
 """Tolerances by which joints that rest may move: encoders are noisy, arms sag."""
 
@@ -57,9 +64,9 @@ class DriverSettings:
     stall_patience: float = setting(
         3.0,
         's',
-        'joints without progress for this time, by their clock and by ours, have stalled, or '
-        'the trajectory was refused; after a stop in mid-motion the next one waits for so long, since the '
-        'stop may be as late',
+        'joints without progress for this time, by their clock and by ours, have stalled, or the'
+        ' trajectory was refused; after a stop in mid-motion the next one waits for so long, since'
+        ' the stop may be as late',
         (0.2, 60.0),
         'too small: a controller that is slow to begin is called refusing',
         live=True,
@@ -102,8 +109,8 @@ class DriverSettings:
     first_speed: float = setting(
         0.3,
         '1',
-        'share of its speed at which motions after a start are made, up to the first one that is larger '
-        'than first_reach',
+        'share of its speed at which motions after a start are made, up to the first one that is'
+        ' larger than first_reach',
         (0.01, 1.0),
         'too large: a wrong table is noticed at full speed',
         live=True,
@@ -179,8 +186,8 @@ class Driver:
         """
         Whether a stopped motion may still begin, or continue after a rest.
 
-        A controller may need `stall_patience` to execute a command, by its clock and by ours: a rest before that
-        is no evidence.
+        A controller may need `stall_patience` to execute a command, by its clock and by ours: a
+        rest before that is no evidence.
         """
         if self._stopped is None:
             return False
@@ -194,13 +201,17 @@ class Driver:
         return now - self._heard > self.settings.silence
 
     def stamp_fault(self, now: float) -> str:
-        """Return a line if joint states arrive but their stamps have not changed for `silence`, '' otherwise."""
+        """
+        Return a line if joint states arrive with unchanged stamps, '' otherwise.
+
+        The stamps have not changed for `silence`.
+        """
         constant = self._heard - self._advanced
         if self.is_silent(now) or not constant > self.settings.silence:
             return ''
         return (
-            f'the stamps of the joint states must advance, they have not for {constant:.1f} s while messages arrive: stopped; correct '
-            'the clock of their publisher'
+            f'the stamps of the joint states must advance, they have not for {constant:.1f} s while'
+            ' messages arrive: stopped; correct the clock of their publisher'
         )
 
     def start(self) -> None:
@@ -224,8 +235,8 @@ class Driver:
         """
         if self.state not in (DriveState.IDLE, DriveState.MEASURING):
             raise InputError(
-                f'a motion may begin if the joints rest and no fault is present, the state is {self.state}: {self.reason}; '
-                'start anew',
+                'a motion may begin if the joints rest and no fault is present, the state is'
+                f' {self.state}: {self.reason}; start anew',
                 code='wrong_state',
             )
         if self.position is None or self.is_silent(now):
@@ -235,7 +246,8 @@ class Driver:
             )
         if not self.rests:
             raise InputError(
-                'the joints must rest before a motion begins, they have just moved; start again when they rest',
+                'the joints must rest before a motion begins, they have just moved; start again'
+                ' when they rest',
                 code='joints_moving',
             )
         points = points.ordered(self.joint_names).slowed(
@@ -267,9 +279,9 @@ class Driver:
             or points.acceleration is None
         ):
             raise InputError(
-                'a motion must have accelerations and stay within the limits of the joints, it leaves the range by '
-                f'{max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of the speed and {acceleration:.3f} of the '
-                'acceleration; it is not sent',
+                'a motion must have accelerations and stay within the limits of the joints, it'
+                f' leaves the range by {max(beyond, 0.0):.3g} rad or m and reaches {speed:.3f} of'
+                f' the speed and {acceleration:.3f} of the acceleration; it is not sent',
                 code='joint_limits',
             )
 
@@ -277,7 +289,8 @@ class Driver:
         """
         Process one joint state; return whether all joints must stop.
 
-        A position that is not finite makes the message count as ignored, a rate that is not finite as missing.
+        A position that is not finite makes the message count as ignored, a rate that is not finite
+        as missing.
 
         Parameters
         ----------
@@ -329,18 +342,26 @@ class Driver:
         """Check the time limits; return whether all joints must stop."""
         if self.is_driving and self.is_silent(now):
             return self.stop(
-                f'no usable joint state for {now - self._heard:.1f} s: stopped; see that joint states are published'
-                + self.ignored_words()
+                f'no usable joint state for {now - self._heard:.1f} s: stopped; see that joint'
+                ' states are published' + self.ignored_words()
             )
         return False
 
     def ignored_words(self) -> str:
-        """Return the joints whose positions were not finite and the number of ignored joint states, in brackets; '' for none."""
+        """
+        Return the joints without finite positions and the number of ignored states.
+
+        The number is that of ignored joint states, in brackets. The result is '' for none.
+        """
         counts = ', '.join(f'{name} {count}' for name, count in self.ignored.items())
         return f' (ignored because a position was not finite: {counts})' if counts else ''
 
     def refused(self, why: str) -> bool:
-        """Record that the controller rejected or aborted the goal; return whether all joints must stop."""
+        """
+        Record that the controller rejected or aborted the goal.
+
+        Return whether all joints must stop.
+        """
         return self.is_driving and self.stop(f'the controller does not follow: {why}')
 
     def stop(self, why: str) -> bool:
@@ -372,13 +393,17 @@ class Driver:
         )
         if np.max(over) > 0:
             joint = int(np.argmax(over))
-            return f'joint {self._place_of(joint, position)} is beyond its range: stopped; see the limits in the description of the joints'
+            return (
+                f'joint {self._place_of(joint, position)} is beyond its range: stopped; see the'
+                ' limits in the description of the joints'
+            )
         fast = np.where(np.isfinite(rate), np.abs(rate), 0.0) / self.limits.speed
         if np.max(fast) > OVERSPEED:
             joint = int(np.argmax(fast))
             return (
-                f'joint {self.joint_names[joint]} turns at {fast[joint]:.2f} times its largest speed: stopped; '
-                'see the limits in the description of the joints and in the controller'
+                f'joint {self.joint_names[joint]} turns at {fast[joint]:.2f} times its largest'
+                ' speed: stopped; see the limits in the description of the joints and in the'
+                ' controller'
             )
         return ''
 
@@ -388,20 +413,20 @@ class Driver:
         if watch.has_strayed:
             joint = watch.suspect()
             return (
-                f'joint {self._place_of(joint, self.position)} does not follow: the joints are '
-                f'{self._amount(joint, watch.deviation.max() * watch.tolerance[joint])} from their path: stopped; '
-                'see whether something holds it'
+                f'joint {self._place_of(joint, self.position)} does not follow: the joints are'
+                f' {self._amount(joint, watch.deviation.max() * watch.tolerance[joint])} from their'
+                ' path: stopped; see whether something holds it'
             )
         if watch.has_stalled_for <= self.settings.stall_patience:
             return ''
         if not watch.has_begun:
             return (
-                f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the controller refused it or does not '
-                'listen, see its log'
+                f'nothing moved for {watch.waited:.1f} s after a trajectory was sent: stopped; the'
+                ' controller refused it or does not listen, see its log'
             )
         return (
-            f'joint {self.joint_names[watch.suspect()]} has made no progress for {watch.waited:.1f} s: stopped; '
-            'see whether something holds it'
+            f'joint {self.joint_names[watch.suspect()]} has made no progress for {watch.waited:.1f}'
+            ' s: stopped; see whether something holds it'
         )
 
     def _note_rest(self):
@@ -420,7 +445,8 @@ class Driver:
             self._become(DriveState.MEASURING, self.reason)
         elif self._time - self._settling_since > self.settings.settling_patience:
             return self.stop(
-                f'the joints do not rest within {self.settings.settling_patience:g} s: stopped; find the cause of the motion'
+                f'the joints do not rest within {self.settings.settling_patience:g} s: stopped;'
+                ' find the cause of the motion'
             )
         return False
 

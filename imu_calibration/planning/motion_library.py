@@ -19,7 +19,9 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile, Segment
 
 TRAJECTORY_STEP_SECONDS = 0.05
-"""Time between the points of a trajectory, s: quintics between them follow the motion to a micrometre."""
+"""
+Time between the points of a trajectory, s: quintics between them follow the motion to a micrometre.
+"""
 
 
 class MotionKind(StrEnum):
@@ -48,7 +50,10 @@ class PlannedMotion:
     joint_names: tuple[str, ...]
     """Joints in the order of the columns."""
     place: np.ndarray
-    """Start and end, rad or m, shape (n_joints,); after whole turns an endless joint counts as returned."""
+    """
+    Start and end, rad or m, shape (n_joints,); after whole turns an endless joint counts as
+    returned.
+    """
     segments: tuple[Segment, ...]
     """Segments of the motion."""
     text: str
@@ -62,7 +67,9 @@ class PlannedMotion:
         return float(sum(segment.duration for segment in self.segments))
 
     def travel(self, position: np.ndarray) -> tuple[Segment, ...]:
-        """Return the way from where the joints are to the place of the motion: one move, or none."""
+        """
+        Return the way from where the joints are to the place of the motion: one move, or none.
+        """
         return (
             MotionBuilder(len(self.place), limits=self.limits, start=position)
             .move_to(self.place)
@@ -70,7 +77,9 @@ class PlannedMotion:
         )
 
     def from_position(self, position: np.ndarray) -> tuple[Segment, ...]:
-        """Return all segments from the present position, with whole turns of endless joints unchanged."""
+        """
+        Return all segments from the present position, with whole turns of endless joints unchanged.
+        """
         way = self.travel(position)
         shift = (way[-1].end if way else np.asarray(position, float)) - self.place
         return way + tuple(
@@ -82,7 +91,11 @@ class PlannedMotion:
         return self.seconds + sum(segment.duration for segment in self.travel(position))
 
     def points(self, position: np.ndarray) -> TrajectoryPoints:
-        """Return the trajectory from where the joints rest: positions, velocities and accelerations, at rest at the end."""
+        """
+        Return the trajectory from where the joints rest.
+
+        Positions, velocities and accelerations, at rest at the end.
+        """
         return trajectory(self.joint_names, self.from_position(position))
 
     @property
@@ -103,7 +116,9 @@ class PlannedMotion:
 
 
 def trajectory(joint_names: tuple[str, ...], segments: tuple[Segment, ...]) -> TrajectoryPoints:
-    """Return the points of consecutive segments, one at each transition; no points without motion."""
+    """
+    Return the points of consecutive segments, one at each transition; no points without motion.
+    """
     if not segments:
         return TrajectoryPoints.stop(joint_names)
     edges = np.concatenate([[0.0], np.cumsum([segment.duration for segment in segments])])
@@ -134,17 +149,29 @@ def place_words(names: tuple[str, ...], place: np.ndarray, limits: MotionLimits)
 
 
 N_TRIED = 512
-"""Number of positions from which places are chosen: a power of two, as the Sobol sequence requires."""
+"""
+Number of positions from which places are chosen: a power of two, as the Sobol sequence requires.
+"""
 POSITION_GRID = np.pi / 4
-"""On a table with few joints the positions are multiples of this, so that they include faces, edges and corners."""
+"""
+On a table with few joints the positions are multiples of this, so that they include faces, edges
+and corners.
+"""
 ENDLESS_END = 1e9
 """Finite stand-in for the ends of endless joints, rad."""
 HEADING = 0.4
-"""Weight of the horizontal axes relative to the vertical in comparisons of attitudes: headings show the tilt only."""
+"""
+Weight of the horizontal axes relative to the vertical in comparisons of attitudes: headings show
+the tilt only.
+"""
 
 
 def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends within which places are chosen: of joints that turn, at most one turn about the middle of the range."""
+    """
+    Return the ends within which places are chosen.
+
+    Of joints that turn, at most one turn about the middle of the range.
+    """
     wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
     middle = 0.5 * (
         np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END)
@@ -155,7 +182,11 @@ def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
 
 
 def up_at(table: Table, position: np.ndarray) -> np.ndarray:
-    """Return which direction of the sensor frame points up where the joints rest at a position, unit vector, shape (3,)."""
+    """
+    Return which direction of the sensor frame points up at a position.
+
+    The joints rest at the position. The direction is a unit vector, shape (3,).
+    """
     return reference_motion(table, rest_at(np.asarray(position, float)[None])).mat_sn[0] @ np.array(
         [0.0, 0.0, 1.0]
     )
@@ -171,10 +202,12 @@ def candidates(limits: MotionLimits) -> np.ndarray:
     parts = [home[None], spread]
     if len(limits) <= 3:
         steps = [
-            np.arange(np.ceil(a / POSITION_GRID - 1e-9), np.floor(b / POSITION_GRID + 1e-9) + 1)
-            * POSITION_GRID
-            if turning
-            else np.linspace(a, b, 3)
+            (
+                np.arange(np.ceil(a / POSITION_GRID - 1e-9), np.floor(b / POSITION_GRID + 1e-9) + 1)
+                * POSITION_GRID
+                if turning
+                else np.linspace(a, b, 3)
+            )
             for a, b, turning in zip(lower, upper, limits.turns, strict=True)
         ]
         grid = np.stack(np.meshgrid(*steps, indexing='ij'), axis=-1).reshape(-1, len(limits))
@@ -184,10 +217,13 @@ def candidates(limits: MotionLimits) -> np.ndarray:
 
 def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
     """
-    Return positions whose attitudes have the largest distances, the first at home, shape (n, n_joints).
+    Return positions whose attitudes have the largest distances, the first at home.
 
-    Each next position has the attitude furthest from those of the chosen positions; of equally distant attitudes the position nearest to
-    zero is chosen, by the order of `candidates`. Fewer positions are returned where the remaining attitudes are close to chosen ones.
+    Shape (n, n_joints).
+
+    Each next position has the attitude furthest from those of the chosen positions; of equally
+    distant attitudes the position nearest to zero is chosen, by the order of `candidates`. Fewer
+    positions are returned where the remaining attitudes are close to chosen ones.
     """
     tried = candidates(limits)
     mats = reference_motion(table, rest_at(tried)).mat_sn
@@ -203,7 +239,10 @@ def choose_places(table: Table, limits: MotionLimits) -> np.ndarray:
 
 
 LIMIT_SHARE = 0.98
-"""Share of speeds and accelerations that is used, so that splines between the points of a trajectory keep the limits too."""
+"""
+Share of speeds and accelerations that is used, so that splines between the points of a trajectory
+keep the limits too.
+"""
 DWELLS = (1.8, 2.5, 4.0, 6.5, 10.0, 16.0)
 """Durations of a rest, s: half a second to settle, and at least one second of window."""
 SPIN_TIME = (2.0, 7.0)
@@ -217,7 +256,10 @@ SPEEDS = (1.0, 0.5)
 MAX_SWING = {True: 120.0 * DEG, False: 0.3}
 """Amplitude of a swing of a joint that turns, rad, or slides, m, at most."""
 REST_PLACES, SPIN_PLACES, SWING_PLACES, TOGETHER_PLACES = 20, 4, 3, 2
-"""Places for rests; for spins and for swings of each joint, and for each set of joints, of a chain with at most three joints."""
+"""
+Places for rests; for spins and for swings of each joint, and for each set of joints, of a chain
+with at most three joints.
+"""
 
 
 class MotionLibrary:
@@ -324,7 +366,11 @@ class MotionLibrary:
                         yield MotionKind.TOGETHER, *self._whole_turns(place, rates, 4.0)
 
     def _subset(self, count: int, first: int) -> np.ndarray:
-        """Return a subset of the positions, different for each motion; fewer for a long chain, because moves grow with their square."""
+        """
+        Return a subset of the positions, different for each motion.
+
+        Fewer for a long chain, because moves grow with their square.
+        """
         count = max(1, min(count, 3 * count // len(self.names)))
         some = (np.arange(count) * max(len(self.spread) // count, 1) + first) % len(self.spread)
         return self.spread[np.unique(some)]
@@ -347,7 +393,11 @@ class MotionLibrary:
         )
 
     def _sweep(self, place, rates):
-        """Turn a limited joint at a constant rate through its range and back; None if that is too short for a window."""
+        """
+        Turn a limited joint at a constant rate through its range and back.
+
+        None if that is too short for a window.
+        """
         joint = int(np.argmax(np.abs(rates)))
         lower, upper = self.limits.lower[joint], self.limits.upper[joint]
         start = place.copy()
@@ -360,7 +410,10 @@ class MotionLibrary:
                 return (
                     start,
                     segments,
-                    f'sweep {self._rate_words(share * rates)} for {min(held, SPIN_TIME[1]):.1f} s and back',
+                    (
+                        f'sweep {self._rate_words(share * rates)} for {min(held, SPIN_TIME[1]):.1f}'
+                        ' s and back'
+                    ),
                 )
         return None
 
@@ -399,9 +452,11 @@ class MotionLibrary:
         )  # the largest values are between the instants of `motion`
         middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))
         far = ', '.join(
-            f'{name} by {value:.0f}° at {hertz:.2g} Hz'
-            if turning
-            else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'
+            (
+                f'{name} by {value:.0f}° at {hertz:.2g} Hz'
+                if turning
+                else f'{name} by {1000 * size:.0f} mm at {hertz:.2g} Hz'
+            )
             for name, size, value, hertz, turning, on in zip(
                 self.names,
                 amplitude,
@@ -432,7 +487,11 @@ SPEED, ACCELERATION = 60.0 * DEG, 90.0 * DEG
 
 
 def yaw_table(gravity: float | None = None) -> Table:
-    """Return the table: one vertical joint without end, whose angle is known from odometry or marks on the floor."""
+    """
+    Return the table.
+
+    One vertical joint without end, whose angle is known from odometry or marks on the floor.
+    """
     joint = Joint(
         'yaw', (0.0, 0.0, 1.0), limits=JointLimits(None, None, SPEED, ACCELERATION, endless=True)
     )

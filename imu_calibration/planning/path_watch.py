@@ -15,8 +15,10 @@ PATH_STEP_SECONDS = 0.01
 MAX_LEAD_SECONDS = 0.1
 """Largest progress in excess of the elapsed time between two joint states, s: stamps jitter."""
 DEAD_BAND = 0.5
-"""Places of the path as near as this, in tolerances, fit alike: turning points of swings look the same
-from both sides, and arms sag."""
+"""
+Places of the path as near as this, in tolerances, fit alike: turning points of swings look the same
+from both sides, and arms sag.
+"""
 MIN_PACE = 0.05
 """Least share of its speed at which a path is thought to be followed."""
 MIN_BEGUN_MOVEMENT = 0.4
@@ -28,15 +30,19 @@ MAX_REST_RATE = 0.05
 
 
 LATENESS_TIE = 1e-3
-"""Of joints that are equally late, the one that has moved least is named; after a motion there and back all may be where they began."""
+"""
+Of joints that are equally late, the one that has moved least is named; after a motion there and
+back all may be where they began.
+"""
 
 
 class PathWatch:
     """
     Follows joints along a trajectory.
 
-    The clock does not determine the position: a controller may lag, and scale its speed. The progress is the point where on the path
-    they are, never backwards and never faster than the clock; while the path rests, the clock counts.
+    The clock does not determine the position: a controller may lag, and scale its speed. The
+    progress is the point where on the path they are, never backwards and never faster than the
+    clock; while the path rests, the clock counts.
 
     Parameters
     ----------
@@ -54,7 +60,8 @@ class PathWatch:
         self._time = np.linspace(0.0, points.duration, count + 1)
         motion = path.at(self._time)
         self._path, self.tolerance = motion.position / tolerance, np.asarray(tolerance, float)
-        # The rate of the spline may vanish where an oscillation reverses: rest means no motion over several steps.
+        # The rate of the spline may vanish where an oscillation reverses: rest means no motion over
+        # several steps.
         moved = np.max(np.abs(np.diff(self._path, axis=0, prepend=self._path[:1])), axis=1)
         self._rests = moved < MAX_REST_RATE * PATH_STEP_SECONDS
         edge = np.append(np.flatnonzero(~self._rests), len(self._time) - 1)
@@ -90,9 +97,12 @@ class PathWatch:
     @property
     def has_stalled_for(self) -> float:
         """
-        Seconds without progress of the joints, by their clock and by ours, scaled to the speed of the path.
+        Seconds without progress of the joints.
 
-        A simulated clock that runs faster than ours gives the controller less time than its stamps show.
+        By their clock and by ours, scaled to the speed of the path.
+
+        A simulated clock that runs faster than ours gives the controller less time than its stamps
+        show.
         """
         return min(self.waited, self._now - self._further) * self.pace
 
@@ -144,11 +154,17 @@ class PathWatch:
         return bool(np.max(self.deviation) > 1.0)
 
     def suspect(self) -> int:
-        """Return the joint with the smallest share of the commanded motion: before this point after a deviation, after it in a stall."""
+        """
+        Return the joint with the smallest share of the commanded motion.
+
+        Before this point after a deviation, after it in a stall.
+        """
         near, place = int(STALLED_SECONDS * self.pace / PATH_STEP_SECONDS) + 1, self._recent[-1][1]
         if self.has_strayed:
             wanted = np.ptp(self._path[max(self._at - near, 0) : self._at + 1], axis=0)
-        else:  # distance to the following path: of joints with equal motion, a joint that has arrived is not the cause
+        # Distance to the following path: of joints with equal motion, a joint that has arrived is
+        # not the cause
+        else:
             wanted = np.max(np.abs(self._path[self._at : self._at + near + 1] - place), axis=0)
         moved = np.ptp(np.array([place for _, place in self._recent]), axis=0)
         return int(np.argmax(wanted - moved - LATENESS_TIE * self._most))

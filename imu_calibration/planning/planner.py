@@ -32,9 +32,15 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Segment
 MAX_PLAN_MOTIONS = 400
 """Motions of a plan at most."""
 FURTHER = 1.02
-"""Factor on the standard deviations of the search, applied when they meet the goal and the exact covariance does not."""
+"""
+Factor on the standard deviations of the search, applied when they meet the goal and the exact
+covariance does not.
+"""
 MIN_PLAN_GAIN = 2e-3
-"""Least reduction of the distance to the goal by a motion; near the goal the least share of the distance."""
+"""
+Least reduction of the distance to the goal by a motion; near the goal the least share of the
+distance.
+"""
 
 
 class CandidateMotions:
@@ -76,7 +82,9 @@ def greedy(
     problem: PlanningProblem, start: int, *, first: Sequence[int] = (), longest: float = np.inf
 ) -> list[int]:
     """
-    Return motions that reach the goal, or the smallest distance to it, each with the best gain per second at its step.
+    Return motions that reach the goal, or the smallest distance to it.
+
+    Each motion is the one with the best gain per second at its step.
 
     Parameters
     ----------
@@ -114,7 +122,8 @@ def greedy(
         if left == 0.0 and len(chosen) >= len(first):
             if remaining(problem, chosen, start) == 0.0:
                 break
-            # The belief has constant biases within a motion; if that was optimistic, the target must be lower.
+            # The belief has constant biases within a motion; if that was optimistic, the target
+            # must be lower.
             margin *= FURTHER
     return chosen
 
@@ -129,7 +138,11 @@ def remaining(problem: PlanningProblem, sequence: Sequence[int], start: int) -> 
 def exchanged(
     problem: PlanningProblem, sequence: Sequence[int], start: int, *, fixed: int = 0
 ) -> list[int]:
-    """Return a shorter plan that does as much: motions are left out, latest first and none of the first `fixed`."""
+    """
+    Return a shorter plan that does as much.
+
+    Motions are left out, latest first and none of the first `fixed`.
+    """
     best, goal = list(sequence), remaining(problem, sequence, start) + 1e-9
     for place in range(len(best) - 1, fixed - 1, -1):
         trial = best[:place] + best[place + 1 :]
@@ -141,7 +154,10 @@ def exchanged(
 GOAL_REACHED = 'all that was wanted is reached'
 STUCK = 'no motion within the limits reduces the remaining standard deviations'
 MAX_BOUND_RATIO, MIN_RELATIVE_WEIGHT = 1.1, 0.03
-"""A plan this many times longer than the bound is searched again, each parameter with at least this share of the largest weight."""
+"""
+A plan this many times longer than the bound is searched again, each parameter with at least this
+share of the largest weight.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,13 +191,19 @@ class Plan:
     wanted: np.ndarray
     """Whether each parameter is requested, shape (n_params,)."""
     history: np.ndarray
-    """Standard deviations in tolerances before the first motion and after each, of the requested parameters, shape (n_motions + 1, k)."""
+    """
+    Standard deviations in tolerances before the first motion and after each, of the requested
+    parameters, shape (n_motions + 1, k).
+    """
     missing: tuple[str, ...]
     """Parameters outside their tolerance at the end, or pairs of causes that remain collinear."""
     start: np.ndarray | None = None
     """Where the joints are at the beginning, shape (n_joints,); None: by hand."""
     lower_bound_seconds: float = float('nan')
-    """No plan made of these motions meets the tolerances in less, s; NaN where that was not worked out."""
+    """
+    No plan made of these motions meets the tolerances in less, s; NaN where that was not worked
+    out.
+    """
     told_apart: str = ''
     """The causes that the plan separates, if that is its goal."""
 
@@ -206,7 +228,9 @@ class Plan:
 
     @property
     def segments(self) -> tuple[tuple[Segment, ...], ...]:
-        """Segments of each motion, the way to it included, each going on where the last one ended."""
+        """
+        Segments of each motion, the way to it included, each going on where the last one ended.
+        """
         position, found = np.asarray(self.start), []
         for motion in self.motions:
             found.append(motion.from_position(position))
@@ -239,7 +263,11 @@ class Planner:
         self._first: list[int] | None = None if problem.known is None else []
 
     def take(self, calibration: Calibration) -> None:
-        """Replace the prediction by the covariance of a calibration, for the parameters that the model shares with it."""
+        """
+        Replace the prediction by the covariance of a calibration.
+
+        For the parameters that the model shares with it.
+        """
         names = {name: k for k, name in enumerate(calibration.param_names)}
         self.problem.known = self.problem.coordinates.information_from(
             names, calibration.covariance
@@ -255,7 +283,11 @@ class Planner:
         )
 
     def next_motion(self, position: np.ndarray) -> Decision:
-        """Return the motion with the largest gain per second from where the joints are, and count on it."""
+        """
+        Return the motion with the largest gain per second, and count on it.
+
+        The gain is from where the joints are.
+        """
         missing = self.problem.goal.missing(self._posterior.known)
         place = self.problem.place_near(position)
         if self._first is None:
@@ -276,7 +308,11 @@ class Planner:
         return Decision(motion, reason, motion.seconds_from(position))
 
     def probe(self, position: np.ndarray, reach: np.ndarray) -> PlannedMotion | None:
-        """Return a motion of every joint by at most `reach` (rad or m, shape (n_joints,)) to the wider side and back; None for zero."""
+        """
+        Return a motion of every joint to the wider side and back, None for zero.
+
+        Each joint moves by at most `reach` (rad or m, shape (n_joints,)).
+        """
         if not np.any(reach):
             return None
         library = self.problem.library
@@ -299,7 +335,11 @@ class Planner:
         )
 
     def unwinding(self, position: np.ndarray) -> PlannedMotion | None:
-        """Return the move that turns endless joints with restricted turns back to the middle of their range; None within half a turn."""
+        """
+        Return the move that turns endless joints back to the middle of their range.
+
+        The joints have restricted turns. The result is None within half a turn.
+        """
         library = self.problem.library
         limits, declared = library.limits, limits_of(library.table).endless
         middle = np.where(declared & ~limits.endless, 0.5 * (limits.lower + limits.upper), position)
@@ -403,7 +443,8 @@ def make_planner(
     ----------
     table : Table
     noise : mapping
-        Sensor -> NoiseModel of single samples at `rate`, see `noise_of_grade`; encoder steps are those of the table.
+        Sensor -> NoiseModel of single samples at `rate`, see `noise_of_grade`; encoder steps are
+        those of the table.
     tolerances : mapping, optional
         {section: {effect: tolerance}}, SI.
     rate : float
@@ -436,7 +477,9 @@ def plan_by_hand(
     model: HandModel, *, tolerances: np.ndarray, noise: Mapping[str, NoiseModel], rate: float
 ) -> Plan:
     """
-    Return the poses and turns that bring every parameter within its tolerance, each the best per second at its time.
+    Return the poses and turns that bring every parameter within its tolerance.
+
+    Each is the best per second at its time.
 
     Parameters
     ----------
@@ -482,7 +525,9 @@ PLAN_FORMAT = 'imu_calibration/plan/1'
 
 
 def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so."""
+    """
+    Return the content of plan.yaml: plain data in SI, except angles of joints in degrees, named so.
+    """
     begins = [0.0, *plan.ends.tolist()]
     of_joints = (
         {}
@@ -495,9 +540,9 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
     return {
         'format': PLAN_FORMAT,
         'seconds': round(plan.seconds, 3),
-        'lower_bound_seconds': None
-        if np.isnan(plan.lower_bound_seconds)
-        else round(plan.lower_bound_seconds, 3),
+        'lower_bound_seconds': (
+            None if np.isnan(plan.lower_bound_seconds) else round(plan.lower_bound_seconds, 3)
+        ),
         **of_joints,
         'motions': [
             {
@@ -525,7 +570,11 @@ def plan_to_mapping(plan: Plan, provenance: dict[str, Any]) -> dict[str, Any]:
 
 
 def trajectory_to_mapping(points: TrajectoryPoints) -> dict[str, Any]:
-    """Return a trajectory as the fields of trajectory_msgs/JointTrajectory, as ``ros2 topic pub`` reads them."""
+    """
+    Return a trajectory as the fields of trajectory_msgs/JointTrajectory.
+
+    As ``ros2 topic pub`` reads them.
+    """
     columns = {
         'positions': points.position,
         'velocities': points.rate,

@@ -1,4 +1,8 @@
-"""The inputs of a plan: the chain, the model in tolerances, the noise, and the information of every motion."""
+"""
+The inputs of a plan.
+
+The chain, the model in tolerances, the noise, and the information of every motion.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +37,10 @@ from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise
 FIRST_REST = 4.0
 """Seconds of the first rest at least, from which the noise of the IMU is estimated."""
 LEAST_RESTS = 6
-"""Rests with which a session begins: with the motions between them, 11 windows for the proof and for a diagnosis, which hold out some."""
+"""
+Rests with which a session begins: with the motions between them, 11 windows for the proof and for a
+diagnosis, which hold out some.
+"""
 PROBABILITY = 0.95
 """Probability that a calibration of the plan reports every parameter within its tolerance."""
 COMMON_SHARES = (0.5, 0.9)
@@ -97,9 +104,11 @@ class PlanningProblem:
         """(place, place) -> the move from one to the other."""
         places = self.library.places
         return {
-            (a, b): MotionBuilder(len(start), limits=self.library.limits, start=start)
-            .move_to(end)
-            .segments
+            (a, b): (
+                MotionBuilder(len(start), limits=self.library.limits, start=start)
+                .move_to(end)
+                .segments
+            )
             for a, start in enumerate(places)
             for b, end in enumerate(places)
         }
@@ -116,7 +125,11 @@ class PlanningProblem:
         return seconds.reshape((len(self.library.places),) * 2)
 
     def way_information(self, place: int) -> np.ndarray:
-        """Return the information about z and the biases in the move from a place to each motion, shape (k, m, m)."""
+        """
+        Return the information about z and the biases in the move from a place to each motion.
+
+        Shape (k, m, m).
+        """
         posterior, targets = self.posterior(), self.library.place_of
         found = np.array(
             [
@@ -136,13 +149,19 @@ class PlanningProblem:
         return Posterior(self.prior, self.noise)
 
     def place_near(self, position: np.ndarray) -> int:
-        """Return the number of the place nearest to a position, without whole turns of endless joints."""
+        """
+        Return the number of the place nearest to a position, without whole turns of endless joints.
+        """
         away = self.library.places - position
         turns = np.where(self.library.limits.endless, np.round(away / (2 * np.pi)), 0.0)
         return int(np.argmin(np.abs(away - 2 * np.pi * turns).sum(axis=1)))
 
     def first_rests(self, place: int) -> list[int]:
-        """Return the first rests of a session, in widely different attitudes, each place the nearest one; the first rest is longer."""
+        """
+        Return the first rests of a session, in widely different attitudes.
+
+        Each place is the nearest one, and the first rest is longer.
+        """
         rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE]
         left, chosen = {int(self.library.place_of[k]): None for k in rests}, []
         left = dict.fromkeys(
@@ -167,10 +186,13 @@ class PlanningProblem:
 
     def variance_factor(self, windows: Sequence[PlannedWindow]) -> float:
         """
-        Return the factor on the noise variance that its estimate exceeds on none of six axes, with probability PROBABILITY.
+        Return the factor on the noise variance that its estimate exceeds on none of six axes.
 
-        ``chi2_isf((1 - P) / 6, nu) / nu`` with nu degrees of freedom for each window at rest, weighted by its samples. Where something is
-        known, the noise was estimated from the rests of a whole session already. Goals of separation contain a probability.
+        With probability PROBABILITY.
+
+        ``chi2_isf((1 - P) / 6, nu) / nu`` with nu degrees of freedom for each window at rest,
+        weighted by its samples. Where something is known, the noise was estimated from the rests of
+        a whole session already. Goals of separation contain a probability.
         """
         if not isinstance(self.goal, WithinTolerances):
             return 1.0
@@ -181,7 +203,11 @@ class PlanningProblem:
         return float(chi2_isf((1 - PROBABILITY) / 6, BATCH_DOF * rests) / (BATCH_DOF * rests))
 
     def least_session(self) -> float:
-        """Return the least time of the rests with which a session begins, and of the ways between them, s."""
+        """
+        Return the least time of the first rests and of the ways between them, s.
+
+        These are the rests with which a session begins.
+        """
         rests = self.first_rests(0)
         away = self.way_seconds[~np.eye(len(self.way_seconds), dtype=bool)]
         return (
@@ -192,14 +218,18 @@ class PlanningProblem:
 
     def lower_bound(self, *, factor: float = 1.0, relaxed: Relaxation | None = None) -> float:
         """
-        Return a time below which no plan made of these motions and the moves between their places meets the tolerances, s.
+        Return a time below which no plan of these motions meets the tolerances, s.
 
-        With the variance of the noise within windows larger by `factor`. NaN where a tolerance is out of reach. `relaxed` is the relaxation
-        for the same arguments where it is available already.
+        The plans are made of these motions and the moves between their places.
 
-        Without prior information on the biases, a share of their wander is common to a session of at most T, which limits their
-        parameters for any amount of data: every plan needs at least ``min(T, value(T))``, the value that of the
-        relaxation for sessions of T. The largest bound over T is used; without any T the share is zero.
+        With the variance of the noise within windows larger by `factor`. NaN where a tolerance is
+        out of reach. `relaxed` is the relaxation for the same arguments where it is available
+        already.
+
+        Without prior information on the biases, a share of their wander is common to a session of
+        at most T, which limits their parameters for any amount of data: every plan needs at least
+        ``min(T, value(T))``, the value that of the relaxation for sessions of T. The largest bound
+        over T is used; without any T the share is zero.
         """
         best = (relaxed or self.relaxation(factor=factor)).seconds
         if self.known is not None or not np.isfinite(best):
@@ -218,7 +248,11 @@ class PlanningProblem:
         return max(best, floor, self.least_session())
 
     def _bias_floor(self, factor: float) -> float:
-        """Return the observation time that the biases alone need, s; infinite if they are out of reach."""
+        """
+        Return the observation time that the biases alone need, s.
+
+        Infinite if they are out of reach.
+        """
         model, coordinates, floor = self.coordinates.model, self.coordinates, 0.0
         lengths = np.geomspace(0.01, MAX_REACHABLE_SECONDS, 2000)
         for sensor in SENSORS:
@@ -239,7 +273,11 @@ class PlanningProblem:
     def relaxation(
         self, *, common: tuple[float, float] = (0.0, 0.0), factor: float = 1.0
     ) -> Relaxation:
-        """Return the relaxed plan; `common`: (share of the biases' covariance, seconds of the longest session that counts)."""
+        """
+        Return the relaxed plan.
+
+        `common`: (share of the biases' covariance, seconds of the longest session that counts).
+        """
         share, seconds = common
         edges = [key for key, windows in self.way_windows.items() if windows]
         own = np.flatnonzero(self.seconds > 0)
@@ -268,9 +306,12 @@ class PlanningProblem:
 
     def _with_common(self, prior, asked, share, seconds):
         """
-        Return (prior information, requested rows) where a bias and the offset common to the session are one coordinate b.
+        Return (prior information, requested rows) with one coordinate b for two offsets.
 
-        With P and P' the prior variances of the bias and of b, ``var(bias) = (1 / P + 1 / (P' - P))^-1 + (P / P')^2 var(b)``.
+        A bias and the offset common to the session are this one coordinate b.
+
+        With P and P' the prior variances of the bias and of b, ``var(bias) = (1 / P + 1 / (P' -
+        P))^-1 + (P / P')^2 var(b)``.
         """
         prior, asked, model = prior.copy(), asked.copy(), self.coordinates.model
         for sensor in SENSORS:
@@ -287,14 +328,19 @@ class PlanningProblem:
                 after = before + offset
                 room = (1.0 - before * offset / after) * (after / before) ** 2
                 prior[place, place] = 1.0 / after
-                # Without any margin a small number is used: the value then exceeds any session of interest.
+                # Without any margin a small number is used: the value then exceeds any session of
+                # interest.
                 asked[np.abs(asked[:, place]) > 0.5] /= np.sqrt(max(room, 1e-4))
         return prior, asked
 
     def timed(
         self, sequence: Sequence[int], start: int
     ) -> tuple[list[PlannedWindow], np.ndarray, float]:
-        """Return (windows, their middles, total time) of motions one after the other from a place, with the ways between them."""
+        """
+        Return (windows, their middles, total time) of motions one after the other from a place.
+
+        With the ways between them.
+        """
         windows, times, now, place = [], [], 0.0, start
         for number in sequence:
             target = int(self.library.place_of[number])
@@ -309,7 +355,11 @@ class PlanningProblem:
     def covariance_after(
         self, sequence: Sequence[int], start: int, *, cautious: bool = False
     ) -> tuple[np.ndarray, float]:
-        """Return (covariance of z, total time) after motions one after the other from a place; `cautious`: with `variance_factor`."""
+        """
+        Return (covariance of z, total time) after motions one after the other from a place.
+
+        `cautious`: with `variance_factor`.
+        """
         windows, times, seconds = self.timed(sequence, start)
         total = self.prior
         if windows:
@@ -323,7 +373,9 @@ class PlanningProblem:
 
     def best_covariance(self, seconds: float) -> np.ndarray:
         """
-        Return a lower bound of the covariance of z of all plans of these motions and their moves in this time.
+        Return a lower bound of the covariance of z of all plans in this time.
+
+        The plans consist of these motions and their moves.
 
         Every motion fills the whole time at once, and the biases are independent between windows.
         """
@@ -344,7 +396,9 @@ class PlanningProblem:
 
 def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
     """
-    Return sensor -> NoiseModel of the samples of a simulated IMU: white noise, and a bias that wanders by its instability.
+    Return sensor -> NoiseModel of the samples of a simulated IMU.
+
+    White noise, and a bias that wanders by its instability.
 
     Parameters
     ----------
@@ -361,19 +415,22 @@ def noise_of_grade(noise: SimulatedNoise, rate: float) -> dict[str, NoiseModel]:
         sensor: NoiseModel(
             np.full(3, density**2 * rate + resolution**2 / 12),
             np.ones(3),
-            bias_processes=(BiasProcess(instability, noise.correlation_time),)
-            if instability > 0
-            else (),
+            bias_processes=(
+                (BiasProcess(instability, noise.correlation_time),) if instability > 0 else ()
+            ),
         )
         for sensor, (density, instability, resolution) in figures.items()
     }
 
 
 def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dict[str, NoiseModel]:
-    """Return sensor -> NoiseModel of samples at `rate` (Hz): the identified model, or that of a grade."""
+    """
+    Return sensor -> NoiseModel of samples at `rate` (Hz): the identified model, or that of a grade.
+    """
     if grade not in GRADES:
         raise InputError(
-            f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or give the noise"
+            f"the grade must be one of {', '.join(sorted(GRADES))}, got '{grade}'; choose one, or"
+            ' give the noise'
         )
     if figures is None:
         return noise_of_grade(GRADES[grade].noise, rate)

@@ -21,7 +21,9 @@ from imu_calibration.preprocessing.window import WindowSettings
 from imu_calibration.simulation.motion_builder import Profile, Segment
 
 MAX_WEIGHT_STEPS = 600
-"""Steps of the multiplicative algorithm; the certificate is mostly within a few per cent after 200."""
+"""
+Steps of the multiplicative algorithm; the certificate is mostly within a few per cent after 200.
+"""
 MAX_REACHABLE_SECONDS = 1e7
 """Tolerances that are not met after this time for every motion are out of reach, s."""
 CERTIFICATE_RATIO = 1.01
@@ -44,8 +46,9 @@ def relax(
     """
     Return the relaxed plan with the best certificate found; NaN where a tolerance is out of reach.
 
-    Visits and weights are improved by turns with multiplicative steps: visits of motions that are worth more than they cost grow (the
-    algorithm of A-optimal design), and so do the weights of parameters with the largest excess over tolerance.
+    Visits and weights are improved by turns with multiplicative steps: visits of motions that are
+    worth more than they cost grow (the algorithm of A-optimal design), and so do the weights of
+    parameters with the largest excess over tolerance.
 
     Parameters
     ----------
@@ -112,7 +115,11 @@ def _worst(information, asked):
 
 
 def _scale(direction, root, rows):
-    """Return how much of `direction` must be added to ``root @ root.T`` for the worst parameter to meet its tolerance."""
+    """
+    Return how much of `direction` must be added to ``root @ root.T``.
+
+    With this amount the worst parameter meets its tolerance.
+    """
     inner = scipy.linalg.solve_triangular(
         root, scipy.linalg.solve_triangular(root, direction, lower=True).T, lower=True
     )
@@ -129,7 +136,9 @@ def _scale(direction, root, rows):
 SAMPLING = 16.0
 """Instants per second at which columns are evaluated: a turn at 300 deg/s has 19."""
 LEAST_INSTANTS = 4
-"""Instants of a rest, where columns are all one and the bias wanders, and of the shortest motion."""
+"""
+Instants of a rest, where columns are all one and the bias wanders, and of the shortest motion.
+"""
 BELIEF_BLOCK_ROWS = 8192
 """Instants whose columns are held in memory at a time."""
 WINDOWS = {'rest': 'static', 'spin': 'spin'}
@@ -151,7 +160,9 @@ class PlannedWindow:
     means: dict[str, np.ndarray]
     """Sensor -> rows of the means, shape (3, n)."""
     variance: dict[str, np.ndarray]
-    """Sensor -> variance of the means in addition to the bias in the middle of the window, shape (3,)."""
+    """
+    Sensor -> variance of the means in addition to the bias in the middle of the window, shape (3,).
+    """
     within: np.ndarray
     """Information of the samples about their means, of both sensors together, shape (n, n)."""
 
@@ -215,7 +226,11 @@ class WindowPredictor:
         ]
 
     def _cut(self, segments) -> Iterator[tuple[JointMotion, str, float, float, float]]:
-        """Yield (motion at some instants, kind, middle, length with settling, seconds of data) of each window."""
+        """
+        Yield (motion at some instants, kind, middle, length, seconds) of each window.
+
+        The length includes settling, and the seconds are seconds of data.
+        """
         begin = 0.0
         for segment in segments:
             kind = WINDOWS.get(segment.kind, 'dynamic')
@@ -241,7 +256,8 @@ class WindowPredictor:
         """
         Return (variances, directions) of the changes of the bias after the middle of a window.
 
-        Given its value in the middle, the bias before is independent of the bias after, with the mirrored covariance.
+        Given its value in the middle, the bias before is independent of the bias after, with the
+        mirrored covariance.
         """
         half = count // 2
         return np.linalg.eigh(
@@ -281,8 +297,9 @@ class Posterior:
     """
     Covariance of the coordinates z and of every bias process of every axis.
 
-    Between motions the processes decay, ``u <- exp(-dt / time) u + noise``, so that early observations of a bias contain little information
-    on its present value: a dwell saturates, a return does not. They are constant within one motion.
+    Between motions the processes decay, ``u <- exp(-dt / time) u + noise``, so that early
+    observations of a bias contain little information on its present value: a dwell saturates, a
+    return does not. They are constant within one motion.
 
     Parameters
     ----------
@@ -315,7 +332,9 @@ class Posterior:
         return self.covariance[: self.size, : self.size]
 
     def information_of(self, windows: Sequence[PlannedWindow]) -> np.ndarray:
-        """Return the information about z and the biases in the windows of a motion, shape (m, m)."""
+        """
+        Return the information about z and the biases in the windows of a motion, shape (m, m).
+        """
         total = np.zeros_like(self.covariance)
         for window in windows:
             first = self.size
@@ -374,7 +393,9 @@ def exact_information(
     factor: float = 1.0,
 ) -> np.ndarray:
     """
-    Return the information about z of the windows of a whole plan, as the calibration weighs them, shape (n, n).
+    Return the information about z of the windows of a whole plan, as the calibration weighs them.
+
+    Shape (n, n).
 
     Parameters
     ----------
@@ -407,14 +428,19 @@ def additive_bound(
     window: PlannedWindow, noise: dict[str, NoiseModel], *, share: float = 1.0, factor: float = 1.0
 ) -> np.ndarray:
     """
-    Return an information matrix that bounds from above what a window adds in any plan, shape (n, n).
+    Return an information matrix that bounds from above what a window adds in any plan.
 
-    For the given share of the covariance of the bias processes, the remainder is `common_variance`; `factor` as in `exact_information`.
+    Shape (n, n).
 
-    The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an Ornstein-Uhlenbeck process seen at the middles
-    of the windows, whose inverse is tridiagonal. Its rows in absolute value sum to at most ``coth(g / (2 time)) / sd^2`` with g the smaller
-    distance to a neighbour, so (Gershgorin) ``G_j >= sd_j^2 diag(tanh(g / (2 time_j)))`` as matrices; and g is at least half the window's
-    own length. A larger covariance is less information: with each G_j at its bound the means are independent, and information adds up.
+    For the given share of the covariance of the bias processes, the remainder is `common_variance`;
+    `factor` as in `exact_information`.
+
+    The covariance of the window means is ``diag(variance) + sum_j G_j`` with G_j that of an
+    Ornstein-Uhlenbeck process seen at the middles of the windows, whose inverse is tridiagonal. Its
+    rows in absolute value sum to at most ``coth(g / (2 time)) / sd^2`` with g the smaller distance
+    to a neighbour, so (Gershgorin) ``G_j >= sd_j^2 diag(tanh(g / (2 time_j)))`` as matrices; and g
+    is at least half the window's own length. A larger covariance is less information: with each G_j
+    at its bound the means are independent, and information adds up.
     """
     total = window.within / factor
     for sensor in SENSORS:
@@ -431,10 +457,12 @@ def additive_bound(
 
 def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarray | float:
     """
-    Return c such that the bias processes seen at any instants within so many seconds have a covariance of at least ``c 1 1'``.
+    Return c such that the bias covariance is at least ``c 1 1'``.
 
-    ``1' G^-1 1`` is the information about a constant with the process, at most ``(T + 2 time) / (2 time sd^2)``, that of observing
-    it all the time; of several processes the inverses add up.
+    It is the covariance of the bias processes seen at any instants within so many seconds.
+
+    ``1' G^-1 1`` is the information about a constant with the process, at most ``(T + 2 time) / (2
+    time sd^2)``, that of observing it all the time; of several processes the inverses add up.
     """
     return sum(
         process.sd**2 * 2 * process.time / (seconds + 2 * process.time)
@@ -444,11 +472,14 @@ def common_variance(noise: NoiseModel, seconds: np.ndarray | float) -> np.ndarra
 
 def least_bias_variance(noise: NoiseModel, white: float, seconds: np.ndarray) -> np.ndarray:
     """
-    Return the variance of a constant bias from continuous observation, with white noise and the bias processes, shape of `seconds`.
+    Return the variance of a constant bias from continuous observation.
 
-    For one process, ``integral(S exp(-|t - s| / time) h(s)) + white h(t) = 1`` is solved by ``h = a + b cosh(k (t - T / 2))`` with
-    ``k^2 = 1 / time^2 + 2 S / (time white)``, and the variance is ``1 / integral(h)``. Of several processes the variances add up
-    (parallel sums are concave), with the white noise added to any one of them.
+    With white noise and the bias processes, shape of `seconds`.
+
+    For one process, ``integral(S exp(-|t - s| / time) h(s)) + white h(t) = 1`` is solved by ``h = a
+    + b cosh(k (t - T / 2))`` with ``k^2 = 1 / time^2 + 2 S / (time white)``, and the variance is
+    ``1 / integral(h)``. Of several processes the variances add up (parallel sums are concave), with
+    the white noise added to any one of them.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """
 A stream becomes checked windows.
 
-In: blocks of samples and a table. Out: clean samples, static windows, constant-rate spins, dynamic stretches, findings with a severity.
-Read `window_finder` first; static poses are found in `static_detector`; `checks` is the registry of checks.
+In: blocks of samples and a table. Out: clean samples, static windows, constant-rate spins, dynamic
+stretches, findings with a severity. Read `window_finder` first; static poses are found in
+`static_detector`; `checks` is the registry of checks.
 """

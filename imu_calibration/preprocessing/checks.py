@@ -1,7 +1,10 @@
 """
-Checks of a recording before the estimate: their registry, and the checks of frozen outputs and of stamps.
+Checks of a recording before the estimate.
 
-`CHECKS` is the registry: a check is a function of the `Evidence` that yields `Finding` objects; adding one is adding an entry.
+Their registry, and the checks of frozen outputs and of stamps.
+
+`CHECKS` is the registry: a check is a function of the `Evidence` that yields `Finding` objects;
+adding one is adding an entry.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,8 +43,8 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'frozen',
                 REFUSE,
-                f'the {sensor} must measure something, its outputs never change in {evidence.n_samples} '
-                'samples; check the sensor and its driver',
+                f'the {sensor} must measure something, its outputs never change in'
+                f' {evidence.n_samples} samples; check the sensor and its driver',
             )
             continue
         for axis in np.flatnonzero(constant):
@@ -49,8 +52,8 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 yield CheckFinding(
                     'frozen',
                     REFUSE,
-                    f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while the '
-                    'remaining axes do; check the sensor and its driver',
+                    f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while'
+                    ' the remaining axes do; check the sensor and its driver',
                 )
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(
@@ -65,8 +68,8 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 yield CheckFinding(
                     'frozen',
                     WARNING,
-                    f'{sensor} {"xyz"[axis]} is constant for {seconds:.1f} s while different axes move; '
-                    'check its connection, and exclude that time',
+                    f'{sensor} {"xyz"[axis]} is constant for {seconds:.1f} s while different axes'
+                    ' move; check its connection, and exclude that time',
                     samples=int(stuck.sum() * chunks.size),
                 )
 
@@ -92,18 +95,18 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'frozen',
             WARNING,
-            f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats '
-            f'one reading {span_words([span])}, which its noise does not allow; check the sensor and its driver, and '
-            'exclude that time',
+            f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats'
+            f' one reading {span_words([span])}, which its noise does not allow; check the sensor'
+            ' and its driver, and exclude that time',
             samples=parts[0].samples,
         )
     if joints:
         yield CheckFinding(
             'frozen',
             WARNING,
-            'joint states must follow the table, they are constant while the IMU turns, '
-            f'{span_words([(part.start, part.stop) for part in joints])}; check the driver of the table, or exclude the '
-            'time in which the IMU was carried',
+            'joint states must follow the table, they are constant while the IMU turns,'
+            f' {span_words([(part.start, part.stop) for part in joints])}; check the driver of the'
+            ' table, or exclude the time in which the IMU was carried',
             samples=sum(part.samples for part in joints),
         )
 
@@ -117,15 +120,23 @@ def span_words(spans: Sequence[tuple[float, float]]) -> str:
 WHOLE_MS = 1_000_000
 STAMP_FAULTS = {
     'not finite': 'are not finite: the driver sends them; they are left out',
-    'repeated stamp': 'repeat the stamp before: stamp each sample when it is measured; the second of equal stamps is left out',
+    'repeated stamp': (
+        'repeat the stamp before: stamp each sample when it is measured; the second of equal stamps'
+        ' is left out'
+    ),
     'backward stamp': 'step back in time: samples that arrive late are left out; publish in order',
     'stray stamp': 'have a stray stamp: a single outlying stamp is excluded',
-    'spike': 'are spikes: readings that differ from their neighbours beyond any motion are excluded; if they are many, check the bus and '
-    'the driver',
+    'spike': (
+        'are spikes: readings that differ from their neighbours beyond any motion are excluded; if'
+        ' they are many, check the bus and the driver'
+    ),
 }
 """Reason for which samples were dropped -> what they do, and the remedy."""
 SPIKE_SHARE = 5e-3
-"""Occasional knocks resemble spikes, and 1 % of spikes do not degrade a calibration; a larger share has a cause."""
+"""
+Occasional knocks resemble spikes, and 1 % of spikes do not degrade a calibration; a larger share
+has a cause.
+"""
 GAP_SHARE = 0.01
 RATE_SHARE = 0.02
 
@@ -145,16 +156,16 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'stamps',
                 REFUSE,
-                f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total} '
-                f'only {found.count} do ({reasons}); correct the driver and record again',
+                f'{MESSAGES[name]} must hold finite samples whose header stamps advance, of {total}'
+                f' only {found.count} do ({reasons}); correct the driver and record again',
             )
             continue
         if found.unstamped:
             yield CheckFinding(
                 'stamps',
                 WARNING,
-                f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of arrival '
-                'is used; the driver should stamp each sample at its measurement',
+                f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of'
+                ' arrival is used; the driver should stamp each sample at its measurement',
             )
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
@@ -162,8 +173,8 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 f'{count} of {total} samples {STAMP_FAULTS[reason]}'
                 if reason != 'clock reset'
                 else (
-                    f'the stamps jump {"once" if count == 1 else f"{count} times"}: the clock was set while recording; the parts are processed '
-                    'separately'
+                    f'the stamps jump {"once" if count == 1 else f"{count} times"}: the clock was'
+                    ' set while recording; the parts are processed separately'
                 )
             )
             yield CheckFinding('stamps', severity, f'{MESSAGES[name]}: {text}')
@@ -189,8 +200,9 @@ def gaps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'gaps',
                 severity,
-                f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""}, {found.gap_total:.2f} s '
-                f'of {found.duration:.0f} s, the longest {found.longest_step:.2f} s; motion within a gap is not used',
+                f'{name}: {found.n_gaps} gap{"s" if found.n_gaps > 1 else ""},'
+                f' {found.gap_total:.2f} s of {found.duration:.0f} s, the longest'
+                f' {found.longest_step:.2f} s; motion within a gap is not used',
             )
 
 
@@ -202,9 +214,9 @@ def sampling(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'sampling',
                 WARNING,
-                f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is '
-                f'{real:.2f} Hz: samples were lost, or stamps are made when messages arrive; check the driver and the '
-                'load of the recorder',
+                f'{name}: the usual step between stamps is that of {nominal:.2f} Hz, the rate is'
+                f' {real:.2f} Hz: samples were lost, or stamps are made when messages arrive; check'
+                ' the driver and the load of the recorder',
             )
         elif nominal:
             yield CheckFinding(
@@ -230,7 +242,8 @@ def jitter(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             faults.append(f'all stamps are multiples of {found.stamp_step_ns // WHOLE_MS} ms')
         if found.irregular > MAX_IRREGULAR_SHARE:
             faults.append(
-                f'{100 * found.irregular:.0f} % of the steps are off the usual {found.period * 1e3:.4g} ms by more than a tenth'
+                f'{100 * found.irregular:.0f} % of the steps are off the usual'
+                f' {found.period * 1e3:.4g} ms by more than a tenth'
             )
         if faults:
             yield CheckFinding(
@@ -254,17 +267,17 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'clocks',
             REFUSE,
-            f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s '
-            f'{"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the clocks or stamp both on '
-            'one computer',
+            f'Imu and JointState must be stamped by one clock, the joints begin {abs(late):.6g} s'
+            f' {"after" if late > 0 else "before"} the Imu and they never overlap; synchronise the'
+            ' clocks or stamp both on one computer',
         )
     elif overlap < 0.9 * shorter:
         yield CheckFinding(
             'clocks',
             WARNING,
-            f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints begin '
-            f'{abs(late):.1f} s {"after" if late > 0 else "before"} the Imu: only the overlap is used; are both stamped '
-            'by one clock?',
+            f'Imu and JointState overlap for {overlap:.1f} s of {shorter:.1f} s only, the joints'
+            f' begin {abs(late):.1f} s {"after" if late > 0 else "before"} the Imu: only the'
+            ' overlap is used; are both stamped by one clock?',
         )
 
 
@@ -309,7 +322,10 @@ class Preflight(EvidenceGatherer):
         self.findings: tuple[CheckFinding, ...] = ()
         self.streams: dict[str, StreamStatistics] = {}
         self.lost: dict[str, int] = {}
-        """Findings; name -> StreamStatistics; reason -> number of unreadable messages: complete after `finish`."""
+        """
+        Findings; name -> StreamStatistics; reason -> number of unreadable messages: complete after
+        `finish`.
+        """
 
     def finish(self, cleaner: BlockCleaner) -> None:
         """

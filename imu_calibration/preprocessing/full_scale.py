@@ -11,13 +11,15 @@ from imu_calibration.preprocessing.scan import Chunks, Rest
 
 MIN_MISSED_ANGLE = 0.25
 """
-Rms angle by which gravity misses the direction after a turn, rad, above which factors are tested: scale errors of a tenth cause less.
+Rms angle by which gravity misses the direction after a turn, rad, above which factors are tested:
+scale errors of a tenth cause less.
 """
 MAX_ANGLE_SHARE = 0.3
 """A factor is accepted when the remaining angle is below this share of the angle without it."""
 FACTORS = 2.0 ** np.arange(-4.0, 4.01, 0.25)
 """
-Tested ratios of readings to true rates: full-scale ranges from a sixteenth to sixteen times the set range, and intermediate values.
+Tested ratios of readings to true rates: full-scale ranges from a sixteenth to sixteen times the set
+range, and intermediate values.
 """
 NEAR_POWER = 0.15
 """A factor within this share of a power of two is one: scales are off by a few per cent."""
@@ -30,7 +32,10 @@ MAX_TURN_SECONDS = 30.0
 
 def believed_factor(missed: Callable[[float], float]) -> float:
     """
-    Return the factor between measured and true rates that carries gravity from before each turn to after it, 1 when they fit as they are.
+    Return the factor between measured and true rates that fits gravity.
+
+    The factor carries gravity from before each turn to after it. It is 1 when the rates fit as they
+    are.
 
     Parameters
     ----------
@@ -54,9 +59,12 @@ def nearest_power(factor: float) -> float:
 
 def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     """
-    Return the `believed_factor` of a recording in chunks, or None when too few turns lie between rests.
+    Return the `believed_factor` of a recording in chunks.
 
-    The mean rates of the chunks are added up from rest to rest; turns within a chunk commute well enough for a factor.
+    Or None when too few turns lie between rests.
+
+    The mean rates of the chunks are added up from rest to rest; turns within a chunk commute well
+    enough for a factor.
     """
     if rest is None or len(rest.ranges) <= LEAST_TURNS:
         return None
@@ -149,12 +157,20 @@ class Extremes:
 
     @property
     def jumped(self) -> bool:
-        """Whether the largest value was often reached by a large step, which does not occur with rounded readings of a constant."""
+        """
+        Whether the largest value was often reached by a large step.
+
+        This does not occur with rounded readings of a constant.
+        """
         return self.n_jumps >= MIN_CLIPPED_SAMPLES
 
     @property
     def n_clipped(self) -> int:
-        """Samples at the largest value if their number is far above that of neighbouring values, else 0."""
+        """
+        Samples at the largest value if they are unusually many, else 0.
+
+        Their number must be far above that of neighbouring values.
+        """
         counts = [
             count for value, count in self._below.items() if value > NEAR_LARGEST_SHARE * self.level
         ][:10]
@@ -165,14 +181,20 @@ class Extremes:
 LARGEST_TURN = 0.7
 """Turns of gravity from chunk to chunk above it are left out, rad."""
 FORCE_BAND = 0.2
-"""Chunks in which the specific force differs from the usual length, or scatters, by more than this share are excluded as accelerated."""
+"""
+Chunks in which the specific force differs from the usual length, or scatters, by more than this
+share are excluded as accelerated.
+"""
 LEAST_TURN = 1.0
 """Gravity must turn by this much altogether, rad."""
 LEAST_EXPLAINED = 0.5
 CHUNK_SD_FACTOR = 4.0
 """Factor on standard deviations for the correlation of errors of neighbouring chunks."""
 DETERMINED_SD_SHARE = 0.15
-"""A direction is determined when the standard deviation of its column is below this share of its length."""
+"""
+A direction is determined when the standard deviation of its column is below this share of its
+length.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,11 +203,13 @@ class Turning:
 
     matrix: np.ndarray
     """
-    ``true rate = matrix @ measured rate`` in the frame of the accelerometer, zero across the directions that were not seen, shape (3, 3).
+    ``true rate = matrix @ measured rate`` in the frame of the accelerometer, zero across the
+    directions that were not seen, shape (3, 3).
     """
     seen: np.ndarray
     """
-    Projector on the directions with measured rates, shape (3, 3): turns about only (1, 1, 1) determine one direction and no axis.
+    Projector on the directions with measured rates, shape (3, 3): turns about only (1, 1, 1)
+    determine one direction and no axis.
     """
 
     @property
@@ -208,9 +232,12 @@ class Turning:
 
 def relate_turns(chunks: Chunks) -> Turning | None:
     """
-    Return the `Turning` of Chunks, or None when gravity turns too little or is not explained by the rates.
+    Return the `Turning` of Chunks.
 
-    ``du/dt = u x (matrix @ rate + offset)`` for the direction u of specific force; no assumptions on units, axes or bias.
+    Or None when gravity turns too little or is not explained by the rates.
+
+    ``du/dt = u x (matrix @ rate + offset)`` for the direction u of specific force; no assumptions
+    on units, axes or bias.
     """
     pairs = _pairs(chunks)
     if pairs is None:
@@ -228,7 +255,8 @@ def relate_turns(chunks: Chunks) -> Turning | None:
             return None
         if sure.all():
             return Turning(matrix / scale @ seen.T, seen @ seen.T)
-        # The direction with the smallest rates may be leakage of another direction, and then degrades both.
+        # The direction with the smallest rates may be leakage of another direction, and then
+        # degrades both.
         kept = kept & (spread > spread[kept].min())
     return None
 
@@ -259,7 +287,11 @@ def _fit(direction, change, turn_time, rate):
 
 
 def _pairs(chunks):
-    """Return (direction, its change, time between, rate) for neighbouring chunks in which gravity rules the accelerometer, or None."""
+    """
+    Return (direction, its change, time between, rate), or None.
+
+    The values are for neighbouring chunks in which gravity rules the accelerometer.
+    """
     if len(chunks) < 20:
         return None
     length = np.linalg.norm(chunks.mean[:, :3], axis=1)

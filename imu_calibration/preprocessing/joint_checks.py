@@ -31,19 +31,28 @@ LASTING = 1.0
 MAX_REPEATED_RATE = 1e-6
 """Largest rate of a joint with a repeated state after smoothing of the positions, rad/s."""
 FROZEN_SHARE = 0.8
-"""Share of the unexplained rate that lies along the axis of a joint that is frozen, as a mean square."""
+"""
+Share of the unexplained rate that lies along the axis of a joint that is frozen, as a mean square.
+"""
 OWN = 0.3
-"""The unexplained rate along that axis is at least this share of the measured rate along it: a wrong gain causes less."""
+"""
+The unexplained rate along that axis is at least this share of the measured rate along it: a wrong
+gain causes less.
+"""
 OFTEN = 0.25
-"""Share of repeated readings of one axis from which the steps of a gyroscope are coarser than its noise."""
+"""
+Share of repeated readings of one axis from which the steps of a gyroscope are coarser than its
+noise.
+"""
 
 
 def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | None:
     """
     Return the part that is frozen for a second or more while the remaining parts turn, or None.
 
-    A joint is frozen when its state is constant while the gyroscope measures a rate about its axis that the other joints do not explain.
-    A gyroscope with steps coarser than its noise may repeat a reading while the reference rate stays within one step.
+    A joint is frozen when its state is constant while the gyroscope measures a rate about its axis
+    that the other joints do not explain. A gyroscope with steps coarser than its noise may repeat a
+    reading while the reference rate stays within one step.
 
     Parameters
     ----------
@@ -93,14 +102,19 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
             return CheckFinding(
                 'frozen',
                 REFUSE,
-                f'joint states must follow the table, {name} is constant {span_words(spans)} while the '
-                'IMU turns about its axis; check the driver of the table, and exclude that time',
+                f'joint states must follow the table, {name} is constant {span_words(spans)} while'
+                ' the IMU turns about its axis; check the driver of the table, and exclude that'
+                ' time',
             )
     return None
 
 
 def _frozen(window, table, expected, *, joint):
-    """Yield (start, stop) in which a joint's state is constant while the residual rate is along its axis."""
+    """
+    Yield (start, stop) in which a joint's state is constant despite rotation.
+
+    The residual rate is along the joint's axis in that time.
+    """
     for start, stop in runs_of(np.abs(window.motion.rate[:, joint]) < MAX_REPEATED_RATE):
         if window.time[stop - 1] - window.time[start] < LASTING:
             continue
@@ -131,7 +145,11 @@ def _frozen(window, table, expected, *, joint):
 
 
 def _rounded(reading, expected, bias, step):
-    """Return whether one reading represents the reference rates, shape (n, 3), up to one step per axis and wrong gains and axes."""
+    """
+    Return whether one reading represents the reference rates.
+
+    Shape (n, 3), up to one step per axis and wrong gains and axes.
+    """
     error = np.linalg.norm(reading - expected - bias, axis=1)
     return bool(
         (np.ptp(expected, axis=0) <= step).all()
@@ -179,7 +197,9 @@ def against_joints(
     gathered: Reduced, model: SensorModel, table: Table | None = None
 ) -> tuple[CheckFinding, ...]:
     """
-    Return the findings of a comparison of measured rates and forces with those implied by the joints.
+    Return the findings of a comparison of rates and forces with the joints.
+
+    The measured rates and forces are compared with the ones that the joints imply.
 
     Parameters
     ----------
@@ -201,7 +221,11 @@ def against_joints(
 
 
 def _moments(accumulator, model, sensor):
-    """Return sums of products (measured with reference, reference with itself, measured with itself), or None."""
+    """
+    Return sums of products (measured with reference, reference with itself, measured with itself).
+
+    Or None.
+    """
     part = model.columns_of(sensor, Role.LINEAR)
     rows = [row for row in accumulator.rows if sensor == 'gyroscope' or row.kind == 'static']
     if not rows:
@@ -222,7 +246,9 @@ def _moments(accumulator, model, sensor):
 
 
 def _seen(sensor, moment):
-    """Return (projector on the directions that the reference shows, inverse of its moment there)."""
+    """
+    Return (projector on the directions that the reference shows, inverse of its moment there).
+    """
     values, vectors = np.linalg.eigh(moment)
     shown = values > LEAST_POWER_SHARE[sensor] * values.max()
     vectors = vectors[:, shown]
@@ -252,8 +278,8 @@ def _rate_units(moments):
         return
     if 40 < ratio < 80:
         yield wrong_rate_unit(
-            f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints: probably deg/s, '
-            'gyroscope_scale 57.29578; convert them in the driver'
+            f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints:'
+            ' probably deg/s, gyroscope_scale 57.29578; convert them in the driver'
         )
     elif 1 / 80 < ratio < 1 / 40:
         yield CheckFinding(
@@ -267,8 +293,8 @@ def _rate_units(moments):
         and np.linalg.norm(cross) ** 2 > RELATED * np.trace(measured) * np.trace(reference) / 3
     ):
         yield wrong_rate_unit(
-            f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints: counts or volts?; '
-            'convert them in the driver'
+            f'angular rates must be in rad/s, they are {ratio:.4g} times the rates of the joints:'
+            ' counts or volts?; convert them in the driver'
         )
 
 
@@ -293,19 +319,22 @@ def _axes(sensor, moments, table, windows):
     yield CheckFinding(
         'handedness',
         REFUSE,
-        f'{what} must be {whose}, {match.words(seen) or NO_EXCHANGE}: {_cause(match, matrix, seen, table)}'
-        + (f'; or {delay.words}' if delay else ''),
+        f'{what} must be {whose}, {match.words(seen) or NO_EXCHANGE}:'
+        f' {_cause(match, matrix, seen, table)}' + (f'; or {delay.words}' if delay else ''),
     )
 
 
 def _cause(match, matrix, seen, table):
     if match.turned and match.mirrored:
         return (
-            'this recording does not separate a rotated sensor from a wrong sign; '
-            'correct mount.rpy_deg or the sign of a joint axis in the table, or the signs in the driver'
+            'this recording does not separate a rotated sensor from a wrong sign; correct'
+            ' mount.rpy_deg or the sign of a joint axis in the table, or the signs in the driver'
         )
     if match.mirrored:
-        return 'left-handed axes, which no mounting explains; correct signs and order in the driver, or the joint axes in the table'
+        return (
+            'left-handed axes, which no mounting explains; correct signs and order in the driver,'
+            ' or the joint axes in the table'
+        )
     fits = ''
     if table is not None and np.trace(seen) > 2.5:
         fits = (
@@ -317,7 +346,11 @@ def _cause(match, matrix, seen, table):
 
 
 def _mount_rpy_deg(matrix, table):
-    """Return roll, pitch, yaw of the rotation nearest to the measured matrix, in the convention of `mount.rpy_deg`."""
+    """
+    Return roll, pitch, yaw of the rotation nearest to the measured matrix.
+
+    The convention is that of `mount.rpy_deg`.
+    """
     return np.degrees(rpy_from_rotation((nearest_rotation(matrix) @ table.mat_sl).T))
 
 
@@ -325,7 +358,8 @@ def check_units(gathered: Reduced, model: SensorModel, table: Table | None = Non
     """
     Refuse recordings with units other than SI, or with axes other than those of the table.
 
-    Compares the length of the specific force at rest with gravity, and rates and forces with the values implied by the joints.
+    Compares the length of the specific force at rest with gravity, and rates and forces with the
+    values implied by the joints.
 
     Raises
     ------

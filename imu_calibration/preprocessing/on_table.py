@@ -1,4 +1,8 @@
-"""Agreement of the IMU with the joints: exchanged or reversed axes, delay, and rotation against the table."""
+"""
+Agreement of the IMU with the joints.
+
+Exchanged or reversed axes, delay, and rotation against the table.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +25,11 @@ AGREEMENT_TIE = 0.05
 
 
 def signed_permutations() -> np.ndarray:
-    """Return the 48 matrices that exchange axes and signs, the identity first, then by number of changes; shape (48, 3, 3)."""
+    """
+    Return the 48 matrices that exchange axes and signs, shape (48, 3, 3).
+
+    The identity is first. The rest is ordered by number of changes.
+    """
     every_sign = product((1.0, -1.0), repeat=3)
     found = [
         np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -51,7 +59,11 @@ class AxisMatch:
         return self.as_they_are < POOR
 
     def exchanges(self, seen: np.ndarray = np.eye(3)) -> list[tuple[int, int, float]]:
-        """Return (measured axis, reference axis, sign) of each wrong axis, for the reference axes with motion."""
+        """
+        Return (measured axis, reference axis, sign) of each wrong axis.
+
+        For the reference axes with motion.
+        """
         return [(i, j, sign) for i, j, sign in _wrong_axes(self.matrix) if seen[j, j] > 0.5]
 
     def words(self, seen: np.ndarray) -> str:
@@ -60,7 +72,9 @@ class AxisMatch:
 
 
 def _wrong_axes(matrix):
-    """Return (row, column, sign) of the entries of a signed permutation that differ from the identity."""
+    """
+    Return (row, column, sign) of the entries of a signed permutation that differ from the identity.
+    """
     return [
         (int(i), int(j), float(matrix[i, j]))
         for i, j in np.argwhere(matrix)
@@ -97,7 +111,10 @@ def match_axes(matrix: np.ndarray, seen: np.ndarray = np.eye(3)) -> AxisMatch:
 
 
 SAME = 0.5
-"""Smallest share of the measured rates that the reference explains on the same table, as a squared correlation."""
+"""
+Smallest share of the measured rates that the reference explains on the same table, as a squared
+correlation.
+"""
 LEAST_SHARE_EXPLAINED = 0.8
 """Smallest share explained of an exchange that is reported."""
 TESTED_PIECE_SECONDS = 5.0
@@ -107,20 +124,30 @@ TESTED_RATE = 0.02
 MIN_TESTED_SAMPLES, MAX_TESTED_SAMPLES = 20, 5_000
 """Samples that are tested."""
 MAX_PERMUTED_JOINTS = 3
-"""All orders and signs are tested up to this number of joints; above it, each sign and each exchange of two joints."""
+"""
+All orders and signs are tested up to this number of joints; above it, each sign and each exchange
+of two joints.
+"""
 
 
 class Exchange(NamedTuple):
-    """Signs and order of joints, and IMU axes, with which the reference explains the measured rates."""
+    """
+    Signs and order of joints, and IMU axes, with which the reference explains the measured rates.
+    """
 
     joints: tuple[str, ...]
     """One phrase per joint to correct."""
     axes: tuple[str, ...]
     """One phrase per IMU axis to correct, in addition."""
     instead: tuple[str, ...]
-    """One phrase per IMU axis; with these corrections and unchanged joints, rates and specific force are explained equally well."""
+    """
+    One phrase per IMU axis; with these corrections and unchanged joints, rates and specific force
+    are explained equally well.
+    """
     share: float
-    """Share of the rates that it explains, ``1 - sum |measured - reference|^2 / sum |measured|^2``."""
+    """
+    Share of the rates that it explains, ``1 - sum |measured - reference|^2 / sum |measured|^2``.
+    """
     span: tuple[float, float] | None
     """(start, stop) of the part of the recording to which it applies, s; None: all of it."""
 
@@ -129,8 +156,9 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
     """
     Return the `Exchange` that explains rates that the table as described does not explain, or None.
 
-    Order and signs of joints are combined with the 48 signed permutations P of the IMU axes; the share is that of ``P @ rate_s``.
-    Candidates with equal shares of the rates are separated by the specific force, then by the number of changes.
+    Order and signs of joints are combined with the 48 signed permutations P of the IMU axes; the
+    share is that of ``P @ rate_s``. Candidates with equal shares of the rates are separated by the
+    specific force, then by the number of changes.
 
     Parameters
     ----------
@@ -183,7 +211,12 @@ def find_exchange(windows: Sequence[Window], table: Table) -> Exchange | None:
 
 
 def _best(measured, motion, table):
-    """Return ((order, signs), matrix of the axes, that of the best candidate without joints, share explained) of the best candidate."""
+    """
+    Return the axes and the shares of the best candidate.
+
+    The result is ((order, signs), matrix of the axes, that of the best candidate without joints,
+    share explained) of the best candidate.
+    """
     candidates, axes = _candidates(motion.position.shape[1]), signed_permutations()
     shares = np.empty((2, len(candidates), len(axes)))
     for k, (order, signs) in enumerate(candidates):
@@ -212,7 +245,11 @@ def _best(measured, motion, table):
 
 
 def _candidates(n_joints):
-    """Return (index of the joint with the readings of each joint, signs) of the candidates, the description itself first."""
+    """
+    Return (index of the joint with the readings of each joint, signs) of candidates.
+
+    The description itself is the first of the candidates.
+    """
     identity, plus = list(range(n_joints)), [1.0] * n_joints
     if n_joints <= MAX_PERMUTED_JOINTS:
         return [
@@ -230,7 +267,8 @@ def _candidates(n_joints):
 
 def _joint_phrases(names, order, signs):
     return tuple(
-        f'{names[k]} turns {"the other way round" if j == k else f"as {names[j]} should" + ", reversed" * (sign < 0)}'
+        f'{names[k]} turns'
+        f' {"the other way round" if j == k else f"as {names[j]} should" + ", reversed" * (sign < 0)}'
         for k, (j, sign) in enumerate(zip(order, signs))
         if k != j or sign < 0
     )
@@ -245,7 +283,9 @@ def _axis_phrases(axes, seen=np.eye(3)):
 
 
 MIN_RATE_GAIN = 0.05
-"""Smallest gain of the measured rates with respect to the rates of the table for an IMU on the table."""
+"""
+Smallest gain of the measured rates with respect to the rates of the table for an IMU on the table.
+"""
 LARGEST_SHIFT = 5.0
 """Largest delay between the streams that is tested, s."""
 LEAST_SHIFT = 0.05
@@ -260,12 +300,14 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     """
     Return the cause if the gyroscope does not measure the motion of the joints, otherwise None.
 
-    Causes: an IMU that rests while the table turns, a delay between the streams, and a different motion.
+    Causes: an IMU that rests while the table turns, a delay between the streams, and a different
+    motion.
 
     Parameters
     ----------
     moments : tuple of three arrays (3, 3)
-        Sums of products of rates: measured with reference, reference with itself, measured with itself.
+        Sums of products of rates: measured with reference, reference with itself, measured with
+        itself.
     windows : list of Window
         Stored moving windows with their samples; without them, no delay is found.
     table : Table, optional
@@ -295,8 +337,8 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
         key, cause = (
             'imu_topic',
             (
-                'its motion is not that of the table; give the topic of the IMU on the table, and check '
-                'the names of the joints and both clocks'
+                'its motion is not that of the table; give the topic of the IMU on the table, and'
+                ' check the names of the joints and both clocks'
             ),
         )
     return CheckFinding(
@@ -309,7 +351,11 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
 
 
 def exchanged(exchange: Exchange, windows: list[Window], table: Table) -> CheckFinding | None:
-    """Return the finding of joints or IMU axes that are exchanged or reversed, or None if a delay explains the rates better."""
+    """
+    Return the finding of joints or IMU axes that are exchanged or reversed.
+
+    Or None if a delay explains the rates better.
+    """
     shift = _best_shift(windows, table)
     late = abs(shift.seconds) > LEAST_SHIFT and shift.share > exchange.share - SHARE_TIE
     if late and shift.share > exchange.share + SHARE_TIE:
@@ -340,7 +386,11 @@ def _cause(windows, table):
 
 
 def _a_period_late(windows, table):
-    """Return the finding for streams of a repeating motion that agree clearly better a period earlier or later, or None."""
+    """
+    Return the finding for streams shifted by a period, or None.
+
+    The streams are of a repeating motion and agree clearly better a period earlier or later.
+    """
     shift, share, unshifted, ambiguous = _best_shift(windows, table)
     # opposite rates: a wrong sign, or half a period
     if (
@@ -353,8 +403,9 @@ def _a_period_late(windows, table):
     return CheckFinding(
         'on_table',
         REFUSE,
-        f'both streams must share one clock, the joints explain {100 * unshifted:.0f} % of the rates '
-        f'with a delay up to {LEAST_SHIFT} s and {100 * share:.0f} % with a larger one: {_late(shift)}',
+        f'both streams must share one clock, the joints explain {100 * unshifted:.0f} % of the'
+        f' rates with a delay up to {LEAST_SHIFT} s and {100 * share:.0f} % with a larger one:'
+        f' {_late(shift)}',
     )
 
 
@@ -376,7 +427,10 @@ class _Shift(NamedTuple):
     unshifted: float
     """Largest one within +-LEAST_SHIFT, the range of a lag; negative if the rates are opposite."""
     ambiguous: bool
-    """Whether it is one period of a repeating motion from a peak within the range of a lag, and a delay of the other sign is as good."""
+    """
+    Whether it is one period of a repeating motion from a peak within the range of a lag, and a
+    delay of the other sign is as good.
+    """
 
 
 @dataclass(frozen=True)
@@ -391,9 +445,12 @@ class Delay:
 
 def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
     """
-    Return the delay that explains rates of the opposite sign, or None if a sign explains them better.
+    Return the delay that explains rates of the opposite sign.
 
-    For sweeps to and fro, half a period of delay and a wrong sign differ only by the differences between the sweeps.
+    Or None if a sign explains them better.
+
+    For sweeps to and fro, half a period of delay and a wrong sign differ only by the differences
+    between the sweeps.
 
     Parameters
     ----------
@@ -410,9 +467,12 @@ def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
 
 def _best_shift(windows, table):
     """
-    Return the `_Shift` that explains the rates best; of equally good ones, the smallest; without samples, no shift.
+    Return the `_Shift` that explains the rates best; of equally good ones, the smallest.
 
-    ``share(s) = c |c| / (e_m e_r)`` with c the sum of measured(t) reference(t - s) and e their sums of squares, all of the same pairs.
+    Without samples, no shift.
+
+    ``share(s) = c |c| / (e_m e_r)`` with c the sum of measured(t) reference(t - s) and e their sums
+    of squares, all of the same pairs.
     """
     windows = [window for window in windows if len(window) >= MIN_TESTED_SAMPLES]
     if not windows:
@@ -450,7 +510,8 @@ def _best_shift(windows, table):
     middle, lag = RESOLVED * most, int(RESOLVED * LEAST_SHIFT / period)
     near = np.abs(shares[middle - lag : middle + lag + 1])
     place = int(np.argmax(near)) + middle - lag
-    # The nearest peak to zero delay among those within SHARE_TIE of the highest: periodic motion has many.
+    # The nearest peak to zero delay among those within SHARE_TIE of the highest: periodic motion
+    # has many.
     inner = shares[1:-1]
     peaks = 1 + np.flatnonzero(
         (inner >= shares[:-2]) & (inner >= shares[2:]) & (inner >= shares.max() - SHARE_TIE)
@@ -468,7 +529,11 @@ def _best_shift(windows, table):
 
 
 def _correlations(first, second, most):
-    """Return the sums of first(t) second(t - s) for s up to +-most samples, in steps of 1 / RESOLVED of a sample."""
+    """
+    Return the sums of first(t) second(t - s) for s up to +-most samples.
+
+    s is in steps of 1 / RESOLVED of a sample.
+    """
     size = 1 << int(np.ceil(np.log2(2 * len(first))))
     sums = np.fft.irfft(
         (np.fft.rfft(first, size, axis=0) * np.conj(np.fft.rfft(second, size, axis=0))).sum(axis=1),

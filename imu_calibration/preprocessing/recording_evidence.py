@@ -1,4 +1,8 @@
-"""Evidence of one pass over a recording for its checks, and checks of the header and covariance of single messages."""
+"""
+Evidence of one pass over a recording for its checks, and checks of messages.
+
+The checks of messages are of the header and covariance of single messages.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -215,11 +219,17 @@ class MessageEvidence:
     frame_ids: dict[str, int] = field(default_factory=dict)
     """frame_id -> messages."""
     covariances: dict[str, np.ndarray] = field(default_factory=dict)
-    """'specific force', 'angular rate', 'orientation' -> covariance of the last message, shape (3, 3), SI."""
+    """
+    'specific force', 'angular rate', 'orientation' -> covariance of the last message, shape (3, 3),
+    SI.
+    """
     orientation: np.ndarray | None = None
     """Quaternion x, y, z, w of the last message, shape (4,)."""
     age: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Arrival minus stamp by the clock of this computer, s, shape (n,); messages without a stamp are left out."""
+    """
+    Arrival minus stamp by the clock of this computer, s, shape (n,); messages without a stamp are
+    left out.
+    """
 
 
 def check_messages(evidence: MessageEvidence) -> tuple[CheckFinding, ...]:
@@ -238,9 +248,9 @@ def frame(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'frame',
             WARNING,
-            f'messages must name their frame, {evidence.frame_ids[""]} of '
-            f'{sum(evidence.frame_ids.values())} have an '
-            "empty frame_id: they cannot be transformed; set the driver's frame_id, usually imu_link",
+            f'messages must name their frame, {evidence.frame_ids[""]} of'
+            f' {sum(evidence.frame_ids.values())} have an empty frame_id: they cannot be'
+            " transformed; set the driver's frame_id, usually imu_link",
         )
     if len(names) > 1:
         yield CheckFinding(
@@ -255,7 +265,9 @@ def frame(evidence: MessageEvidence) -> Iterator[CheckFinding]:
 
 
 def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
-    """Covariances are unknown (zeros), absent (-1) or covariances: finite, symmetric, not negative."""
+    """
+    Covariances are unknown (zeros), absent (-1) or covariances: finite, symmetric, not negative.
+    """
     for name, matrix in evidence.covariances.items():
         if matrix[0, 0] == ABSENT_MARK:
             if name != 'orientation':
@@ -269,9 +281,9 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'covariance',
                 WARNING,
-                f'variances of the {name} must be finite and not negative, they are '
-                f'{_numbers(np.diag(matrix))}; filters that believe them diverge: correct the driver, or fill them with '
-                'compensator_node',
+                f'variances of the {name} must be finite and not negative, they are'
+                f' {_numbers(np.diag(matrix))}; filters that believe them diverge: correct the'
+                ' driver, or fill them with compensator_node',
             )
         elif not matrix.any():
             if name != 'orientation':
@@ -291,8 +303,9 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'covariance',
                 WARNING,
-                f'variances of the {name} must be greater than zero, they are '
-                f'{_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct the driver',
+                f'variances of the {name} must be greater than zero, they are'
+                f' {_numbers(np.diag(matrix))}: a filter would treat these axes as exact; correct'
+                ' the driver',
             )
         else:
             yield CheckFinding(
@@ -333,9 +346,10 @@ def age(evidence: MessageEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'age',
             WARNING,
-            f'stamps must agree with the clock of this computer within {OLD} s, they are '
-            f'{abs(median):.3g} s {"behind" if median > 0 else "ahead of"} it: transforms and filters drop such messages; '
-            'synchronise the clocks, or for a recording play /clock and set use_sim_time',
+            f'stamps must agree with the clock of this computer within {OLD} s, they are'
+            f' {abs(median):.3g} s {"behind" if median > 0 else "ahead of"} it: transforms and'
+            ' filters drop such messages; synchronise the clocks, or for a recording play /clock'
+            ' and set use_sim_time',
         )
     else:
         yield CheckFinding(

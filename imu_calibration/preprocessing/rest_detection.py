@@ -10,13 +10,19 @@ from imu_calibration.core.samples import ImuSamples, runs_of
 from imu_calibration.preprocessing.window import WindowSettings
 
 SPANS = (0.25, 1.0)
-"""Variances are computed over these times, s: the short one detects a knock, the long one a slow swing."""
+"""
+Variances are computed over these times, s: the short one detects a knock, the long one a slow
+swing.
+"""
 QUIETNESS_REACH = 1.3
 """Samples at a larger distance do not change quietness, s."""
 BELOW = 0.1
 """Vibration is the part removed by three running means over this time, s: above about 8 Hz."""
 STEADY_SECONDS = 0.75
-"""Vibration is steady when it is not above the quiet ratio of its minimum within this time on both sides, s; a knock is not steady."""
+"""
+Vibration is steady when it is not above the quiet ratio of its minimum within this time on both
+sides, s; a knock is not steady.
+"""
 _MIN_QUIET_SAMPLES = 10
 _GRID = 0.01  # s: spans begin and end on this grid, or at every sample of a slow IMU
 _GROWTH = 2.0
@@ -24,7 +30,11 @@ _GUARD = 0.05  # s excluded on both sides of a disturbance: its first samples ca
 
 
 class QuietFloor:
-    """Running estimate of the quiet variances: the median over the last chunks, so that a noisy one does not set it."""
+    """
+    Running estimate of the quiet variances.
+
+    The median over the last chunks, so that a noisy one does not set it.
+    """
 
     def __init__(self) -> None:
         self._history = {}
@@ -50,8 +60,9 @@ def quiet_beside_joints(
     """
     Return a mask of the samples in a quiet span, or in a vibration of a table with resting joints.
 
-    Resting joints imply rest where the IMU vibrates: a vibration is steady, and means over a tenth of a second are as quiet as without
-    it. A hand, a shove and a slow turn change these means; a knock is not steady.
+    Resting joints imply rest where the IMU vibrates: a vibration is steady, and means over a tenth
+    of a second are as quiet as without it. A hand, a shove and a slow turn change these means; a
+    knock is not steady.
 
     Parameters
     ----------
@@ -102,7 +113,11 @@ def _low_passed_piece(values, first, last, width):
 
 
 def _steady(cells, *, ratio, resting):
-    """Return a mask of the samples in a short span at rest whose variance is about the minimum of the spans around."""
+    """
+    Return a mask of the samples in a short span at rest with minimal variance.
+
+    The variance of the span is about the minimum of the spans around.
+    """
     width = cells.width(SPANS[0])
     variance, at_rest = cells.variance(width), _free_of(~cells.all_of(resting), width)
     around = 2 * int(round(cells.cells_in(STEADY_SECONDS))) + 1
@@ -125,8 +140,9 @@ def quiet_samples(
     """
     Return a mask of the samples in a quiet span.
 
-    A span is quiet when the variances of specific force and of angular rate, summed over the axes, are below ``ratio^2``
-    times their floors; a sample is quiet when some quiet span of each length contains it.
+    A span is quiet when the variances of specific force and of angular rate, summed over the axes,
+    are below ``ratio^2`` times their floors; a sample is quiet when some quiet span of each length
+    contains it.
 
     Parameters
     ----------
@@ -139,7 +155,8 @@ def quiet_samples(
     floor : QuietFloor
         Running floor, updated here.
     resting : array of bool, shape (n,), optional
-        Samples with the joints at rest; the floor is computed from spans within them. None: from the quietest tenth of all.
+        Samples with the joints at rest; the floor is computed from spans within them. None: from
+        the quietest tenth of all.
     spans : tuple of float
         Lengths of the spans, s.
 
@@ -156,7 +173,8 @@ def quiet_samples(
         limit = floor.update(span, _chunk_floor(variance, width, at_rest))
         if limit is None and np.isinf(shorter).all():
             return np.zeros(cells.edges[-1], bool)
-        # at rest the variance hardly grows with the span; otherwise the quietest part was moving as well
+        # at rest the variance hardly grows with the span; otherwise the quietest part was moving as
+        # well
         shorter = limit = np.maximum(
             shorter if limit is None else np.minimum(limit, _GROWTH * shorter), cells.least
         )
@@ -186,7 +204,11 @@ def _free_of(busy, width):
 
 
 def least_variance(values: np.ndarray) -> float:
-    """Return the least variance, summed over axes: of half a converter step, or of 1e-5 of the readings."""
+    """
+    Return the least variance, summed over axes.
+
+    Of half a converter step, or of 1e-5 of the readings.
+    """
     some = np.ascontiguousarray(values[:4000].T)
     change = np.abs(np.diff(some, axis=1))
     step = np.where(change > 0, change, np.inf).min(axis=1, initial=np.inf)
@@ -236,7 +258,11 @@ class Cells:
         )
 
     def variance(self, width: int) -> np.ndarray:
-        """Return the variances of force and rate over `width` cells from each cell on, axes added, shape (n_spans, 2)."""
+        """
+        Return the variances of force and rate over `width` cells from each cell on, axes added.
+
+        Shape (n_spans, 2).
+        """
         count, variances = self.edges[width:] - self.edges[:-width], []
         for sums, squares in self._sums:
             total, square = sums[:, width:] - sums[:, :-width], squares[width:] - squares[:-width]
@@ -268,22 +294,35 @@ def _covered(calm, width):
 
 
 def shrunk(mask: np.ndarray, margin: int) -> np.ndarray:
-    """Return `mask` without the cells within `margin` cells of a False one; cells beyond the ends count as True."""
+    """
+    Return `mask` without the cells within `margin` cells of a False one.
+
+    Cells beyond the ends count as True.
+    """
     return minimum_filter1d(mask, 2 * margin + 1, mode='constant', cval=1)
 
 
 _TURNING_SD = 30.0
-"""A mean rate that differs from the usual one by this many noise sds and a hundredth of the largest rate is a steady turn, not a bias."""
+"""
+A mean rate that differs from the usual one by this many noise sds and a hundredth of the largest
+rate is a steady turn, not a bias.
+"""
 
 _STEP_SPAN = 0.5
 """Duration of the means whose differences show a transition from rest to a slow turn, s."""
 _ENOUGH = 6
 """Fewest intervals for the scatter of their mean rates."""
 _SCATTERS = 8.0
-"""A mean rate that differs from both neighbours by this many times the scatter (at least the noise of one sample) is a turn."""
+"""
+A mean rate that differs from both neighbours by this many times the scatter (at least the noise of
+one sample) is a turn.
+"""
 
 _LEAVES = 5.0
-"""A low-passed reading that differs from the mean of the middle half by more than this many sds belongs to the turn before or after."""
+"""
+A low-passed reading that differs from the mean of the middle half by more than this many sds
+belongs to the turn before or after.
+"""
 
 _LARGEST_GROWTH = 4.0
 """Bias wander over a long rest adds less variance than this."""
@@ -293,9 +332,9 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
     """
     Find the intervals of rest from IMU data only.
 
-    Compares short-time variances with the quietest tenth of the recording, so any unit is allowed, also counts. The
-    first `settling` seconds of an interval are excluded, except at the start of the recording; steady turns and intervals shorter than
-    `static_minimum` are not reported.
+    Compares short-time variances with the quietest tenth of the recording, so any unit is allowed,
+    also counts. The first `settling` seconds of an interval are excluded, except at the start of
+    the recording; steady turns and intervals shorter than `static_minimum` are not reported.
 
     Parameters
     ----------
@@ -317,12 +356,14 @@ def find_still(imu: ImuSamples, settings: WindowSettings = WindowSettings()) -> 
     step = np.diff(imu.stamp_ns)
     if not (np.isfinite(imu.force_s).all() and np.isfinite(imu.rate_s).all()):
         raise InputError(
-            'samples must be finite to search for rest, got NaN or infinite values; drop them first',
+            'samples must be finite to search for rest, got NaN or infinite values; drop them'
+            ' first',
             code='not_finite',
         )
     if np.any(step < 0):
         raise InputError(
-            'stamps must not decrease in the search for rest, got a backward step; clean the stream first',
+            'stamps must not decrease in the search for rest, got a backward step; clean the stream'
+            ' first',
             code='stamps_backwards',
         )
     if not np.any(step > 0):
@@ -354,7 +395,11 @@ def _intervals(stamp_ns, quiet, period, settings):
 
 
 def _keeps_attitude(force, period):
-    """Return whether the scatter over the interval equals the scatter over short spans: under vibration, slow turns are quiet."""
+    """
+    Return whether the scatter over the interval equals the scatter over short spans.
+
+    Under vibration, slow turns are quiet.
+    """
     width = min(max(10, int(round(SPANS[0] / period))), len(force))
     pieces = force[: len(force) // width * width].reshape(-1, width, 3)
     local = np.mean(pieces.var(axis=1, ddof=1).sum(axis=1)) + least_variance(force)
@@ -362,7 +407,11 @@ def _keeps_attitude(force, period):
 
 
 def _at_one_rate(rate, found, period, shortest):
-    """Divide intervals where the rate changes by its noise and a thousandth of the largest: a transition from rest to a slow turn."""
+    """
+    Divide intervals where the rate changes by its noise and a thousandth of the largest.
+
+    A transition from rest to a slow turn.
+    """
     if not found:
         return found
     noise = np.median([rate[piece].std(axis=0) for piece in found], axis=0)
@@ -391,7 +440,11 @@ def _farthest(values, centre):
 
 
 def _trimmed(imu, found, period, shortest):
-    """Trim both ends of intervals where the low-passed readings exceed the scatter of the middle: a turn begins below the noise."""
+    """
+    Trim both ends of intervals where the low-passed readings exceed the scatter of the middle.
+
+    A turn begins below the noise.
+    """
     first, last = (
         np.array([getattr(piece, end) for piece in found], int) for end in ('start', 'stop')
     )
@@ -420,7 +473,11 @@ def _trimmed(imu, found, period, shortest):
 
 
 def _not_turning(rate, found):
-    """Exclude intervals whose mean rate differs significantly from their neighbours: slow and steady turns."""
+    """
+    Exclude intervals whose mean rate differs significantly from their neighbours.
+
+    Slow and steady turns.
+    """
     if len(found) < 2:
         return found
     means = np.array([rate[piece].mean(axis=0) for piece in found])

@@ -8,7 +8,10 @@ from imu_calibration.core.samples import AlignedArrays, runs_of
 from imu_calibration.kinematics.rotations import unit_rows
 
 CHUNK_SECONDS = 0.25
-"""s; short against turns by hand, long against the period of the samples; also the distance at which temperatures are kept."""
+"""
+s; short against turns by hand, long against the period of the samples; also the distance at which
+temperatures are kept.
+"""
 MIN_CHUNK_SAMPLES, MAX_CHUNK_SAMPLES = 8, 2048
 """Samples per chunk."""
 FIRST = 200
@@ -39,7 +42,9 @@ class Chunks(AlignedArrays):
 
 class ChunkSeries:
     """
-    Cuts clean samples into chunks of equal number; how the stream was cut into blocks does not matter.
+    Cuts clean samples into chunks of equal number.
+
+    How the stream was cut into blocks does not matter.
 
     Parameters
     ----------
@@ -60,7 +65,11 @@ class ChunkSeries:
         self._parts, self._n_chunks = [], 0
 
     def push(self, stamp_ns: np.ndarray, columns: np.ndarray) -> None:
-        """Process clean samples of one epoch of the clock: stamps, shape (n,), and force and rate, shape (6, n)."""
+        """
+        Process clean samples of one epoch of the clock.
+
+        Stamps, shape (n,), and force and rate, shape (6, n).
+        """
         self._count_changes(columns)
         if self._rest is not None:
             stamp_ns, columns = (
@@ -151,7 +160,10 @@ LEAST_FACES = 6
 FARTHEST = 0.8
 """Bias in units of gravity from which on readings are no sphere but counts with an offset."""
 LEAST_SPREAD = 0.05
-"""Smallest eigenvalue of the scatter of directions (1/3 when they are even) above which poses separate bias from length."""
+"""
+Smallest eigenvalue of the scatter of directions (1/3 when they are even) above which poses separate
+bias from length.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +175,10 @@ class Rest:
     rate: np.ndarray
     """Median of the mean rate, shape (3,)."""
     range: np.ndarray
-    """Median over the chunks at rest of largest minus smallest, force then rate, shape (6,); 0 where the noise does not show."""
+    """
+    Median over the chunks at rest of largest minus smallest, force then rate, shape (6,); 0 where
+    the noise does not show.
+    """
     ranges: np.ndarray
     """First chunk of each stretch and the one after its last, shape (n_stretches, 2)."""
 
@@ -174,12 +189,18 @@ class Rest:
 
     @property
     def sphere(self) -> tuple[np.ndarray, float] | None:
-        """Centre (the bias) and radius of the sphere on which the readings of many poses lie, or None."""
+        """
+        Centre (the bias) and radius of the sphere on which the readings of many poses lie, or None.
+        """
         return self._sphere() if len(self.force) >= LEAST_POSES else None
 
     @property
     def bias(self) -> np.ndarray | None:
-        """Bias of the accelerometer, to a tenth of gravity or so, where six faces or more show it, or None."""
+        """
+        Bias of the accelerometer, to a tenth of gravity or so, where six faces or more show it.
+
+        Or None.
+        """
         found = self._sphere() if len(self.force) >= LEAST_FACES else None
         return None if found is None else found[0]
 
@@ -197,7 +218,9 @@ class Rest:
 
     @property
     def length(self) -> float:
-        """Gravity in the units of the accelerometer: the radius of the sphere, else the median length."""
+        """
+        Gravity in the units of the accelerometer: the radius of the sphere, else the median length.
+        """
         return float(np.median(self.norm)) if self.sphere is None else self.sphere[1]
 
 
@@ -220,8 +243,8 @@ def still_chunks(chunks: Chunks) -> np.ndarray:
     """
     Return in which chunks the sensor is at rest, bool, shape (n,).
 
-    At rest both sensors scatter as little as in the quietest tenth, and gravity keeps its direction. Both are relative, so that
-    counts and g do as well as m/s^2.
+    At rest both sensors scatter as little as in the quietest tenth, and gravity keeps its
+    direction. Both are relative, so that counts and g do as well as m/s^2.
     """
     if len(chunks) < LEAST_CHUNKS:
         return np.zeros(len(chunks), bool)
@@ -256,7 +279,10 @@ SENSOR_COLUMNS = {'accelerometer': slice(0, 3), 'gyroscope': slice(3, 6)}
 LONG = 4
 """Chunks, one second."""
 MIN_NOISE_STEPS = 2.0
-"""A sensor with a noise at rest of at least this many converter steps in a chunk is not constant on three axes for a second."""
+"""
+A sensor with a noise at rest of at least this many converter steps in a chunk is not constant on
+three axes for a second.
+"""
 MIN_TURN_RATE = 0.1
 """Mean rate of a chunk from which on the IMU turns, rad/s."""
 
@@ -293,8 +319,9 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
     """
     Return sensor -> which chunks it is frozen in, bool, shape (n,).
 
-    A sensor with visible noise at rest never repeats one reading on three axes for a second. A sensor with steps coarser than its noise,
-    or without noise, does so at every rest: the constant stretches then outnumber the rests with noise, and none is reported.
+    A sensor with visible noise at rest never repeats one reading on three axes for a second. A
+    sensor with steps coarser than its noise, or without noise, does so at every rest: the constant
+    stretches then outnumber the rests with noise, and none is reported.
 
     Parameters
     ----------
@@ -347,8 +374,8 @@ def frozen_joints(
     still_ns : array, shape (n, 2)
         First and last stamp of each stretch in which no joint position changes.
     rate_at_rest : array, shape (3,)
-        Reading of the gyroscope at rest, rad/s; its most frequent reading with constant joints if that explains more (spins about
-        the vertical are as steady as rests).
+        Reading of the gyroscope at rest, rad/s; its most frequent reading with constant joints if
+        that explains more (spins about the vertical are as steady as rests).
 
     """
     inside = np.zeros(len(chunks), bool)
@@ -379,7 +406,11 @@ def _part(chunks, who, start, stop):
 
 
 class StandingJoints:
-    """Notes, in bounded memory, in which stretches of more than half a second no joint position changes."""
+    """
+    Notes, in bounded memory, of stretches without change of a joint position.
+
+    The stretches are of more than half a second and no joint position changes in them.
+    """
 
     LEAST_NS = 500_000_000
     CAPACITY = 10_000
@@ -390,7 +421,9 @@ class StandingJoints:
         self._last = np.zeros(0)
 
     def push(self, stamp_ns: np.ndarray, position: np.ndarray) -> None:
-        """Process joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints)."""
+        """
+        Process joint samples in order: stamps, shape (n,), and positions, shape (n, n_joints).
+        """
         if len(self._last) != position.shape[1]:
             self._last = np.full(position.shape[1], np.nan)  # differs from any position
         starts = np.flatnonzero(

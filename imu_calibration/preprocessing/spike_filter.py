@@ -1,4 +1,6 @@
-"""Single outlying readings: a glitch on the bus, a corrupt message; dropped before any averaging."""
+"""
+Single outlying readings: a glitch on the bus, a corrupt message; dropped before any averaging.
+"""
 
 import numpy as np
 
@@ -15,15 +17,24 @@ SPIKE_NEIGHBOURS = 4
 LARGE = 8.0
 """Deviations below this many noise sds are not tested."""
 PREDICTION_SHARE = 0.2
-"""Largest difference of the predictions from either side, as a share of the deviation: a knock, a stop and fast twisting exceed it."""
+"""
+Largest difference of the predictions from either side, as a share of the deviation: a knock, a stop
+and fast twisting exceed it.
+"""
 SPIKE_SPREADS = 10.0
 """Factor on the spread of the eight neighbours without the two lowest and the two highest."""
 PREDICTION_MARGIN = 0.25
 """The same in units of `LARGE` noise sds, for the noise of these predictions."""
 SHARED = 1.5
-"""The same for the differences of the four neighbours, of which the noise is 0.4 of this unit: more in two of six readings is a knock."""
+"""
+The same for the differences of the four neighbours, of which the noise is 0.4 of this unit: more in
+two of six readings is a knock.
+"""
 BETWEEN = (0.03, 0.4)
-"""A neighbour that deviates by more than the first share of a spike, and less than the second, indicates a knock."""
+"""
+A neighbour that deviates by more than the first share of a spike, and less than the second,
+indicates a knock.
+"""
 NOISE_ROUNDING = 1e-7
 """Share of the readings below which differences are due to rounding."""
 _CANDIDATE = 6.0
@@ -32,13 +43,17 @@ _NORMAL = 1.4826 / np.sqrt(1.5)  # sd of white noise over the median of |x_k - (
 
 class SpikeFilter:
     """
-    Removes spikes from a stream; the result does not depend on the division of the stream into pieces.
+    Removes spikes from a stream.
 
-    A reading is a spike when its deviation from the cubic through the four nearest readings exceeds `LARGE` sds of the noise and by far the
-    differences of its neighbours. The cubic follows fast motion; it must agree with the predictions from each side. Where one of the four
-    is an outlier as well, the median of the nine readings around replaces the cubic (Hampel's test). The noise is estimated from medians of
-    second differences, over the chunk of samples before or the samples around; white noise exceeds 8 sds once in 1e15 samples. Source:
-    Pearson et al., EURASIP J. Adv. Signal Process. 2016:87.
+    The result does not depend on the division of the stream into pieces.
+
+    A reading is a spike when its deviation from the cubic through the four nearest readings exceeds
+    `LARGE` sds of the noise and by far the differences of its neighbours. The cubic follows fast
+    motion; it must agree with the predictions from each side. Where one of the four is an outlier
+    as well, the median of the nine readings around replaces the cubic (Hampel's test). The noise is
+    estimated from medians of second differences, over the chunk of samples before or the samples
+    around; white noise exceeds 8 sds once in 1e15 samples. Source: Pearson et al., EURASIP J. Adv.
+    Signal Process. 2016:87.
     """
 
     def __init__(self) -> None:
@@ -110,8 +125,8 @@ class SpikeFilter:
             knock = _knocked(values[inner[:, None] + [-2, -1, 1, 2]], limit[row]) & (
                 inner == at[row]
             )
-            # during vibration, as at the first touch of a hand, the previous noise does not apply; a spike affects three second
-            # differences, two in six
+            # during vibration, as at the first touch of a hand, the previous noise does not apply;
+            # a spike affects three second differences, two in six
             shaking = LARGE * _NORMAL * np.median(second[window[:, 1:-1], column], axis=1)
             limit = np.maximum(limit[row, column[:, 0]], shaking)
             first = np.clip(at[row] - SPIKE_NEIGHBOURS, 0, len(values) - 2 * SPIKE_NEIGHBOURS - 1)
@@ -128,7 +143,11 @@ class SpikeFilter:
         return spiky
 
     def _add_noise(self, second):
-        """Estimate the noise sd of each complete chunk, at least the converter's step, shape (n_chunks, 6)."""
+        """
+        Estimate the noise sd of each complete chunk, at least the converter's step.
+
+        Shape (n_chunks, 6).
+        """
         start = self._n_noise * NOISE_SAMPLES - self._first
         count = (len(second) - 1 - start) // NOISE_SAMPLES if len(second) > NOISE_SAMPLES else 0
         if self._n_noise == 0 and count == 0:  # a stream that ended before
@@ -144,7 +163,8 @@ class SpikeFilter:
         steps = np.where(change > 0, change, np.inf).min(axis=1)
         steps = np.minimum.accumulate(np.vstack([self._step, steps]))[1:]
         usual = _NORMAL * _median(parts)
-        # a constant output (clipped, frozen, coarse) has no noise estimate: the previous one is kept
+        # a constant output (clipped, frozen, coarse) has no noise estimate: the previous one is
+        # kept
         known = np.vstack([self._noise[-1:], usual])
         last = np.maximum.accumulate(np.where(known > 0, np.arange(len(known))[:, None], 0))
         usual = np.take_along_axis(known, last, axis=0)[1:]
@@ -160,13 +180,22 @@ class SpikeFilter:
 
 
 def _median(values):
-    """Return the median along axis 1; a sort of short columns is several times faster than the partition of `np.median`."""
+    """
+    Return the median along axis 1.
+
+    A sort of short columns is several times faster than the partition of `np.median`.
+    """
     ordered, count = np.sort(values, axis=1), values.shape[1]
     return 0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2])
 
 
 def _knocked(beside, limit):
-    """Return where two or more of the six readings deviate in the neighbours `beside` (m, 4, 6) as well: motion affects several axes."""
+    """
+    Return where two or more of the six readings deviate in the neighbours as well.
+
+    The neighbours are `beside` (m, 4, 6). Such a deviation indicates motion, which affects several
+    axes.
+    """
     return (
         np.count_nonzero(
             np.abs(np.einsum('mkc,k->mc', beside, [-1.0, 2.0, -2.0, 1.0])) > SHARED * limit, axis=1
@@ -177,10 +206,14 @@ def _knocked(beside, limit):
 
 def _contradicted(around, place, limit):
     """
-    Compare with the cubic through two neighbours on either side, and with the straight lines through the two on each side.
+    Compare with the cubic and the straight lines through the neighbours.
 
-    A motion with such a deviation at one reading also affects its neighbours: the impulse response of 0.9 of the Nyquist bandwidth has a
-    tenth there. Both lines must therefore agree with the cubic; `place` of the reading in `around` is the middle except at the ends.
+    The cubic is through two neighbours on either side, and the lines are through the two on each
+    side.
+
+    A motion with such a deviation at one reading also affects its neighbours: the impulse response
+    of 0.9 of the Nyquist bandwidth has a tenth there. Both lines must therefore agree with the
+    cubic; `place` of the reading in `around` is the middle except at the ends.
     """
     a, b, x, c, d = around[:, SPIKE_NEIGHBOURS - 2 : SPIKE_NEIGHBOURS + 3].T
     predicted = (4 * (b + c) - (a + d)) / 6

@@ -13,9 +13,13 @@ class Stamping(StrEnum):
     """Use of a stretch of stamps."""
 
     REGULAR = 'regular'
-    """Steps of a clock, or integer multiples where samples were lost: the stamps are used unchanged."""
+    """
+    Steps of a clock, or integer multiples where samples were lost: the stamps are used unchanged.
+    """
     COUNTED = 'counted'
-    """Steps scatter about a line through the number of the sample: times are computed from that line."""
+    """
+    Steps scatter about a line through the number of the sample: times are computed from that line.
+    """
     IRREGULAR = 'irregular'
     """Steps scatter and follow no line: the stamps are the best estimate of the sampling times."""
 
@@ -24,23 +28,34 @@ REGULAR, COUNTED, IRREGULAR = Stamping
 MIN_REGULAR_STEP, MAX_REGULAR_STEP = 0.5, 1.5
 """A step between these many periods is a regular one."""
 WHOLE_STEP_SHARE = 0.1
-"""A longer step within this share of a period of an integer number of periods is regular too: samples were lost."""
+"""
+A longer step within this share of a period of an integer number of periods is regular too: samples
+were lost.
+"""
 MAX_IRREGULAR_SHARE = 0.05
 """Largest share of irregular steps."""
 MOST_LOST = 4
 """Largest number of lost samples per received one; beyond it the usual step is not the period."""
 LAG = 64
-"""Lag, in samples, at which the variance of stamp differences is compared with the variance at lag one."""
+"""
+Lag, in samples, at which the variance of stamp differences is compared with the variance at lag
+one.
+"""
 DRIFTING = 16.0
 """
-Ratio of these variances from which the steps are independent of one another, so that the stamps diverge from every line.
+Ratio of these variances from which the steps are independent of one another, so that the stamps
+diverge from every line.
 
-It is about 1 for jitter about a line, `LAG` for independent steps, and below 11 for packets of up to 100 samples.
+It is about 1 for jitter about a line, `LAG` for independent steps, and below 11 for packets of up
+to 100 samples.
 """
 PAUSE_NS = 1_000_000_000
 """A longer step is a pause; counting restarts after it."""
 SKEWED = 0.35
-"""Largest share of the range of times of arrival below their median: 0.5 of symmetric jitter, 0.17 of exponential lateness."""
+"""
+Largest share of the range of times of arrival below their median: 0.5 of symmetric jitter, 0.17 of
+exponential lateness.
+"""
 PACKET = 1.5
 """Samples received together, on average, from which stamps are those of packets."""
 MIN_PERIOD_STEPS = 16
@@ -75,23 +90,26 @@ class StampLine:
             return f'the steps between stamps scatter and follow no clock near {rate:.4g} Hz'
         if self.at_once >= PACKET:
             return (
-                f'stamps are times of arrival, about {self.at_once:.0f} samples at once; regular times at {rate:.4g} Hz are drawn '
-                'through them'
+                f'stamps are times of arrival, about {self.at_once:.0f} samples at once; regular'
+                f' times at {rate:.4g} Hz are drawn through them'
             )
         return (
-            f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular times at {rate:.4g} Hz are drawn '
-            'through them'
+            f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular'
+            f' times at {rate:.4g} Hz are drawn through them'
         )
 
 
 def describe_stamps(stamp_ns: np.ndarray) -> StampLine | None:
     """
-    Return the StampLine of the stamps of one stretch in the order of arrival, None when they are too few.
+    Return the StampLine of the stamps of one stretch in the order of arrival.
+
+    None when they are too few.
 
     Parameters
     ----------
     stamp_ns : ndarray of int64, shape (n,)
-        Without repeated messages; at least 256 are required to separate counted from irregular stamps.
+        Without repeated messages; at least 256 are required to separate counted from irregular
+        stamps.
 
     """
     step = np.diff(stamp_ns)
@@ -136,7 +154,11 @@ def is_regular(step: np.ndarray, period: float) -> np.ndarray:
 
 
 def regular_share(step: np.ndarray, period: float) -> float:
-    """Return the share of steps consistent with one clock and lost samples; 0 when more than `MOST_LOST` would be lost."""
+    """
+    Return the share of steps consistent with one clock and lost samples.
+
+    0 when more than `MOST_LOST` would be lost.
+    """
     number = np.rint(step / period)
     whole = np.abs(step / period - number)
     good = is_regular(step, period) | ((number >= 2) & (whole <= WHOLE_STEP_SHARE))
@@ -145,7 +167,11 @@ def regular_share(step: np.ndarray, period: float) -> float:
 
 
 def _without_losses(apart: np.ndarray, resolution: float) -> np.ndarray:
-    """Return the differences across `LAG` steps, without the ones that contain lost samples or a pause."""
+    """
+    Return the differences across `LAG` steps.
+
+    Without the ones that contain lost samples or a pause.
+    """
     off = np.abs(apart - np.median(apart)) if len(apart) else apart
     return (
         apart[off <= 3 * np.median(off) + 0.5 * np.median(apart) / LAG + resolution]
@@ -156,10 +182,13 @@ def _without_losses(apart: np.ndarray, resolution: float) -> np.ndarray:
 
 def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     """
-    Return the line of stamps near it: through the earliest ones of times of arrival, otherwise through their median.
+    Return the line of stamps near it.
 
-    Times of arrival keep the order, are late by more than a period, and arrive in packets or with a distribution skewed to late stamps. The
-    earliest of symmetric jitter is no sampling time: with 3 ms (Gaussian) it is 7 ms early and scatters three times as much as the mean.
+    Through the earliest ones of times of arrival, otherwise through their median.
+
+    Times of arrival keep the order, are late by more than a period, and arrive in packets or with a
+    distribution skewed to late stamps. The earliest of symmetric jitter is no sampling time: with 3
+    ms (Gaussian) it is 7 ms early and scatters three times as much as the mean.
     """
     number = np.arange(len(stamp_ns))
     residual = (stamp_ns - stamp_ns[0]) - period * number
@@ -175,21 +204,30 @@ def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
 CLOCK_BLOCK = LAG
 """Samples that give one point of the clock; the stamps are classified again after as many."""
 LOSS_REACH = 32
-"""Samples on both sides of a long step that decide between lost and late samples; packets are smaller."""
+"""
+Samples on both sides of a long step that decide between lost and late samples; packets are smaller.
+"""
 LOST_PERIOD_SHARE = 0.6
-"""Samples were lost at a long step if the clock is ahead by more than this share of a period after it, relative to before."""
+"""
+Samples were lost at a long step if the clock is ahead by more than this share of a period after it,
+relative to before.
+"""
 FOLLOW = 0.05
-"""A period that has changed by more than this share is another one; smaller changes are averaged."""
+"""
+A period that has changed by more than this share is another one; smaller changes are averaged.
+"""
 NEW_WEIGHT = 0.1
 """Weight of a new block in that average."""
 
 
 class CountedClock:
     """
-    Times of samples from their stamps, in order: each block of 64 gives one point; the times are interpolated linearly between points.
+    Times of samples from their stamps, in order: each block of 64 gives one point.
 
-    The points are those of the earliest stamps where stamps are times of arrival, which can only be late, otherwise the means. The
-    result does not depend on the division of the stamps into blocks.
+    The times are interpolated linearly between points.
+
+    The points are those of the earliest stamps where stamps are times of arrival, which can only be
+    late, otherwise the means. The result does not depend on the division of the stamps into blocks.
 
     Parameters
     ----------
@@ -219,7 +257,11 @@ class CountedClock:
         self._raw = np.concatenate([self._raw, stamp_ns])
 
     def take(self, final: bool = False) -> np.ndarray:
-        """Return the times that are determined now (all with `final`), int64, ns, in the order of the stamps."""
+        """
+        Return the times that are determined now (all with `final`), int64, ns.
+
+        They are in the order of the stamps.
+        """
         while len(self._raw) >= CLOCK_BLOCK + LOSS_REACH or (final and len(self._raw)):
             pause = np.flatnonzero(np.diff(self._raw[: CLOCK_BLOCK + LOSS_REACH]) > PAUSE_NS)
             end = len(self._raw) if not len(pause) else int(pause[0]) + 1
@@ -258,7 +300,11 @@ class CountedClock:
         self._block = number
 
     def _numbered(self, stamp: np.ndarray, count: int) -> np.ndarray:
-        """Return the numbers of the first `count` samples: increments of one, plus the number of samples lost at a long step."""
+        """
+        Return the numbers of the first `count` samples.
+
+        Increments of one, plus the number of samples lost at a long step.
+        """
         middle = np.min if self._arrivals else np.median
         number = self._next + np.arange(len(stamp))
         step = np.diff(stamp, prepend=self._before[1, -1] if self._before.shape[1] else stamp[0])
@@ -315,10 +361,12 @@ STAMP_HISTORY = 4 * LAG
 
 class SampleTimes:
     """
-    Assigns regular times to samples with irregular stamps; the result does not depend on the division of the stream into blocks.
+    Assigns regular times to samples with irregular stamps.
 
-    Regular stamps pass unchanged and without delay, except for the first few; they are reviewed every 64 samples. Repeated messages (same
-    stamp, same readings) are removed.
+    The result does not depend on the division of the stream into blocks.
+
+    Regular stamps pass unchanged and without delay, except for the first few; they are reviewed
+    every 64 samples. Repeated messages (same stamp, same readings) are removed.
     """
 
     def __init__(self) -> None:
@@ -337,7 +385,9 @@ class SampleTimes:
         self._history, self._unseen, self._reviewed = np.zeros(0, np.int64), 0, 0
 
     def push(self, samples: ImuSamples) -> ImuSamples | None:
-        """Return the samples whose times are determined now, in the order of arrival; None for none."""
+        """
+        Return the samples whose times are determined now, in the order of arrival; None for none.
+        """
         if self._pass(samples):
             return samples
         samples, ready = self._without_repeated(samples), []
@@ -360,7 +410,9 @@ class SampleTimes:
         return _joined(ready)
 
     def _pass(self, samples: ImuSamples) -> bool:
-        """Return whether all steps agree with the known clock: the usual case, without further tests."""
+        """
+        Return whether all steps agree with the known clock: the usual case, without further tests.
+        """
         if self._learning or self._clock is not None or self.line is None or not len(samples):
             return False
         step = np.diff(
@@ -434,7 +486,11 @@ class SampleTimes:
         return [replace(timed, stamp_ns=times)]
 
     def odd_line(self, count: int) -> StampLine | None:
-        """Return the relation of the irregular stamps to the sampling, when it concerns more than a few of `count` samples."""
+        """
+        Return the relation of the irregular stamps to the sampling.
+
+        It is returned when it concerns more than a few of `count` samples.
+        """
         number, word = max((self.n_rebuilt, COUNTED), (self.n_irregular, IRREGULAR))
         return self._odd_lines.get(word) if number > MAX_IRREGULAR_SHARE * count else None
 

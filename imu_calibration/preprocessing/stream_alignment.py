@@ -1,4 +1,8 @@
-"""Alignment of streams, chunk by chunk of a fixed grid in time: position and phase of the joints at the IMU's stamps."""
+"""
+Alignment of streams, chunk by chunk of a fixed grid in time.
+
+Position and phase of the joints at the IMU's stamps.
+"""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -70,7 +74,9 @@ class SampleBuffer:
 
 
 JOINT_WAIT = 60.0
-"""The IMU or the joints may be ahead of each other by this much before missing samples are skipped, s."""
+"""
+The IMU or the joints may be ahead of each other by this much before missing samples are skipped, s.
+"""
 TEMPERATURE_WAIT = 5.0
 """Largest delay of the temperature relative to the IMU, s."""
 _LEAST_MARGIN = max(window_cutter.PHASE_REACH, QUIETNESS_REACH) + 0.4
@@ -81,9 +87,10 @@ class MotionChunks:
     """
     One epoch of the clock: converts samples to `PhasedSamples`, in order.
 
-    Chunk k holds the IMU samples of `chunk` seconds from ``start + k * chunk`` on; `start` is the first IMU sample. The
-    result depends on samples within the chunk and a margin only, and a chunk is processed when all streams have passed
-    its margin (or are given up), so the division of the streams into blocks has no effect. The waiting times bound the memory.
+    Chunk k holds the IMU samples of `chunk` seconds from ``start + k * chunk`` on; `start` is the
+    first IMU sample. The result depends on samples within the chunk and a margin only, and a chunk
+    is processed when all streams have passed its margin (or are given up), so the division of the
+    streams into blocks has no effect. The waiting times bound the memory.
     """
 
     def __init__(
@@ -111,7 +118,11 @@ class MotionChunks:
         return min(self._settings.settling + self._settings.static_minimum, self.margin)
 
     def change(self, settings: WindowSettings) -> None:
-        """Use other settings from the next chunk on; the length of the chunks and their margin are unchanged."""
+        """
+        Use other settings from the next chunk on.
+
+        The length of the chunks and their margin are unchanged.
+        """
         self._settings = settings
 
     @property
@@ -147,7 +158,11 @@ class MotionChunks:
             )
 
     def take(self, final: bool = False) -> Iterator[PhasedSamples]:
-        """Yield the chunks that can be processed (all with `final`) as `PhasedSamples`, without samples that have no joints."""
+        """
+        Yield the chunks that can be processed (all with `final`) as `PhasedSamples`.
+
+        Without samples that have no joints.
+        """
         if self._start_ns is not None:
             passed = np.inf if final else self._passed_ns()
             while (
@@ -264,7 +279,11 @@ class MotionChunks:
         )
 
     def _joint_runs(self, first_ns, last_ns, period):
-        """Return joint readings between two stamps as stretches without gaps, and the longest step that is no gap, s."""
+        """
+        Return joint readings between two stamps as stretches without gaps.
+
+        The longest step that is no gap, in s, is returned as well.
+        """
         joints = self._joints.between(first_ns, last_ns)
         limit = max(self._settings.gap, 5 * period)
         if joints is None or not len(joints):
@@ -286,7 +305,11 @@ class MotionChunks:
         return runs, limit
 
     def _phases(self, time, runs, final):
-        """Return the phase of each IMU sample, the level of the joints there and the steps of their encoders."""
+        """
+        Return the phase of each IMU sample, and the level and steps of the joints there.
+
+        The level is that of the joints and the steps are of their encoders.
+        """
         phase = np.full(len(time), LOST, np.int8)
         level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
         steps = np.zeros(level.shape)
@@ -333,7 +356,11 @@ class MotionChunks:
         return np.interp(at, known, readings.temperature_c), np.interp(at, known, readings.branch)
 
     def _at_edge(self, stamp_ns, limit, final):
-        """Return a mask of the samples close before the first joint state or after the last one, where no joint state is missing."""
+        """
+        Return a mask of the samples close before the first joint state or after the last one.
+
+        Where no joint state is missing.
+        """
         if self._first_joint_ns is None:
             return np.zeros(len(stamp_ns), bool)
         edge = (stamp_ns < self._first_joint_ns) & (stamp_ns >= self._first_joint_ns - _ns(limit))

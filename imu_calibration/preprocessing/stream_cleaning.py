@@ -22,7 +22,10 @@ _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
 """A larger backward step is a reset of the clock, a smaller one a late sample."""
 FORWARD_RESET_NS = 3600 * _SECOND
-"""A larger forward step is a reset of the clock as well (a computer that receives the date after start-up)."""
+"""
+A larger forward step is a reset of the clock as well (a computer that receives the date after
+start-up).
+"""
 NEVER_NS = 1 << 62
 _NEEDED = {
     ImuSamples: ('force_s', 'rate_s'),
@@ -35,11 +38,11 @@ class StreamCheck:
     """
     Cleans one stream; the result does not depend on its division into pieces.
 
-    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is kept), 'backward stamp' (a late
-    sample), 'stray stamp' (one sample far from both neighbours), of an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps,
-    each of which starts a new epoch.
-    Where the stamps of an IMU follow a clock only loosely (packets, times of arrival, milliseconds, jitter), the times of its samples
-    are computed first (see `sample_times`).
+    Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is
+    kept), 'backward stamp' (a late sample), 'stray stamp' (one sample far from both neighbours), of
+    an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps, each of which starts a new
+    epoch. Where the stamps of an IMU follow a clock only loosely (packets, times of arrival,
+    milliseconds, jitter), the times of its samples are computed first (see `sample_times`).
     """
 
     def __init__(self) -> None:
@@ -58,11 +61,19 @@ class StreamCheck:
 
     @property
     def line(self) -> StampLine | None:
-        """Regularity of the IMU stamps (`stamping.StampLine`); None for other streams, and until enough stamps have been received."""
+        """
+        Regularity of the IMU stamps (`stamping.StampLine`).
+
+        None for other streams, and until enough stamps have been received.
+        """
         return None if self._times is None else self._times.line
 
     def push(self, samples: Any) -> list[tuple[int, Any]]:
-        """Return a list of (epoch, samples) that are accepted; a few are buffered until their times are determined."""
+        """
+        Return a list of (epoch, samples) that are accepted.
+
+        A few are buffered until their times are determined.
+        """
         if samples is None or not len(samples):
             return []
         return self._without_spikes(self._accept(self._without_strays(self._finite(samples))))
@@ -230,7 +241,9 @@ class StreamStatistics:
     period: float
     """Median step between stamps, s; 0 with fewer than two samples."""
     stamp_step_ns: int
-    """Greatest common divisor of the steps between stamps, ns (1000000: milliseconds); 0 when unknown."""
+    """
+    Greatest common divisor of the steps between stamps, ns (1000000: milliseconds); 0 when unknown.
+    """
     n_gaps: int
     """Number of gaps."""
     gap_total: float
@@ -273,7 +286,11 @@ MAX_STEP_DEVIATION = 0.1
 
 
 class StepHistogram:
-    """Numbers and sums of steps in bins of equal ratio; adding pieces in any order gives the same numbers."""
+    """
+    Numbers and sums of steps in bins of equal ratio.
+
+    Adding pieces in any order gives the same numbers.
+    """
 
     def __init__(self) -> None:
         self.common_step_ns = 0
@@ -296,7 +313,8 @@ class StepHistogram:
         """
         Return the fields of `StreamStatistics` from `period` to `irregular`.
 
-        The median is exact to one per cent, and exactly when the steps are equal; all steps of a bin count alike.
+        The median is exact to one per cent, and exactly when the steps are equal; all steps of a
+        bin count alike.
         """
         mean, total = self._sum_ns / np.maximum(self._number, 1), int(self._number.sum())
         median = mean[np.searchsorted(np.cumsum(self._number), (total + 1) // 2)]
@@ -328,7 +346,9 @@ _SAMPLE_TYPES: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class CleanedBlock:
-    """Usable samples of one or several blocks: per stream (epoch of the clock, samples), ... in order."""
+    """
+    Usable samples of one or several blocks: per stream (epoch of the clock, samples), ... in order.
+    """
 
     imu: Sequence[tuple[int, ImuSamples]] = ()
     """SI."""
@@ -353,7 +373,9 @@ class Watcher(Protocol):
 
 class BlockCleaner:
     """
-    Converts the streams of a session to SI and one order of joints, and drops unusable samples (see `StreamCheck`).
+    Converts the streams of a session to SI and one order of joints.
+
+    It drops unusable samples (see `StreamCheck`).
 
     Parameters
     ----------
@@ -389,7 +411,11 @@ class BlockCleaner:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Return the dropped samples per stream: 'imu not finite', 'joints repeated stamp', ... -> number of samples."""
+        """
+        Return the dropped samples per stream.
+
+        'imu not finite', 'joints repeated stamp', ... -> number of samples.
+        """
         self._clean()
         return {
             f'{name} {reason}': count
@@ -418,7 +444,9 @@ class BlockCleaner:
 
     def push(self, block: SampleBlock) -> CleanedBlock:
         """
-        Add a block and return the samples usable now; small blocks are collected up to `CLEANING_BATCH` samples.
+        Add a block and return the samples usable now.
+
+        Small blocks are collected up to `CLEANING_BATCH` samples.
 
         Raises
         ------
@@ -481,8 +509,9 @@ class BlockCleaner:
         missing = [name for name in self._names if name not in joints.names]
         if missing:
             raise InputError(
-                f"joint states must hold the table's joints {', '.join(self._names)}, got {', '.join(joints.names)}; "
-                'correct the names in the table or choose another joint topic',
+                f"joint states must hold the table's joints {', '.join(self._names)}, got"
+                f' {", ".join(joints.names)}; correct the names in the table or choose another'
+                ' joint topic',
                 code='joint_names',
             )
         order = [joints.names.index(name) for name in self._names]

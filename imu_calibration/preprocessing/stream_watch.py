@@ -12,7 +12,10 @@ from imu_calibration.preprocessing.stream_cleaning import MESSAGES, STREAMS
 from imu_calibration.preprocessing.window_cutter import dropped
 
 SILENT_AFTER = 2.0
-"""Seconds without a message after which a stream counts as silent; also the lead of one stream's stamps over the other's."""
+"""
+Seconds without a message after which a stream counts as silent; also the lead of one stream's
+stamps over the other's.
+"""
 RECENT_SECONDS = 10.0
 """Seconds for which a loss is called recent."""
 COLD_AFTER = 10.0
@@ -71,7 +74,9 @@ class StreamWatch:
 
     @property
     def last_arrival(self) -> float | None:
-        """Arrival time of the last message, s of the clock given to `note`; None before the first."""
+        """
+        Arrival time of the last message, s of the clock given to `note`; None before the first.
+        """
         return max(self._arrived.values(), default=None)
 
     def note(self, block: SampleBlock, now: float) -> None:
@@ -97,7 +102,11 @@ class StreamWatch:
         self._lost = lost
 
     def _apart_for(self, lead, now):
-        """Return the time for which the stamps of the streams have differed, s; in a fast replay they differ briefly."""
+        """
+        Return the time for which the stamps of the streams have differed, s.
+
+        In a fast replay they differ briefly.
+        """
         if abs(lead) <= SILENT_AFTER:
             self._apart_since = None
             return 0.0
@@ -159,14 +168,20 @@ class StreamWatch:
             else 0.0
         )
         if self._apart_for(lead, now) > SILENT_AFTER:
-            return TROUBLE, (
-                f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"} the joint stamps; '
-                'bring the clocks together'
+            return (
+                TROUBLE,
+                (
+                    f'the Imu stamps are {abs(lead):.1f} s {"ahead of" if lead > 0 else "behind"}'
+                    ' the joint stamps; bring the clocks together'
+                ),
             )
         if stamping is not None and stamping.word == IRREGULAR:
             return (
                 TROUBLE,
-                f"{stamping}: sampling times are unknown; the driver should stamp by the sensor's clock",
+                (
+                    f'{stamping}: sampling times are unknown; the driver should stamp by the'
+                    " sensor's clock"
+                ),
             )
         if self._unstamped_at is not None and now - self._unstamped_at < RECENT_SECONDS:
             notes = ', '.join(f'{count} {reason}' for reason, count in self._notes.items())

@@ -1,4 +1,6 @@
-"""Checks of the readings: units, axes, clipping outputs, biases, gravity, resolution, temperature."""
+"""
+Checks of the readings: units, axes, clipping outputs, biases, gravity, resolution, temperature.
+"""
 
 from collections.abc import Iterator
 
@@ -28,7 +30,10 @@ from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 CHANNELS = (('accelerometer', slice(0, 3), 'm/s^2'), ('gyroscope', slice(3, 6), 'rad/s'))
 GRAVITY_SHARE = 0.02
 LINEAR = 0.8
-"""m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity. Readings in g have at least 0.8."""
+"""
+m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity.
+Readings in g have at least 0.8.
+"""
 MAX_GYRO_RATE = 100.0
 """rad/s, 5700 deg/s: above the range of nearly all gyroscopes."""
 FASTEST_DEG = 5000.0
@@ -64,17 +69,23 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def force_error(length: float, where: str = 'at rest') -> InputError | None:
-    """Return the error for a median length of the specific force that is not gravity in m/s^2, None for one that can be."""
+    """
+    Return the error for a median length of the specific force that is not gravity in m/s^2.
+
+    None for one that can be.
+    """
     said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
     if unit := unit_of_rest(length):
         return InputError(
-            f'{said}it is probably {unit}, accelerometer_scale {OTHER_UNITS[unit]:.6g}; convert it in the driver',
+            f'{said}it is probably {unit}, accelerometer_scale {OTHER_UNITS[unit]:.6g}; convert it'
+            ' in the driver',
             key='nominal',
             code='force_unit',
         )
     if length < LINEAR:
         return InputError(
-            f'{said}it is probably acceleration without gravity, as phones compute it; record the raw accelerometer',
+            f'{said}it is probably acceleration without gravity, as phones compute it; record the'
+            ' raw accelerometer',
             key='imu_topic',
             code='without_gravity',
         )
@@ -97,12 +108,16 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     convert = 'convert them in the driver'
     if turning is not None:
         ratio = 1.0 / turning.factor
-        came = f'angular rates must be in rad/s, they are {significant(ratio)} times the rotation of the measured gravity: '
+        came = (
+            f'angular rates must be in rad/s, they are {significant(ratio)} times the rotation of'
+            ' the measured gravity: '
+        )
         if 0.6 < ratio * DEG < 1.6:
             yield wrong_rate_unit(f'{came}probably deg/s, gyroscope_scale 57.29578; {convert}')
         elif 0.6 < ratio / DEG < 1.6:
             yield wrong_rate_unit(
-                f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert them once'
+                f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert'
+                ' them once'
             )
         elif _full_scale(evidence) is not None:
             return
@@ -112,18 +127,23 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'rate_unit',
                 GOOD,
-                f'angular rate in rad/s: gravity rotates according to the rates{_about(turning.axes)}',
+                'angular rate in rad/s: gravity rotates according to the'
+                f' rates{_about(turning.axes)}',
             )
     elif largest > MAX_GYRO_RATE:
         unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
         yield wrong_rate_unit(
-            f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes measure: {unit}?; '
-            f'{convert}'
+            f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes'
+            f' measure: {unit}?; {convert}'
         )
 
 
 def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
-    """The driver converts for the set full-scale range: gravity turns from rest to rest by the integral of the rates."""
+    """
+    The driver converts for the set full-scale range.
+
+    Gravity turns from rest to rest by the integral of the rates.
+    """
     factor = _full_scale(evidence)
     if factor is None:
         return
@@ -132,14 +152,16 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'full_scale',
             WARNING,
-            f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set; '
-            'correct its setting (a calibration would include the factor in the matrix, and be wrong after the correction)',
+            f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set;'
+            ' correct its setting (a calibration would include the factor in the matrix, and be'
+            ' wrong after the correction)',
         )
     else:
         yield CheckFinding(
             'full_scale',
             WARNING,
-            f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at rest',
+            f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at'
+            ' rest',
         )
 
 
@@ -169,7 +191,8 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             )
         return
     what = ', '.join(
-        f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's {'xyz'[i]}"
+        f"the gyroscope's {'xyz'[j]} is {'minus ' if sign < 0 else ''}the accelerometer's"
+        f' {"xyz"[i]}'
         for i, j, sign in match.exchanges(turning.seen)
     )
     if not what or match.agreement < MIN_MATCH:
@@ -184,8 +207,9 @@ def handedness(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     yield CheckFinding(
         'handedness',
         REFUSE,
-        'accelerometer and gyroscope must share right-handed axes, gravity does not rotate '
-        f'according to the rates: {what} ({kind}); correct signs and order of the axes in the driver',
+        'accelerometer and gyroscope must share right-handed axes, gravity does not rotate'
+        f' according to the rates: {what} ({kind}); correct signs and order of the axes in the'
+        ' driver',
     )
 
 
@@ -202,9 +226,11 @@ def clipping(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         words, total, level = [], 0, 0.0
         for axis, ends in enumerate(evidence.ends[part]):
             counts = [
-                _clipped(end, sign * held[:, axis], evidence.chunks.size)
-                if end.level > least[axis] and (fine[axis] or end.jumped)
-                else 0
+                (
+                    _clipped(end, sign * held[:, axis], evidence.chunks.size)
+                    if end.level > least[axis] and (fine[axis] or end.jumped)
+                    else 0
+                )
                 for sign, end in zip((1, -1), ends)
             ]
             if sum(counts):
@@ -234,7 +260,11 @@ def _held(evidence, sensor):
 
 
 def _clipped(end, held, size):
-    """Return how many readings are at the end of the range; a pile that is a frozen stretch with its two ends is none."""
+    """
+    Return how many readings are at the end of the range.
+
+    A pile that is a frozen stretch with its two ends is none.
+    """
     frozen = size * int(np.isclose(held, end.level, rtol=1e-9).sum())
     return end.n_clipped if not frozen or end.n_clipped > frozen + 2 * size else 0
 
@@ -243,7 +273,8 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The biases are such as sensors have."""
     rest = evidence.rest
     if rest is None or rest.bias is None or not 3.0 < evidence.length < 30.0:
-        return  # with few attitudes, a steady spin about the vertical is not distinguishable from rest
+        # With few attitudes, a steady spin about the vertical is not distinguishable from rest
+        return
     found = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
     for sensor, _, unit in CHANNELS:
         size = float(np.linalg.norm(found[sensor]))
@@ -257,8 +288,9 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'bias',
                 WARNING,
-                f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of '
-                'sensor has; check offsets in the driver, the supply and the soldering of the sensor',
+                f'the bias of the {sensor} is {people} ([{values}] {unit}), more than any grade of'
+                ' sensor has; check offsets in the driver, the supply and the soldering of the'
+                ' sensor',
             )
 
 
@@ -277,9 +309,9 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'gravity',
             WARNING,
-            f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads '
-            f'{rest.length:.3f} ({what}), {100 * off:+.1f} %: scale or bias is wrong (gravity differs by '
-            f'{100 * GRAVITY_PLACE_SHARE} % between sites)',
+            f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads'
+            f' {rest.length:.3f} ({what}), {100 * off:+.1f} %: scale or bias is wrong (gravity'
+            f' differs by {100 * GRAVITY_PLACE_SHARE} % between sites)',
         )
     else:
         yield CheckFinding(
@@ -295,9 +327,9 @@ def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'repeated_readings',
             WARNING,
-            f'{100 * share:.0f} % of the samples repeat all six readings of the one before: '
-            'the driver publishes faster than the sensor measures, and noise is underestimated; publish each measurement '
-            'once',
+            f'{100 * share:.0f} % of the samples repeat all six readings of the one before: the'
+            ' driver publishes faster than the sensor measures, and noise is underestimated;'
+            ' publish each measurement once',
         )
 
 
@@ -320,7 +352,8 @@ def resolution(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             yield CheckFinding(
                 'resolution',
                 NOTE,
-                f'the {sensor} is read in steps of {people}, coarser than its noise on {_axes(coarse)}'
+                f'the {sensor} is read in steps of {people}, coarser than its noise on'
+                f' {_axes(coarse)}'
                 + (f' and constant at rest on {_axes(constant)}' if constant.any() else '')
                 + ': means over short windows are rounded too; the noise is at least step/sqrt(12)',
             )

@@ -54,13 +54,18 @@ class Window:
     rate_s: np.ndarray
     """Measured angular rate, rad/s, shape (n, 3)."""
     motion: JointMotion
-    """The joints at the IMU's stamps; one row at rest: mean position, and rates of zero unless the joints creep significantly."""
+    """
+    The joints at the IMU's stamps; one row at rest: mean position, and rates of zero unless the
+    joints creep significantly.
+    """
     temperature_c: np.ndarray | None = None
     """Temperature at the samples, degrees Celsius, shape (n,), or None."""
     reason: UnusedReason = UnusedReason.NONE
     """Why the window is unused."""
     joint_step: np.ndarray | None = None
-    """Steps of the encoders visible in the readings, rad, zero where none are, shape (n_joints,)."""
+    """
+    Steps of the encoders visible in the readings, rad, zero where none are, shape (n_joints,).
+    """
     corrected: np.ndarray | None = None
     """See `ImuSamples`."""
 
@@ -87,7 +92,11 @@ class Window:
 
     @property
     def noise_sd(self) -> np.ndarray:
-        """White noise of specific force and angular rate from second differences, shape (2, 3); smooth motion cancels."""
+        """
+        White noise of specific force and angular rate from second differences, shape (2, 3).
+
+        Smooth motion cancels.
+        """
         second = np.diff(np.stack([self.force_s, self.rate_s]), 2, axis=1)
         return second.std(axis=1) / np.sqrt(6) if second.shape[1] > 1 else np.full((2, 3), np.nan)
 
@@ -103,7 +112,10 @@ class PhasedSamples(AlignedArrays):
     rate_s: np.ndarray
     """Shape (n, 3)."""
     motion: JointMotion
-    """At session time; derivatives are zero where the joints rest, the thermal branch is NaN where the temperature is unknown."""
+    """
+    At session time; derivatives are zero where the joints rest, the thermal branch is NaN where the
+    temperature is unknown.
+    """
     temperature_c: np.ndarray
     """NaN where unknown, shape (n,)."""
     phase: np.ndarray
@@ -152,7 +164,11 @@ STORED_IN_MEMORY = 64 << 20
 
 
 class StoredWindows:
-    """A list of windows in a temporary file, so that memory does not grow with the recording; an access reads a window from the file."""
+    """
+    A list of windows in a temporary file, so that memory does not grow with the recording.
+
+    An access reads a window from the file.
+    """
 
     def __init__(self) -> None:
         self._file: Any = SpooledTemporaryFile(max_size=STORED_IN_MEMORY)
@@ -180,7 +196,11 @@ WINDOW_GROUP_SAMPLES = 4096
 
 
 def chunks(windows: Iterable[Window]) -> Iterator[list[Window]]:
-    """Yield the windows in groups of at most `WINDOW_GROUP_SAMPLES` samples, or of a single longer window, in order."""
+    """
+    Yield the windows in groups of limited size, in order.
+
+    A group has at most `WINDOW_GROUP_SAMPLES` samples, or is a single longer window.
+    """
     part, size = [], 0
     for window in windows:
         if part and size + len(window.motion) > WINDOW_GROUP_SAMPLES:
@@ -193,7 +213,11 @@ def chunks(windows: Iterable[Window]) -> Iterator[list[Window]]:
 
 
 def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None]:
-    """Return the motion of all windows in one piece, and the temperatures (window means where static), or None."""
+    """
+    Return the motion of all windows in one piece, and the temperatures (window means where static).
+
+    Or None.
+    """
     known = [
         [w.temperature_c.mean()] if w.kind == WindowKind.STATIC else w.temperature_c
         for w in windows
@@ -206,7 +230,11 @@ def joined_motion(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | 
 
 
 def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | None, np.ndarray]:
-    """Return the result of `joined_motion`, and for each sample the row of the motion that belongs to it."""
+    """
+    Return the result of `joined_motion`, and the row of motion for each sample.
+
+    The row is that of the motion that belongs to the sample.
+    """
     lengths = [len(w.motion) for w in windows]
     starts = np.cumsum([0] + lengths)
     rows = np.concatenate(
@@ -219,7 +247,11 @@ def all_samples(windows: Sequence[Window]) -> tuple[JointMotion, np.ndarray | No
 
 
 def _mean_motion(motion):
-    """Return one row: the mean position and, when the slope of a straight line is significant, this slope."""
+    """
+    Return one row.
+
+    The mean position and, when the slope of a straight line is significant, this slope.
+    """
     mean = motion.position.mean(axis=0)
     some = slice(
         None, None, max(1, len(motion) // 500)
@@ -228,7 +260,8 @@ def _mean_motion(motion):
     slope = time @ position / max(time @ time, 1e-12)
     rest = (position - time[:, None] * slope).std(axis=0)
     distance = np.abs(slope) * (time[-1] - time[0])
-    # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no creep
+    # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no
+    # creep
     slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
     zero, branch = np.zeros((1, len(mean))), motion.thermal_branch
     return JointMotion(

@@ -54,10 +54,11 @@ def joint_phases(
     """
     Return the phase of each joint reading of a stretch without gaps.
 
-    At rest: every slope over 0.2 s, and at least one slope over a second that contains the reading, is below `static_rate` plus errors of
-    noise and encoder steps (four standard deviations; 1.5 steps over the span). Steady: within at least one second that
-    contains the reading the rates over 0.2 s change by less than `spin_rate_variation` of their middle, or by less than `static_rate`,
-    and the readings show no ripple about them.
+    At rest: every slope over 0.2 s, and at least one slope over a second that contains the reading,
+    is below `static_rate` plus errors of noise and encoder steps (four standard deviations; 1.5
+    steps over the span). Steady: within at least one second that contains the reading the rates
+    over 0.2 s change by less than `spin_rate_variation` of their middle, or by less than
+    `static_rate`, and the readings show no ripple about them.
 
     Parameters
     ----------
@@ -104,12 +105,17 @@ def joint_phases(
 def _resolution(rows, noise_rad):
     """Return the step of the encoders and the noise of the readings, both (n_joints,), rad."""
     step = np.array([encoder_step(row) for row in rows])
-    # the lower quartile: if a quarter of the readings are at rest, it contains neither jitter nor jerk
+    # the lower quartile: if a quarter of the readings are at rest, it contains neither jitter nor
+    # jerk
     return step, np.maximum(noise_rad or 0.0, _white_noise(rows, 0.25))
 
 
 def _white_noise(rows, quantile, chosen=None):
-    """Return the noise of the readings from a quantile of their fourth differences, (n_joints,); smooth motion drops out."""
+    """
+    Return the noise of the readings from a quantile of their fourth differences, (n_joints,).
+
+    Smooth motion drops out.
+    """
     fourth = np.abs(np.diff(rows, 4, axis=1))
     fourth = fourth if chosen is None else fourth[:, chosen[2:-2]]
     if fourth.shape[1] < 12:
@@ -154,7 +160,11 @@ def _widened(mask, half):
 
 
 def _slopes(time, rows, half):
-    """Return least-squares slopes and means over ``2 half + 1`` readings, fewer at the ends, and the residuals of the readings."""
+    """
+    Return least-squares slopes, means, and the residuals of the readings.
+
+    The slopes and means are over ``2 half + 1`` readings, fewer at the ends.
+    """
     n = len(time)
     half = min(half, n - 1)
     place = np.arange(n)
@@ -199,14 +209,20 @@ class JointRun:
         self.step = np.array([encoder_step(column) for column in position.T])
 
     def covered(self, time: np.ndarray, before: bool, after: bool) -> np.ndarray:
-        """Return a mask of the instants between the readings or, where the joints rest, within two periods of the first or last."""
+        """
+        Return a mask of the instants between the readings or.
+
+        Where the joints rest, within two periods of the first or last.
+        """
         reach = 2 * np.median(np.diff(self.time))
         low = self.time[0] - (reach if before and self.phase[0] == STILL else 0.0)
         high = self.time[-1] + (reach if after and self.phase[-1] == STILL else 0.0)
         return (time >= low) & (time <= high)
 
     def at(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the phase (if equal at both neighbours, otherwise moving) and the level at instants."""
+        """
+        Return the phase (if equal at both neighbours, otherwise moving) and the level at instants.
+        """
         right = np.minimum(np.searchsorted(self.time, time), len(self.time) - 1)
         left = np.maximum(right - 1, 0)
         phase = np.where(self.phase[left] == self.phase[right], self.phase[right], MOVING)
@@ -214,7 +230,11 @@ class JointRun:
         return phase.astype(np.int8), level
 
     def near_motion(self, time: np.ndarray, distance: float) -> np.ndarray:
-        """Return a mask of the instants between the readings that are within `distance` of one with moving joints."""
+        """
+        Return a mask of the instants near a reading with moving joints.
+
+        The instants are between the readings and within `distance` of one with moving joints.
+        """
         if not len(self._moving):
             return np.zeros(len(time), bool)
         right = np.searchsorted(self._moving, time)
@@ -238,9 +258,14 @@ class JointRun:
 
 
 BEST_BIAS, BEST_TIME = 1e-4, 100.0
-"""m/s^2 and s: the best accelerometers hold their bias to 10 ug over minutes (a Gauss-Markov process; field figures in `sensor_noise`)."""
+"""
+m/s^2 and s: the best accelerometers hold their bias to 10 ug over minutes (a Gauss-Markov process;
+field figures in `sensor_noise`).
+"""
 PIECE_SECONDS = 0.25
-"""Duration of the means from which noise at low frequency is estimated, s: longer than sensor filters."""
+"""
+Duration of the means from which noise at low frequency is estimated, s: longer than sensor filters.
+"""
 MIN_NOISE_PIECES = 4
 MIN_MOVING_SECONDS = 5.0
 """Least length of moving windows, s."""
@@ -250,10 +275,11 @@ class WanderLimit:
     """
     The longest moving window that the noise at rest allows.
 
-    Over T the sd of the mean of white noise of density d is ``d / sqrt(T)``, of a bias about ``sd sqrt(2 T / time)``. They are equal at
-    ``T = d sqrt(time / 2) / sd``; in a longer window, drift biases scale factors and arms. That
-    is 80 s at 120 ug/sqrt(Hz), and less than a second at 1 ug/sqrt(Hz). Where the change of gravity during the jitter of the stamps
-    exceeds the noise, the reference limits the accuracy, and means over short windows would contain its errors instead.
+    Over T the sd of the mean of white noise of density d is ``d / sqrt(T)``, of a bias about ``sd
+    sqrt(2 T / time)``. They are equal at ``T = d sqrt(time / 2) / sd``; in a longer window, drift
+    biases scale factors and arms. That is 80 s at 120 ug/sqrt(Hz), and less than a second at 1
+    ug/sqrt(Hz). Where the change of gravity during the jitter of the stamps exceeds the noise, the
+    reference limits the accuracy, and means over short windows would contain its errors instead.
     """
 
     def __init__(self) -> None:
@@ -271,7 +297,9 @@ class WanderLimit:
             )
 
     def pieces(self, samples: PhasedSamples) -> int:
-        """Return the number of windows into which motion is cut; one if no rest has occurred yet."""
+        """
+        Return the number of windows into which motion is cut; one if no rest has occurred yet.
+        """
         if not self._densities or len(samples) < 3:
             return 1
         density = float(np.median(self._densities))
@@ -301,10 +329,13 @@ _MIN_WINDOW_SAMPLES = 5
 
 class WindowCutter:
     """
-    Converts samples, in order and in pieces of any length, to windows; buffers a few window lengths at most.
+    Converts samples, in order and in pieces of any length, to windows.
+
+    Buffers a few window lengths at most.
 
     Three steps, each with the least delay:
-    runs of one phase that are too short for it become motion, samples get a use, runs of one use become windows or are unused.
+    runs of one phase that are too short for it become motion, samples get a use, runs of one use
+    become windows or are unused.
     """
 
     def __init__(self, settings: WindowSettings, short_rest: float, keep_unused: bool = False):
@@ -328,7 +359,11 @@ class WindowCutter:
         )
 
     def push(self, samples: PhasedSamples | None, final: bool = False) -> list[Window]:
-        """Add the next samples (or None) and return the complete windows; with `final` all remaining ones."""
+        """
+        Add the next samples (or None) and return the complete windows.
+
+        With `final` all remaining ones.
+        """
         windows = []
         if self._waiting is not None:
             samples = (
@@ -401,7 +436,11 @@ class WindowCutter:
         return windows
 
     def _shed(self, samples, start, stop, use):
-        """Cut complete windows off a run while it is twice as long as a window, open or not: independent of the time of arrival."""
+        """
+        Cut complete windows off a run while it is twice as long as a window, open or not.
+
+        Independent of the time of arrival.
+        """
         windows, longest = [], self._longest(use)
         while samples.time[stop - 1] - samples.time[start] >= 2 * longest:
             cut = int(np.searchsorted(samples.time, samples.time[start] + longest))
@@ -424,13 +463,21 @@ class WindowCutter:
         return use
 
     def _last_time(self, time, event, name):
-        """Return the time of the last event at or before each sample, and remember the last one under `name`."""
+        """
+        Return the time of the last event at or before each sample.
+
+        The last one is remembered under `name`.
+        """
         last = np.maximum.accumulate(np.where(event, time, getattr(self, name)))
         setattr(self, name, last[-1])
         return last
 
     def _close(self, samples, use):
-        """Return the windows of a complete run of one use, cut into equal pieces of at most the longest length."""
+        """
+        Return the windows of a complete run of one use, cut into equal pieces.
+
+        The pieces are of at most the longest length.
+        """
         pieces = max(1, ceil((samples.time[-1] - samples.time[0]) / self._longest(use)))
         return [
             window for part in _equal_parts(samples, pieces) for window in self._finished(part, use)
@@ -482,7 +529,11 @@ ACCEPTED = (*_USES, 'edge of joints')
 
 
 def dropped(counts: dict[str | UnusedReason | WindowKind, int]) -> dict[str, int]:
-    """Return the counts of samples that were lost or could not be used, reason -> count, without zeros."""
+    """
+    Return the counts of samples that were lost or could not be used, reason -> count.
+
+    Without zeros.
+    """
     return {
         reason: int(count)
         for reason, count in sorted(counts.items())

@@ -1,4 +1,8 @@
-"""Windows from streams: static, spinning and dynamic windows with the joints' motion, and samples with their reference."""
+"""
+Windows from streams.
+
+Static, spinning and dynamic windows with the joints' motion, and samples with their reference.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -26,11 +30,14 @@ from imu_calibration.preprocessing.window_cutter import WindowCutter
 
 class MotionGatherer:
     """
-    Converts streams to windows, in bounded memory; the result does not depend on the division of the streams into blocks.
+    Converts streams to windows, in bounded memory.
 
-    Cleaning is done by the `BlockCleaner`; `stream_alignment.MotionChunks` interpolates the joints at the IMU's stamps; `WindowCutter`
-    makes the windows. After a clock reset the first two restart.
-    Streams may differ in delay by a minute (temperature: five seconds); later samples are not used.
+    The result does not depend on the division of the streams into blocks.
+
+    Cleaning is done by the `BlockCleaner`; `stream_alignment.MotionChunks` interpolates the joints
+    at the IMU's stamps; `WindowCutter` makes the windows. After a clock reset the first two
+    restart. Streams may differ in delay by a minute (temperature: five seconds); later samples are
+    not used.
 
     Parameters
     ----------
@@ -38,7 +45,8 @@ class MotionGatherer:
         Names of the joints and their noise; None accepts the joints of the stream in their order.
     settings : WindowSettings
     keep_unused : bool
-        Also return windows of kind 'unused', so that every accepted sample is in exactly one window, in order.
+        Also return windows of kind 'unused', so that every accepted sample is in exactly one
+        window, in order.
     nominal, watchers
         As for the `BlockCleaner`.
 
@@ -75,10 +83,11 @@ class MotionGatherer:
         """
         Return reason -> number of samples.
 
-        'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short', 'rest too short': accepted, but in
-        no window.
-        'edge of joints': just before the first or after the last joint state, in motion. 'no joint state', 'late IMU sample',
-        'imu not finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. Drops reported by blocks are not included.
+        'static', 'spin', 'dynamic': in windows. 'settling', 'not quiet', 'turn-on', 'too short',
+        'rest too short': accepted, but in no window. 'edge of joints': just before the first or
+        after the last joint state, in motion. 'no joint state', 'late IMU sample', 'imu not
+        finite', 'joints repeated stamp', ...: dropped; 'imu clock reset': jumps. Drops reported by
+        blocks are not included.
         """
         counts: Counter[str | UnusedReason | WindowKind] = Counter(self.cleaner.counts)
         for source in (self._lost_counts, self._chunks.counts, self._cutter.counts):
@@ -165,7 +174,11 @@ class MotionGatherer:
             windows += self._next_epoch()
 
     def _epoch_is_over(self):
-        """Return whether the clocks of IMU and joints were both reset, or only one and the other did not follow in time."""
+        """
+        Return whether the clocks of IMU and joints were both reset, or only one.
+
+        If only one was reset, the other did not follow in time.
+        """
         queues = [self._queue['imu'], self._queue['joints']]
         return all(queues) or any(queue and _span(queue) > JOINT_WAIT for queue in queues)
 
@@ -226,7 +239,11 @@ def _span(queue):
 
 
 def session_truth(blocks: Iterable[SampleBlock], table: Table) -> tuple[ImuSamples, Reference]:
-    """Return the samples of a session with their reference from the table, where joints and IMU are both present."""
+    """
+    Return the samples of a session with their reference from the table.
+
+    Where joints and IMU are both present.
+    """
     windows = MotionGatherer(table, WindowSettings(), keep_unused=True).all_of(blocks)
     motion, _, rows = all_samples(windows)
     stamp_ns, force_s, rate_s, time = (

@@ -25,11 +25,17 @@ class CalibrationOptions:
     """Options of the estimate and of its assessment."""
 
     accelerometer_model: str | None = None
-    """Named model or names joined by '+'; None: bias+matrix, and accel_size_effect when the rotation shows it."""
+    """
+    Named model or names joined by '+'; None: bias+matrix, and accel_size_effect when the rotation
+    shows it.
+    """
     gyroscope_model: str | None = None
     """The same; None: bias+matrix."""
     reference_model: str | None = None
-    """Effects of table and clock joined by '+', or 'none'; None: table_tilt, and earth_rate when only the azimuth is unknown."""
+    """
+    Effects of table and clock joined by '+', or 'none'; None: table_tilt, and earth_rate when only
+    the azimuth is unknown.
+    """
     tolerances: dict = field(default_factory=dict)
     """{section: {effect: tolerance}}."""
     windows: WindowSettings = WindowSettings()
@@ -37,7 +43,9 @@ class CalibrationOptions:
     nominal: NominalScaling | None = None
     """For recordings in volts or counts."""
     gravity: float | None = None
-    """Local gravity where there is no table, m/s^2; None: the standard gravity, with its uncertainty."""
+    """
+    Local gravity where there is no table, m/s^2; None: the standard gravity, with its uncertainty.
+    """
     catalogue: Catalogue = CATALOGUE
     """The effects that there are."""
     noise: NoiseFigures | None = None
@@ -59,10 +67,12 @@ class CalibrationOptions:
 
 def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
     """
-    Return the model of the gathered columns; `settle_model` removes the size effect if the rotation does not determine it.
+    Return the model of the gathered columns.
 
-    With an unknown place of the mount, the size effect includes a common `lever_arm` and the origin is the mean of the three
-    sensitive points.
+    `settle_model` removes the size effect if the rotation does not determine it.
+
+    With an unknown place of the mount, the size effect includes a common `lever_arm` and the origin
+    is the mean of the three sensitive points.
     """
     names = table.joint_names
     asked = {'accelerometer': options.accelerometer_model, 'gyroscope': options.gyroscope_model}
@@ -98,6 +108,11 @@ def choose_model(options: CalibrationOptions, table: Table) -> SensorModel:
 def settle_model(
     model: SensorModel, options: CalibrationOptions, gathered: SessionData
 ) -> SensorModel:
-    """Return the model without the size effect if it was not requested and the recording has no rotation that determines it."""
+    """
+    Return the model without the size effect if it is neither requested nor determined.
+
+    The effect is removed if it was not requested and the recording has no rotation that determines
+    it.
+    """
     turns = any(gathered.accumulator.samples.get(kind) for kind in ('spin', 'dynamic'))
     return model if options.accelerometer_model is not None or turns else model.without_arms()

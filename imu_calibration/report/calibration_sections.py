@@ -1,4 +1,8 @@
-"""The page of a calibration, and its sections with figures: observability, error budget, readings at rest."""
+"""
+The page of a calibration, and its sections with figures.
+
+Observability, error budget, readings at rest.
+"""
 
 from dataclasses import dataclass
 from itertools import compress
@@ -173,7 +177,11 @@ MIN_DRAWN_SHARE = 1e-5
 
 
 def budget_section(result: CalibrationResult) -> dict[str, Any]:
-    """Return the figure, and the standard deviations of the parameters by cause and by term of the reported variances."""
+    """
+    Return the figure, and the standard deviations of the parameters.
+
+    The standard deviations are given by cause and by term of the reported variances.
+    """
     budget = result.error_budget()
     terms = {
         name: np.sqrt(np.maximum(variance, 0.0))
@@ -248,11 +256,17 @@ def _dots(figure, result, budget):
 
 
 LEVEL_FORCE_SHARE = 0.02
-"""Windows with a mean specific force further than this share from 1 g turn through the vertical and have no reading at 1 g."""
+"""
+Windows with a mean specific force further than this share from 1 g turn through the vertical and
+have no reading at 1 g.
+"""
 
 
 WITHIN_DEG, STILL_DEG_S = 5.0, 0.2
-"""Windows within this angle of a sensor axis are used; slower windows are at rest, faster ones are grouped by rate rounded to 1 deg/s."""
+"""
+Windows within this angle of a sensor axis are used; slower windows are at rest, faster ones are
+grouped by rate rounded to 1 deg/s.
+"""
 
 
 @dataclass(frozen=True)
@@ -290,12 +304,15 @@ def axis_readings(
     gravity: float,
 ) -> list[AxisReading]:
     """
-    Return readings at +-1 g, at rest and in rotation, before and after compensation, as lines of Zhang's Tables 2 and 4.
+    Return readings at +-1 g, at rest and in rotation, before and after compensation.
+
+    As lines of Zhang's Tables 2 and 4.
 
     Parameters
     ----------
     measured, compensated, reference : arrays, shape (n, 3)
-        Window means of specific force: raw, corrected, and of a perfect sensor at the reference point, m/s^2.
+        Window means of specific force: raw, corrected, and of a perfect sensor at the reference
+        point, m/s^2.
     rate : array, shape (n,)
         Turn rate of the table in each window, rad/s.
     gravity : float
@@ -340,7 +357,11 @@ def axis_readings(
 
 
 def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list[AxisReading]]:
-    """Return the readings at rest (Table 2) and in rotation (Table 4), of three sensors in each position."""
+    """
+    Return the readings at rest (Table 2) and in rotation (Table 4).
+
+    They are the readings of three sensors in each position.
+    """
     gravity = result.gravity
     true = errors.true['accelerometer']
     chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL_FORCE_SHARE) & (
@@ -410,7 +431,9 @@ def residual_figure(result: CalibrationResult) -> Drawn | None:
 
 
 def draw_windows(errors: WindowErrors, sensor: str) -> Drawn:
-    """Return the errors of raw and corrected readings of one sensor in every held-out window, as SVG."""
+    """
+    Return the errors of raw and corrected readings of one sensor in every held-out window, as SVG.
+    """
     label = f'Errors of raw and corrected readings of the {sensor} in every held-out window'
     return draw(f'residuals-{sensor}', (7.2, 3.6), _windows, errors, sensor, label=label)
 
@@ -458,7 +481,9 @@ def _points(axes, time, values, hollow=False):
 
 def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
     """
-    Return sensor -> (lags in s, autocorrelation (n_lags, 3), two-sided 95 % bound of white noise), from the kept moving windows.
+    Return sensor -> (lags in s, autocorrelation (n_lags, 3), two-sided 95 % bound of white noise).
+
+    From the kept moving windows.
 
     The mean of each window is subtracted from its residual; windows are weighted by their length.
     """

@@ -1,4 +1,8 @@
-"""The report of a diagnosis: each finding as a sentence with its figure, and the evidence on every candidate effect."""
+"""
+The report of a diagnosis.
+
+Each finding as a sentence with its figure, and the evidence on every candidate effect.
+"""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -23,16 +27,24 @@ from imu_calibration.selection.proposals import Proposal
 
 BINS = 16
 FEW = 200
-"""Below this number of points the effect is drawn against its own prediction, with points that can be seen."""
+"""
+Below this number of points the effect is drawn against its own prediction, with points that can be
+seen.
+"""
 SPAN = {'windows': 'over 0.25 s', 'poses': 'of each pose'}
 """Averaging span of a point of a residual over time."""
 MIN_DRAWN_FIT = 0.5
-"""Share of the fitted effect that a single variable must explain for the effect to be drawn against it."""
+"""
+Share of the fitted effect that a single variable must explain for the effect to be drawn against
+it.
+"""
 
 
 def diagnosis_report(result: DiagnosisResult) -> str:
     """
-    Return the report of a diagnosis as one self-contained HTML page; the same input gives the same bytes.
+    Return the report of a diagnosis as one self-contained HTML page.
+
+    The same input gives the same bytes.
 
     Parameters
     ----------
@@ -100,7 +112,10 @@ def draw_formula(diagnosis: Diagnosis, proposal: Proposal) -> Drawn:
         diagnosis,
         proposal.sensor,
         against,
-        label=f'Residual against the variable of the formula, before and after: {" and ".join(proposal.columns)}',
+        label=(
+            'Residual against the variable of the formula, before and after:'
+            f' {" and ".join(proposal.columns)}'
+        ),
     )
 
 
@@ -152,7 +167,11 @@ def _binned(edges, values, *signals):
 def cause_of(
     diagnosis: Diagnosis, sensor: str, against: Sequence[str]
 ) -> tuple[int, str, np.ndarray]:
-    """Return (axis, label, values): the axis of a sensor that changes most, and the variable of some kinds that its change follows."""
+    """
+    Return (axis, label, values).
+
+    The axis of a sensor that changes most, and the variable of some kinds that its change follows.
+    """
     traces = diagnosis.traces
     signal = traces.before[sensor] - traces.after[sensor]
     axis = int(np.argmax((signal**2).mean(axis=0)))
@@ -211,7 +230,11 @@ def _marker(values, many):
 
 
 def _curve(values, signal):
-    """Return means of the fitted signal over bins of equal width of the cause, where a bin holds enough to have a mean."""
+    """
+    Return means of the fitted signal over bins of equal width of the cause.
+
+    Where a bin holds enough to have a mean.
+    """
     if len(values) < FEW:
         order = np.argsort(values)
         return values[order], signal[order]
@@ -271,7 +294,9 @@ def overlay_section(
     traces: Traces, joint_names: Sequence[str], causes: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """
-    Return for each sensor its name, table of bands and charts: signals, differences, residuals, spectra and histograms by axis.
+    Return for each sensor its name, table of bands and charts.
+
+    Signals, differences, residuals, spectra and histograms by axis.
 
     Parameters
     ----------
@@ -318,9 +343,9 @@ def _sensor(traces, sensor, against, first):
                 segments[k].time,
                 {
                     when: (
-                        segments[k].signals['measured'] - segments[k].signals[f'simulated {when}']
+                        (segments[k].signals['measured'] - segments[k].signals[f'simulated {when}'])
+                        * factor
                     )
-                    * factor
                     for when in WHEN
                 },
             ),
@@ -371,7 +396,11 @@ def _sensor(traces, sensor, against, first):
 
 
 def histogram(residuals: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return (middles of the bins, name -> counts) of residuals, shape (n,) each; the bins contain 99.9 % of each."""
+    """
+    Return (middles of the bins, name -> counts) of residuals, shape (n,) each.
+
+    The bins contain 99.9 % of each.
+    """
     limit = max(float(np.quantile(np.abs(own), 0.999)) for own in residuals.values()) or 1.0
     edges = np.linspace(-limit, limit, HISTOGRAM_BINS + 1)
     return edges[:-1] + edges[1] / 2 - edges[0] / 2, {

@@ -22,7 +22,11 @@ from imu_calibration.selection.unexplained import Unexplained
 
 
 class Drawn(str):
-    """SVG of a matplotlib figure: templates do not escape it, a notebook shows it, a file can contain it."""
+    """
+    SVG of a matplotlib figure.
+
+    Templates do not escape it, a notebook shows it, a file can contain it.
+    """
 
     figure: Any
     """The matplotlib figure."""
@@ -45,7 +49,9 @@ class Drawn(str):
         return self.figure.axes
 
     def save(self, path: str | PathLike) -> None:
-        """Write the figure as PDF, SVG or PNG, by the end of the name; raises InputError for others."""
+        """
+        Write the figure as PDF, SVG or PNG, by the end of the name; raises InputError for others.
+        """
         kind = Path(path).suffix.lower()
         if kind not in ('.pdf', '.svg', '.png'):
             raise InputError(
@@ -58,7 +64,11 @@ class Drawn(str):
             files.write_whole(path, self.bytes_as(kind[1:]))
 
     def bytes_as(self, kind: str) -> bytes:
-        """Return the figure as 'pdf', or as 'png' with 200 pixels per inch; the same input gives the same bytes."""
+        """
+        Return the figure as 'pdf', or as 'png' with 200 pixels per inch.
+
+        The same input gives the same bytes.
+        """
         whole = io.BytesIO()
         self.figure.savefig(
             whole,
@@ -71,7 +81,11 @@ class Drawn(str):
 
     @property
     def data(self) -> list[dict[str, Any]]:
-        """For each axes its title and labels, and 'lines': list of (label, x (n,), y (n,)) as arrays in the units of the labels."""
+        """
+        For each axes its title and labels, and 'lines'.
+
+        List of (label, x (n,), y (n,)) as arrays in the units of the labels.
+        """
         return [
             {
                 'title': axes.get_title(loc='left'),
@@ -86,7 +100,10 @@ class Drawn(str):
 INK, GREY, FAINT = '#1b2430', '#5c6877', '#98a2b0'
 BEFORE, AFTER = '#d55e00', '#0072b2'
 AXIS_COLOURS = {'x': '#d55e00', 'y': '#009e73', 'z': '#0072b2'}
-"""Colours of the three axes: vermilion, bluish green and blue of Okabe and Ito, distinct for colour-blind readers."""
+"""
+Colours of the three axes: vermilion, bluish green and blue of Okabe and Ito, distinct for
+colour-blind readers.
+"""
 STATUS = {'determined': '#2b8a57', 'weak': '#d08a12', 'held': '#b4322c'}
 MARKER = {'x': 'o', 'y': 's', 'z': '^'}
 NAMESPACES = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
@@ -144,7 +161,11 @@ def _style():
 
 
 def _laid_out(figure):
-    """Place the axes once and return the canvas; `savefig` would do it twice more, and draw once without need."""
+    """
+    Place the axes once and return the canvas.
+
+    `savefig` would do it twice more, and draw once without need.
+    """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     canvas = FigureCanvasSVG(figure)
@@ -154,7 +175,11 @@ def _laid_out(figure):
 
 
 def _inside(svg, label):
-    """Return only the svg element: without prologue, metadata and the identifiers that repeat from figure to figure."""
+    """
+    Return only the svg element.
+
+    Without prologue, metadata and the identifiers that repeat from figure to figure.
+    """
     svg = svg[svg.index('<svg') :]
     svg = re.sub(r'<metadata>.*?</metadata>', '', svg, flags=re.S)
     svg = re.sub(r' id="[A-Za-z0-9.]+_[0-9]+"', '', svg)
@@ -165,7 +190,11 @@ def _inside(svg, label):
 
 
 def log_axis(axis: Any) -> None:
-    """Make an axis logarithmic with decades only, written as plain text (mathtext uses most of the time of a page)."""
+    """
+    Make an axis logarithmic with decades only, written as plain text.
+
+    Plain text is used because mathtext uses most of the time of a page.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     axis.axes.set(**{f'{axis.axis_name}scale': 'log'})

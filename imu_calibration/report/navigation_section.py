@@ -1,4 +1,8 @@
-"""Effect of the errors in navigation: dead reckoning from the windows of this recording, before and after calibration."""
+"""
+Effect of the errors in navigation.
+
+Dead reckoning from the windows of this recording, before and after calibration.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -43,15 +47,19 @@ def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[
     """Return figures and end values of dead reckoning at rest and in motion, None without it."""
     before, moving = rest_growth(errors), motion_growth(result)
     return {
-        'rest': None
-        if before is None
-        else _shown('rest', before, *expected_growth(result, errors)),
+        'rest': (
+            None if before is None else _shown('rest', before, *expected_growth(result, errors))
+        ),
         'moving': None if moving is None else _shown('moving', *moving, {}),
     }
 
 
 def _shown(name, before, after, parts):
-    """Return the figure, and (velocity, position) at the end before, after and of each part of the error."""
+    """
+    Return the figure, and (velocity, position) at the end by part of the error.
+
+    The pairs are given before, after and of each part of the error.
+    """
     return {
         'figure': draw(
             f'growth-{name}',
@@ -72,9 +80,12 @@ def _shown(name, before, after, parts):
 
 def rest_growth(errors: WindowErrors) -> Growth | None:
     """
-    Return the Growth of uncalibrated runs of 50 s at rest, one per pose of the recording; None without poses.
+    Return the Growth of uncalibrated runs of 50 s at rest, one per pose of the recording.
 
-    Each run starts from the true attitude and feels the mean error that its window showed, as a constant.
+    None without poses.
+
+    Each run starts from the true attitude and feels the mean error that its window showed, as a
+    constant.
     """
     static = np.flatnonzero(errors.kind == 'static')[:MAX_RUNS]
     if not len(static):
@@ -107,11 +118,15 @@ def expected_growth(
     result: CalibrationResult, errors: WindowErrors
 ) -> tuple[Growth, dict[str, Growth]]:
     """
-    Return the expected Growth (rms) at rest after calibration, and its parts: parameters, instability, noise.
+    Return the expected Growth (rms) at rest after calibration, and its parts.
 
-    The mean of a short window shows its noise more than the calibration's errors, so that the errors are predicted: a constant
-    error d of the specific force gives ``d t``, ``d t^2 / 2``, one w of the rate across the vertical ``g w t^2 / 2``, ``g w t^3 / 6``;
-    white noise of density N gives ``N t^(1/2)``, ``N t^(3/2) / 3^(1/2)`` and ``g N t^(3/2) / 3^(1/2)``, ``g N t^(5/2) / 20^(1/2)``.
+    Parameters, instability, noise.
+
+    The mean of a short window shows its noise more than the calibration's errors, so that the
+    errors are predicted: a constant error d of the specific force gives ``d t``, ``d t^2 / 2``, one
+    w of the rate across the vertical ``g w t^2 / 2``, ``g w t^3 / 6``; white noise of density N
+    gives ``N t^(1/2)``, ``N t^(3/2) / 3^(1/2)`` and ``g N t^(3/2) / 3^(1/2)``, ``g N t^(5/2) /
+    20^(1/2)``.
     """
     static = np.flatnonzero(errors.kind == 'static')[:MAX_RUNS]
     time = np.linspace(0.0, REST_RUN_SECONDS, RUN_INSTANTS)
@@ -147,7 +162,12 @@ def expected_growth(
 
 
 def _constant_variances(uncertainty, force):
-    """Return the variance of the specific-force error, all axes, and of the rate error across the vertical, from the parameters."""
+    """
+    Return the variances of the errors of specific force and rate from the parameters.
+
+    The variance of the specific-force error covers all axes, and the variance of the rate error is
+    across the vertical.
+    """
     covariance, up = uncertainty.at(force).parameters, force / np.linalg.norm(force)
     return np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:]) - up @ covariance[3:, 3:] @ up
 
@@ -162,7 +182,11 @@ def _constant_growth(time, variances, gravity):
 
 
 def noise_densities(result: CalibrationResult) -> list[float]:
-    """Return the densities of accelerometer and gyroscope noise at low frequency, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz)."""
+    """
+    Return the densities of accelerometer and gyroscope noise at low frequency.
+
+    The units are m/s^2/sqrt(Hz) and rad/s/sqrt(Hz).
+    """
     found = [result.calibration.statistics[sensor] for sensor in ('accelerometer', 'gyroscope')]
     return [
         float(
@@ -177,9 +201,12 @@ def noise_densities(result: CalibrationResult) -> list[float]:
 
 def motion_growth(result: CalibrationResult) -> tuple[Growth, Growth] | None:
     """
-    Return (before, after) Growth over the moving stretches of the recording, each from rest at the true attitude, or None.
+    Return (before, after) Growth over the moving stretches of the recording, or None.
 
-    The truth is that of the table, carried to the origin that the calibration compensates to. Noise is included.
+    Each stretch starts from rest at the true attitude.
+
+    The truth is that of the table, carried to the origin that the calibration compensates to. Noise
+    is included.
     """
     windows = [w for w in result.gathered.kept if w.time[-1] - w.time[0] >= MIN_DRAWN_SECONDS][
         :MAX_RUNS
@@ -240,7 +267,11 @@ def _moving_runs(result, window, length):
 
 
 def _at_origin(calibration, ref):
-    """Return the reference at the origin of the calibration's arms, which the common lever arm leads to."""
+    """
+    Return the reference at the origin of the calibration's arms.
+
+    The common lever arm leads to this origin.
+    """
     arm = calibration.of('accelerometer', Role.ARM)
     if arm is None:
         return ref
@@ -249,7 +280,11 @@ def _at_origin(calibration, ref):
 
 
 def _growths(figure, before, after, parts):
-    """Velocity and position, each with median and the range of the runs; parts of the expected error as thin lines."""
+    """
+    Velocity and position, each with median and the range of the runs.
+
+    Parts of the expected error as thin lines.
+    """
     for axes, name, unit in zip(figure.subplots(1, 2), ('velocity', 'position'), ('m/s', 'm')):
         for growth, colour, label in zip((before, after), (BEFORE, AFTER), ('before', 'after')):
             low, middle, high = np.quantile(

@@ -28,7 +28,11 @@ def draw_curve(result: NoiseIdentification, sensor: str) -> Drawn:
 
 
 def _curves(figure, result, sensor):
-    """Points with 95 % bands, the model's line, the contribution of the trends, and a slope for each process of the noisiest axis."""
+    """
+    Points with 95 % bands, the model's line, and the contribution of the trends.
+
+    There is also a slope for each process of the noisiest axis.
+    """
     axes, curve, (factor, unit) = (
         figure.subplots(),
         result.record.curve,

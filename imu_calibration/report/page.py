@@ -10,7 +10,11 @@ from imu_calibration.effects.base import UNITS
 
 
 def render(template: str, **content: Any) -> str:
-    """Return the HTML of one of the package's templates; numbers are printed by the filters `number`, `fixed`, `in_unit` and `chance`."""
+    """
+    Return the HTML of one of the package's templates.
+
+    Numbers are printed by the filters `number`, `fixed`, `in_unit` and `chance`.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -42,7 +46,11 @@ def render(template: str, **content: Any) -> str:
 
 
 def text(value: float | None, digits: int = 3) -> str:
-    """Return a number with `digits` significant digits and a real minus sign; an en dash for None and non-finite values."""
+    """
+    Return a number with `digits` significant digits and a real minus sign.
+
+    An en dash for None and non-finite values.
+    """
     if value is None or not np.isfinite(value):
         return '–'
     shown = significant(float(value), digits)
@@ -71,7 +79,9 @@ def pair(value: float, sd: float) -> tuple[str, str]:
 
 
 def people(value: float, sd: float, unit: str, *, quantity: str = '') -> tuple[str, str, str]:
-    """Return (value, sd, unit) as text in the units of `units.for_people`, '' for the unit of a ratio."""
+    """
+    Return (value, sd, unit) as text in the units of `units.for_people`, '' for the unit of a ratio.
+    """
     factor, shown = for_people(unit, quantity)
     return (*pair(value * factor, sd * factor), '' if shown == '1' else shown)
 
@@ -98,5 +108,9 @@ def printed(unit: str) -> str:
 
 
 def bar_length(share: float) -> float:
-    """Return the length of the bar of a standard deviation in tolerances, percent: logarithmic, from a thousandth to ten."""
+    """
+    Return the length of the bar of a standard deviation in tolerances, percent.
+
+    Logarithmic, from a thousandth to ten.
+    """
     return round(float(np.clip((np.log10(max(share, 1e-9)) + 3) / 4, 0.02, 1.0)) * 100, 1)

@@ -100,7 +100,9 @@ def draw_motion(plan: Plan) -> str:
 
 
 def draw_progress(plan: Plan) -> Drawn:
-    """Return the standard deviations in tolerances against time as SVG, one line for each parameter."""
+    """
+    Return the standard deviations in tolerances against time as SVG, one line for each parameter.
+    """
     return draw(
         'plan-progress',
         (8.6, 4.2),

@@ -1,4 +1,8 @@
-"""How well a choice of parameters predicts windows that it was not fitted to: small problems on normal matrices."""
+"""
+How well a choice of parameters predicts windows that it was not fitted to.
+
+Small problems on normal matrices.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,17 +26,26 @@ from imu_calibration.selection.reduced_recording import Recent
 MIN_FOLD_WINDOWS = 8
 """Least number of windows for held-out folds."""
 MOST_FITS = 128
-"""Fits kept with covariances or predictions: a search tries thousands of choices, and asks for the last again."""
+"""
+Fits kept with covariances or predictions: a search tries thousands of choices, and asks for the
+last again.
+"""
 EVIDENCE_FOLDS = 6
 """Parts that are held out in turn."""
 LEAST_SCATTER = 20
 """Least excess of windows over parameters for a test with their scatter."""
 LOCKED_EVERY = 4
-"""One of this many windows of each kind is locked: excluded from estimation, selection and rejection."""
+"""
+One of this many windows of each kind is locked: excluded from estimation, selection and rejection.
+"""
 
 
 def locked_windows(kind: np.ndarray) -> np.ndarray:
-    """Return the mask of the windows that are used only for the gain: every fourth of each kind, spread through the session."""
+    """
+    Return the mask of the windows that are used only for the gain.
+
+    Every fourth of each kind, spread through the session.
+    """
     return _turn_of(kind, LOCKED_EVERY) == LOCKED_EVERY - 2
 
 
@@ -50,7 +63,9 @@ def _turn_of(kind, modulus):
 
 class Evidence:
     """
-    Evidence for choices of parameters, each a sequence of indices, from rows of known noise in folds.
+    Evidence for choices of parameters, each a sequence of indices.
+
+    From rows of known noise in folds.
 
     Losses are minus twice log likelihoods, up to a constant.
 
@@ -83,14 +98,23 @@ class Evidence:
         self._predictions: dict[tuple, np.ndarray] = Recent(MOST_FITS)
 
     def equations(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (matrix, right side) of the normal equations of all parameters on all rows, with the prior."""
+        """
+        Return (matrix, right side) of the normal equations of all parameters on all rows.
+
+        With the prior.
+        """
         known = 1 / self._prior['prior_sd'] ** 2
-        return self.total[:-1, :-1] + np.diag(known), self.total[:-1, -1] + known * self._prior[
-            'prior_mean'
-        ]
+        return (
+            self.total[:-1, :-1] + np.diag(known),
+            self.total[:-1, -1] + known * self._prior['prior_mean'],
+        )
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return (values, covariance) of the parameters `used`, fitted to all folds or to all but fold `number`."""
+        """
+        Return (values, covariance) of the parameters `used`.
+
+        They are fitted to all folds or to all but fold `number`.
+        """
         ordered = tuple(sorted(used))
         if (ordered, number) not in self._fits:
             normal = self.total if number is None else self.without[number]
@@ -116,7 +140,11 @@ class Evidence:
         return self._losses[key]
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
-        """Return the loss on held-out data by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
+        """
+        Return the loss on held-out data by sensor.
+
+        Of the windows' means and within the windows, of each axis, shape (2, 3).
+        """
         raise NotImplementedError(f'{type(self).__name__} has no effect that acts on both sensors')
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
@@ -126,7 +154,11 @@ class Evidence:
         )
 
     def left_by_others(self, used: Sequence[int]) -> np.ndarray:
-        """Return the vectors that map rows of all parameters to residuals of the fit to all other folds, shape (n_folds, q + 1)."""
+        """
+        Return the vectors that map rows of all parameters to residuals, per fold.
+
+        The residuals are of the fit to all other folds, and the shape is (n_folds, q + 1).
+        """
         left = np.zeros((len(self.without), len(self.total)))
         left[:, np.append(sorted(used), -1)] = self._left_by_others(tuple(sorted(used)))
         return left
@@ -140,7 +172,11 @@ class Evidence:
         return float(_squares(folds[None], left)[0])
 
     def _left_by_others(self, used):
-        """Return for each fold the map from rows of `used`, sorted, to residuals of the fit to all other folds, shape (n_folds, n + 1)."""
+        """
+        Return for each fold the map from rows of `used`, sorted, to residuals.
+
+        The residuals are of the fit to all other folds, and the shape is (n_folds, n + 1).
+        """
         if used not in self._predictions:
             at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)] ** 2
             places = np.append(at, -1)
@@ -165,7 +201,8 @@ class WindowEvidence(Evidence):
     fold : array, shape (k,)
         Fold of each window.
     scatter : dict, optional
-        Sensor -> factor of the scatter within (and of the mean) of each window over its kind, at least 1, shape (k, 3).
+        Sensor -> factor of the scatter within (and of the mean) of each window over its kind, at
+        least 1, shape (k, 3).
 
     """
 
@@ -217,7 +254,11 @@ class WindowEvidence(Evidence):
         return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)] ** 2))
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
-        """Return the loss of `heldout` by sensor: of the windows' means and within the windows, of each axis, shape (2, 3)."""
+        """
+        Return the loss of `heldout` by sensor.
+
+        Of the windows' means and within the windows, of each axis, shape (2, 3).
+        """
         left = self.left_by_others(used)
         return {
             sensor: np.stack(
@@ -232,10 +273,14 @@ class WindowEvidence(Evidence):
 
     def unpredicted(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
-        Return the same loss; the means are in units of their prediction error by the fit to the other folds: their number is expected.
+        Return the same loss.
 
-        A slow bias process is correlated over folds: without this, the loss of a fold includes the uncertainty of the fit to
-        the other folds. The effect of a drift within windows, which does not determine it, is predicted too.
+        The means are in units of their prediction error by the fit to the other folds: their number
+        is expected.
+
+        A slow bias process is correlated over folds: without this, the loss of a fold includes the
+        uncertainty of the fit to the other folds. The effect of a drift within windows, which does
+        not determine it, is predicted too.
         """
         left, own, found = (
             self.left_by_others(used),
@@ -258,7 +303,11 @@ class WindowEvidence(Evidence):
 
     @cached_property
     def _within_whole(self):
-        """Sensor -> part within the windows of each fold, for each axis, including effects that are smooth in time."""
+        """
+        Sensor -> part within the windows of each fold.
+
+        For each axis, including effects that are smooth in time.
+        """
         whole, folds = (
             replace(self.space, join_within=self.space.join),
             [self.fold == number for number in range(self.fold.max() + 1)],
@@ -280,11 +329,14 @@ class WindowEvidence(Evidence):
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """
-        Return the p-value of some of the parameters `used`, from their scatter over windows (Hotelling's T^2); 0 with few windows.
+        Return the p-value of some of the parameters `used`.
 
-        With the slopes ``g_k = A_k' V_k^-1 e_k`` of the windows at the fit and its covariance C, the estimates have the covariance
-        ``C sum(g_k g_k') C`` for any noise. The model has white noise within windows, equal in all of a kind; a bias
-        process within them, and encoders where two joints turn fast, violate both (White 1980, Econometrica 48).
+        From their scatter over windows (Hotelling's T^2); 0 with few windows.
+
+        With the slopes ``g_k = A_k' V_k^-1 e_k`` of the windows at the fit and its covariance C,
+        the estimates have the covariance ``C sum(g_k g_k') C`` for any noise. The model has white
+        noise within windows, equal in all of a kind; a bias process within them, and encoders where
+        two joints turn fast, violate both (White 1980, Econometrica 48).
         """
         values, covariance = self.fit(used)
         reduced, slopes = (
@@ -324,7 +376,11 @@ class WindowEvidence(Evidence):
 
 
 def _squares(parts, rows):
-    """Return residual sums of squares from normal matrices of folds, shape (p, f, n, n), and residual vectors (f, n), shape (p,)."""
+    """
+    Return residual sums of squares from normal matrices of folds.
+
+    Shape (p, f, n, n), and residual vectors (f, n), shape (p,).
+    """
     return ((parts @ rows[:, :, None])[..., 0] * rows).sum(axis=(1, 2))
 
 
@@ -332,7 +388,8 @@ DISAGREE = 1e-4
 """Significance level of the test that the halves differ."""
 MAX_HALVES_LOSS = 1 / 16
 """
-Share of an effect's chi-square that is lost with one value for both halves, above which they disagree.
+Share of an effect's chi-square that is lost with one value for both halves, above which they
+disagree.
 
 For halves of equal precision: values that differ by half of the joint estimate.
 """
@@ -346,8 +403,9 @@ def agree(
     """
     Return whether the estimates of some parameters from two halves agree within their precision.
 
-    They disagree when the difference is significant and one value for both loses more than `MAX_HALVES_LOSS` of the chi-square.
-    A half that hardly determines an effect loses little, for any value: before any rotation, an arm may be estimated at a metre.
+    They disagree when the difference is significant and one value for both loses more than
+    `MAX_HALVES_LOSS` of the chi-square. A half that hardly determines an effect loses little, for
+    any value: before any rotation, an arm may be estimated at a metre.
 
     Parameters
     ----------

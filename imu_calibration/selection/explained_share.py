@@ -1,4 +1,8 @@
-"""Share of the excess over noise that the chosen effects remove; prevents findings that stand in for a cause outside the catalogue."""
+"""
+Share of the excess over noise that the chosen effects remove.
+
+Prevents findings that stand in for a cause outside the catalogue.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -12,15 +16,23 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Search
 
 MIN_EXPLAINED_SHARE = 0.7
-"""Share of the unexplained that a finding must remove from held-out windows, where a significant rest remains."""
+"""
+Share of the unexplained that a finding must remove from held-out windows, where a significant rest
+remains.
+"""
 MIN_SMOOTH_SHARE = 0.9
 """The same for an effect that is smooth in time: any smooth curve resembles any other."""
 SHOWS = 0.2
-"""An effect counts in a sensor or part where it removes at least this share of its largest removal."""
+"""
+An effect counts in a sensor or part where it removes at least this share of its largest removal.
+"""
 SIGNIFICANT_REST = 5.0
 """Standard deviations above the expectation from noise from which an excess is significant."""
 ONE_OF_THREE = 6.0 / 5.0
-"""Factor on this limit for a single axis: the largest of three is tested, and fewer squares have heavier tails."""
+"""
+Factor on this limit for a single axis: the largest of three is tested, and fewer squares have
+heavier tails.
+"""
 
 
 class Explained:
@@ -31,11 +43,13 @@ class Explained:
     ----------
     search : Search
     losses : callable
-        Returns for parameters in use: sensor -> squares on held-out data in units of their noise, shape (n_parts, n_axes).
+        Returns for parameters in use: sensor -> squares on held-out data in units of their noise,
+        shape (n_parts, n_axes).
     numbers : dict
         Sensor -> number of squares of each part, their expectation from noise, shape (n_parts,).
     least_part : float
-        Share of its largest removal with which an effect counts in a part; minus infinity: in all parts.
+        Share of its largest removal with which an effect counts in a part; minus infinity: in all
+        parts.
 
     """
 
@@ -55,7 +69,11 @@ class Explained:
         )
 
     def excess(self, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
-        """Return sensor -> held-out loss minus its expectation from noise, of each part and axis, shape (n_parts, n_axes)."""
+        """
+        Return sensor -> held-out loss minus its expectation from noise, of each part and axis.
+
+        Shape (n_parts, n_axes).
+        """
         losses = self.losses(self.search.indices(chosen))
         return {
             sensor: parts - self.numbers[sensor][:, None] / parts.shape[1]
@@ -66,20 +84,30 @@ class Explained:
         """
         Return the excess over noise of each part in standard deviations, shape (n_parts,).
 
-        The larger one of all axes together and of the worst axis, with a stricter limit: two quiet axes dilute the excess of the third.
+        The larger one of all axes together and of the worst axis, with a stricter limit: two quiet
+        axes dilute the excess of the third.
         """
         together, alone = self._sigmas(sensor, excess)
         return np.maximum(together, alone.max(axis=1))
 
     def _sigmas(self, sensor, excess):
-        """Return the same of all axes together, shape (n_parts,), and of each axis, shape (n_parts, n_axes)."""
+        """
+        Return the same of all axes together, shape (n_parts,), and of each axis.
+
+        Shape (n_parts, n_axes).
+        """
         sd = np.sqrt(2 * np.maximum(self.numbers[sensor], 1.0))
-        return excess.sum(axis=1) / sd, excess / (sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE)[
-            :, None
-        ]
+        return (
+            excess.sum(axis=1) / sd,
+            excess / (sd / np.sqrt(excess.shape[1]) * ONE_OF_THREE)[:, None],
+        )
 
     def rest(self, chosen: Sequence[Question]) -> float:
-        """Return the excess that noise does not explain, of all sensors and parts in which it is significant."""
+        """
+        Return the excess that noise does not explain.
+
+        It covers all sensors and parts in which it is significant.
+        """
         return float(
             sum(self._rest(sensor, excess).sum() for sensor, excess in self.excess(chosen).items())
         )
@@ -92,10 +120,12 @@ class Explained:
 
     def share(self, chosen: Sequence[Question], question: Question) -> float:
         """
-        Return the least share of the unexplained that the effect removes, over the sensors in which it shows.
+        Return the least share of the unexplained that the effect removes.
 
-        In each sensor only the parts with the effect count (means of windows, within windows, or both): an unexplained excess in the other
-        part does not hide it.
+        It is the least over the sensors in which the effect shows.
+
+        In each sensor only the parts with the effect count (means of windows, within windows, or
+        both): an unexplained excess in the other part does not hide it.
         """
         return min(
             (
@@ -110,7 +140,11 @@ class Explained:
         return sum(rest for _, rest in self._where_it_shows(chosen, question))
 
     def _where_it_shows(self, chosen, question):
-        """Return (removed by the effect, significant remaining excess) of each sensor, in the parts where the effect shows."""
+        """
+        Return (removed by the effect, significant remaining excess) of each sensor.
+
+        Both refer to the parts where the effect shows.
+        """
         with_it, without = (
             self.excess(chosen),
             self.excess([q for q in chosen if q is not question]),
@@ -130,8 +164,9 @@ class ExplainedWindows(Explained):
     """
     The same on the windows of a table.
 
-    The noise here has no window offsets, and the estimated bias process up to a plausible size. A window that scatters more within than
-    its kind has a less certain mean: one turn about two fast axes among many slow ones.
+    The noise here has no window offsets, and the estimated bias process up to a plausible size. A
+    window that scatters more within than its kind has a less certain mean: one turn about two fast
+    axes among many slow ones.
 
     Parameters
     ----------
@@ -164,7 +199,11 @@ class ExplainedWindows(Explained):
 
 
 def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
-    """Return the choice without effects that remove too little, weakest first; `share(chosen, question)` is the share that each removes."""
+    """
+    Return the choice without effects that remove too little, weakest first.
+
+    `share(chosen, question)` is the share that each removes.
+    """
     chosen = list(chosen)
     while chosen:
         shares = [share(chosen, question) / needed_share(question) for question in chosen]

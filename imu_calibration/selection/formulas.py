@@ -27,7 +27,10 @@ JOINT_ORDERS, PAIR_ORDERS, FEW_ORDERS = range(1, 9), range(1, 7), range(1, 4)
 CONSTANTS = (0.07, 0.2, 0.6)
 """Time constants of settling, as shares of the recording."""
 SOFT_SIGN = 'tanh({} / 0.005)'
-"""The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise, and would shake the bias there."""
+"""
+The sense of a rate changes over 0.3 deg/s: at rest a sign is that of the Earth's rate or of noise,
+and would shake the bias there.
+"""
 TEMPERATURE_FACTOR = f'({TEMPERATURE_RISE})'
 UNIT_OF = {
     'force': 'm/s^2',
@@ -49,7 +52,10 @@ class Formula:
     factors: tuple
     """Quantities that a column is the product of, with repetition; its unit follows."""
     phased: str = ''
-    """The same with a phase, where the columns are the cosine and the sine of one angle: text with {phase}."""
+    """
+    The same with a phase, where the columns are the cosine and the sine of one angle: text with
+    {phase}.
+    """
 
     @property
     def family(self) -> frozenset[str]:
@@ -90,9 +96,10 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
     """
     Return the formulas that are tried.
 
-    Products of up to three of specific force and rate; angular acceleration, magnitudes and signs with one more factor; all of these times
-    the temperature and times settling; harmonics of one joint, of two joints, times the joint's rate, the temperature, or the sensor's
-    input; and vectors fixed to the table while the sensor turns.
+    Products of up to three of specific force and rate; angular acceleration, magnitudes and signs
+    with one more factor; all of these times the temperature and times settling; harmonics of one
+    joint, of two joints, times the joint's rate, the temperature, or the sensor's input; and
+    vectors fixed to the table while the sensor turns.
 
     Parameters
     ----------
@@ -251,7 +258,9 @@ def _function(texts):
 
 class FormulaSearch:
     """
-    Formulas on one sensor's blocks, with baseline and catalogue projected out up to plausible sizes.
+    Formulas on one sensor's blocks.
+
+    With baseline and catalogue projected out up to plausible sizes.
 
     Parameters
     ----------
@@ -290,7 +299,8 @@ class FormulaSearch:
                 full_matrices=False,
                 lapack_driver='gesdd',
             )[:2]
-            # Plausible contributions of the catalogue count as noise: a direction keeps the excess over its plausible size.
+            # Plausible contributions of the catalogue count as noise: a direction keeps the excess
+            # over its plausible size.
             basis, damped = left, (1.0 - 1.0 / np.sqrt(1.0 + sizes**2))[:, None]
             columns = every[:, ends[3] :] / whiten.scale[axis]
             self._rest.append(part[:, -1] - basis @ (damped[:, 0] * (basis.T @ part[:, -1])))

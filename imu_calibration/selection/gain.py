@@ -1,4 +1,8 @@
-"""Gain of the extended model in predicting held-out windows; the locked ones were also excluded from its selection."""
+"""
+Gain of the extended model in predicting held-out windows.
+
+The locked ones were also excluded from its selection.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +18,14 @@ REST_MEASURE = 'means of windows at rest'
 MEASURES = ('samples', 'window means', 'samples about the mean of their window', REST_MEASURE)
 """Residuals of which a gain is reported."""
 APPLIED, OF_MODEL = 'error of corrected readings', 'residual of the model'
-"""Kinds of residuals: of readings as compensation corrects them, relative to the reference, or of raw readings, relative to the model."""
+"""
+Kinds of residuals: of readings as compensation corrects them, relative to the reference, or of raw
+readings, relative to the model.
+"""
 LEAST_REDUCTION = 0.01
 """
-With an unexplained excess, or without rests, a finding reduces the cross-validated residual by more than this share, with
-97.5 % confidence.
+With an unexplained excess, or without rests, a finding reduces the cross-validated residual by more
+than this share, with 97.5 % confidence.
 """
 
 
@@ -43,7 +50,11 @@ class Gain:
 
     @property
     def least(self) -> float:
-        """Lower end of the interval, minus infinity with too few windows, e.g. for rests in a recording without any."""
+        """
+        Lower end of the interval, minus infinity with too few windows.
+
+        Too few windows occur, for example, for rests in a recording without any.
+        """
         return -np.inf if np.isnan(self.ci95[0]) else self.ci95[0]
 
     @property
@@ -64,9 +75,12 @@ def heldout_gain(
     sensors: Sequence[str],
 ) -> Gain:
     """
-    Return the Gain of the choice `after` over the choice `before` on the locked windows, which are used only here.
+    Return the Gain of the choice `after` over the choice `before` on locked windows.
 
-    Both are fitted to the windows that choose, and these choose sensor and measure too (`gain_in_turn`).
+    The locked windows are used only here.
+
+    Both are fitted to the windows that choose, and these choose sensor and measure too
+    (`gain_in_turn`).
 
     Parameters
     ----------
@@ -96,8 +110,9 @@ def gain_in_turn(
     """
     Return the same Gain on the selection windows by cross-validation.
 
-    Returned is the measure with the largest reduction; if that is uncertain, the one with the surest: a small lag may reduce window means
-    by a tenth through noise, and samples by a certain half percent. For a quiet sensor moving windows show the encoder, rests the sensor.
+    Returned is the measure with the largest reduction; if that is uncertain, the one with the
+    surest: a small lag may reduce window means by a tenth through noise, and samples by a certain
+    half percent. For a quiet sensor moving windows show the encoder, rests the sensor.
     """
     found, fold = [], problem.evidence.fold
     for sensor in sensors:
@@ -133,7 +148,11 @@ def gain_of(
 
 
 def _squares(space, values, sensor):
-    """Return measure -> (sums of squares, their numbers) per window, each (k,), at vectors of `ParameterSpace.reduced`, one or many."""
+    """
+    Return measure -> (sums of squares, their numbers) per window, each (k,).
+
+    They are taken at vectors of `ParameterSpace.reduced`, one or many.
+    """
     recording = space.recording
     means, within = np.zeros(len(recording.windows)), np.zeros(len(recording.windows))
     for axis in range(3):
@@ -169,7 +188,11 @@ def _certainty(pair):
 
 
 def reduction_interval(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
-    """Return the 95 % interval of the reduction over resampled windows, from (sums of squares, numbers) per window before and after."""
+    """
+    Return the 95 % interval of the reduction over resampled windows.
+
+    From (sums of squares, numbers) per window before and after.
+    """
     n_windows = len(pair[0][0])
     if n_windows < 3:
         return (float('nan'), float('nan'))

@@ -1,4 +1,8 @@
-"""The search from windows to named effects: remove clipped samples, linearise, choose, prove, relinearise."""
+"""
+The search from windows to named effects.
+
+Remove clipped samples, linearise, choose, prove, relinearise.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +45,10 @@ EXPLANATIONS = 4
 LEFT = 0.1
 """Largest remaining share of a significant excess after pairs, or effects of implausible size."""
 LEFT_BEFORE = 3 * LEFT
-"""The same before the choice is relinearised: a larger share is rejected at once, because a trial needs up to eight linearisations."""
+"""
+The same before the choice is relinearised: a larger share is rejected at once, because a trial
+needs up to eight linearisations.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +68,21 @@ class Investigation(SelectedEffects):
     not_testable: list[dict]
     """Effects that could not be tested."""
     unstable: Sequence[Question] = field(default_factory=list)
-    """Questions that would have become findings, but the parts of the recording disagree on them."""
+    """
+    Questions that would have become findings, but the parts of the recording disagree on them.
+    """
     rejected: Sequence[Question] = field(default_factory=list)
-    """Questions selected by likelihood but not named: their gain is too small, or the remaining excess too large."""
+    """
+    Questions selected by likelihood but not named: their gain is too small, or the remaining excess
+    too large.
+    """
     rivals: Sequence[Rival] = field(default_factory=list)
     """Alternatives to findings that fit nearly as well."""
     onset: Onset | None = None
-    """Parameters that change at one moment: the other results are those of the longer part of the recording."""
+    """
+    Parameters that change at one moment: the other results are those of the longer part of the
+    recording.
+    """
 
 
 def investigate(
@@ -80,7 +95,8 @@ def investigate(
     """
     Test every effect that a model lacks on held-out windows.
 
-    If parameters change at one moment (`find_onset`), the search is repeated: with a step of the clock, or on the longer part alone.
+    If parameters change at one moment (`find_onset`), the search is repeated: with a step of the
+    clock, or on the longer part alone.
 
     Parameters
     ----------
@@ -161,7 +177,11 @@ def investigate(
 
 
 def _explained(problem, linearised_at, start=()):
-    """Return (the _Outcome of a search, rivals of its findings, `linearised_at` with the lags resolved if there are any)."""
+    """
+    Return (the _Outcome of a search, rivals of its findings, `linearised_at`).
+
+    In `linearised_at` the lags are resolved if there are any.
+    """
     chosen = problem.search.run(start)
     chosen = [
         question
@@ -232,8 +252,9 @@ def _with_lags(explanations, linearised_at):
     """
     Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
 
-    Where one of several effects does not help, a shorter one is tried, where a single one does not, another. Only a trial that helps where
-    it begins, or the best of all, is relinearised at its choice.
+    Where one of several effects does not help, a shorter one is tried, where a single one does not,
+    another. Only a trial that helps where it begins, or the best of all, is relinearised at its
+    choice.
     """
     most, refused, tried = None, [], []
     for number in range(EXPLANATIONS):
@@ -254,7 +275,11 @@ def _with_lags(explanations, linearised_at):
 
 
 def _best_of(trials, linearised_at):
-    """Return the finished trial with the highest rank; a trial is finished only if its rank exceeds that of the best."""
+    """
+    Return the finished trial with the highest rank.
+
+    A trial is finished only if its rank exceeds that of the best.
+    """
     best = None
     for trial in sorted(trials, key=lambda trial: trial.rank, reverse=True):
         if best is None or trial.rank > best.rank:
@@ -271,8 +296,9 @@ def _looked_again(outcome, linearised_at, any_size, tried):
     """
     Return the _Outcome of the searches for the cause of a remaining significant excess.
 
-    Further searches start from pairs, or allow implausible sizes. Any two of many effects reduce an excess of
-    a different cause somewhat: together they must remove nearly all. `tried` has the labels of each choice that was linearised.
+    Further searches start from pairs, or allow implausible sizes. Any two of many effects reduce an
+    excess of a different cause somewhat: together they must remove nearly all. `tried` has the
+    labels of each choice that was linearised.
     """
     if not outcome.rest:
         return outcome
@@ -293,7 +319,11 @@ def _looked_again(outcome, linearised_at, any_size, tried):
 
 
 def _settled(linearised_at, problem, chosen):
-    """Return the _Outcome of a choice: relinearise at the effects, then keep the ones with sufficient share and gain."""
+    """
+    Return the _Outcome of a choice.
+
+    Relinearise at the effects, then keep the ones with sufficient share and gain.
+    """
     return _without_unnamed(_relinearised(linearised_at, problem, chosen), linearised_at)
 
 
@@ -322,7 +352,11 @@ def _outcome(problem, chosen):
 
 
 def _without_unnamed(outcome, linearised_at):
-    """Return the _Outcome linearised at its findings alone, where lags or errors of the table that are not named act at its point."""
+    """
+    Return the _Outcome linearised at its findings alone.
+
+    Where lags or errors of the table that are not named act at its point.
+    """
     for _ in range(LINEARISATIONS - 1):
         if not outcome.problem.acts_beside(outcome.named):
             break
@@ -343,7 +377,9 @@ def _without_unnamed(outcome, linearised_at):
 
 
 def _searched(problem, chosen):
-    """Return the choice of a search at another linearisation; it starts from the resolved effects."""
+    """
+    Return the choice of a search at another linearisation; it starts from the resolved effects.
+    """
     return problem.search.run(_resolved(problem, chosen))
 
 
@@ -363,21 +399,31 @@ def too_few_windows(count: int) -> NotObservableError:
 
 
 def _agreed(problem, explained, named):
-    """Return (findings on which both halves agree and that hold without the other ones, findings on which the halves disagree)."""
+    """
+    Return (findings that hold, findings on which the two halves disagree).
+
+    The first are findings on which both halves agree and that hold without the other ones.
+    """
     unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
     kept = [question for question in named if question not in unstable]
-    return problem.search.drop_insignificant(
-        _that_help(problem, explained, kept) if unstable else kept
-    ), unstable
+    return (
+        problem.search.drop_insignificant(
+            _that_help(problem, explained, kept) if unstable else kept
+        ),
+        unstable,
+    )
 
 
 def _that_help(problem, explained, named):
     """
-    Return the admissible findings that improve cross-validated prediction, by backward elimination of the least helpful.
+    Return the admissible findings that improve cross-validated prediction.
 
-    Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a misfit that repeats with the motion is
-    evidence for any effect that correlates with it. So the unweighted residual must decrease too. The locked windows are not
-    used: their later gain would be biased.
+    By backward elimination of the least helpful.
+
+    Likelihood alone is not enough: without rests the noise is estimated from the misfit, and a
+    misfit that repeats with the motion is evidence for any effect that correlates with it. So the
+    unweighted residual must decrease too. The locked windows are not used: their later gain would
+    be biased.
     """
     kept = [
         question
@@ -400,14 +446,17 @@ def _needed_reduction(problem, explained, chosen, question):
     """
     Return the required relative reduction of the residual.
 
-    Zero; `LEAST_REDUCTION` with an unexplained excess, or without rests to separate misfit from noise.
+    Zero; `LEAST_REDUCTION` with an unexplained excess, or without rests to separate misfit from
+    noise.
     """
     clear = not problem.recording.moving.all() and not explained.rest_beside(chosen, question)
     return 0.0 if clear else LEAST_REDUCTION
 
 
 def _sure_reduction(problem, chosen, question):
-    """Return the lower end of the interval of an effect's reduction of the cross-validated residual."""
+    """
+    Return the lower end of the interval of an effect's reduction of the cross-validated residual.
+    """
     return gain_in_turn(
         problem,
         [q for q in chosen if q is not question],

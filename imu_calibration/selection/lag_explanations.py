@@ -1,10 +1,14 @@
 """
-One explanation of the lags of both sensors, as simple and as common to both as the recording allows.
+One explanation of the lags of both sensors.
 
-A late clock, a delay of one sensor and its filters have the same first derivative, so a search meets them in any order, and halves of one
-recording may name one lag differently. Here every description of a sensor's lag is linearised at its own estimate, both sensors'
-costs are summed, and of all explanations within the search's price of the best the simplest is selected: fewest effects first,
-then a common clock before separate lags, then a delay before a filter. All other ones are its rivals.
+As simple and as common to both as the recording allows.
+
+A late clock, a delay of one sensor and its filters have the same first derivative, so a search
+meets them in any order, and halves of one recording may name one lag differently. Here every
+description of a sensor's lag is linearised at its own estimate, both sensors' costs are summed, and
+of all explanations within the search's price of the best the simplest is selected: fewest effects
+first, then a common clock before separate lags, then a delay before a filter. All other ones are
+its rivals.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,11 +29,14 @@ LAG_KINDS = (('delay',), ('bandwidth',), ('filter',), ('delay', 'bandwidth'))
 """Descriptions of one sensor's lag, the simplest first."""
 DELAY = LAG_KINDS[0]
 FIRST_SHARE = 0.3
-"""Initial share of the low-pass in a lag with a delay: at zero its derivative equals the delay's."""
+"""
+Initial share of the low-pass in a lag with a delay: at zero its derivative equals the delay's.
+"""
 MAX_CLOCK_LOSS = 0.01
 """
-Without rests: largest loss of a common clock against separate lags, as a share of their log likelihood: noise is estimated from
-the misfit there, and the evidence that separates a motor's ripple from a filter is not reproducible between recordings.
+Without rests: largest loss of a common clock against separate lags, as a share of their log
+likelihood: noise is estimated from the misfit there, and the evidence that separates a motor's
+ripple from a filter is not reproducible between recordings.
 """
 DELAY_LINEARISATIONS = 3
 """Linearisations of a delay with a low-pass."""
@@ -109,7 +116,11 @@ class LagExplanations:
     def others(
         self, most: int | None = None, refused: Sequence[Explanation] = ()
     ) -> list[Explanation]:
-        """Return the explanations with at most so many effects, without given ones and without those of the same columns and cost."""
+        """
+        Return the explanations with at most so many effects.
+
+        Without given ones and without those of the same columns and cost.
+        """
         costs = {each.cost for each in refused}
         return [
             each
@@ -124,7 +135,11 @@ class LagExplanations:
     def settled(
         self, selected: Explanation, linearised_at: Callable
     ) -> tuple[LinearisedProblem, list[Question], list[Rival]]:
-        """Return (the LinearisedProblem at an explanation, the choice with it, alternatives to its members that fit nearly as well)."""
+        """
+        Return (the LinearisedProblem at an explanation, the choice with it, alternatives).
+
+        The alternatives to the choice's members fit nearly as well.
+        """
         names = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
         values = selected.values | {names[name]: value for name, value in selected.lags.items()}
         there = linearised_at(point=point_with(self.problem.baseline, self.problem.effects, values))
@@ -144,7 +159,9 @@ def lag_explanations(
     problem: LinearisedProblem, chosen: Sequence[Question], linearised_at: Callable
 ) -> LagExplanations | None:
     """
-    Return the LagExplanations of a choice; None where it has no lag, no lag explains the data, or some of the family cannot be tested.
+    Return the LagExplanations of a choice.
+
+    None where it has no lag, no lag explains the data, or some of the family cannot be tested.
 
     Parameters
     ----------
@@ -152,7 +169,8 @@ def lag_explanations(
         Linearised where no lag acts.
     chosen : sequence of Question
     linearised_at : callable
-        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, with some of the effects.
+        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, with some of the
+        effects.
 
     """
     rest = [
@@ -192,8 +210,8 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
     ----------
     explanations : sequence of Explanation
     silent : float, optional
-        Cost without any lag, for a recording without rests: an explanation of as many effects with a common clock is then accepted
-        within the resolution of the misfit.
+        Cost without any lag, for a recording without rests: an explanation of as many effects with
+        a common clock is then accepted within the resolution of the misfit.
 
     """
     best = min(explanation.cost for explanation in explanations)
@@ -261,7 +279,11 @@ def _described(problem, linearised_at, effects, *, rest, clocks):
 
 
 def _explanations(described, judges, names):
-    """Return every Explanation that the descriptions of each sensor make together, and that is better than none."""
+    """
+    Return every Explanation that the descriptions of each sensor make together.
+
+    Only an Explanation that is better than none is returned.
+    """
     options = {
         sensor: [
             _none(described[0], judges, sensor),
@@ -320,7 +342,11 @@ def _none(hypothesis, judges, sensor):
 
 
 def _cost(hypothesis, chosen, judges, sensor):
-    """Return the held-out cost of one sensor's windows, nats, judged with the noise and the band of each linearisation in turn."""
+    """
+    Return the held-out cost of one sensor's windows, nats.
+
+    It is judged with the noise and the band of each linearisation in turn.
+    """
     used, losses = hypothesis.problem.search.indices(chosen), []
     for judge in judges:
         space = replace(
@@ -337,7 +363,11 @@ def _cost(hypothesis, chosen, judges, sensor):
 
 
 def _described_together(one, two, names):
-    """Yield the explanations of two sensors' lags: separate lags, or a common clock and the additional lags of each."""
+    """
+    Yield the explanations of two sensors' lags.
+
+    Separate lags, or a common clock and the additional lags of each.
+    """
     values = {name: (two if name.startswith(two.sensor) else one).values[name] for name in names}
     cost = one.cost + two.cost
     own = one.own(one.lags) | two.own(two.lags)
@@ -363,7 +393,11 @@ def _described_together(one, two, names):
 
 
 def _rivals(settled, selected, near):
-    """Return the alternatives to a member of an explanation that fit nearly as well: members of explanations with no more effects."""
+    """
+    Return the alternatives to a member of an explanation that fit nearly as well.
+
+    Members of explanations with no more effects.
+    """
     asked, found = {question.name: question for question in settled.questions}, {}
     for other in sorted(near, key=lambda explanation: explanation.cost):
         gone, come = (

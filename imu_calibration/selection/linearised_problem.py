@@ -1,4 +1,8 @@
-"""The recording reduced around a point of linearisation, the search on it, and the decision whether to relinearise."""
+"""
+The recording reduced around a point of linearisation, and the search on it.
+
+It also holds the decision whether to relinearise.
+"""
 
 from collections.abc import Sequence
 from copy import copy
@@ -60,7 +64,8 @@ class LinearisedProblem:
     point : (SensorModel, array), optional
         Point of linearisation; default: the baseline's solution.
     locked : array, shape (k,)
-        Mask of the windows reserved for the gain: they have columns, but are excluded from noise, fits and choices.
+        Mask of the windows reserved for the gain: they have columns, but are excluded from noise,
+        fits and choices.
     bias_processes : dict, optional
         Sensor -> its bias processes, where measured separately.
     any_size : bool
@@ -132,25 +137,39 @@ class LinearisedProblem:
         return replace(self.all_samples, recording=self.recording.select(self.locked))
 
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
-        """Return all parameters of the space for a choice, fitted to the selection windows, with all of the baseline, shape (q,)."""
+        """
+        Return all parameters of the space for a choice, fitted to the selection windows.
+
+        With all of the baseline, shape (q,).
+        """
         return self.absolute(self.search.values(chosen))
 
     def absolute(self, values: np.ndarray) -> np.ndarray:
-        """Return parameters of the whole space in full, from those that count from the linearisation, shape (q,)."""
+        """
+        Return parameters of the whole space in full, from those that count from the linearisation.
+
+        Shape (q,).
+        """
         values = np.array(values)
         change = counted_from_values(self.recording.model, self.baseline)
         values[: len(change)] += np.where(change, self.recording.values, 0.0)
         return values
 
     def needs_another(self, chosen: Sequence[Question]) -> bool:
-        """Return whether the linearisation is too coarse for the choice: curvature times evidence."""
+        """
+        Return whether the linearisation is too coarse for the choice: curvature times evidence.
+        """
         return any(
             '@' in question.label or self.curvature_shows(chosen, question) > TOO_COARSE
             for question in chosen
         )
 
     def curvature_shows(self, chosen: Sequence[Question], question: Question) -> float:
-        """Return the evidence of an effect's curvature, nats: its separability from its first derivative."""
+        """
+        Return the evidence of an effect's curvature, nats.
+
+        Its separability from its first derivative.
+        """
         without = self.search.indices([q for q in chosen if q is not question])
         weight = self.evidence.loss(without) - self.evidence.loss(self.search.indices(chosen))
         return (
@@ -177,7 +196,11 @@ class LinearisedProblem:
         return agree(fits, self.evidence.fit(used), at)
 
     def windows_agree(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether an effect is also significant against its scatter over windows (`WindowEvidence.p_value_by_scatter`)."""
+        """
+        Return whether an effect is also significant against its scatter over windows.
+
+        The scatter is judged by `WindowEvidence.p_value_by_scatter`.
+        """
         p_value = self.evidence.p_value_by_scatter(self.search.indices(chosen), question.parameters)
         return p_value * len(self.questions) < FAMILY_WISE
 
@@ -189,7 +212,12 @@ class LinearisedProblem:
         return [normal_matrix(judged, self.noise, half) for half in (early, ~early)]
 
     def acts_beside(self, chosen: Sequence[Question]) -> bool:
-        """Return whether the point of linearisation has a lag, delay or error of the table that is not among the chosen effects."""
+        """
+        Return whether the point of linearisation has a timing effect that is not chosen.
+
+        Timing effects are a lag, a delay or an error of the table that is not among the chosen
+        effects.
+        """
         kept = {(q.sensor, q.name) for q in chosen} | set(self.baseline.slices)
         model = self.recording.model
         return any(

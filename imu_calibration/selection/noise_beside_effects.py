@@ -1,4 +1,6 @@
-"""Noise estimated in addition to candidate effects, and the band of frequencies in which it holds."""
+"""
+Noise estimated in addition to candidate effects, and the band of frequencies in which it holds.
+"""
 
 from dataclasses import replace
 
@@ -30,11 +32,14 @@ from imu_calibration.selection.parameter_space import ParameterSpace, normal_mat
 
 def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
     """
-    Return the space with only the slow part of the centred rows on axes with a fast part that no effect explains.
+    Return the space with only the slow part of the centred rows on some axes.
 
-    Joint states at 100 Hz do not show a motor's ripple at 47 Hz, and no effect of the catalogue makes up for it; judged sample by sample,
-    such a recording is evidence for any effect that reduces the ripple. The fast part is replaced by white noise of the slow part's
-    variance, so that all counts of samples hold.
+    These are the axes with a fast part that no effect explains.
+
+    Joint states at 100 Hz do not show a motor's ripple at 47 Hz, and no effect of the catalogue
+    makes up for it; judged sample by sample, such a recording is evidence for any effect that
+    reduces the ripple. The fast part is replaced by white noise of the slow part's variance, so
+    that all counts of samples hold.
     """
     recording, moving = space.recording, space.recording.moving
     slow_only, slow_variance = {}, {}
@@ -57,26 +62,29 @@ def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
 
 STRONG = 10.0
 """
-Twice the logarithm of the Bayes factor required for an effect smooth in time against a bias process only: very strong (Kass, Raftery
-1995), since some fifteen of them are tested.
+Twice the logarithm of the Bayes factor required for an effect smooth in time against a bias process
+only: very strong (Kass, Raftery 1995), since some fifteen of them are tested.
 """
 PLAUSIBLE = 3.0
 """
-A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in an arc, half a milligravity, was one.
+A wander of up to this many times the natural one passes for noise; with eight a cable that pulls in
+an arc, half a milligravity, was one.
 """
 MAX_MIDDLE_RATIO, MAX_WANDER_RATIO = 3.0, 4.0
 """
-So does one of up to this many times that of the middle axis, and of this many times the plausible one at most: the axes of a sensor are
-of one make and their biases wander alike, while a cable pulls along one. Not of the quietest: a bias that steps may rest on one axis.
+So does one of up to this many times that of the middle axis, and of this many times the plausible
+one at most: the axes of a sensor are of one make and their biases wander alike, while a cable pulls
+along one. Not of the quietest: a bias that steps may rest on one axis.
 """
 STABLE = {'accelerometer': 1e-4, 'gyroscope': 0.0}
 """
-Bias variation that is normal for any white noise, m/s^2 and rad/s: the best accelerometers keep their bias to 10 ug.
+Bias variation that is normal for any white noise, m/s^2 and rad/s: the best accelerometers keep
+their bias to 10 ug.
 """
 MAX_DRIFT_RATIO = 100.0
 """
-Largest drift over the usual bias variation: the ratio by which the effects' priors, for consumer instruments, exceed their bias
-variation.
+Largest drift over the usual bias variation: the ratio by which the effects' priors, for consumer
+instruments, exceed their bias variation.
 """
 LEAST_FACTOR = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
@@ -90,15 +98,17 @@ def noise_beside_effects(
     """
     Return sensor -> NoiseModel, estimated together with a model of all candidate effects.
 
-    Windows' offsets and the bias process are estimated by restricted maximum likelihood on the means of the windows; the variance within
-    moving windows from the residual, and its serial correlation from the misfit of each window along its columns.
+    Windows' offsets and the bias process are estimated by restricted maximum likelihood on the
+    means of the windows; the variance within moving windows from the residual, and its serial
+    correlation from the misfit of each window along its columns.
 
     Parameters
     ----------
     space : ParameterSpace
     smooth : dict
-        Sensor -> list of tuples of parameters: effects that are smooth in time. Only the best choice among them, if any is needed, remains
-        in the model with which the bias process is estimated.
+        Sensor -> list of tuples of parameters: effects that are smooth in time. Only the best
+        choice among them, if any is needed, remains in the model with which the bias process is
+        estimated.
     known : dict, optional
         Sensor -> its bias processes, where measured separately.
 
@@ -119,7 +129,11 @@ def noise_beside_effects(
 
 
 def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
-    """Return the least bias processes: the known ones, else from the white noise of the sensor and the time between samples, s."""
+    """
+    Return the least bias processes.
+
+    The known ones, else from the white noise of the sensor and the time between samples, s.
+    """
     return noise.known or (
         BiasProcess(
             NATURAL * float(np.sqrt(np.median(noise.white_variance) * period)), CORRELATION_TIMES[0]
@@ -133,7 +147,8 @@ def plausible_processes(
     """
     Return the bias processes up to a size that is plausible as noise.
 
-    As found in the recording, naturally at least, at most as such biases do within its duration, s: further where all axes do so.
+    As found in the recording, naturally at least, at most as such biases do within its duration, s:
+    further where all axes do so.
     """
     natural = natural_processes(noise, period)
     if noise.known or not noise.bias_processes:
@@ -174,7 +189,11 @@ def _white_without_rest(space, sensor):
 
 
 def _with_moving_factors(space, sensor, noise, values, look_along):
-    """Return the noise with the scatter of moving windows: the residual's variance, and a factor for directions along the columns."""
+    """
+    Return the noise with the scatter of moving windows.
+
+    The residual's variance, and a factor for directions along the columns.
+    """
     found = {}
     for kind in np.unique(space.recording.kind[space.recording.moving]):
         rows = space.recording.kind == kind
@@ -199,7 +218,11 @@ def _with_moving_factors(space, sensor, noise, values, look_along):
 
 
 def _with_bias_process(space, sensor, noise, smooth):
-    """Return the noise of a sensor with window offsets and bias process, estimated with all effects but the superfluous smooth ones."""
+    """
+    Return the noise of a sensor with window offsets and bias process.
+
+    It is estimated with all effects but the superfluous smooth ones.
+    """
     recording, superfluous = (
         space.recording,
         sorted({k for parameters in smooth for k in parameters}),
@@ -245,8 +268,8 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
     """
     Return the prior sd of parameters as drifts of a sensor, shape (q,).
 
-    With the prior of the catalogue, for consumer instruments, a navigation gyroscope would drift by 15 000 times its bias
-    variation, and its actual drift would be unlikely.
+    With the prior of the catalogue, for consumer instruments, a navigation gyroscope would drift by
+    15 000 times its bias variation, and its actual drift would be unlikely.
 
     Parameters
     ----------
@@ -263,10 +286,12 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
 
 def _needed_smooth(search, options, *, prior_sd):
     """
-    Return the parameters of the smooth effect that beats the bias process, each with the noise estimated jointly.
+    Return the parameters of the smooth effect that beats the bias process.
 
-    By restricted likelihood, all parameters integrated out under their priors: at its maximum over as many as there are windows the wander
-    is underestimated, and noise of 15 s resembles a drift.
+    Each one is judged with the noise estimated jointly.
+
+    By restricted likelihood, all parameters integrated out under their priors: at its maximum over
+    as many as there are windows the wander is underestimated, and noise of 15 s resembles a drift.
     """
     losses = [search.best([])[1]]
     losses += [
@@ -276,7 +301,11 @@ def _needed_smooth(search, options, *, prior_sd):
 
 
 def _known_otherwise(space, sensor, noise, own):
-    """Return the information on the parameters `own` from priors and from within windows (normal matrix)."""
+    """
+    Return the information on the parameters `own` (normal matrix).
+
+    It includes the information from priors and from within windows.
+    """
     at = np.append(own, space.size)
     information = within_matrix(space, noise, sensors=(sensor,))[np.ix_(at, at)]
     prior = 1 / space.prior_sd[own] ** 2

@@ -1,4 +1,8 @@
-"""Parameters that change at one moment: exchanged axes, a displaced mount, a belt that slipped, a clock that was set."""
+"""
+Parameters that change at one moment.
+
+Exchanged axes, a displaced mount, a belt that slipped, a clock that was set.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,13 +24,24 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import largest_axes, residuals
 
 MIN_ONSET_WINDOWS = MIN_FOLD_WINDOWS + 1
-"""Least number of moving windows before and after an onset: the longer part, without the window of the onset, can be searched."""
+"""
+Least number of moving windows before and after an onset: the longer part, without the window of the
+onset, can be searched.
+"""
 SUDDEN = 0.5
-"""Largest share of the excess of a linear change in time that an onset may have: above it the change may be gradual."""
+"""
+Largest share of the excess of a linear change in time that an onset may have: above it the change
+may be gradual.
+"""
 LIKELY = 16.0
-"""A moment between two windows is refined if its loss is at most the least one and this (a likelihood ratio of 3e-4)."""
+"""
+A moment between two windows is refined if its loss is at most the least one and this (a likelihood
+ratio of 3e-4).
+"""
 SIMPLER = 1.25
-"""A group of fewer parameters is preferred if its excess is at most this many times the least one."""
+"""
+A group of fewer parameters is preferred if its excess is at most this many times the least one.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +65,10 @@ class Onset:
     share: float
     """Share of the excess over noise that the second state removes."""
     axes: tuple[str, ...] = ()
-    """Axes whose rows of the matrices change, the largest change first; empty for an effect of the reference."""
+    """
+    Axes whose rows of the matrices change, the largest change first; empty for an effect of the
+    reference.
+    """
 
     def to_mapping(self) -> dict:
         """Return the onset as plain data."""
@@ -83,10 +101,11 @@ def find_onset(
     """
     Return the Onset that explains the residual of a choice, None without one.
 
-    For each group of parameters and each moment between two windows, the model ``columns @ values + after * columns[:, group] @ change`` is
-    fitted with the noise at rest. The onset must remove `MIN_EXPLAINED_SHARE` of the excess, and its excess must be at most half that of a
-    linear change of the same parameters with time. The moment is then refined to the sample at which the residuals of both states are
-    least.
+    For each group of parameters and each moment between two windows, the model ``columns @ values +
+    after * columns[:, group] @ change`` is fitted with the noise at rest. The onset must remove
+    `MIN_EXPLAINED_SHARE` of the excess, and its excess must be at most half that of a linear change
+    of the same parameters with time. The moment is then refined to the sample at which the
+    residuals of both states are least.
     """
     used, space, groups = (
         problem.search.indices(chosen),
@@ -184,7 +203,11 @@ def _of_reference(model):
 
 
 def _fit(total, own, small, changed=None):
-    """Return (loss, values, changes, sds of the changes) of the parameters `own`; `changed`: (cross products, products, places)."""
+    """
+    Return (loss, values, changes, sds of the changes) of the parameters `own`.
+
+    `changed`: (cross products, products, places).
+    """
     known = 1 / small.prior_sd[own] ** 2
     normal, right = (
         total[np.ix_(own, own)] + np.diag(known),
@@ -209,7 +232,8 @@ def _refined(windows, table, model, *, states, between):
     """
     Return (mean, standard deviation) of the posterior of the moment between two times, s.
 
-    With a flat prior, ``p(t) ~ exp(-S(t) / 2)``, S the sum of squares of the residuals of the first state before t and the second after it.
+    With a flat prior, ``p(t) ~ exp(-S(t) / 2)``, S the sum of squares of the residuals of the first
+    state before t and the second after it.
     """
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
     noise = np.median([w.noise_sd for w in near], axis=0)

@@ -20,8 +20,9 @@ class ParameterSpace:
     """
     A reduced recording in the parameters under test.
 
-    The parameters of the extended model are first, then the amplitudes of the banks of time constants, per sensor. Rows are
-    ``[design | residual]`` of one axis; all their columns act on that axis.
+    The parameters of the extended model are first, then the amplitudes of the banks of time
+    constants, per sensor. Rows are ``[design | residual]`` of one axis; all their columns act on
+    that axis.
     """
 
     recording: ReducedRecording
@@ -36,12 +37,13 @@ class ParameterSpace:
     """Sensor -> the parameters that act on each axis."""
     join: dict[str, list[np.ndarray]]
     """
-    Sensor -> per axis the matrix that turns ``[columns | residual]`` of three axes into ``[design | residual]``, shape (p + 3, q_a + 1).
+    Sensor -> per axis the matrix that turns ``[columns | residual]`` of three axes into ``[design |
+    residual]``, shape (p + 3, q_a + 1).
     """
     join_within: dict[str, list[np.ndarray]]
     """
-    The same for the part within windows: zero for effects that are smooth in time, since the bias varies there too and the noise within
-    is modelled as white.
+    The same for the part within windows: zero for effects that are smooth in time, since the bias
+    varies there too and the noise within is modelled as white.
     """
     slow_only: dict[str, np.ndarray] = field(
         default_factory=lambda: {sensor: np.zeros(3, bool) for sensor in SENSORS}
@@ -58,11 +60,19 @@ class ParameterSpace:
         return len(self.names)
 
     def places(self, sensor: str, axis: int) -> np.ndarray:
-        """Return the positions of the rows of an axis in a normal matrix of all parameters, shape (q_a + 1,)."""
+        """
+        Return the positions of the rows of an axis in a normal matrix of all parameters.
+
+        Shape (q_a + 1,).
+        """
         return np.append(self.index[sensor][axis], self.size)
 
     def reduced(self, used: Sequence[int], values: np.ndarray) -> np.ndarray:
-        """Return the vector that maps rows of all parameters to residuals at `values` of the parameters `used`, shape (q + 1,)."""
+        """
+        Return the vector that maps rows of all parameters to residuals, shape (q + 1,).
+
+        The residuals are taken at `values` of the parameters `used`.
+        """
         found = np.zeros(self.size + 1)
         found[list(used)], found[-1] = -values, 1.0
         return found
@@ -106,7 +116,11 @@ class ParameterSpace:
         }
 
     def within_each(self, sensor: str, axis: int, rows: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the products of the centred rows of the windows `rows` (mask), some windows at a time, shape (m, q_a + 1, q_a + 1)."""
+        """
+        Yield the products of the centred rows of the windows `rows` (mask), some windows at a time.
+
+        Shape (m, q_a + 1, q_a + 1).
+        """
         missing, join = self._missing(sensor, axis), self.join_within[sensor][axis]
         for some, factors in self.recording.factors_of(sensor, self._compared(sensor, axis), rows):
             found = join.T @ (factors.transpose(0, 2, 1) @ factors @ join)
@@ -132,7 +146,11 @@ class ParameterSpace:
         return found
 
     def slopes_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
-        """Return the products of the centred rows of each window with themselves times `weights` (q_a + 1,), shape (k, q_a + 1)."""
+        """
+        Return the products of the centred rows of each window with themselves.
+
+        They are multiplied by `weights` (q_a + 1,), and the shape is (k, q_a + 1).
+        """
         join, recording = self.join_within[sensor][axis], self.recording
         found = np.zeros((len(recording.kind), join.shape[1]))
         for some, factors in recording.factors_of(
@@ -142,7 +160,11 @@ class ParameterSpace:
         return found
 
     def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
-        """Return the sum of squares of the centred rows of each window times its `weights` (k, q_a + 1), shape (k,)."""
+        """
+        Return the sum of squares of the weighted centred rows of each window, shape (k,).
+
+        The centred rows are multiplied by the window's `weights` (k, q_a + 1).
+        """
         columns, recording = weights @ self.join[sensor][axis].T, self.recording
         found = np.zeros(len(columns))
         for some, factors in recording.factors_of(sensor, 'within', recording.moving):
@@ -154,7 +176,11 @@ class ParameterSpace:
         return 'slow' if self.slow_only[sensor][axis] else 'within'
 
     def _missing(self, sensor, axis):
-        """Return the squares that replace the fast part of each window, zero where that part is compared, shape (k,)."""
+        """
+        Return the squares that replace the fast part of each window, shape (k,).
+
+        They are zero where that part is compared.
+        """
         if not self.slow_only[sensor][axis]:
             return np.zeros(len(self.recording.count))
         return self.slow_variance[sensor][axis] * np.maximum(
@@ -164,10 +190,13 @@ class ParameterSpace:
 
 def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> ParameterSpace:
     """
-    Return the ParameterSpace of a recording: the Jacobian of the coefficients joins columns to parameters.
+    Return the ParameterSpace of a recording.
 
-    Parameters of the baseline are relative to the point of linearisation; parameters of all other effects are absolute, so that an
-    omitted effect is zero even where the point of linearisation includes it.
+    The Jacobian of the coefficients joins columns to parameters.
+
+    Parameters of the baseline are relative to the point of linearisation; parameters of all other
+    effects are absolute, so that an omitted effect is zero even where the point of linearisation
+    includes it.
 
     Parameters
     ----------
@@ -220,7 +249,12 @@ def bank_places(recording: ReducedRecording) -> dict[str, slice]:
 
 
 def _join(jacobian, sensor, axis, recording, removed, smooth):
-    """Return (parameters that act on an axis, matrix that joins columns to them, the matrix for the part within windows)."""
+    """
+    Return (parameters that act on an axis, matrix for columns, matrix for the part).
+
+    The first matrix joins columns to the parameters, and the second one is for the part within
+    windows.
+    """
     bank, places = recording.bank[sensor], bank_places(recording)
     p, n_model = jacobian.shape
     ends = np.cumsum([p, *(len(entry.slopes) for entry in bank)])
@@ -237,7 +271,11 @@ def _join(jacobian, sensor, axis, recording, removed, smooth):
 
 
 def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray:
-    """Return a mask of the parameters that count from the linearisation: those of the baseline, time constants and times of steps."""
+    """
+    Return a mask of the parameters that count from the linearisation.
+
+    Those of the baseline, time constants and times of steps.
+    """
     masks = [np.full(e.size, e.key in baseline.slices) for e in model.effects]
     for effect, mask in zip(model.effects, masks):
         if effect.timed:
@@ -246,7 +284,11 @@ def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray
 
 
 def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Question]:
-    """Return a Question for each effect; one with a time constant gives one per time constant of the bank."""
+    """
+    Return a Question for each effect.
+
+    One with a time constant gives one per time constant of the bank.
+    """
     model, places, asked = space.recording.model, bank_places(space.recording), []
     for effect in effects:
         if effect.key in model.slices:
@@ -273,7 +315,11 @@ def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ..
 def normal_matrix(
     space: ParameterSpace, noise: dict[str, NoiseModel], select: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the normal matrix of the windows `select` (mask; all where not given), shape (q + 1, q + 1)."""
+    """
+    Return the normal matrix of the windows `select` (mask; all where not given).
+
+    Shape (q + 1, q + 1).
+    """
     of_means = np.zeros((space.size + 1, space.size + 1))
     for sensor in SENSORS:
         for axis, rows in enumerate(white_means(space, noise, sensor)):
@@ -340,7 +386,11 @@ def matrix_of_each(space: ParameterSpace, noise: dict[str, NoiseModel]) -> np.nd
 def scatter_of_each(
     space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return sensor -> factor of each window's scatter within, at parameters (q,), over its kind, shape (k, 3)."""
+    """
+    Return sensor -> factor of each window's scatter within, at parameters (q,), over its kind.
+
+    Shape (k, 3).
+    """
     recording, found, reduced = space.recording, {}, space.reduced(range(space.size), values)
     for sensor in SENSORS:
         usual = (
@@ -364,7 +414,9 @@ def white_means(
     scatter: np.ndarray | None = None,
 ) -> list[np.ndarray]:
     """
-    Return for each axis the mean rows, turned into independent rows of unit variance, shape (k, q_a + 1).
+    Return for each axis the mean rows, turned into independent rows of unit variance.
+
+    Shape (k, q_a + 1).
 
     `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
     """

@@ -1,4 +1,8 @@
-"""A formula for the unexplained residual: search, test on held-out windows, description and a term for a model."""
+"""
+A formula for the unexplained residual.
+
+Search, test on held-out windows, description and a term for a model.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -28,7 +32,9 @@ MOST_TERMS = 2
 ONE_SHAPE = 0.9
 """Share of a formula's amplitudes, all axes, that one shape must have to replace all of it."""
 OTHER_SENSOR = 3.0
-"""Standard deviations by which a cause of the table may differ from the estimate of the other sensor."""
+"""
+Standard deviations by which a cause of the table may differ from the estimate of the other sensor.
+"""
 SHOWN_ALIKE = 3
 """Largest number of reported formulas of a class."""
 CONCERNED_SDS = 4.0
@@ -86,7 +92,8 @@ class Proposal:
             for effect, value, sd in zip(self.effects, self.values, self.sds)
         ]
         text = (
-            f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f} %, on windows held out) follows '
+            f'{100 * self.share:.0f} % of it ({100 * self.ci95[0]:.0f} to {100 * self.ci95[1]:.0f}'
+            ' %, on windows held out) follows '
             + ' and '.join(f'{column}, {part}' for column, part in zip(self.columns, parts))
         )
         if self.nearest is not None:
@@ -121,9 +128,11 @@ class Proposal:
             'rms_reduction': self.reduction,
             'p_value': self.p_value,
             'indistinguishable_from': list(self.alike),
-            'nearest_of_the_catalogue': None
-            if self.nearest is None
-            else {'effect': self.nearest[0], 'share': self.nearest[1]},
+            'nearest_of_the_catalogue': (
+                None
+                if self.nearest is None
+                else {'effect': self.nearest[0], 'share': self.nearest[1]}
+            ),
             'confirming_motion': self.motion,
             'sentence': self.sentence,
         }
@@ -131,9 +140,12 @@ class Proposal:
 
 def find_formulas(blocks: RestBlocks, problem: LinearisedProblem) -> list[FormulaChoice]:
     """
-    Return the formulas that a sensor's residual follows most likely, each in addition to the earlier ones, at most `MOST_TERMS`.
+    Return the formulas that a sensor's residual follows most likely.
 
-    They are chosen on the selection windows, with all plausible contributions of the catalogue projected out.
+    Each one is in addition to the earlier ones, and there are at most `MOST_TERMS`.
+
+    They are chosen on the selection windows, with all plausible contributions of the catalogue
+    projected out.
     """
     search = FormulaSearch(
         blocks,
@@ -160,10 +172,13 @@ def propose(
     formulas: Sequence[FormulaChoice],
 ) -> Proposal | None:
     """
-    Return a Proposal for the residual of a sensor with the chosen effects, or None where no formula removes most of it.
+    Return a Proposal for the residual of a sensor with the chosen effects.
 
-    Of the `formulas` (`find_formulas`) the first ones are taken on which both halves of the selection windows agree and that add enough;
-    the share is from the locked windows with the findings in the model.
+    Or None where no formula removes most of it.
+
+    Of the `formulas` (`find_formulas`) the first ones are taken on which both halves of the
+    selection windows agree and that add enough; the share is from the locked windows with the
+    findings in the model.
     """
     plain = fits.fit()
     if plain.excess <= 0:
@@ -189,7 +204,8 @@ def _plausible(sensor, problem):
     """
     Return a factor of the covariance that the catalogue's parameters may have, shape (q, q).
 
-    A cause in the table acts on both sensors: its explained share here is limited by its estimate there.
+    A cause in the table acts on both sensors: its explained share here is limited by its estimate
+    there.
     """
     plausible = np.diag(problem.space.prior_sd)
     other = next(each for each in SENSORS if each != sensor)
@@ -217,7 +233,9 @@ def _joined(choices):
 
 
 def _stable(fits, choices):
-    """Return whether the halves of the recording agree on the last choice within their precision."""
+    """
+    Return whether the halves of the recording agree on the last choice within their precision.
+    """
     width = choices[-1].columns.shape[1]
     early, late, whole = (fits.fit(_joined(choices), half=half) for half in (0, 1, None))
     apart = ((early.amplitudes - late.amplitudes) / np.sqrt(early.sd**2 + late.sd**2))[-width:]
@@ -267,7 +285,11 @@ def _proposal_of(blocks, problem, fits, plain, choices):
 
 
 def _shapes(fits, choices, choice):
-    """Return (column means (b, 1, 3), text or three texts, Formula) of the one or two shapes that hold a choice's amplitudes."""
+    """
+    Return (column means (b, 1, 3), text or three texts, Formula) of shapes.
+
+    They are the one or two shapes that hold a choice's amplitudes.
+    """
     formula, columns = choice.formula, choice.columns
     if len(formula.columns) == 1:
         return [(columns, formula.columns[0], formula)]
@@ -321,7 +343,10 @@ def _effect(sensor, number, text, formula, values, taken):
         tolerance_reason='a tenth of the estimate',
         prior_sd=_digits(10 * largest),
         largest=_digits(3 * largest),
-        text=f'The {sensor} output follows {_joined_text(text)}: a formula that a diagnosis proposed, its cause is not known.',
+        text=(
+            f'The {sensor} output follows {_joined_text(text)}: a formula that a diagnosis'
+            ' proposed, its cause is not known.'
+        ),
     )
 
 

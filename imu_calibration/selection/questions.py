@@ -93,7 +93,9 @@ def testable_effects(
 
 def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
     """
-    Return (testable effects, list of {'effect', 'why', 'needs'}) of the catalogue's effects that the model lacks.
+    Return (testable effects, list of {'effect', 'why', 'needs'}).
+
+    Both refer to the catalogue's effects that the model lacks.
 
     ``why_not(effect)`` gives (why, needs), or None for a testable effect.
     """
@@ -156,12 +158,20 @@ def _why_not(effect, have, table, *, kinds, span, turned, shaken):
 
 
 def time_constants(duration: float, number: int = N_TIME_CONSTANTS) -> np.ndarray:
-    """Return time constants of warm-ups that a recording of `duration` s determines, s, shape (number,); default the ones of the bank."""
+    """
+    Return time constants of warm-ups that a recording of `duration` s determines, s.
+
+    Shape (number,); default the ones of the bank.
+    """
     return np.geomspace(max(duration / 30, 5.0), 2.0 * duration, number)
 
 
 def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel:
-    """Return the model with all these effects, except those that are tested differently (warm-ups, saturation)."""
+    """
+    Return the model with all these effects, except the ones tested differently.
+
+    The exceptions are warm-ups and saturation.
+    """
     kept = [e for e in effects if e.warp is not None or not special(e)]
     added = {sensor: tuple(e.name for e in kept if e.sensor == sensor) for sensor in SECTIONS}
     return replace(
@@ -172,7 +182,11 @@ def extended_model(model: SensorModel, effects: Sequence[Effect]) -> SensorModel
 def point_with(
     model: SensorModel, effects: Sequence[Effect], values: dict[str, float]
 ) -> tuple[SensorModel, np.ndarray]:
-    """Return (the model with all these effects linearised there, its parameters) at the given values, else at the prior."""
+    """
+    Return (the model with all these effects linearised there, its parameters).
+
+    The linearisation is at the given values, else at the prior.
+    """
     wide = extended_model(model, effects)
     start = np.array(
         [values.get(name, known) for name, known in zip(wide.param_names, wide.start())]
@@ -187,20 +201,32 @@ def without_saturation(effects: Sequence[Effect]) -> list[Effect]:
 
 
 def special(effect: Effect) -> bool:
-    """Return whether an effect has no columns of its own: saturation (censoring), warm-up (bank of time constants), step (its time)."""
+    """
+    Return whether an effect has no columns of its own.
+
+    Saturation (censoring), warm-up (bank of time constants), step (its time).
+    """
     return effect.role is Role.LIMIT or effect.timed
 
 
 MAX_TABLE_PASSES = 6
 """Most passes over a recording with repeated linearisation."""
 STARTS = 6
-"""Number of start values of the time constant, with a ratio of 2.3: the iteration converges from a start within this factor."""
+"""
+Number of start values of the time constant, with a ratio of 2.3: the iteration converges from a
+start within this factor.
+"""
 LINEAR_STEPS = 25
-"""Steps of a numerical derivative (5 ms of a delay) up to which a linearisation is valid in weakly determined directions."""
+"""
+Steps of a numerical derivative (5 ms of a delay) up to which a linearisation is valid in weakly
+determined directions.
+"""
 
 
 def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
-    """Return the model linearised at a solution outside the validity of its linearisation, else None."""
+    """
+    Return the model linearised at a solution outside the validity of its linearisation, else None.
+    """
     for effect in model.relinearised:
         if effect.key in solution.model.slices:
             part = solution.model.slices[effect.key]
@@ -211,7 +237,11 @@ def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | Non
 
 
 def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> list[SensorModel]:
-    """Return the model with the columns of a warm-up at each of several time constants that a recording of `duration` s can show."""
+    """
+    Return the model with the columns of a warm-up at several time constants.
+
+    A recording of `duration` s can show each of these time constants.
+    """
     return [
         replace(model, point={**model.point, effect.name: effect.at_time_constant(constant)})
         for constant in time_constants(duration, STARTS)
@@ -222,8 +252,9 @@ def _cautious(solution):
     """
     Return values to linearise at: those of the solution, except along weakly determined directions.
 
-    At zero, lag and delay have the same first derivative. They are separable only at a point where both are nonzero;
-    a full step along their difference would be arbitrary. The step is therefore regularised with LINEAR_STEPS towards the point.
+    At zero, lag and delay have the same first derivative. They are separable only at a point where
+    both are nonzero; a full step along their difference would be arbitrary. The step is therefore
+    regularised with LINEAR_STEPS towards the point.
     """
     model, values = solution.model, solution.values
     move, pull = np.zeros(len(values)), np.zeros(len(values))

@@ -1,4 +1,6 @@
-"""A recording reduced to factors: columns at a bank of time constants, windows of the recent past."""
+"""
+A recording reduced to factors: columns at a bank of time constants, windows of the recent past.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -50,8 +52,9 @@ class Recent(dict):
 
 BANK_PRIOR_RATIO = 10.0
 """
-Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with opposite signs, and where the prior
-constrained them the estimated noise changed; from a factor of six on it does not.
+Standard deviations of amplitudes in a bank, times the effect's own: neighbours share one curve with
+opposite signs, and where the prior constrained them the estimated noise changed; from a factor of
+six on it does not.
 """
 
 
@@ -95,7 +98,11 @@ class BankEntry:
 def make_bank(
     effects: Sequence[Effect], constants: np.ndarray, model: SensorModel, *, values: np.ndarray
 ) -> dict[str, list[BankEntry]]:
-    """Return sensor -> list of BankEntry for the `effects` that have a time constant, at `values` of a model for the rest of the sensor."""
+    """
+    Return sensor -> list of BankEntry for the `effects` that have a time constant.
+
+    They are taken at `values` of a model for the rest of the sensor.
+    """
     bank = {sensor: [] for sensor in SENSORS}
     for effect in effects:
         if effect.time_constant:
@@ -150,7 +157,11 @@ MOST_SUMS = 32
 
 @dataclass(frozen=True, eq=False)
 class ReducedRecording:
-    """Windows of one recording as statistics of ``[columns of the model | bank of time constants | output]``; residuals at a point."""
+    """
+    Windows of one recording as statistics, and residuals at a point.
+
+    The statistics are of ``[columns of the model | bank of time constants | output]``.
+    """
 
     model: SensorModel
     """Model of all candidate effects, linearised at its point."""
@@ -161,9 +172,15 @@ class ReducedRecording:
     windows: tuple[WindowStatistics, ...]
     """Reduced as for a calibration, kept one by one, without their triangular factors."""
     factors: dict[tuple[str, str], list[np.ndarray]]
-    """(sensor, one of `PARTS`) -> triangular factor of the centred rows ``[columns | output]`` of each window."""
+    """
+    (sensor, one of `PARTS`) -> triangular factor of the centred rows ``[columns | output]`` of each
+    window.
+    """
     describe: dict[str, np.ndarray]
-    """Window means of variables that a residual may depend on: 'time', 'temperature', joint angles, rates; each (k,)."""
+    """
+    Window means of variables that a residual may depend on: 'time', 'temperature', joint angles,
+    rates; each (k,).
+    """
 
     @cached_property
     def kind(self) -> np.ndarray:
@@ -222,9 +239,12 @@ class ReducedRecording:
         self, sensor: str, part: str, rows: np.ndarray
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
-        Yield the triangular factors of the centred rows ``[columns | residual]``, of some windows at a time.
+        Yield the triangular factors of the centred rows ``[columns | residual]``.
 
-        Factors of all windows, and their products even more, would take several times the memory of the samples.
+        Each step covers some windows at a time.
+
+        Factors of all windows, and their products even more, would take several times the memory of
+        the samples.
 
         Parameters
         ----------
@@ -237,7 +257,8 @@ class ReducedRecording:
         Yields
         ------
         tuple
-            Indices of the windows, shape (m,), and their factors, shape (m, r, p + 3); missing rows are zero.
+            Indices of the windows, shape (m,), and their factors, shape (m, r, p + 3); missing rows
+            are zero.
 
         """
         chosen = np.flatnonzero(rows & self.moving)
@@ -252,7 +273,11 @@ class ReducedRecording:
             )
 
     def product_sum(self, sensor: str, part: str, rows: np.ndarray) -> np.ndarray:
-        """Return the products of the centred rows ``[columns | residual]`` of the windows `rows` (mask), summed, shape (p + 3, p + 3)."""
+        """
+        Return the summed products of the centred rows ``[columns | residual]``.
+
+        The sum is over the windows `rows` (mask), and the shape is (p + 3, p + 3).
+        """
         key = sensor, part, rows.tobytes()
         if key not in self._sums:
             width = self._width(sensor)
@@ -284,7 +309,11 @@ class ReducedRecording:
         return rows
 
     def rebased(self, values: np.ndarray) -> 'ReducedRecording':
-        """Return the same recording with the residual of other `values`; the point of linearisation is unchanged."""
+        """
+        Return the same recording with the residual of other `values`.
+
+        The point of linearisation is unchanged.
+        """
         return replace(self, values=values)
 
     def select(self, rows: np.ndarray) -> 'ReducedRecording':
@@ -380,9 +409,9 @@ def _describe(window):
     found = {
         'time': float(window.time.mean()),
         'specific force': float(np.linalg.norm(window.force_s.mean(axis=0))),
-        'temperature': np.nan
-        if window.temperature_c is None
-        else float(window.temperature_c.mean()),
+        'temperature': (
+            np.nan if window.temperature_c is None else float(window.temperature_c.mean())
+        ),
         'rate': float(np.sqrt((motion.rate**2).sum(axis=1).mean())),
     }
     for joint in range(motion.position.shape[1]):
@@ -393,9 +422,11 @@ def _describe(window):
 
 def mean_arms(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """
-    Return the mean lever arm of the accelerometers for each of them, zero where a model has none, shape (3, 3).
+    Return the mean lever arm of the accelerometers for each of them, zero where a model has none.
 
-    Their differences change the derivative of a delay little where they are millimetres, and distort it where a recording does not
-    determine them and they are estimated as centimetres.
+    Shape (3, 3).
+
+    Their differences change the derivative of a delay little where they are millimetres, and
+    distort it where a recording does not determine them and they are estimated as centimetres.
     """
     return np.tile(all_arms(model, values).mean(axis=0), (3, 1))

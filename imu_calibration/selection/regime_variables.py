@@ -1,4 +1,8 @@
-"""Variables of regimes: angles, rates and sides of the joints, speed, force, time, temperature, in ranges of values."""
+"""
+Variables of regimes.
+
+Angles, rates and sides of the joints, speed, force, time, temperature, in ranges of values.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +25,11 @@ MOST_BOUNDS = 16
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A variable of regimes at the rows of all blocks, in bins, and the description of a range of values."""
+    """
+    A variable of regimes at the rows of all blocks, in bins.
+
+    It also holds the description of a range of values.
+    """
 
     name: str
     bins: np.ndarray
@@ -30,7 +38,9 @@ class Variable:
     """Where bins begin, and where the last one ends; none for classes."""
     cyclic: bool
     words: Callable
-    """``words(chosen, bounds)``: the condition, from the bins in order and where they begin and end."""
+    """
+    ``words(chosen, bounds)``: the condition, from the bins in order and where they begin and end.
+    """
     values: np.ndarray
     """Value at each row, in the unit of the edges, shape (n,)."""
     starts: np.ndarray
@@ -43,7 +53,9 @@ class Variable:
 
     @property
     def ranges(self) -> np.ndarray:
-        """Ranges of neighbouring bins, 1 in each bin of a range, the shortest first, shape (r, k)."""
+        """
+        Ranges of neighbouring bins, 1 in each bin of a range, the shortest first, shape (r, k).
+        """
         count, places = int(self.bins.max()) + 1, np.arange(int(self.bins.max()) + 1)
         parts = [
             (places - first) % count < length
@@ -55,7 +67,11 @@ class Variable:
 
     @property
     def curves(self) -> np.ndarray:
-        """Means over the blocks of smooth functions of the variable, cubic or of the third order; none of classes; shape (b, k)."""
+        """
+        Means over the blocks of smooth functions of the variable, cubic or of the third order.
+
+        None of classes; shape (b, k).
+        """
         if not len(self.edges):
             return np.zeros((len(self.starts), 0))
         if self.cyclic:
@@ -84,7 +100,11 @@ class Variable:
         )
 
     def inside(self, low: float, high: float) -> np.ndarray:
-        """Return the share of each block between two bounds, the first and the last range open at their ends, shape (b,)."""
+        """
+        Return the share of each block between two bounds, shape (b,).
+
+        The first and the last range are open at their ends.
+        """
         if self.cyclic:
             rows = (self.values - low) % 360.0 < ((high - low) % 360.0 or 360.0)
         else:
@@ -94,7 +114,11 @@ class Variable:
         return block_means(rows.astype(float), self.starts)
 
     def near(self, chosen: Sequence[int], end: int) -> list[float]:
-        """Return where a range of bins may begin (`end` 0) or end (1): between values that lie in the bins on both sides, evenly spread."""
+        """
+        Return where a range of bins may begin (`end` 0) or end (1).
+
+        Between values that lie in the bins on both sides, evenly spread.
+        """
         first = chosen[0] if end == 0 else chosen[-1] + 1
         if not self.cyclic and first in (0, len(self.edges) - 1):
             return []
@@ -181,7 +205,11 @@ def _cyclic(name, degrees, starts):
 def ranged(
     name: str, values: np.ndarray, unit: str, *, starts: np.ndarray, least: float = 1e-3
 ) -> list[Variable]:
-    """Return the variable of a value at each row in bins of equal numbers of blocks, or none where it hardly changes."""
+    """
+    Return the variable of a value at each row, in bins of equal numbers of blocks.
+
+    Return none where the value hardly changes.
+    """
     edges = np.unique(
         np.round(np.quantile(block_means(values, starts), np.linspace(0.0, 1.0, N_BINS + 1)), 3)
     )

@@ -1,4 +1,8 @@
-"""Regimes of the motion that contain most of a sensor's residual: permutation test, and comparison with smooth curves and formulas."""
+"""
+Regimes of the motion that contain most of a sensor's residual.
+
+Permutation test, and comparison with smooth curves and formulas.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,19 +17,33 @@ from imu_calibration.selection.regime_variables import FEWEST, Variable, variabl
 from imu_calibration.selection.residual_blocks import BlockWhitener, RestBlocks
 
 REGIME_LEVEL = 0.05
-"""Probability that a recording without a place has one reported, for all axes of a sensor together."""
+"""
+Probability that a recording without a place has one reported, for all axes of a sensor together.
+"""
 PERMUTED = 199
 """Random exchanges of the residual between windows."""
 INTENSITIES, LEAST_ALIKE = 3, 4
-"""Classes of motion intensity within a kind of window, at most, and windows of each, at least: the residual is exchanged within them."""
+"""
+Classes of motion intensity within a kind of window, at most, and windows of each, at least: the
+residual is exchanged within them.
+"""
 MOST_OF_IT = 0.8
-"""Least share of the excess that an offset in a regime removes, or that lies in a regime of larger scatter."""
+"""
+Least share of the excess that an offset in a regime removes, or that lies in a regime of larger
+scatter.
+"""
 NEARLY_ALL = 0.95
 """Share of the scatter of a range in its reported part."""
 REGIME_SHARE_TIE = 0.01
-"""Difference of the shares of two regimes up to which the order of variables decides: joints before the sensor."""
+"""
+Difference of the shares of two regimes up to which the order of variables decides: joints before
+the sensor.
+"""
 SURE = 16.0
-"""Least advantage of a regime over a smooth curve or a formula, twice the difference of log likelihood, nats."""
+"""
+Least advantage of a regime over a smooth curve or a formula, twice the difference of log
+likelihood, nats.
+"""
 LOUDER = 1.5
 """Least ratio of the variances inside and outside of a regime of larger scatter."""
 MAX_REGIME_SHARE = 0.6
@@ -35,7 +53,9 @@ REPORTED = 4
 SCORINGS = 12
 """Steps of the fit of a variance that is a smooth function of a variable."""
 MAX_VARIANCE_RATIO = 1e3
-"""Largest ratio of a square and its variance in a step, which limits the influence of few residuals."""
+"""
+Largest ratio of a square and its variance in a step, which limits the influence of few residuals.
+"""
 TINY = 1e-9
 """Keeps columns that a part of the recording does not have from making a system singular."""
 
@@ -55,7 +75,10 @@ class RestRegime:
     share: float
     """Share of the axis' excess that an offset there removes, or that lies there."""
     p_value: float
-    """Probability of an equal gain with the residual exchanged between windows, for all ranges of all variables."""
+    """
+    Probability of an equal gain with the residual exchanged between windows, for all ranges of all
+    variables.
+    """
     size: float
     """Offset, or sd of the additional scatter, m/s^2 or rad/s."""
     inside: np.ndarray
@@ -63,9 +86,14 @@ class RestRegime:
     time: np.ndarray
     """Middle of each block, s, shape (b,)."""
     offset: bool
-    """Whether the output differs by a constant offset there; the complement could then have it as well."""
+    """
+    Whether the output differs by a constant offset there; the complement could then have it as
+    well.
+    """
     bounds: tuple[float, float] | None
-    """Where it begins and ends, SI or degrees for angles; an angle may begin beyond where it ends."""
+    """
+    Where it begins and ends, SI or degrees for angles; an angle may begin beyond where it ends.
+    """
 
     def to_mapping(self) -> dict:
         """Return the regime as plain data."""
@@ -140,10 +168,12 @@ def find_regimes(
 
 def exchanges(window: np.ndarray, kind: np.ndarray, intensity: np.ndarray) -> np.ndarray:
     """
-    Return random exchanges of the blocks' residuals: each window has the sequence of another of its kind and intensity of motion.
+    Return random exchanges of the blocks' residuals.
 
-    Exchanged are whole windows, since the residual within a window is correlated; a sequence is repeated or cut to the length of its new
-    window.
+    Each window has the sequence of another of its kind and intensity of motion.
+
+    Exchanged are whole windows, since the residual within a window is correlated; a sequence is
+    repeated or cut to the length of its new window.
 
     Parameters
     ----------
@@ -201,7 +231,11 @@ class AxisResidual:
         return columns - self.design @ (self._inverse @ (self.design.T @ columns))
 
     def offsets(self, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (amplitude, residual sum of squares) with each one of some columns in the model, both shape (k,)."""
+        """
+        Return (amplitude, residual sum of squares) per column, both shape (k,).
+
+        Each one of some columns is in the model in turn.
+        """
         size, product = (
             np.maximum((marks * self.free(marks)).sum(axis=0), TINY),
             marks.T @ self.values,
@@ -233,7 +267,9 @@ class _Ranges:
 
 class RegimeSearch:
     """
-    Search for ranges of variables in which the residual of a sensor has another offset or a larger scatter.
+    Search for ranges of variables in which the residual of a sensor differs.
+
+    In such a range the residual has another offset or a larger scatter.
 
     Parameters
     ----------
@@ -269,7 +305,9 @@ class RegimeSearch:
         formula: np.ndarray | None = None,
     ) -> list[RestRegime]:
         """
-        Return the ranges with another offset, the likeliest first, without those that a smooth curve or a formula describes as well.
+        Return the ranges with another offset, the likeliest first.
+
+        Without those that a smooth curve or a formula describes as well.
 
         The statistic is the largest share of the squares that one offset explains.
 
@@ -331,7 +369,11 @@ class RegimeSearch:
         return _largest_share_first(found)
 
     def _refined(self, rest, white, each, number):
-        """Return (share of each block inside, bounds, words, offset, residual sum of squares) of a range with refined bounds."""
+        """
+        Return the description of a range with refined bounds.
+
+        It is (share of each block inside, bounds, words, offset, residual sum of squares).
+        """
         variable, chosen = each.variable, each.variable.chosen(each.member[number])
         bounds, mark = variable.bounds(chosen), each.marks[:, chosen].sum(axis=1)
         for end in (0, 1) if bounds else ():
@@ -350,9 +392,12 @@ class RegimeSearch:
         self, axis: str, rough: np.ndarray, weight: np.ndarray, *, level: float
     ) -> list[RestRegime]:
         """
-        Return the ranges with a larger variance within blocks, the likeliest first; arguments as `offsets`, and:
+        Return the ranges with a larger variance within blocks, the likeliest first.
 
-        The statistic is the largest fall of minus twice the log likelihood by a separate variance in a range.
+        Arguments as `offsets`, and:
+
+        The statistic is the largest fall of minus twice the log likelihood by a separate variance
+        in a range.
 
         Parameters
         ----------
@@ -418,7 +463,11 @@ class RegimeSearch:
         return _largest_share_first(found)
 
     def _falls(self, rough, weight):
-        """Return per variable the fall of the cost by a separate variance in each range, zero where it is hardly larger, (r, m)."""
+        """
+        Return per variable the fall of the cost by a separate variance in each range.
+
+        It is zero where the variance is hardly larger, and the shape is (r, m).
+        """
         squares, count, gains = rough * weight[:, None], weight.sum(), []
         energy = squares.sum(axis=0)
         for each in self._ranges:
@@ -439,7 +488,11 @@ class RegimeSearch:
         return gains
 
     def _tested(self, gains):
-        """Return (p-value of the largest of the gains (r, 1 + m), the likeliest ranges (_Ranges, number) in order of variables)."""
+        """
+        Return (p-value of the largest gain, the likeliest ranges (_Ranges, number)).
+
+        The gains have shape (r, 1 + m), and the ranges are in order of variables.
+        """
         if not gains:
             return 1.0, []
         largest = np.max([each.max(axis=0) for each in gains], axis=0)
@@ -469,16 +522,21 @@ def _tightened(chosen, excess):
 
 
 def _cost(energy, count):
-    """Return minus twice the log likelihood of residuals with one variance, at least that of noise."""
+    """
+    Return minus twice the log likelihood of residuals with one variance, at least that of noise.
+    """
     variance = np.maximum(energy / np.maximum(count, 1.0), 1.0)
     return count * np.log(variance) + energy / variance
 
 
 def _smooth_scatter(columns, variance, weight):
     """
-    Return (minus twice the log likelihood, dispersion) of variances that are exp(a combination of columns), by Fisher scoring.
+    Return (minus twice the log likelihood, dispersion) by Fisher scoring.
 
-    The dispersion is 1 where the variances scatter about the curve as those of Gaussian noise with `weight` degrees of freedom.
+    The variances are exp(a combination of columns).
+
+    The dispersion is 1 where the variances scatter about the curve as those of Gaussian noise with
+    `weight` degrees of freedom.
     """
     design, root = np.column_stack([np.ones(len(columns)), columns]), np.sqrt(weight)
     values = np.zeros(design.shape[1])

@@ -1,4 +1,8 @@
-"""The search of `calibrate` and `diagnose`: supported effects, without findings that a formula or a regime replaces."""
+"""
+The search of `calibrate` and `diagnose`.
+
+Supported effects, without findings that a formula or a regime replaces.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -25,7 +29,10 @@ from imu_calibration.selection.unexplained import Unexplained, beyond_noise, une
 MIN_FORMULA_SDS = 10.0
 """Standard deviations above noise at rest from which a formula is searched in moving blocks."""
 NOT_NEEDED = 0.05
-"""Least share of a finding's reduction of the residual that must remain with a formula or a regime in the model."""
+"""
+Least share of a finding's reduction of the residual that must remain with a formula or a regime in
+the model.
+"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,7 +46,9 @@ class ResidualAnalysis(Investigation):
 
     @classmethod
     def of(cls, found: Investigation, table: Table) -> 'ResidualAnalysis':
-        """Return an Investigation as a ResidualAnalysis; a ResidualAnalysis is returned unchanged."""
+        """
+        Return an Investigation as a ResidualAnalysis; a ResidualAnalysis is returned unchanged.
+        """
         return (
             found
             if isinstance(found, cls)
@@ -63,7 +72,9 @@ class ResidualAnalysis(Investigation):
         return rest_blocks(self.used, self.table, self.problem, explained=self.explained)
 
     def fits(self, sensor: str, chosen: Sequence[Question] | None = None) -> BlockFits:
-        """Return the fits of a choice, of the findings where not given, to the blocks of a sensor."""
+        """
+        Return the fits of a choice, of the findings where not given, to the blocks of a sensor.
+        """
         space, used = (
             self.problem.space,
             tuple(self.search.indices(self.named if chosen is None else chosen)),
@@ -80,7 +91,11 @@ class ResidualAnalysis(Investigation):
         chosen: Sequence[Question] | None = None,
         formula: np.ndarray | None = None,
     ) -> list[RestRegime]:
-        """Return the regimes of a sensor's residual with a choice in the model, the findings where not given (`find_regimes`)."""
+        """
+        Return the regimes of a sensor's residual with a choice in the model.
+
+        Return the findings where no choice is given (`find_regimes`).
+        """
         fits, offsets = (
             self.fits(sensor, chosen),
             chosen is not None or self.rests[sensor].significant or formula is not None,
@@ -95,32 +110,47 @@ class ResidualAnalysis(Investigation):
         )
 
     def formulas(self, sensor: str) -> list[FormulaChoice]:
-        """Return the likeliest formulas for the residual of a sensor, for any choice of effects (`find_formulas`)."""
+        """
+        Return the likeliest formulas for the residual of a sensor.
+
+        For any choice of effects (`find_formulas`).
+        """
         if sensor not in self._formulas:
             self._formulas[sensor] = find_formulas(self.blocks[sensor], self.problem)
         return self._formulas[sensor]
 
     def proposed(self, sensor: str, fits: BlockFits) -> Proposal | None:
-        """Return a formula for the residual of a sensor with the choice of some fits (`propose`)."""
+        """
+        Return a formula for the residual of a sensor with the choice of some fits (`propose`).
+        """
         return propose(self.blocks[sensor], self.problem, fits, formulas=self.formulas(sensor))
 
     @cached_property
     def proposals(self) -> dict[str, Proposal | None]:
         """
-        Sensor -> a formula for its residual, where it is significant or clear within moving windows.
+        Sensor -> a formula for its residual.
 
-        Variation within moving windows is modelled as noise; a formula that explains it shows that it is deterministic.
+        Where it is significant or clear within moving windows.
+
+        Variation within moving windows is modelled as noise; a formula that explains it shows that
+        it is deterministic.
         """
         fits = {sensor: self.fits(sensor) for sensor in self.rests}
         return {
-            sensor: self.proposed(sensor, fits[sensor])
-            if rest.significant or fits[sensor].sigma > MIN_FORMULA_SDS
-            else None
+            sensor: (
+                self.proposed(sensor, fits[sensor])
+                if rest.significant or fits[sensor].sigma > MIN_FORMULA_SDS
+                else None
+            )
             for sensor, rest in self.rests.items()
         }
 
     def columns(self, sensor: str, proposal: Proposal | None) -> np.ndarray | None:
-        """Return the columns of the formulas of a proposal over the blocks of a sensor, shape (b, k, 3), or None without one."""
+        """
+        Return the columns of the formulas of a proposal over the blocks of a sensor.
+
+        Shape (b, k, 3), or None without one.
+        """
         if proposal is None:
             return None
         blocks = self.blocks[sensor]
@@ -131,7 +161,11 @@ class ResidualAnalysis(Investigation):
 
     @cached_property
     def unexplained(self) -> dict[str, Unexplained]:
-        """Sensor -> the unexplained excess with its tones, and with regimes and a proposal where it is significant."""
+        """
+        Sensor -> the unexplained excess with its tones.
+
+        It includes regimes and a proposal where the excess is significant.
+        """
         report('analysing the residual')
         tones = find_tones(
             self,
@@ -171,14 +205,22 @@ class ResidualAnalysis(Investigation):
         return replace(found, significant=True, rms=float(np.hypot.reduce(sizes)))
 
     def released(self) -> dict[str, Unexplained]:
-        """Return `unexplained` and free the blocks and their fits, which are computed again on demand: solutions need that memory."""
+        """
+        Return `unexplained` and free the blocks and their fits, which are computed again on demand.
+
+        Solutions need that memory.
+        """
         found, _ = self.unexplained, self.stamp_jitter
         self.__dict__.pop('blocks', None)
         self._fits.clear()
         return found
 
     def without(self, gone: Sequence[Question]) -> 'ResidualAnalysis':
-        """Return the ResidualAnalysis without some findings; they become rejected, and widen the uncertainty of all other ones."""
+        """
+        Return the ResidualAnalysis without some findings.
+
+        They become rejected, and widen the uncertainty of all other ones.
+        """
         names = {question.name for question in gone}
         other = replace(
             self,
@@ -199,7 +241,9 @@ def inquire(
     bias_processes: dict | None = None,
 ) -> ResidualAnalysis:
     """
-    Test every effect that a model lacks (`investigate`), and withdraw findings that a formula or a regime replaces.
+    Test every effect that a model lacks (`investigate`).
+
+    Findings that a formula or a regime replaces are withdrawn.
 
     Parameters
     ----------
@@ -228,19 +272,27 @@ def without_superseded(found: ResidualAnalysis) -> ResidualAnalysis:
 
 def superseded(found: ResidualAnalysis) -> list[Question]:
     """
-    Return the findings that a formula or a regime replaces: they approximated the part that correlates with them.
+    Return the findings that a formula or a regime replaces.
 
-    A response to the cube of a force is three quarters a response to the force; its residual would be reported as a formula in addition to
-    a wrong effect; a step at warm temperature is like a polynomial of the temperature. So each finding is omitted once, in all sensors on
-    which it acts, and is kept if held-out windows need it in addition to the substitute: the formula for the residual of all findings, a
-    formula for the residual without it, or the regimes of that. This is tested where a residual remains; for effects of the temperature
-    always: settling or a step during the warm-up is so similar that hardly any residual remains.
+    They approximated the part that correlates with them.
+
+    A response to the cube of a force is three quarters a response to the force; its residual would
+    be reported as a formula in addition to a wrong effect; a step at warm temperature is like a
+    polynomial of the temperature. So each finding is omitted once, in all sensors on which it acts,
+    and is kept if held-out windows need it in addition to the substitute: the formula for the
+    residual of all findings, a formula for the residual without it, or the regimes of that. This is
+    tested where a residual remains; for effects of the temperature always: settling or a step
+    during the warm-up is so similar that hardly any residual remains.
     """
     return [question for question in found.named if _done_without(found, question)]
 
 
 def _done_without(found, question):
-    """Return whether a finding hardly reduces the residual of its sensors with a substitute in some of them."""
+    """
+    Return whether a finding hardly reduces the residual with a substitute.
+
+    The residual is that of the finding's sensors, and the substitute is in some of them.
+    """
     sensors = sensors_of(question.effect)
     warm = 'temperature' in question.effect.needs
     asked = [
@@ -275,7 +327,11 @@ def _done_without(found, question):
 
 
 def _places(found, sensor, chosen):
-    """Return an indicator column of the regimes where an offset explains most of an axis' residual, shape (b, 1, 3), or None."""
+    """
+    Return an indicator column of the regimes where an offset explains most of an axis' residual.
+
+    Shape (b, 1, 3), or None.
+    """
     offsets = [regime for regime in found.regimes(sensor, chosen) if regime.offset]
     first = {regime.axis: regime.inside for regime in reversed(offsets)}
     nowhere = np.zeros(len(found.blocks[sensor].time))

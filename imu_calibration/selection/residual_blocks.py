@@ -1,4 +1,8 @@
-"""The residual of one sensor in short blocks, with the columns of all candidate effects, and fits of columns to it."""
+"""
+The residual of one sensor in short blocks.
+
+With the columns of all candidate effects, and fits of columns to it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +38,10 @@ COVARIANCE_PARTS = 16
 AT_A_TIME = 256
 """Blocks whose columns are in memory at once."""
 WHITE_BENDS, PER_FREEDOM = 6.0, 35 / 18
-"""Variance of second differences of unit white noise, and their number for each degree of freedom of a mean of their squares."""
+"""
+Variance of second differences of unit white noise, and their number for each degree of freedom of a
+mean of their squares.
+"""
 WITHIN = 5
 """Rows at which the columns of a block are evaluated."""
 
@@ -65,8 +72,8 @@ class RestBlocks:
     """How every bias moves (BiasProcess)."""
     rough: np.ndarray
     """
-    Variance of the residual within a block by second differences, which suppress causes that vary with the motion, without errors of the
-    stamps, shape (b, 3).
+    Variance of the residual within a block by second differences, which suppress causes that vary
+    with the motion, without errors of the stamps, shape (b, 3).
     """
     freedom: np.ndarray
     """Its degrees of freedom, shape (b,)."""
@@ -75,7 +82,9 @@ class RestBlocks:
 
     @property
     def warms(self) -> bool:
-        """Whether the temperature is known and changes by as much as a thermal effect needs to show."""
+        """
+        Whether the temperature is known and changes by as much as a thermal effect needs to show.
+        """
         return self.ref.temperature_c is not None and bool(
             np.ptp(self.ref.temperature_c) >= TEMPERATURE_SPAN
         )
@@ -86,12 +95,20 @@ class RestBlocks:
 
     @cached_property
     def white(self) -> list['BlockWhitener']:
-        """Whiteners of the blocks outside locked windows and of those inside; large, therefore shared by the fits of all choices."""
+        """
+        Whiteners of the blocks outside locked windows and of those inside.
+
+        Large, therefore shared by the fits of all choices.
+        """
         return [BlockWhitener(self, ~self.locked), BlockWhitener(self, self.locked)]
 
 
 class BlockWhitener:
-    """Makes rows of the blocks `select` (mask) independent, of unit variance: white noise of each block and a bias that moves."""
+    """
+    Makes rows of the blocks `select` (mask) independent, of unit variance.
+
+    White noise of each block and a bias that moves.
+    """
 
     def __init__(self, blocks: RestBlocks, select: np.ndarray):
         variance, time = blocks.variance[select], blocks.time[select]
@@ -109,7 +126,11 @@ class BlockWhitener:
         )
 
     def __call__(self, rows: np.ndarray, axis: int | None = None) -> np.ndarray:
-        """Return whitened rows of an axis, shape of the selection; of all axes, still to be divided by ``scale[axis]``, without `axis`."""
+        """
+        Return whitened rows of an axis, shape of the selection.
+
+        Of all axes, still to be divided by ``scale[axis]``, without `axis`.
+        """
         white = solve_triangular(self._factor, rows[self._select], lower=True, check_finite=False)
         return white if axis is None else white / self.scale[axis]
 
@@ -194,7 +215,8 @@ def rest_blocks(
             windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which]
         )
         variance = floor.low_variance * busier[place] / count[:, None]
-        # An estimated bias process would absorb a step or a warm-up; regimes are searched with the least bias processes.
+        # An estimated bias process would absorb a step or a warm-up; regimes are searched with the
+        # least bias processes.
         processes = natural_processes(floor, problem.recording.period)
         rows = np.concatenate([columns_of[sensor], block_means(residual, edges)], axis=1)
         design = tuple(rows @ join for join in problem.space.join[sensor])
@@ -214,7 +236,11 @@ def rest_blocks(
 
 
 def _roughness(residual, inner, edges, *, number, least):
-    """Return the variance by the `number` of second differences in blocks that begin at the samples `edges`, at least rounding, (b, 3)."""
+    """
+    Return the variance by the `number` of second differences in blocks, shape (b, 3).
+
+    The blocks begin at the samples `edges`, and the variance is at least that of rounding.
+    """
     bends = np.diff(residual, 2, axis=0, prepend=residual[:1], append=residual[-1:])
     squares = np.add.reduceat(inner[:, None] * bends**2, edges, axis=0) / WHITE_BENDS
     return np.maximum(squares / np.maximum(number, 1)[:, None], least**2)
@@ -228,7 +254,11 @@ def _inner(windows):
 
 
 def _slope(residual, windows, edges, sensor):
-    """Return the mean square of the rate of change of the predicted output in blocks that begin at the samples `edges`, shape (b, 3)."""
+    """
+    Return the mean square of the rate of change of the predicted output in blocks.
+
+    The blocks begin at the samples `edges`, and the shape is (b, 3).
+    """
     ends, squares = np.cumsum([0, *map(len, windows)]), np.zeros_like(residual)
     for window, first in zip(windows, ends):
         if len(window) > 2:
@@ -240,7 +270,9 @@ def _slope(residual, windows, edges, sensor):
 
 
 def _some(windows, length):
-    """Return the numbers of the windows in use: all, or a random part of a long recording, in order."""
+    """
+    Return the numbers of the windows in use: all, or a random part of a long recording, in order.
+    """
     blocks = sum(
         1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length))
         for w in windows
@@ -258,8 +290,8 @@ def _busier(windows, sensor, floor, kinds, judged):
     """
     Return by how much each window's white noise exceeds that at rest, shape (k, 3).
 
-    By kind, from second differences of the windows `judged` (mask), which suppress causes that vary with the motion; at most
-    the misfit of the kind.
+    By kind, from second differences of the windows `judged` (mask), which suppress causes that vary
+    with the motion; at most the misfit of the kind.
     """
     place = SENSORS.index(sensor)
     found = np.ones((len(windows), 3))
@@ -286,19 +318,29 @@ def _busier(windows, sensor, floor, kinds, judged):
 def residuals(
     windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return sensor -> residual of every sample of all windows at some values, shape (n, 3): rows within blocks would be too coarse."""
+    """
+    Return sensor -> residual of every sample of all windows at some values, shape (n, 3).
+
+    Rows within blocks would be too coarse.
+    """
     predicted = [
         predict_windows(group, table, model, values=values) for group in chunks(windows)
     ]  # columns need much memory
     return {
-        sensor: np.concatenate([measured(window, sensor) for window in windows])
-        - np.concatenate([part[sensor] for part in predicted])
+        sensor: (
+            np.concatenate([measured(window, sensor) for window in windows])
+            - np.concatenate([part[sensor] for part in predicted])
+        )
         for sensor in SENSORS
     }
 
 
 def _block_means(problem, table, motion, temperature, starts):
-    """Return sensor -> means of all columns over the blocks, shape (b, p): some blocks at a time, as their columns need much memory."""
+    """
+    Return sensor -> means of all columns over the blocks, shape (b, p).
+
+    Some blocks at a time, as their columns need much memory.
+    """
     recording, found, edges = (
         problem.recording,
         {sensor: [] for sensor in SENSORS},
@@ -325,7 +367,11 @@ def block_means(rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def _cut(window, length):
-    """Return the first sample of each block of a window, the rows of its motion in use, and the number of them in each block."""
+    """
+    Return the first sample of each block of a window, its rows, and their number.
+
+    The rows are the ones of the window's motion in use, and the number is that in each block.
+    """
     if len(window.motion) == 1:
         return np.array([0]), np.array([0]), np.array([1])
     count = max(1, round((window.time[-1] - window.time[0]) / length))
@@ -338,7 +384,10 @@ def _cut(window, length):
 
 
 AMPLITUDE_PRIOR_SD = 1e6
-"""Prior sd of amplitudes; unit: the amplitude that equals one standard deviation of noise in all blocks."""
+"""
+Prior sd of amplitudes; unit: the amplitude that equals one standard deviation of noise in all
+blocks.
+"""
 SHARE_RESAMPLES = 500
 LEAST_OF_AXIS = 0.1
 """Share of the strongest axis' squares from which another axis has an excess too."""
@@ -347,7 +396,11 @@ ABOVE_NOISE = 3.0
 
 
 def largest_axes(squares: np.ndarray, least: float = LEAST_OF_AXIS) -> tuple[str, ...]:
-    """Return the axes whose squares, shape (3,), exceed the share `least` of the largest, the largest first."""
+    """
+    Return the axes whose squares.
+
+    Shape (3,), exceed the share `least` of the largest, the largest first.
+    """
     return tuple(AXES[k] for k in np.argsort(-squares) if squares[k] > least * squares.max())
 
 
@@ -425,7 +478,11 @@ class BlockFits:
         )
 
     def axes(self) -> tuple[str, ...]:
-        """Return the axes with an excess in the selection windows, in order of unweighted squares, the largest first."""
+        """
+        Return the axes with an excess in the selection windows.
+
+        They are in order of unweighted squares, the largest first.
+        """
         excess = self._excess()
         noise = ABOVE_NOISE * np.sqrt(2.0 * (~self.blocks.locked).sum())
         squares = excess * np.median(self.blocks.variance[~self.blocks.locked], axis=0)
@@ -437,11 +494,17 @@ class BlockFits:
 
     @property
     def sigma(self) -> float:
-        """Excess of the residual over noise in the selection windows, all axes, standard deviations."""
+        """
+        Excess of the residual over noise in the selection windows, all axes, standard deviations.
+        """
         return float(self._excess().sum() / np.sqrt(6.0 * (~self.blocks.locked).sum()))
 
     def _excess(self):
-        """Return the sums of squares above the expectation from noise in the selection windows, shape (3,)."""
+        """
+        Return the sums of squares above the expectation from noise in the selection windows.
+
+        Shape (3,).
+        """
         excess = np.zeros(3)
         for axis in range(3):
             left = self._solved(axis, self._at[axis])[2]
@@ -449,7 +512,11 @@ class BlockFits:
         return excess
 
     def _solved(self, axis, at, columns=None, half=None):
-        """Return (values, covariance, residual) of a fit to the selection windows: of the parameters `at`, then of columns."""
+        """
+        Return (values, covariance, residual) of a fit to the selection windows.
+
+        Of the parameters `at`, then of columns.
+        """
         rows = self._rows(0, axis, at, columns)
         if half is not None:
             time = self.blocks.time[~self.blocks.locked]

@@ -1,4 +1,9 @@
-"""Alternatives to a finding: collinear effects compared at their estimated sizes, pairs of effects, and the simpler of two explanations."""
+"""
+Alternatives to a finding.
+
+Collinear effects compared at their estimated sizes, pairs of effects, and the simpler of two
+explanations.
+"""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -18,7 +23,10 @@ from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import PENALTY, TIE, Search
 
 MIN_CURVATURE_NATS = 0.1
-"""Evidence of a curvature below which it does not separate effects, nats: a delay of 0.1 ms is a lag of 0.1 ms."""
+"""
+Evidence of a curvature below which it does not separate effects, nats: a delay of 0.1 ms is a lag
+of 0.1 ms.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +54,10 @@ def settle_rivals(
     """
     Return (the LinearisedProblem at the best of a choice and its rivals, the rivals close to it).
 
-    The first derivatives of a delay and of a low-pass are the same, and a search that is linearised at one of them represents its rival by
-    its tangent only: the first one would win. So each is linearised at its own estimate, and all are compared with the same noise,
-    estimated with each in turn; only compared effects have columns there.
+    The first derivatives of a delay and of a low-pass are the same, and a search that is linearised
+    at one of them represents its rival by its tangent only: the first one would win. So each is
+    linearised at its own estimate, and all are compared with the same noise, estimated with each in
+    turn; only compared effects have columns there.
 
     Parameters
     ----------
@@ -56,7 +65,8 @@ def settle_rivals(
         Linearised where none of them acts.
     chosen : sequence of Question
     linearised_at : callable
-        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, or with some of the effects.
+        ``linearised_at(point=..., effects=...)``: the LinearisedProblem elsewhere, or with some of
+        the effects.
 
     """
     chosen = [question for question in chosen if '@' not in question.label]
@@ -95,7 +105,11 @@ def settle_rivals(
 
 
 def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[Question]:
-    """Return the same questions at another linearisation: a warm-up at the likeliest time constant of its bank."""
+    """
+    Return the same questions at another linearisation.
+
+    A warm-up at the likeliest time constant of its bank.
+    """
     found = []
     for each in chosen:
         asked = [question for question in problem.questions if question.name == each.name]
@@ -117,7 +131,11 @@ def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> li
 
 
 def _swapped(problem, chosen):
-    """Return the choices with an effect replaced by one that only curvature separates from it, where the curvature is observable."""
+    """
+    Return the choices with an effect replaced by one that only curvature separates from it.
+
+    Where the curvature is observable.
+    """
     return [
         [other if each is question else each for each in chosen]
         for question in chosen
@@ -129,7 +147,11 @@ def _swapped(problem, chosen):
 
 
 def _cost(problem, chosen, judge):
-    """Return the held-out cost of a choice at its own linearisation, judged with the noise and the band of another attempt."""
+    """
+    Return the held-out cost of a choice at its own linearisation.
+
+    It is judged with the noise and the band of another attempt.
+    """
     space = replace(
         problem.evidence.space,
         slow_only=judge.space.slow_only,
@@ -142,7 +164,10 @@ def _cost(problem, chosen, judge):
 
 
 AS_MUCH = 0.5
-"""Share of the held-out likelihood of an effect that a simpler one must reach to be tested as its replacement."""
+"""
+Share of the held-out likelihood of an effect that a simpler one must reach to be tested as its
+replacement.
+"""
 
 
 def simpler(
@@ -151,9 +176,10 @@ def simpler(
     """
     Return findings with no more parameters than the held-out residual supports.
 
-    With unexplained misfit, likelihood prefers more parameters: arms of the three accelerometers, where one common arm
-    fits as well. So an effect with fewer parameters replaces a finding when the unweighted residual, in the unit of the
-    sensor, is not sure to fall by `LEAST_REDUCTION` from the one to the other.
+    With unexplained misfit, likelihood prefers more parameters: arms of the three accelerometers,
+    where one common arm fits as well. So an effect with fewer parameters replaces a finding when
+    the unweighted residual, in the unit of the sensor, is not sure to fall by `LEAST_REDUCTION`
+    from the one to the other.
     """
     kept = list(named)
     for place, question in enumerate(named):
@@ -175,7 +201,11 @@ def simpler(
 
 
 def _fewer(search, kept, question):
-    """Return effects of the same sensors with fewer parameters that explain about as much in the place of a finding, fewest first."""
+    """
+    Return smaller effects that explain about as much in the place of a finding.
+
+    They are effects of the same sensors with fewer parameters, fewest first.
+    """
     beside = [each for each in kept if each is not question]
     enough = AS_MUCH * search.score(beside, question).gain
     fewer = [
@@ -202,9 +232,10 @@ def best_pairs(search: Search) -> list[list[Question]]:
     """
     Return the pairs that lower the loss most and are possible, the best first, at most three.
 
-    The normal matrix with the baseline projected out and each effect's block scaled to the unit matrix gives a system of two blocks for
-    each pair; systems of one shape are solved together. Each member must keep some signal that is not collinear with its mate. That each
-    is significant without its mate is tested by the search from the pair (`Search.run`).
+    The normal matrix with the baseline projected out and each effect's block scaled to the unit
+    matrix gives a system of two blocks for each pair; systems of one shape are solved together.
+    Each member must keep some signal that is not collinear with its mate. That each is significant
+    without its mate is tested by the search from the pair (`Search.run`).
     """
     blocks = _Blocks(search)
     shapes = defaultdict(list)
@@ -226,7 +257,11 @@ def best_pairs(search: Search) -> list[list[Question]]:
 
 
 class _Blocks:
-    """Normal equations of all questions, baseline projected out, each question's own block the unit matrix."""
+    """
+    Normal equations of all questions, baseline projected out.
+
+    Each question's own block is the unit matrix.
+    """
 
     def __init__(self, search):
         self.questions, (information, right) = search.questions, search.evidence.equations()
@@ -254,7 +289,11 @@ class _Blocks:
         return len(self.questions[number].parameters)
 
     def score(self, pairs: Sequence[tuple[int, int]]):
-        """Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape with members that are not collinear."""
+        """
+        Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape.
+
+        The members of a pair are not collinear.
+        """
         places = np.array(
             [
                 [

@@ -18,11 +18,18 @@ from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS, locked_windows
 
 CLIP_MARGIN_SDS = 4.0
-"""Samples predicted within this many standard deviations of the limit are left out: noise decides whether they are clipped."""
+"""
+Samples predicted within this many standard deviations of the limit are left out: noise decides
+whether they are clipped.
+"""
 AGREEMENT = 0.25
-"""Least sum of the probabilities of exceeding the limit over clipped samples, as a share of its expectation for clipping by noise.
+"""
+Least sum of the probabilities of exceeding the limit over clipped samples, as a share of its
+expectation for clipping by noise.
 
-Near one g at rest only the tails of the noise are cut: a correct limit then has a probability of a tenth for each sample."""
+Near one g at rest only the tails of the noise are cut: a correct limit then has a probability of a
+tenth for each sample.
+"""
 MIN_LEFT_SAMPLES = 20
 """A window with fewer samples left is dropped."""
 
@@ -42,7 +49,10 @@ class Saturation:
     n_expected: float
     """Samples that the model expects beyond it, where there are none."""
     rms_before: float
-    """Rms of measured minus predicted where the model expects outputs beyond the limit, without the limit in the model."""
+    """
+    Rms of measured minus predicted where the model expects outputs beyond the limit, without the
+    limit in the model.
+    """
     rms_after: float
     """The same with it."""
 
@@ -68,7 +78,12 @@ def measured(window: Window, sensor: str) -> np.ndarray:
 
 
 def noise_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
-    """Return the sd of samples in static windows, at least that of rounding (without any: of second differences), shape (3,)."""
+    """
+    Return the sd of samples in static windows, shape (3,).
+
+    It is at least that of rounding, and without any static windows it is the sd of second
+    differences.
+    """
     rest = [w for w in windows if w.kind == 'static' and len(w.time) > 8]
     if rest:
         rounding = np.sqrt(
@@ -123,13 +138,18 @@ def _thinned(window, most=50):
 
 
 def may_be_clipped(windows: Sequence[Window], sensor: str) -> bool:
-    """Return whether several samples share the largest output exactly, more than share any of the next smaller outputs."""
+    """
+    Return whether several samples share the largest output exactly.
+
+    They must be more than share any of the next smaller outputs.
+    """
     size = np.concatenate([np.abs(measured(w, sensor)).ravel() for w in windows])
     level = size.max(initial=0.0)
     at = int((size >= level * (1 - 1e-12)).sum())
     if at < MIN_CLIPPED_SAMPLES or level == 0:
         return False
-    # A coarse output repeats all its values, most of all the step at gravity; the values just below the largest show how often.
+    # A coarse output repeats all its values, most of all the step at gravity; the values just below
+    # the largest show how often.
     _, repeats = np.unique(
         size[(size < level * (1 - 1e-12)) & (size > 0.9 * level)], return_counts=True
     )
@@ -185,7 +205,9 @@ def without_clipped(
     noise_sd: dict[str, np.ndarray],
 ) -> list[Window]:
     """
-    Return the windows without samples that are clipped, or predicted within a few standard deviations of the limit.
+    Return the windows without clipped samples.
+
+    Also excluded are samples that are predicted within a few standard deviations of the limit.
 
     Parameters
     ----------
@@ -218,9 +240,12 @@ def without_clipping(
     windows: list[Window], table: Table, model: SensorModel
 ) -> tuple[list[Window], np.ndarray, list[Saturation]]:
     """
-    Return (windows without samples corrupted by a limit, mask of the locked ones, limits estimated from all other windows).
+    Return (windows without corrupted samples, mask of the locked ones, limits).
 
-    One fast swing may be all that reaches a limit: a window in which outputs pile up is not locked, where they do so at a limit.
+    Corrupted samples are corrupted by a limit, and the limits are estimated from all other windows.
+
+    One fast swing may be all that reaches a limit: a window in which outputs pile up is not locked,
+    where they do so at a limit.
     """
     locked, piled = locked_windows(np.array([window.kind for window in windows])), _piled(windows)
     limits, noise_sd, values = _limits(windows_at(windows, piled | ~locked), table, model)
@@ -257,7 +282,11 @@ def _piled(windows):
 
 
 def _limits(windows, table, model):
-    """Return (limits found, standard deviation of single samples by sensor, parameters of a simple fit without corrupted samples)."""
+    """
+    Return (limits found, standard deviation of single samples by sensor, parameters).
+
+    The parameters are from a simple fit without corrupted samples.
+    """
     nothing = [], {}, None
     suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
     if not suspects:

@@ -1,4 +1,8 @@
-"""Choosing effects one after the other by held-out evidence, with earlier choices reconsidered after each step."""
+"""
+Choosing effects one after the other by held-out evidence.
+
+With earlier choices reconsidered after each step.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,16 +23,25 @@ MIN_GAIN_NATS = 4.0
 PENALTY = 1.0
 """Penalty for a parameter in addition to that of held-out prediction, nats."""
 MIN_REPLACEMENT_NATS = 0.01
-"""Least fall of the held-out cost for which an effect is replaced, nats: two lags are a delay, and less than this is rounding."""
+"""
+Least fall of the held-out cost for which an effect is replaced, nats: two lags are a delay, and
+less than this is rounding.
+"""
 TIE = 8.0
-"""Difference of held-out log likelihood up to which effects are not separable by the recording, nats."""
+"""
+Difference of held-out log likelihood up to which effects are not separable by the recording, nats.
+"""
 COLLINEAR = 1e-3
 """
-Share of the gain of an effect that is smooth in time up to which another such effect is not separable from it: the wander of a bias
-follows no model well enough to separate curves that are so alike.
+Share of the gain of an effect that is smooth in time up to which another such effect is not
+separable from it: the wander of a bias follows no model well enough to separate curves that are so
+alike.
 """
 IMPLAUSIBLE = 8.0
-"""Price of a size above that of any known instrument, nats: a plausible effect with the same fit is preferred."""
+"""
+Price of a size above that of any known instrument, nats: a plausible effect with the same fit is
+preferred.
+"""
 MOST_FINDINGS = 6
 """Effects that one recording may be found to lack."""
 CLASS_SIZE = 3
@@ -52,7 +65,9 @@ class Score:
 
     @property
     def net(self) -> float:
-        """Gain less the penalty for the parameters and for a size that is known of no instrument."""
+        """
+        Gain less the penalty for the parameters and for a size that is known of no instrument.
+        """
         return self.gain - PENALTY * self.question.penalty - IMPLAUSIBLE * self.implausible
 
     @property
@@ -81,7 +96,8 @@ class Search:
     any_size : bool
         Whether sizes above those of any known instrument are allowed, for a remaining excess.
     resolved : set of str
-        Effects that were compared at their own linearisation; this search must not revise them: not tested unless chosen.
+        Effects that were compared at their own linearisation; this search must not revise them: not
+        tested unless chosen.
 
     """
 
@@ -119,7 +135,11 @@ class Search:
         return [q for q in self.questions if q.name not in names]
 
     def cost(self, chosen: Sequence[Question], most: float = np.inf) -> float:
-        """Return the held-out cost of a choice, nats, penalties included; above `most` without the penalty for implausible sizes."""
+        """
+        Return the held-out cost of a choice, nats, penalties included.
+
+        Above `most` without the penalty for implausible sizes.
+        """
         cost = 0.5 * self.evidence.heldout(self.indices(chosen)) + PENALTY * sum(
             q.penalty for q in chosen
         )
@@ -148,7 +168,8 @@ class Search:
         """
         Return whether the effect's estimate is possible.
 
-        A lag is not negative, no angle (at 1 g) is within half an encoder step, and no size is implausible, unless allowed.
+        A lag is not negative, no angle (at 1 g) is within half an encoder step, and no size is
+        implausible, unless allowed.
         """
         value, sd = self.estimate(chosen, question)
         if question.effect.nonnegative and value[0] < 0:
@@ -162,7 +183,11 @@ class Search:
         )
 
     def early(self, chosen: Sequence[Question]) -> list[Question]:
-        """Return the lags that would be significant if they were not negative: an early clock with a late sensor."""
+        """
+        Return the lags that would be significant if they were not negative.
+
+        An early clock with a late sensor.
+        """
         scores = [
             self.score(chosen, q)
             for q in self.others(chosen)
@@ -171,13 +196,21 @@ class Search:
         return [score.question for score in scores if replace(score, allowed=True).significant]
 
     def implausible(self, chosen: Sequence[Question], question: Question) -> bool:
-        """Return whether the estimate of a chosen effect exceeds any known instrument; the range is a prior, not a hard limit."""
+        """
+        Return whether the estimate of a chosen effect exceeds any known instrument.
+
+        The range is a prior, not a hard limit.
+        """
         amplitudes = question.effect.n_amplitudes
         value, sd = self.estimate(chosen, question)
         return question.effect.surpasses(value[:amplitudes], sd[:amplitudes])
 
     def values(self, chosen: Sequence[Question]) -> np.ndarray:
-        """Return all parameters for a choice, fitted to all rows; zero for those of other effects, shape (q,)."""
+        """
+        Return all parameters for a choice, fitted to all rows.
+
+        Zero for those of other effects, shape (q,).
+        """
         used, values = self.indices(chosen), np.zeros(len(self.evidence.total) - 1)
         values[list(used)] = self.evidence.fit(used)[0]
         return values
@@ -194,7 +227,11 @@ class Search:
     def moved_by(
         self, chosen: Sequence[Question], question: Question, names: Sequence[str]
     ) -> dict[str, float]:
-        """Return parameter -> its change, of the baseline and of the other choices among `names`, when an effect joins them."""
+        """
+        Return parameter -> its change when an effect joins the baseline and some choices.
+
+        The parameters are of the baseline and of the other choices among `names`.
+        """
         others = [q for q in chosen if q is not question]
         smaller, larger = self.indices(others), self.indices([*others, question])
         moved = self.evidence.fit(larger)[0][: len(smaller)] - self.evidence.fit(smaller)[0]
@@ -216,7 +253,11 @@ class Search:
         )
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:
-        """Return the chosen questions in the order in which they were found, from none or from a first choice."""
+        """
+        Return the chosen questions in the order in which they were found.
+
+        From none or from a first choice.
+        """
         chosen = self.reconsidered(list(start)) if start else []
         for _ in range(2 * MOST_FINDINGS):
             others = self.others(chosen)
@@ -234,7 +275,11 @@ class Search:
         return chosen
 
     def reconsidered(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return the choice without effects that are no longer needed, and with better explanations substituted."""
+        """
+        Return the choice without effects that are no longer needed.
+
+        Better explanations are substituted in it.
+        """
         for _ in range(6):
             smaller = self._dropped(chosen)
             if smaller is not None:
@@ -275,7 +320,11 @@ class Search:
         return best
 
     def drop_insignificant(self, chosen: Sequence[Question]) -> Sequence[Question]:
-        """Return the effects of a choice that are still significant after removals: of a clock and a lag that cancel, none."""
+        """
+        Return the effects of a choice that are still significant after removals.
+
+        Of a clock and a lag that cancel, none.
+        """
         while (smaller := self._dropped(chosen)) is not None:
             chosen = smaller
         return chosen
@@ -283,7 +332,11 @@ class Search:
     def confounded(
         self, chosen: Sequence[Question], question: Question, *, most: int | None = CLASS_SIZE - 1
     ) -> list[tuple[Question, float]]:
-        """Return (question, difference in nats) of effects that would do as well in the place of `question`, best first, at most `most`."""
+        """
+        Return (question, difference in nats) of effects that could replace `question`.
+
+        They would do as well in its place, best first, at most `most`.
+        """
         place, cost = chosen.index(question), self.cost(chosen)
         found, alike = {}, TIE
         if question.effect.smooth:
@@ -296,7 +349,9 @@ class Search:
             tie = alike if other.effect.smooth else TIE
             difference = self.cost(trial, cost + tie) - cost
             if question.effect.contained_in == other.name:
-                continue  # a special case with an equal fit is preferred, and the general effect is not its rival
+                # A special case with an equal fit is preferred, and the general effect is not its
+                # rival
+                continue
             if difference < tie and self.allowed(trial, other):
                 if other.name not in found or difference < found[other.name][1]:
                     found[other.name] = (other, difference)
@@ -305,9 +360,12 @@ class Search:
 
 def least_angle(effect: Effect, encoder_step: float) -> float:
     """
-    Return the size of an effect, an angle (at 1 g), that is half an encoder step (rad); 0 for other effects.
+    Return the size of an effect, an angle (at 1 g), that is half an encoder step (rad).
 
-    Steps repeat each time the table returns to a pose: they do not average out, and resemble errors of the table.
+    0 for other effects.
+
+    Steps repeat each time the table returns to a pose: they do not average out, and resemble errors
+    of the table.
     """
     angles: dict[str | tuple, float] = {'rad': 1.0, 'rad/(m/s^2)': STANDARD_GRAVITY}
     return 0.5 * encoder_step / angles[effect.unit] if effect.unit in angles else 0.0
@@ -326,7 +384,11 @@ class SelectedEffects:
 
     @property
     def implausible(self) -> list[Question]:
-        """Findings with sizes above those of any known instrument: reported, but added to a model only on request."""
+        """
+        Findings with sizes above those of any known instrument.
+
+        Reported, but added to a model only on request.
+        """
         return [
             question for question in self.named if self.search.implausible(self.named, question)
         ]

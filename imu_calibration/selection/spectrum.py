@@ -23,7 +23,10 @@ CYCLES_OF_ORDER = 1.5
 MIN_SPECTRUM_PIECES = 8
 """Least number of pieces for an estimate of the scatter."""
 OUT = 10.0
-"""Least power of an order over the median of all orders; residuals that repeat with the motion have all orders."""
+"""
+Least power of an order over the median of all orders; residuals that repeat with the motion have
+all orders.
+"""
 IN_PHASE = 0.5
 """Cosine of the angle within which a window is in phase."""
 MIN_ORDER_SHARE = 0.75
@@ -31,7 +34,10 @@ MIN_ORDER_SHARE = 0.75
 SHORTEST_CYCLE = 2.2
 """Samples per cycle, at least."""
 REPEATED = 1e-12
-"""Least variance over the squared mean, and least determinant over the squared trace: less is rounding."""
+"""
+Least variance over the squared mean, and least determinant over the squared trace: less is
+rounding.
+"""
 FEWEST_SAMPLES = 16
 """Least number of samples of a window, or of equal steps of a turning joint, for a spectrum."""
 
@@ -56,9 +62,10 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     """
     Return the orders of a joint in a rest, or None where too little turns.
 
-    The residual of each piece of two seconds, without terms linear in time or quadratic in the angle, is projected on exp(-i k angle). The
-    pieces add coherently for tones fixed to the joint, in either direction; noise, hum and effects of the motion cancel.
-    Over the scatter of the pieces this is Hotelling's T² with two degrees of freedom.
+    The residual of each piece of two seconds, without terms linear in time or quadratic in the
+    angle, is projected on exp(-i k angle). The pieces add coherently for tones fixed to the joint,
+    in either direction; noise, hum and effects of the motion cancel. Over the scatter of the pieces
+    this is Hotelling's T² with two degrees of freedom.
 
     Parameters
     ----------
@@ -112,7 +119,11 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
 
 
 def _alike(number, sums, weight, wave):
-    """Return the share of the windows in phase with a wave; effects of a motion have the same phase in all of its pieces only."""
+    """
+    Return the share of the windows in phase with a wave.
+
+    Effects of a motion have the same phase in all of its pieces only.
+    """
     starts = np.flatnonzero(np.diff(number, prepend=-1))
     each, known = np.add.reduceat(sums, starts), np.add.reduceat(weight, starts) > 0
     in_phase = (each * wave.conj()).real > IN_PHASE * np.abs(each) * np.abs(wave)
@@ -122,7 +133,11 @@ def _alike(number, sums, weight, wave):
 def long_enough(
     windows: Sequence[Window], rests: Sequence[np.ndarray], *, with_joints: bool
 ) -> Iterator[tuple[int, Window, np.ndarray]]:
-    """Yield (number, window, rest) of the windows that have enough samples for a spectrum, optionally with the joints at each of them."""
+    """
+    Yield (number, window, rest) of the windows that have enough samples.
+
+    Enough means enough for a spectrum, and optionally the joints at each sample are given too.
+    """
     for place, (window, rest) in enumerate(zip(windows, rests)):
         if len(window) >= FEWEST_SAMPLES and (not with_joints or len(window.motion) == len(window)):
             yield place, window, rest
@@ -141,7 +156,11 @@ def _pieces(windows, rests, joint) -> Iterator[tuple[int, np.ndarray, np.ndarray
 
 
 def _projected(rest, time, angle, order):
-    """Return (sum of the rest against each order, shape (k, m), weight, shape (k,)); zero where a piece does not show an order."""
+    """
+    Return (sum of the rest against each order, shape (k, m), weight, shape (k,)).
+
+    Zero where a piece does not show an order.
+    """
     turned = np.ptp(angle)
     shown = (turned * order > 2 * np.pi * CYCLES_OF_ORDER) & (
         2 * np.pi > SHORTEST_CYCLE * order * np.abs(np.diff(angle)).max()
@@ -159,7 +178,10 @@ def _projected(rest, time, angle, order):
 
 
 FREQUENCY_STEP = 0.1
-"""Spacing of the frequencies under test, cycles per second or per turn; its inverse is the largest length of a stretch."""
+"""
+Spacing of the frequencies under test, cycles per second or per turn; its inverse is the largest
+length of a stretch.
+"""
 ANGLES_PER_TURN = 128
 """Angles per turn at which the residual of a turning joint is sampled."""
 CYCLES_OF_TONE = 3.0
@@ -168,8 +190,8 @@ MAX_FREQUENCY_SHARE = 0.45
 """Highest frequency in that of the samples."""
 MIN_LINE_POWER, LINE_CHANCE = 4.0, 0.05
 """
-Least power over its surroundings in a stretch, and its probability by noise: e^-4, and more where few frequencies determine the
-surroundings.
+Least power over its surroundings in a stretch, and its probability by noise: e^-4, and more where
+few frequencies determine the surroundings.
 """
 TONE_P_VALUE = 1e-4
 """Probability of a tone by noise, times the number of frequencies, axes and joints."""
@@ -208,8 +230,14 @@ class Tone:
         factor, unit = for_people('m/s^2' if self.sensor == SENSORS[0] else 'rad/s')
         where = f'on {self.sensor} {self.axis}, {significant(self.amplitude * factor, 2)} {unit}'
         if self.joint is None:
-            return f'a tone of {self.frequency:.1f} Hz {where}, independent of motion: electrical, or a resonance'
-        return f'{self.frequency:.1f} times per turn of {self.joint} {where}, at every speed: its bearing, gear, motor or encoder'
+            return (
+                f'a tone of {self.frequency:.1f} Hz {where}, independent of motion: electrical, or'
+                ' a resonance'
+            )
+        return (
+            f'{self.frequency:.1f} times per turn of {self.joint} {where}, at every speed: its'
+            ' bearing, gear, motor or encoder'
+        )
 
     def to_mapping(self) -> dict:
         """Return the tone as plain data."""
@@ -228,13 +256,16 @@ def find_tones(
     found: Investigation, table: Table, formulas: Sequence[Proposal] = ()
 ) -> dict[str, tuple[Tone, ...]]:
     """
-    Return sensor -> the tones in the residual of the findings and of some formulas, the most significant first.
+    Return sensor -> the tones in the residual, the most significant first.
 
-    The residual of every stretch of at most ten seconds, or of at most ten turns of a joint in steady rotation, is transformed to
-    frequencies. A peak has four times the median power around it; a tone has peaks in most stretches, tested against noise
-    (binomial law). Rests and motions are both analysed in seconds; a tone at a multiple of a speed is constant per turn and varies per
-    second. Where few stretches turn, integer orders are searched in all motions of the joint (`orders_of`). Fixed frequencies are
-    removed before multiples of a speed are searched.
+    The residual is that of the findings and of some formulas.
+
+    The residual of every stretch of at most ten seconds, or of at most ten turns of a joint in
+    steady rotation, is transformed to frequencies. A peak has four times the median power around
+    it; a tone has peaks in most stretches, tested against noise (binomial law). Rests and motions
+    are both analysed in seconds; a tone at a multiple of a speed is constant per turn and varies
+    per second. Where few stretches turn, integer orders are searched in all motions of the joint
+    (`orders_of`). Fixed frequencies are removed before multiples of a speed are searched.
     """
     model = found.problem.recording.model
     values = found.problem.values(found.named)[: len(model.param_names)]
@@ -279,7 +310,11 @@ def find_tones(
 
 
 def _significant(tones, tests):
-    """Return (axis, joint) -> the most significant tone, its p-value times the number of tests and axes."""
+    """
+    Return (axis, joint) -> the most significant tone.
+
+    Its p-value is multiplied by the number of tests and axes.
+    """
     corrected, first = (
         [replace(tone, p_value=tone.p_value * len(AXES) * tests) for tone in tones],
         {},
@@ -301,7 +336,11 @@ def _without(frequency, time, values):
 
 
 def _whole(sensor, orders, joint) -> Iterator[Tone]:
-    """Yield the most significant Tone of each axis with a constant phase on a joint, if any, from the orders of both sensors."""
+    """
+    Yield the most significant Tone of each axis with a constant phase on a joint, if any.
+
+    From the orders of both sensors.
+    """
     if orders is None:
         return
     for axis in range(3):
@@ -325,11 +364,16 @@ def _whole(sensor, orders, joint) -> Iterator[Tone]:
 def _stretches(
     windows: Sequence[Window], parts: Sequence[np.ndarray], joint: int | None
 ) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Yield (rest at equal steps, shape (n, 3), step in seconds or turns, highest frequency) of stretches that can show a tone."""
+    """
+    Yield (rest, step, highest frequency) of stretches that can show a tone.
+
+    The rest is at equal steps, shape (n, 3), and the step is in seconds or turns.
+    """
     for _, window, rest in long_enough(windows, parts, with_joints=joint is not None):
         step = float(np.median(np.diff(window.time)))
         if joint is None:
-            # Samples that are missing are few: a tone keeps its frequency but for the stretch that they are in.
+            # Samples that are missing are few: a tone keeps its frequency but for the stretch that
+            # they are in.
             yield from (
                 (piece, step, MAX_FREQUENCY_SHARE / step)
                 for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step)))
@@ -411,7 +455,11 @@ def of_stretches(
 
 
 def _powers(rest, size, inside):
-    """Return (power, power around it by octaves, both shape (n, 3), which frequencies have enough around them)."""
+    """
+    Return (power, power around it by octaves, mask of the frequencies).
+
+    Both powers have shape (n, 3), and the mask marks the frequencies that have enough around them.
+    """
     window, line = np.hanning(len(rest)), np.linspace(-1.0, 1.0, len(rest))[:, None]
     level = rest - rest.mean(axis=0)
     level -= line * (line * level).sum(axis=0) / (line**2).sum()

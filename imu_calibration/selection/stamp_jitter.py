@@ -1,4 +1,8 @@
-"""Independent errors of the time stamps, from the scatter of the residual in motion; the scatter without them."""
+"""
+Independent errors of the time stamps, from the scatter of the residual in motion.
+
+The scatter without them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,7 +13,9 @@ import numpy as np
 JITTER_STEPS = 6
 """Steps in which the noise at rest and the variance of the stamps are estimated in turn."""
 BOUND_SDS = 3.0
-"""Standard deviations above its own estimate to which a sensor limits the variance of the stamps."""
+"""
+Standard deviations above its own estimate to which a sensor limits the variance of the stamps.
+"""
 CLEAR_SDS = 5.0
 """Standard deviations from which the scatter of a sensor shows errors of the stamps."""
 ALIKE_VARIANCES = 0.3
@@ -27,7 +33,10 @@ class StampJitter:
     significant: bool
     """Whether the scatter of each sensor alone shows errors of this size."""
     ratio: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Sensor -> kind of moving window -> variance of the noise and these errors over that of the noise."""
+    """
+    Sensor -> kind of moving window -> variance of the noise and these errors over that of the
+    noise.
+    """
 
     @property
     def lines(self) -> list[str]:
@@ -45,7 +54,10 @@ NO_JITTER = StampJitter(0.0, False)
 
 def jitter_text(sd: float) -> str:
     """Return the statement of independent errors of the stamps of a standard deviation, s."""
-    return f'the stamps have independent errors of {1e6 * sd:.0f} us (1 sd), which explain scatter of both sensors in motion'
+    return (
+        f'the stamps have independent errors of {1e6 * sd:.0f} us (1 sd), which explain scatter of'
+        ' both sensors in motion'
+    )
 
 
 def stamp_jitter(
@@ -54,10 +66,11 @@ def stamp_jitter(
     """
     Return the errors of the stamps from the scatter in motion.
 
-    The sample of a stamp with the error d has the residual ``d dy/dt``. Errors of variance v add ``v mean((dy/dt)^2)`` to the variance
-    within a block, with the same v on all axes of both sensors. Each sensor estimates v as the weighted median of
-    ``(variance - noise) / mean((dy/dt)^2)``; a sensor whose slopes show a smaller v limits that of the other one, because scatter
-    that only one sensor has is not an error of the stamps.
+    The sample of a stamp with the error d has the residual ``d dy/dt``. Errors of variance v add
+    ``v mean((dy/dt)^2)`` to the variance within a block, with the same v on all axes of both
+    sensors. Each sensor estimates v as the weighted median of ``(variance - noise) /
+    mean((dy/dt)^2)``; a sensor whose slopes show a smaller v limits that of the other one, because
+    scatter that only one sensor has is not an error of the stamps.
 
     Parameters
     ----------
@@ -81,12 +94,21 @@ def stamp_jitter(
 
 
 def jitter_ratio(rough: np.ndarray, slope: np.ndarray, jitter: float) -> np.ndarray:
-    """Return the variance of the noise and the errors of the stamps (sd `jitter`, s) over that of the noise, shape (b, 3)."""
+    """
+    Return the variance of noise and stamp errors over that of the noise, shape (b, 3).
+
+    The errors of the stamps have the sd `jitter` in s, and the numerator is the variance of noise
+    and errors together.
+    """
     return 1.0 + jitter**2 * slope / _noise(rough, slope, jitter**2)
 
 
 def _noise(rough, slope, variance):
-    """Return the variance of the noise of each axis, from its blocks with the smaller slopes, shape (3,)."""
+    """
+    Return the variance of the noise of each axis, from its blocks with the smaller slopes.
+
+    Shape (3,).
+    """
     quiet = slope <= np.median(slope, axis=0)
     left = np.where(quiet, np.maximum(rough - variance * slope, 0.0), np.nan)
     return np.maximum(np.nanmedian(left, axis=0), 1e-3 * np.median(rough, axis=0))
@@ -96,7 +118,8 @@ def _variance(rough, slope, freedom):
     """
     Return (variance of the stamps by one sensor, its standard deviation), s^2.
 
-    The median of chi-square over its degrees of freedom f is ``(1 - 2 / (9 f))^3`` (Wilson and Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
+    The median of chi-square over its degrees of freedom f is ``(1 - 2 / (9 f))^3`` (Wilson and
+    Hilferty, Proc. Natl. Acad. Sci. 17, 1931).
     """
     variance, rough = 0.0, rough / (1.0 - 2.0 / (9.0 * np.maximum(freedom, 1.0)))[:, None] ** 3
     for _ in range(JITTER_STEPS):

@@ -1,4 +1,8 @@
-"""The residual after the test of every effect: its size, its correlation, and its regimes in the session."""
+"""
+The residual after the test of every effect.
+
+Its size, its correlation, and its regimes in the session.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,10 +29,16 @@ ALPHA = 1e-4
 IN_MOTION = 'motion (moving windows against windows at rest)'
 """Name of the variable that separates moving windows from windows at rest."""
 MUCH_SCATTER = 10.0
-"""Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of an axis with a cause of its own."""
+"""
+Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of
+an axis with a cause of its own.
+"""
 
 LOUD = 0.5
-"""Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained residual."""
+"""
+Least mean square of a tone over the variance of the noise at rest, from which it is an unexplained
+residual.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +48,10 @@ class Unexplained:
     significant: bool
     """Whether it is significant against noise and plausible bias processes."""
     rms: float
-    """Rms beyond noise, m/s^2 or rad/s (but see `unit`): of the windows' means, or within windows where only that is significant."""
+    """
+    Rms beyond noise, m/s^2 or rad/s (but see `unit`): of the windows' means, or within windows
+    where only that is significant.
+    """
     sigma: float
     """Standard deviations by which it exceeds noise."""
     correlates_with: str | None
@@ -50,7 +63,10 @@ class Unexplained:
     noise_sd: np.ndarray
     """Expected sd from noise, shape (k, 3)."""
     unit: str | None = None
-    """Unit of `rms` where it is not the sensor's: 'rad/turn' where turns by hand have the largest residual."""
+    """
+    Unit of `rms` where it is not the sensor's: 'rad/turn' where turns by hand have the largest
+    residual.
+    """
     axes: tuple = ()
     """Axes of the sensor that carry it, the strongest first."""
     regimes: tuple = ()
@@ -78,7 +94,11 @@ def unexplained(
 
 
 def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> Unexplained:
-    """Return the residual of a sensor, as significant if loud tones or the scatter in motion of one axis exceed the noise at rest."""
+    """
+    Return the residual of a sensor.
+
+    As significant if loud tones or the scatter in motion of one axis exceed the noise at rest.
+    """
     scatter, noise = _scatter_of_one_axis(problem, sensor), problem.noise[sensor].white_variance
     squares = np.array(scatter)
     for tone in rest.tones:
@@ -98,9 +118,12 @@ def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> 
 
 def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     """
-    Return the excess variance of moving samples over the noise at rest of an axis that exceeds the others, shape (3,); otherwise 0.
+    Return the excess variance of moving samples over the noise at rest, shape (3,).
 
-    Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a cause in the sensor its own axis.
+    It is given for an axis that exceeds the remaining axes, otherwise 0.
+
+    Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a
+    cause in the sensor its own axis.
     """
     noise, recording = problem.noise[sensor].at_rest_only(), problem.recording
     kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
@@ -120,8 +143,8 @@ def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dic
     """
     Return bias -> its possible error, for each axis with a significant residual.
 
-    A different offset in half of the windows scatters their means by as much as it shifts the bias. Which half is
-    correct is unknown, for any number of windows.
+    A different offset in half of the windows scatters their means by as much as it shifts the bias.
+    Which half is correct is unknown, for any number of windows.
     """
     found = []
     for sensor, rest in rests.items():
@@ -175,7 +198,9 @@ def _rest(problem, explained, sensor, excess, values):
 
 def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None, float]:
     """
-    Return (name, adjusted share of the variance) of the variable with the largest correlation, or (None, 0).
+    Return (name, adjusted share of the variance) of the best variable, or (None, 0).
+
+    The best variable is the one with the largest correlation.
 
     `explanations` are (name, columns (k, m), mask of the windows where they are known).
     """
@@ -216,7 +241,11 @@ def _explanations(recording):
 def slow_explanations(
     time: np.ndarray, temperature: np.ndarray
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield (name, columns, mask) of time, steps in time, and temperature where it is known and changes."""
+    """
+    Yield (name, columns, mask) of time, steps in time, and temperature.
+
+    Temperature is given where it is known and changes.
+    """
     every = np.ones(len(time), bool)
     time = (time - time.mean()) / max(np.ptp(time), 1e-9)
     yield 'time', np.stack([time, time**2, time**3], axis=1), every

@@ -1,4 +1,8 @@
-"""Smooth joint motion put together from segments: rests, moves, ramps, spins and oscillations, with exact derivatives."""
+"""
+Smooth joint motion put together from segments.
+
+Rests, moves, ramps, spins and oscillations, with exact derivatives.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,8 +15,9 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.motion_limits import MotionLimits, free_limits
 
-# Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the septic and a rate blended
-# by the quintic both have continuous position, rate, acceleration and jerk where segments meet.
+# Smooth steps from 0 to 1 and their derivatives, lowest power first. A position blended by the
+# septic and a rate blended by the quintic both have continuous position, rate, acceleration and
+# jerk where segments meet.
 _SEPTIC = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
 _QUINTIC = np.polynomial.Polynomial([0, 0, 0, 10, -15, 6])
 _POSITION_STEP = [_SEPTIC.deriv(order) for order in range(4)]
@@ -34,8 +39,9 @@ class Segment:
     """
     A stretch of motion of all joints.
 
-    ``position = start + rate blend + shift blend + envelope * sum of sines``: the rate changes from `rate_from` to `rate_to`
-    and the position gains `shift`, both by smooth steps, and the sines fade in and out.
+    ``position = start + rate blend + shift blend + envelope * sum of sines``: the rate changes from
+    `rate_from` to `rate_to` and the position gains `shift`, both by smooth steps, and the sines
+    fade in and out.
     """
 
     kind: str
@@ -65,7 +71,11 @@ class Segment:
         return self.start + self.shift + 0.5 * (self.rate_from + self.rate_to) * self.duration
 
     def at(self, time: np.ndarray) -> np.ndarray:
-        """Return position, rate, acceleration and jerk at `time` since the start of the segment, shape (4, n, n_joints)."""
+        """
+        Return position, rate, acceleration and jerk at `time` since the start of the segment.
+
+        Shape (4, n, n_joints).
+        """
         motion = np.zeros((4, len(time), len(self.start)))
         motion[0] = self.start + time[:, None] * self.rate_from
         motion[1] = self.rate_from
@@ -121,7 +131,10 @@ class Profile:
     joint_names: tuple | None = None
     """Joints in column order, when the profile is tied to a table."""
     table: dict | None = None
-    """Description of the table that the profile is made for (as in the table's YAML), when it brings its own."""
+    """
+    Description of the table that the profile is made for (as in the table's YAML), when it brings
+    its own.
+    """
 
     @property
     def edges(self) -> np.ndarray:
@@ -180,8 +193,8 @@ class MotionBuilder:
     """
     Writes segments one after the other, each starting where the last one ended.
 
-    Angles are in degrees here, in radians in the segments. For sliding joints, use the methods with SI units. Each method returns the
-    builder, so that calls can be chained.
+    Angles are in degrees here, in radians in the segments. For sliding joints, use the methods with
+    SI units. Each method returns the builder, so that calls can be chained.
     """
 
     def __init__(
@@ -195,7 +208,8 @@ class MotionBuilder:
         """
         Start at rest at zero, or at the positions `start`.
 
-        `dwell` stretches rests, spins and oscillations, the limits (`MotionLimits`) time moves and ramps.
+        `dwell` stretches rests, spins and oscillations, the limits (`MotionLimits`) time moves and
+        ramps.
         """
         self.segments: tuple[Segment, ...] = ()
         self.dwell = dwell
@@ -217,13 +231,21 @@ class MotionBuilder:
         return self.move_to(self.home).rest(duration)
 
     def move(self, angles_deg: ArrayLike, shortest: bool = True) -> Self:
-        """Move to the joint angles (NaN: do not move that joint), each by less than half a turn when `shortest`."""
+        """
+        Move to the joint angles (NaN: do not move that joint).
+
+        When `shortest`, each joint moves by less than half a turn.
+        """
         return self.move_to(
             np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest
         )
 
     def move_to(self, target: np.ndarray, shortest: bool = True) -> Self:
-        """Move to joint positions in rad and m; endless joints by less than half a turn when `shortest`."""
+        """
+        Move to joint positions in rad and m.
+
+        Endless joints by less than half a turn when `shortest`.
+        """
         shift = np.where(np.isnan(target), 0.0, target - self._position)
         if shortest:
             shift = np.where(self.limits.endless, (shift + np.pi) % (2.0 * np.pi) - np.pi, shift)
@@ -235,7 +257,11 @@ class MotionBuilder:
         )
 
     def spin(self, rates_deg: ArrayLike, duration: float) -> Self:
-        """Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints), for `duration` times dwell, then stop."""
+        """
+        Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints).
+
+        For `duration` times dwell, then stop.
+        """
         last = np.zeros(self.n_joints)
         for rate in np.radians(np.atleast_2d(np.asarray(rates_deg, float))):
             self._ramp(last, rate)
@@ -252,7 +278,11 @@ class MotionBuilder:
         phase: ArrayLike = 0.0,
         fade: float | None = None,
     ) -> Self:
-        """Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,), for `duration` times dwell."""
+        """
+        Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,).
+
+        For `duration` times dwell.
+        """
         return self.swing(np.radians(amplitude_deg), frequency, duration, phase=phase, fade=fade)
 
     def swing(
@@ -301,7 +331,11 @@ class MotionBuilder:
 
 
 def move_time(distance: np.ndarray, limits: MotionLimits) -> float:
-    """Return the duration of a move of all joints by `distance`, shape (n_joints,), within the limits, s."""
+    """
+    Return the duration of a move of all joints by `distance`.
+
+    Shape (n_joints,), within the limits, s.
+    """
     rate = np.max(PEAK_RATE_OF_MOVE * distance / limits.speed)
     return float(
         max(
@@ -326,7 +360,8 @@ def stretch(build: Callable, duration: float) -> tuple[Segment, ...]:
     change = length[1] - length[0]
     if duration < (shortest := length[0] - (1.0 - SHORTEST_DWELL) * change) - 1e-6:
         raise InputError(
-            f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s; choose more or another profile',
+            f'duration must be at least {shortest:.0f} s for this profile, got {duration:g} s;'
+            ' choose more or another profile',
             code='too_short',
         )
     return build(1.0 + (duration - length[0]) / change)

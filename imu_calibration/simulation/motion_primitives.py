@@ -1,4 +1,8 @@
-"""Parts of a turntable session with axes z, y, x from the base outwards, and the motions of the two source papers."""
+"""
+Parts of a turntable session with axes z, y, x from the base outwards.
+
+The module also holds the motions of the two source papers.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -17,7 +21,9 @@ Task = Callable[[MotionBuilder], object]
 
 def pose_deg(up_b: np.ndarray, heading_deg: float = 0.0) -> np.ndarray:
     """
-    Return the joint angles of a z-y-x table (outer, middle, inner) that bring the vertical along `up_b`, deg.
+    Return the joint angles of a z-y-x table that bring the vertical along `up_b`, deg.
+
+    The joints of the table are in the order outer, middle, inner.
 
     From ``up_b = (-sin m, sin i cos m, cos i cos m)``; the outer joint only sets the heading.
     """
@@ -32,7 +38,11 @@ def pose(up_b: np.ndarray, heading_deg: float, dwell: float) -> Task:
 
 
 def spin_vertical(up_b: np.ndarray, speeds_deg: ArrayLike, dwell: float) -> Task:
-    """Turn the outer joint both ways with `up_b` vertical: the body turns about `up_b` and gravity is constant in it."""
+    """
+    Turn the outer joint both ways with `up_b` vertical.
+
+    The body turns about `up_b` and gravity is constant in it.
+    """
     return spin_joint(0, pose_deg(up_b, np.nan), speeds_deg, dwell=dwell)
 
 
@@ -45,7 +55,11 @@ def spin_joint(joint: int, at_deg: ArrayLike, speeds_deg: ArrayLike, *, dwell: f
 
 
 def swing(axis: int, amplitude_deg: float, frequency: float, *, duration: float) -> Task:
-    """Swing about sensor axis 0, 1 or 2: the inner joint, the middle one, or the middle one with the inner a quarter turn on."""
+    """
+    Swing about sensor axis 0, 1 or 2.
+
+    The inner joint, the middle one, or the middle one with the inner a quarter turn on.
+    """
     at_deg, joint = (([0, 0, 0], 2), ([0, 0, 0], 1), ([0, 0, 90], 1))[axis]
     return swing_at(
         np.radians(at_deg),
@@ -85,7 +99,11 @@ def run(
     *,
     reference_every: int = 12,
 ) -> None:
-    """Run tasks in a random order, with returns to the reference pose, so that drift is separable from other effects."""
+    """
+    Run tasks in a random order, with returns to the reference pose.
+
+    So that drift is separable from other effects.
+    """
     builder.rest_at_home(8.0)
     for count, index in enumerate(rng.permutation(len(tasks)), start=1):
         tasks[index](builder)
@@ -95,14 +113,20 @@ def run(
 
 
 def poses(directions: Sequence[np.ndarray] | np.ndarray, dwell: float) -> list[Task]:
-    """Return the tasks of resting with each direction vertical, at headings spread by the golden angle."""
+    """
+    Return the tasks of resting with each direction vertical.
+
+    The headings are spread by the golden angle.
+    """
     return [pose(up_b, GOLDEN_ANGLE_DEG * k, dwell) for k, up_b in enumerate(directions)]
 
 
 def swings(
     amplitudes_and_frequencies: tuple[tuple[float, float], ...], duration: float
 ) -> list[Task]:
-    """Return the tasks of swinging about each sensor axis at each amplitude (deg) and frequency (Hz)."""
+    """
+    Return the tasks of swinging about each sensor axis at each amplitude (deg) and frequency (Hz).
+    """
     return [
         swing(axis, *cycle, duration=duration)
         for axis in range(3)
@@ -111,7 +135,11 @@ def swings(
 
 
 def simultaneous(speeds_deg: tuple[float, float] | np.ndarray, dwell: float) -> list[Task]:
-    """Outer and inner, outer and middle (about y, about z), middle and inner: turns about two axes at a time."""
+    """
+    Outer and inner, outer and middle (about y, about z), middle and inner.
+
+    Turns about two axes at a time.
+    """
     a, b = speeds_deg
     return [
         two_axes(at, rates, dwell)
@@ -150,7 +178,11 @@ GIMBALS = _table([AXIS_VECTORS[axis] for axis in 'ZYX'])
 
 
 def avrutov_rates_deg(sample: int) -> np.ndarray:
-    """Return the rates about x, y, z of Avrutov's gyroscope series (sample 3 or 4), deg/s, shape (11, 3)."""
+    """
+    Return the rates about x, y, z of Avrutov's gyroscope series (sample 3 or 4), deg/s.
+
+    Shape (11, 3).
+    """
     if sample == 3:
         rate = np.arange(0.0, 101.0, 10.0)
         return np.stack([rate, rate ** (1 / 2), rate ** (1 / 3)], axis=1)
@@ -159,14 +191,22 @@ def avrutov_rates_deg(sample: int) -> np.ndarray:
 
 
 def _equal_angles(builder, _rng):
-    """All gimbals at the same angle, 41 positions (averaging of 30...60 s is shortened; `duration` stretches it)."""
+    """
+    All gimbals at the same angle, 41 positions.
+
+    Averaging of 30...60 s is shortened, and `duration` stretches it.
+    """
     builder.rest(5.0)
     for angle in EQUAL_ANGLES_DEG:
         builder.move(np.full(builder.n_joints, angle), shortest=False).rest(5.0)
 
 
 def _body_rates(builder, _rng, sample):
-    """Each row as one turn of the vertical joint: the inner two hold the wanted direction of the rate upright."""
+    """
+    Each row as one turn of the vertical joint.
+
+    The inner two hold the wanted direction of the rate upright.
+    """
     for rates in avrutov_rates_deg(sample):
         speed = np.linalg.norm(rates)
         builder.move(pose_deg(rates if speed else [0, 0, 1], np.nan)).rest(2.0).spin(
@@ -175,7 +215,11 @@ def _body_rates(builder, _rng, sample):
 
 
 def _gimbal_rates(builder, _rng, sample):
-    """Each row commanded to the three gimbals (x inner, z outer): the body rates are not the gimbal rates."""
+    """
+    Each row commanded to the three gimbals (x inner, z outer).
+
+    The body rates are not the gimbal rates.
+    """
     for x, y, z in avrutov_rates_deg(sample):
         builder.move([0.0, 0.0, 0.0]).rest(2.0).spin([[z, y, x]], 30.0)
 
@@ -220,13 +264,18 @@ def _zhang_mixed(builder, _rng):
 SKEW_60_RPY_DEG = (
     Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_euler('xyz', degrees=True).tolist()
 )
-"""A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three sensor axes."""
+"""
+A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three
+sensor axes.
+"""
 
 REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
     **{
         f'avrutov_{order}{suffix}': (
-            f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x or _up_y to turn '
-            'gravity',
+            (
+                f'41 positions of equal angles 0..400 deg, gimbals {order} from the base; add _up_x'
+                ' or _up_y to turn gravity'
+            ),
             _equal_angles,
             _table([AXIS_VECTORS[axis] for axis in order], up),
             3,
@@ -246,7 +295,10 @@ REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
     ),
     **{
         f'avrutov_rates_{sample}': (
-            f'gyroscope series of sample {sample} as body rates: one turn about a fixed axis for each row',
+            (
+                f'gyroscope series of sample {sample} as body rates: one turn about a fixed axis'
+                ' for each row'
+            ),
             partial(_body_rates, sample=sample),
             GIMBALS,
             3,
@@ -255,7 +307,10 @@ REGISTRY: dict[str, tuple[str, Callable, dict, int]] = {
     },
     **{
         f'avrutov_gimbals_{sample}': (
-            f'gyroscope series of sample {sample} commanded to the gimbals, which are not body rates',
+            (
+                f'gyroscope series of sample {sample} commanded to the gimbals, which are not body'
+                ' rates'
+            ),
             partial(_gimbal_rates, sample=sample),
             GIMBALS,
             3,

@@ -45,7 +45,11 @@ def within_limits(
     swing_time: float = 5.0,
     n_other: int = 20,
 ) -> None:
-    """Poses, swings of one joint and of two at once (with at most `n_other` other joints) and, where a joint has no end, spins."""
+    """
+    Poses, swings of one joint and of two at once (with at most `n_other` other joints) and.
+
+    Where a joint has no end, spins.
+    """
     limits, count = builder.limits, builder.n_joints
     lower, upper = (
         np.where(limits.endless, -np.pi, limits.lower),
@@ -63,7 +67,11 @@ def within_limits(
         )
 
     def swing(at, frequency):
-        """Swing the joints in which `frequency` is not zero, up to the limits of range, speed and acceleration."""
+        """
+        Swing the joints in which `frequency` is not zero.
+
+        They swing up to the limits of range, speed and acceleration.
+        """
         omega = 2 * np.pi * np.maximum(frequency, 1e-9)
         reach = [
             0.3 * (upper - lower),
@@ -121,7 +129,10 @@ class _Entry:
     n_joints: int | None = None
     """Joints that it needs; None: any number."""
     adapts: bool = False
-    """Whether a table with another number of joints gets `any_table` instead, and one with joint limits `within_limits`."""
+    """
+    Whether a table with another number of joints gets `any_table` instead, and one with joint
+    limits `within_limits`.
+    """
 
 
 def profile_names() -> dict[str, str]:
@@ -146,16 +157,17 @@ def make_profile(
     seed : int
         Seed of the order of the session, and in 'random' of the motions themselves.
     table : Table, optional
-        The table to be moved; default three axes. Sessions for three axes become poses, spins and swings of every joint
-        on a table with another number of joints, and are within the limits of joints that have them. Profiles with their own
-        table (`Profile.table`) ignore it.
+        The table to be moved; default three axes. Sessions for three axes become poses, spins and
+        swings of every joint on a table with another number of joints, and are within the limits of
+        joints that have them. Profiles with their own table (`Profile.table`) ignore it.
     duration : float, optional
         Wanted length, s; rests and spins are stretched to reach it.
 
     Raises
     ------
     InputError
-        When the name is unknown, the table does not suit the profile, a joint would exceed its limits, or the duration is too short.
+        When the name is unknown, the table does not suit the profile, a joint would exceed its
+        limits, or the duration is too short.
 
     """
     if name not in _REGISTRY:
@@ -169,7 +181,8 @@ def make_profile(
     fits = entry.n_joints in (None, len(joint_names))
     if not (fits or entry.adapts):
         raise InputError(
-            f"profile '{name}' must have a table with {entry.n_joints} joints, got {len(joint_names)}; choose 'any_table'",
+            f"profile '{name}' must have a table with {entry.n_joints} joints, got"
+            f" {len(joint_names)}; choose 'any_table'",
             code='joint_count',
         )
     limits = (
@@ -212,8 +225,8 @@ def _require_within(profile, limits):
                 for end in (limits.lower[column], limits.upper[column], *reached)
             )
             raise InputError(
-                f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}] {unit}, it would move from "
-                f"{least} to {most}; choose 'within_limits'",
+                f"profile '{profile.name}' must keep joint '{name}' within [{lower}, {upper}]"
+                f" {unit}, it would move from {least} to {most}; choose 'within_limits'",
                 code='joint_range',
             )
 
@@ -300,7 +313,9 @@ def _separating(
     cycles=((40.0, 0.4), (10.0, 1.0), (4.0, 2.0), (2.0, 4.0)),
     swing_time=4.0,
 ):
-    """Many angles, three speeds both ways, swings at several frequencies: separates similar effects."""
+    """
+    Many angles, three speeds both ways, swings at several frequencies: separates similar effects.
+    """
     angles = 2 * np.pi * (np.arange(n_angles) + 0.25) / n_angles
     rings = [
         direction
@@ -333,7 +348,9 @@ _separating_short = partial(
 
 
 def _thermal(builder, _rng):
-    """The same short round again and again, so that only time and temperature differ between rounds."""
+    """
+    The same short round again and again, so that only time and temperature differ between rounds.
+    """
     builder.rest_at_home(20.0)
     for turn in range(6):
         for task in [
@@ -346,7 +363,11 @@ def _thermal(builder, _rng):
 
 
 def _tumbling(builder, _rng, rest, parts):
-    """Rest, then swing all joints at once from zero, for each part (deg, Hz, s, s of the rest after it)."""
+    """
+    Rest, then swing all joints at once from zero.
+
+    For each part (deg, Hz, s, s of the rest after it).
+    """
     builder.rest(rest)
     for amplitude_deg, frequency, duration, rest_after in parts:
         builder.move([0, 0, 0]).oscillate(
@@ -447,7 +468,8 @@ _REGISTRY = {
         'the shortest that determines all parameters, about 2 min', _quick, n_joints=3, adapts=True
     ),
     'six_faces': _Entry(
-        'every axis up and down, and turned both ways at one speed, about 1 min: similar effects are collinear',
+        'every axis up and down, and turned both ways at one speed, about 1 min: similar effects'
+        ' are collinear',
         _six_faces,
         n_joints=3,
         adapts=True,

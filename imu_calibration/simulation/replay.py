@@ -35,12 +35,16 @@ class ReplayNoise(NamedTuple):
 def predict_windows(
     windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return sensor -> output of a model without noise at the samples of some windows, m/s^2 and rad/s, shape (n, 3)."""
+    """
+    Return sensor -> output of a model without noise at the samples of some windows.
+
+    The units are m/s^2 and rad/s, and the shape is (n, 3).
+    """
     motion, temperature, rows = all_samples(windows)
     if temperature is None and model.needs_temperature:
         raise InputError(
-            'a model with thermal effects requires the temperature of every sample, the recording has none for some; '
-            'name the temperature topic',
+            'a model with thermal effects requires the temperature of every sample, the recording'
+            ' has none for some; name the temperature topic',
             key='temperature_topic',
             code='temperature_missing',
         )
@@ -50,7 +54,9 @@ def predict_windows(
 
 def noise_at_rest(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
     """
-    Return sensor -> noise of a recording: median over the windows at rest of their white noise, and no bias process.
+    Return sensor -> noise of a recording.
+
+    Median over the windows at rest of their white noise, and no bias process.
 
     Raises
     ------
@@ -61,8 +67,8 @@ def noise_at_rest(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
     found = [window.noise_sd for window in windows if window.kind is WindowKind.STATIC]
     if not found:
         raise InputError(
-            'the noise must be in the statistics of the calibration, or a rest in the recording; both are missing; '
-            'calibrate from a recording with rests',
+            'the noise must be in the statistics of the calibration, or a rest in the recording;'
+            ' both are missing; calibrate from a recording with rests',
             key='calibration',
             code='noise_unknown',
         )
@@ -82,7 +88,9 @@ def replay(
     seed: int = 0,
 ) -> tuple[SampleBlock, int]:
     """
-    Return (the recording with simulated readings, number of its samples without known motion, which are left out).
+    Return (the recording with simulated readings, number of its samples left out).
+
+    Samples without known motion are left out.
 
     Parameters
     ----------
@@ -107,7 +115,8 @@ def replay(
     windows = MotionGatherer(table, keep_unused=True).all_of(blocks)
     if not windows:
         raise InputError(
-            'a replay requires IMU samples between joint states of the table, none was found; check the topics and the stamps',
+            'a replay requires IMU samples between joint states of the table, none was found; check'
+            ' the topics and the stamps',
             code='no_motion',
         )
     outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
@@ -134,9 +143,10 @@ def replay(
         _joined([getattr(block, name) for block in blocks]) for name in ('joints', 'temperature')
     )
     lost = sum(len(block.imu) for block in blocks if block.imu is not None) - len(stamps)
-    return SampleBlock(
-        ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature
-    ), lost
+    return (
+        SampleBlock(ImuSamples(stamps, readings[0], readings[1], frame), joints, temperature),
+        lost,
+    )
 
 
 def _joined(parts):

@@ -1,4 +1,8 @@
-"""Noise of simulated inertial sensors, encoders and clocks by grade, and faults beyond the model by their physics."""
+"""
+Noise of simulated sensors, encoders and clocks, and faults beyond the model.
+
+The inertial sensors, encoders and clocks have noise by grade, and the faults follow their physics.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +22,8 @@ class SimulatedNoise:
     """
     Random errors of one IMU and of its reference.
 
-    The bias wander is a stationary first-order Gauss-Markov process; its standard deviation is the data sheet's
-    in-run instability.
+    The bias wander is a stationary first-order Gauss-Markov process; its standard deviation is the
+    data sheet's in-run instability.
     """
 
     accel_density: float = 0.0
@@ -46,7 +50,9 @@ class SimulatedNoise:
 
 @dataclass(frozen=True)
 class ImuGrade:
-    """A grade of IMU: its noise, and the standard deviations of the errors that a calibration finds."""
+    """
+    A grade of IMU: its noise, and the standard deviations of the errors that a calibration finds.
+    """
 
     noise: SimulatedNoise
     """Random errors."""
@@ -80,7 +86,8 @@ GRADES = {
         0.02,
         0.01,
         3e-3,
-        'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed, the sheet has none',
+        'MPU-6050 data sheet: noise densities, 16 bits at 2 g and 250 deg/s; instability assumed,'
+        ' the sheet has none',
     ),
     'industrial': ImuGrade(
         SimulatedNoise(120 * MICRO_G, 0.007 * DEG, 30 * MICRO_G, 10 * DEG_H, 100.0),
@@ -89,7 +96,8 @@ GRADES = {
         5e-3,
         3e-3,
         3e-3,
-        'Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h; matrix and arms before factory calibration',
+        'Xsens MTi-1 data sheet: 120 ug/sqrt(Hz), 0.007 deg/s/sqrt(Hz), 30 ug, 10 deg/h; matrix and'
+        ' arms before factory calibration',
     ),
     'tactical': ImuGrade(
         SimulatedNoise(
@@ -100,7 +108,8 @@ GRADES = {
         5e-3,
         0.87e-3,
         5e-3,
-        'ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run 15 mg and 0.5 deg/s, axis to axis 0.05 deg',
+        'ADIS16460 data sheet: 0.09 m/s/sqrt(h), 0.12 deg/sqrt(h), 0.2 mg, 8 deg/h, run-to-run 15'
+        ' mg and 0.5 deg/s, axis to axis 0.05 deg',
     ),
     'navigation': ImuGrade(
         SimulatedNoise(1 * MICRO_G, 0.002 / 60 * DEG, 10 * MICRO_G, 0.005 * DEG_H, 100.0),
@@ -109,7 +118,8 @@ GRADES = {
         1e-4,
         3e-5,
         0.02,
-        'assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h, run-to-run 50-100 ug and 0.01-0.03 deg/h',
+        'assumed: 1 ug/sqrt(Hz), 0.002 deg/sqrt(h), instability 5-20 ug and 0.001-0.01 deg/h,'
+        ' run-to-run 50-100 ug and 0.01-0.03 deg/h',
     ),
 }
 """Grades by name."""
@@ -136,8 +146,8 @@ def gauss_markov(
     """
     Return a stationary first-order Gauss-Markov process along the first axis of `shape`.
 
-    ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``, continued from the values `before`, or started
-    from its stationary distribution.
+    ``x[k] = a x[k-1] + sd sqrt(1 - a^2) w[k]`` with ``a = exp(-step / correlation_time)``,
+    continued from the values `before`, or started from its stationary distribution.
     """
     decay = np.exp(-step / correlation_time)
     drive = rng.normal(0.0, standard_deviation, shape)
@@ -171,8 +181,8 @@ class ImuNoise:
     ----------
     model : SimulatedNoise
     sample_rate : float
-        Hz; a density d gives every sample the standard deviation ``d sqrt(sample_rate)``, so that the integral over t seconds
-        scatters by ``d sqrt(t)`` (random-walk convention).
+        Hz; a density d gives every sample the standard deviation ``d sqrt(sample_rate)``, so that
+        the integral over t seconds scatters by ``d sqrt(t)`` (random-walk convention).
     rng : numpy.random.Generator
     drawn : bool
         Whether the first biases are drawn now, not with the first samples.
@@ -194,7 +204,9 @@ class ImuNoise:
         )
 
     def add(self, force_s: np.ndarray, rate_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return readings from outputs without noise, m/s^2 and rad/s, shape (n, 3), n at least 1."""
+        """
+        Return readings from outputs without noise, m/s^2 and rad/s, shape (n, 3), n at least 1.
+        """
         model = self._model
         force, self._force_bias = self._added(
             force_s, model.accel_density, model.accel_instability, self._force_bias
@@ -221,7 +233,9 @@ class ImuNoise:
 def read_encoders(
     position: np.ndarray, model: SimulatedNoise, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return joint positions as read by noisy encoders of finite resolution, rad, shape (n, n_joints)."""
+    """
+    Return joint positions as read by noisy encoders of finite resolution, rad, shape (n, n_joints).
+    """
     return quantise(
         position + rng.normal(0.0, model.encoder_noise, np.shape(position)),
         model.encoder_resolution,
@@ -229,7 +243,11 @@ def read_encoders(
 
 
 class Felt(NamedTuple):
-    """True motion of the housing, and the outputs of its sensing elements up to this cause; all shape (n, 3)."""
+    """
+    True motion of the housing, and the outputs of its sensing elements up to this cause.
+
+    All shape (n, 3).
+    """
 
     true_force: np.ndarray
     """Specific force, m/s^2."""
@@ -245,13 +263,19 @@ Cause = Callable[[Felt], Felt]
 
 
 def _two_half_ranges(rng: np.random.Generator) -> Cause:
-    """Each gyroscope's electrodes have different gains for the two senses of rotation, by 0.2 to 0.4 %."""
+    """
+    Each gyroscope's electrodes have different gains for the two senses of rotation.
+
+    By 0.2 to 0.4 %.
+    """
     gap = rng.uniform(2e-3, 4e-3, 3) * rng.choice([-1, 1], 3)
     return lambda felt: felt._replace(rate=felt.rate + 0.5 * gap * np.abs(felt.true_rate))
 
 
 def _unbalanced_mass(rng: np.random.Generator) -> Cause:
-    """The gyroscopes' masses are off their axes: specific force turns them, 20 to 60 deg/h per g."""
+    """
+    The gyroscopes' masses are off their axes: specific force turns them, 20 to 60 deg/h per g.
+    """
     per_force = (
         rng.uniform(20.0, 60.0, (3, 3)) * rng.choice([-1, 1], (3, 3)) * DEG_H / STANDARD_GRAVITY
     )
@@ -259,7 +283,11 @@ def _unbalanced_mass(rng: np.random.Generator) -> Cause:
 
 
 def _soft_spring(rng: np.random.Generator) -> Cause:
-    """The accelerometers' springs grow softer one way: a parabola in the force along each axis, 0.2 to 0.5 mg at 1 g."""
+    """
+    The accelerometers' springs grow softer one way.
+
+    A parabola in the force along each axis, 0.2 to 0.5 mg at 1 g.
+    """
     per_square = rng.uniform(2e-4, 5e-4, 3) * rng.choice([-1, 1], 3) / STANDARD_GRAVITY
     return lambda felt: felt._replace(force=felt.force + per_square * felt.true_force**2)
 
@@ -283,12 +311,17 @@ CAUSES: dict[str, Callable[[np.random.Generator], Cause]] = {
     'gain_by_sense': _gain_by_sense,
     'narrow_range': _narrow_range,
 }
-"""Name -> function of a generator that draws the size and returns the cause; `narrow_range` belongs last."""
+"""
+Name -> function of a generator that draws the size and returns the cause; `narrow_range` belongs
+last.
+"""
 
 
 def hidden_causes(names: Sequence[str], seed: int, size: float = 1.0) -> list[Cause]:
     """
-    Return the causes of those names, each drawn from a separate generator, `size` times as large as drawn.
+    Return the causes of the given names, `size` times as large as drawn.
+
+    Each cause is drawn from a separate generator.
 
     Raises
     ------
@@ -299,7 +332,8 @@ def hidden_causes(names: Sequence[str], seed: int, size: float = 1.0) -> list[Ca
     for name in names:
         if name not in CAUSES:
             raise InputError(
-                f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of them",
+                f"a hidden cause must be one of {', '.join(CAUSES)}, got '{name}'; name one of"
+                ' them',
                 code='cause_unknown',
             )
     return [

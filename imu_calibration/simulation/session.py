@@ -1,4 +1,8 @@
-"""Simulated sessions: an IMU made of the catalogue's effects on a table that follows a profile or trajectories."""
+"""
+Simulated sessions.
+
+An IMU made of the catalogue's effects on a table that follows a profile or trajectories.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +41,9 @@ ALIASED = 0.31
 
 def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """
-    Return the contribution of the machine to the specific force, m/s^2, and its variance, (m/s^2)^2, each shape (n, 3).
+    Return the contribution of the machine to the specific force, and its variance.
+
+    The units are m/s^2 and (m/s^2)^2, and each has shape (n, 3).
 
     Parameters
     ----------
@@ -57,12 +63,16 @@ def hum_and_variance(time: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndar
 
 
 def unit_hum(time: np.ndarray, rate: float) -> np.ndarray:
-    """Return a sine of unit variance on each axis at times in s, shape (n, 3), for samples per second."""
+    """
+    Return a sine of unit variance on each axis at times in s, shape (n, 3), for samples per second.
+    """
     return np.sqrt(2.0) * np.sin(2 * np.pi * ALIASED * rate * time[:, None] + np.arange(3.0))
 
 
 SESSION_START_NS = 1_700_000_000_000_000_000
-"""First stamp of simulated sessions: arbitrary but fixed, so that the same seed gives the same bytes."""
+"""
+First stamp of simulated sessions: arbitrary but fixed, so that the same seed gives the same bytes.
+"""
 SIMULATED_BLOCK_SAMPLES = 100_000
 TEMPERATURE_RATE = 1.0
 """Temperatures per second of a live simulation."""
@@ -121,7 +131,9 @@ def true_imu(
     seed: int,
     catalogue: Catalogue = CATALOGUE,
 ) -> tuple[SensorModel, np.ndarray]:
-    """Return (model, values): the known ones, or those of a random IMU of a grade with size effect."""
+    """
+    Return (model, values): the known ones, or those of a random IMU of a grade with size effect.
+    """
     if known is None:
         model = SensorModel(
             NAMED_MODELS['size_effect'], joint_names=table.joint_names, catalogue=catalogue
@@ -132,11 +144,13 @@ def true_imu(
 
 
 def require_joints(model: SensorModel, table: Table) -> None:
-    """Refuse a model with effects of the reference for joints that differ from those of the table."""
+    """
+    Refuse a model with effects of the reference for joints that differ from those of the table.
+    """
     if model.reference and set(model.joint_names) != set(table.joint_names):
         raise InputError(
-            f'the calibration must be of a table with joints {", ".join(table.joint_names)}, it names '
-            f'{", ".join(model.joint_names)}; give its table',
+            f'the calibration must be of a table with joints {", ".join(table.joint_names)}, it'
+            f' names {", ".join(model.joint_names)}; give its table',
             key='table',
         )
 
@@ -144,7 +158,11 @@ def require_joints(model: SensorModel, table: Table) -> None:
 def hidden_effect(
     model: SensorModel, name: str, seed: int = 0, *, share: float = 0.3, moment: float = 60.0
 ) -> tuple[str, np.ndarray]:
-    """Return (sensor, values) of an effect of a model's catalogue at a share of its plausible size; a step occurs at `moment`, s."""
+    """
+    Return (sensor, values) of an effect of a model's catalogue at a share of its plausible size.
+
+    A step occurs at `moment`, s.
+    """
     sensor = model.catalogue.owner_of(name, model.joint_names)
     effect = model.catalogue.find(sensor, name, model.joint_names)
     if not effect.plausible:
@@ -309,7 +327,9 @@ class LiveSimulation:
         return felt.force, felt.rate
 
     def truth(self, block: SimulatedBlock) -> ImuSamples:
-        """Return true specific force and rate at the origin of the arms, at the stamps of `block.imu`."""
+        """
+        Return true specific force and rate at the origin of the arms, at the stamps of `block.imu`.
+        """
         force, rate = self._true_motion(block.imu_time)
         return ImuSamples(block.imu.stamp_ns, force, rate, self.options.frame_id)
 
@@ -378,7 +398,11 @@ def answered(
     time: np.ndarray,
     options: SimulationOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outputs of the sensors without noise, each (n, 3): motion, warm-up, and a machine if biases depend on vibration."""
+    """
+    Return the outputs of the sensors without noise, each (n, 3).
+
+    Motion, warm-up, and a machine if biases depend on vibration.
+    """
     warmth, hum = temperature_at(time, options), 0.0
     if warmth is not None:  # it never turns (`kinematics.signal_history`)
         motion = replace(
@@ -393,7 +417,11 @@ def answered(
 
 
 def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
-    """Return the temperature of the warm-up, or None without a temperature topic: ``start + rise (1 - exp(-t / tau))``."""
+    """
+    Return the temperature of the warm-up, or None without a temperature topic.
+
+    ``start + rise (1 - exp(-t / tau))``.
+    """
     if options.temperature_start_c is None:
         return None
     return options.temperature_start_c + options.temperature_rise_c * (

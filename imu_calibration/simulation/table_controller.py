@@ -24,8 +24,9 @@ class JointTrajectory:
     """
     Polynomials between points, at rest before the first and after the last.
 
-    As in joint_trajectory_controller: of degree five where the points give velocities and accelerations, of degree three with only
-    velocities, straight lines with only positions, so that the velocity jumps at every point.
+    As in joint_trajectory_controller: of degree five where the points give velocities and
+    accelerations, of degree three with only velocities, straight lines with only positions, so that
+    the velocity jumps at every point.
     """
 
     time: np.ndarray
@@ -43,7 +44,11 @@ class JointTrajectory:
         return float(self.time[-1])
 
     def at(self, time: np.ndarray) -> JointMotion:
-        """Return the JointMotion at `time`, shape (m,): before the first point as there at rest, after the last at rest."""
+        """
+        Return the JointMotion at `time`, shape (m,).
+
+        Before the first point as there at rest, after the last at rest.
+        """
         time = np.atleast_1d(np.asarray(time, float))
         inside = np.clip(time, self.time[0], self.time[-1])
         motion = [self._curve(inside, order) for order in range(4)]
@@ -84,8 +89,8 @@ def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajec
     """
     if not len(points) or points.position.shape[1] != start.position.shape[1]:
         raise InputError(
-            f'a trajectory must have points with {start.position.shape[1]} positions each, got {points.position.shape}; '
-            'name every joint of the table'
+            f'a trajectory must have points with {start.position.shape[1]} positions each, got'
+            f' {points.position.shape}; name every joint of the table'
         )
     parts = {
         name: np.concatenate([getattr(start, name)[:1], values])
@@ -95,7 +100,11 @@ def trajectory_from(start: JointMotion, points: TrajectoryPoints) -> JointTrajec
 
 
 def braking_from(start: JointMotion, limits: MotionLimits) -> JointTrajectory:
-    """Return the braking trajectory within the acceleration limits, or with more acceleration if the range ends before."""
+    """
+    Return the braking trajectory within the acceleration limits.
+
+    More acceleration is used if the range ends before.
+    """
     position, rate = start.position[0], start.rate[0]
     wanted = float(np.max(PEAK_ACCELERATION_OF_BRAKING * np.abs(rate) / limits.acceleration))
     room = np.where(rate > 0, limits.upper - position, position - limits.lower)
@@ -115,8 +124,8 @@ def excess(
     """
     Return the excess of a trajectory over limits.
 
-    Positions beyond the range (rad or m; at most 0 within it), and the largest speed and acceleration in units of theirs. Velocity jumps of
-    straight lines are ignored.
+    Positions beyond the range (rad or m; at most 0 within it), and the largest speed and
+    acceleration in units of theirs. Velocity jumps of straight lines are ignored.
     """
     count = max(int(np.ceil((trajectory.end - trajectory.time[0]) / step)), 20)
     motion = trajectory.at(
@@ -143,8 +152,8 @@ class ControllerSettings:
     limits: str = setting(
         'refuse',
         '',
-        'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow (it '
-        'is slowed to the limits; beyond the range it is refused) or none (it is followed)',
+        'treatment of a trajectory beyond range, speed or acceleration of the joints: refuse, slow'
+        ' (it is slowed to the limits; beyond the range it is refused) or none (it is followed)',
         symptom='trajectories are not followed, or further and faster than the joints can',
         choices=('refuse', 'slow', 'none'),
     )
@@ -220,7 +229,8 @@ class TableController:
         )
         if settings.stall_joint and settings.stall_joint not in self.joint_names:
             raise InputError(
-                f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got '{settings.stall_joint}'; name one",
+                f"setting 'stall_joint' must be one of {', '.join(self.joint_names)}, got"
+                f" '{settings.stall_joint}'; name one",
                 code='joint_unknown',
             )
         self._profile, self._repeat, self._n_followed = profile, repeat, 0
@@ -254,7 +264,8 @@ class TableController:
             return self._take(begin, braking_from(start, self.limits))
         if 0 <= self.settings.refuse_after <= self._n_followed:
             raise InputError(
-                f'the controller accepts at most {self.settings.refuse_after} trajectories, by its parameter',
+                f'the controller accepts at most {self.settings.refuse_after} trajectories, by its'
+                ' parameter',
                 code='trajectory_count',
             )
         points = points.slowed(self.settings.speed_scaling)
@@ -271,8 +282,8 @@ class TableController:
         beyond, speed, acceleration = excess(trajectory, self.limits)
         if beyond > LIMIT_ROUNDING:
             raise InputError(
-                f'a trajectory must stay within the range of the joints, it exceeds it by {beyond:.3g} rad or m; '
-                'see the limits in the description of the table',
+                'a trajectory must stay within the range of the joints, it exceeds it by'
+                f' {beyond:.3g} rad or m; see the limits in the description of the table',
                 code='joint_range',
             )
         fastest = max(speed, np.sqrt(acceleration))
@@ -280,8 +291,9 @@ class TableController:
             return trajectory
         if self.settings.limits == 'refuse':
             raise InputError(
-                f'a trajectory must keep to speed and acceleration of the joints, it reaches {speed:.2f} times the one and '
-                f'{acceleration:.2f} times the other; give it more time',
+                'a trajectory must keep to speed and acceleration of the joints, it reaches'
+                f' {speed:.2f} times the one and {acceleration:.2f} times the other; give it more'
+                ' time',
                 code='joint_limits',
             )
         return trajectory_from(start, points.slowed(1.0 / fastest))

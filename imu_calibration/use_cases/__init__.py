@@ -1,6 +1,8 @@
 """
-Tasks of the user, from files to files: the command line, notebooks and scripts call the same functions.
+Tasks of the user, from files to files.
 
-In: paths of recordings and tables, choices by name. Out: results that print, draw and save themselves.
-Read `calibrate` first.
+The command line, notebooks and scripts call the same functions.
+
+In: paths of recordings and tables, choices by name. Out: results that print, draw and save
+themselves. Read `calibrate` first.
 """

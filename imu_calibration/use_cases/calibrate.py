@@ -1,4 +1,8 @@
-"""From recordings to a calibration that prints, draws and saves itself, and the test of a calibration on another recording."""
+"""
+From recordings to a calibration that prints, draws and saves itself.
+
+The module also holds the test of a calibration on another recording.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -37,7 +41,11 @@ from imu_calibration.use_cases.recordings import (
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """Result of a calibration: prints the parameters and the verdict, draws residuals, saves calibration.yaml and report.html."""
+    """
+    Result of a calibration.
+
+    Prints the parameters and the verdict, draws residuals, saves calibration.yaml and report.html.
+    """
 
     result: CalibrationResult
     """The calibration with all data of a report."""
@@ -54,11 +62,19 @@ class Calibrated:
 
     @property
     def exit_code(self) -> int:
-        """0 when each sensor helps, every requested parameter is determined and no message was lost, otherwise 3."""
+        """
+        0 when each sensor helps and nothing is missing, otherwise 3.
+
+        Nothing is missing when every requested parameter is determined and no message was lost.
+        """
         return exit_code(self.calibration)
 
     def plot(self, sensor: str = 'accelerometer') -> Drawn:
-        """Return the errors of one sensor in every window, before and after, as a figure for a notebook."""
+        """
+        Return the errors of one sensor in every window, before and after.
+
+        As a figure for a notebook.
+        """
         from imu_calibration.report.calibration_sections import draw_windows
 
         return draw_windows(self.result.window_errors(), sensor)
@@ -108,8 +124,8 @@ def calibrate(
     recordings : path-like, SampleBlock, or a sequence of them
         Bags, or samples in memory.
     table : path-like, Table or Arm, optional
-        The reference: a table description, a robot description (.urdf, .xacro), or their content; without it gravity: poses
-        held still and the turns between them.
+        The reference: a table description, a robot description (.urdf, .xacro), or their content;
+        without it gravity: poses held still and the turns between them.
     jobs : int or None
         Recordings that are read side by side, in processes; None: one per processor.
     earlier : Calibration or path-like, optional
@@ -127,7 +143,8 @@ def calibrate(
     earlier = None if earlier is None else files.given_calibration(earlier)
     if earlier is not None and table is None:
         raise InputError(
-            'an earlier calibration must be compared on a table, none was given; give its description',
+            'an earlier calibration must be compared on a table, none was given; give its'
+            ' description',
             key='table',
             code='table_missing',
         )
@@ -158,13 +175,17 @@ def calibrate(
 
 
 def _beside(result, proof):
-    """Return the result with the error after an earlier calibration, from `proof`, in its own proof."""
+    """
+    Return the result with the error after an earlier calibration, from `proof`, in its own proof.
+    """
     known = {
-        sensor: found
-        | (
-            {'earlier': {name: proof[sensor][name] for name in ('after', 'ci95')}}
-            if sensor in proof
-            else {}
+        sensor: (
+            found
+            | (
+                {'earlier': {name: proof[sensor][name] for name in ('after', 'ci95')}}
+                if sensor in proof
+                else {}
+            )
         )
         for sensor, found in result.calibration.proof.items()
     }
@@ -177,11 +198,15 @@ def _side_by_side(sources, table, options, recordings, jobs):
     """Calibrate with the table, recordings in several processes if `jobs` is above 1."""
     names = [name_of(recording) for recording in recordings]
     names = [
-        name
-        if names.count(name) == 1
-        else f'recording {number}'
-        if isinstance(recording, SampleBlock)
-        else str(Path(recording))
+        (
+            name
+            if names.count(name) == 1
+            else (
+                f'recording {number}'
+                if isinstance(recording, SampleBlock)
+                else str(Path(recording))
+            )
+        )
         for number, (name, recording) in enumerate(zip(names, recordings, strict=True), 1)
     ]
     advance = counter('recordings', len(recordings) if jobs > 1 else 0)
@@ -196,7 +221,9 @@ def check(
     **choices: Unpack[Choices],
 ) -> CheckResult:
     """
-    Test whether a calibration helps on a recording: the error before and after, by sensor and kind of motion.
+    Test whether a calibration helps on a recording.
+
+    The error before and after, by sensor and kind of motion.
 
     Parameters
     ----------
@@ -204,8 +231,8 @@ def check(
         A bag, or samples in memory, of the IMU that was calibrated.
     calibration : Calibration or path-like
     table : path-like, Table or Arm, optional
-        The reference of this recording; it need not be the one of the calibration. Without it gravity is: the IMU held still in some
-        attitudes, and the turns between them.
+        The reference of this recording; it need not be the one of the calibration. Without it
+        gravity is: the IMU held still in some attitudes, and the turns between them.
     choices
         See `Choices`; the topics, the window settings and the local gravity apply.
 
@@ -238,7 +265,10 @@ def _gravity(options, calibration):
         return ()
     taken = gravity_of(calibration, options)
     return (
-        f'gravity is that of the calibration, {taken:.6g} m/s^2; give the local value if it differs',
+        (
+            f'gravity is that of the calibration, {taken:.6g} m/s^2; give the local value if it'
+            ' differs'
+        ),
     )
 
 

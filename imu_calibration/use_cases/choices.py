@@ -1,4 +1,8 @@
-"""Choices of the user by name, the inputs that they select, the list of effects, and the provenance of a result."""
+"""
+Choices of the user by name, the inputs that they select, and the effects.
+
+The module also holds the list of effects and the provenance of a result.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from hashlib import sha256
@@ -44,13 +48,22 @@ class Choices(TypedDict, total=False):
     frame_id: str | None
     """frame_id of the Imu messages; required if a topic has messages of several."""
     accelerometer_model: str | None
-    """A named model or effect names joined by +; default bias+matrix, and accel_size_effect when the rotation shows it."""
+    """
+    A named model or effect names joined by +; default bias+matrix, and accel_size_effect when the
+    rotation shows it.
+    """
     gyroscope_model: str | None
     """The same for the gyroscope; default bias+matrix."""
     reference_model: str | None
-    """Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when only the azimuth is unknown."""
+    """
+    Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when only
+    the azimuth is unknown.
+    """
     gravity: float | None
-    """Local gravity for work by hand or with a robot description, m/s^2; default the standard gravity with its uncertainty."""
+    """
+    Local gravity for work by hand or with a robot description, m/s^2; default the standard gravity
+    with its uncertainty.
+    """
     latitude: float | None
     """Geodetic latitude, degrees, from which gravity follows (WGS 84) where it is not given."""
     height: float | None
@@ -58,13 +71,22 @@ class Choices(TypedDict, total=False):
     model_as_asked: bool
     """Whether the model is used without additions, even where the data support them; default no."""
     tolerances: str | PathLike | Mapping | None
-    """File or {section: {effect: standard deviation up to which it counts as determined}}; default config/tolerances.yaml."""
+    """
+    File or {section: {effect: standard deviation up to which it counts as determined}}; default
+    config/tolerances.yaml.
+    """
     nominal: str | PathLike | NominalScaling | None
     """File or scaling of recordings in volts or counts."""
     noise: str | PathLike | NoiseFigures | None
-    """noise.yaml of this IMU: its bias instability, in place of the estimate from the recording; needs a table."""
+    """
+    noise.yaml of this IMU: its bias instability, in place of the estimate from the recording; needs
+    a table.
+    """
     catalogue: Catalogue | str | PathLike | Mapping | None
-    """Effects added to the package's, or their complete catalogue: a file with `effects`, or {name: definition}; default the package's."""
+    """
+    Effects added to the package's, or their complete catalogue: a file with `effects`, or {name:
+    definition}; default the package's.
+    """
     setting: Sequence[str] | Mapping[str, float]
     """How windows are found: 'NAME=NUMBER', ..., or {name: number}."""
     serial: str | None
@@ -110,7 +132,8 @@ def inputs_of(
     strange = sorted(set(choices) - set(Choices.__annotations__))
     if strange:
         raise InputError(
-            f'{", ".join(strange)} cannot be chosen; the choices are {", ".join(Choices.__annotations__)}',
+            f'{", ".join(strange)} cannot be chosen; the choices are'
+            f' {", ".join(Choices.__annotations__)}',
             code='choice_unknown',
         )
     options, topics = calibration_options(choices), topics_of(choices)
@@ -214,7 +237,9 @@ MAX_SHOWN_COLUMNS = 3
 
 def effect_rows(added: str | PathLike | None = None) -> list[dict[str, Any]]:
     """
-    Return one mapping per effect: name, sensor, unit, tolerance, compensation, sentence, equation, required data and motion.
+    Return one mapping per effect.
+
+    Name, sensor, unit, tolerance, compensation, sentence, equation, required data and motion.
 
     Raises
     ------
@@ -241,7 +266,11 @@ def _row(effect):
 
 
 def _equation(effect):
-    """Return the output of the effect as a sum of coefficients times columns; empty where it changes the reference motion."""
+    """
+    Return the output of the effect as a sum of coefficients times columns.
+
+    Empty where it changes the reference motion.
+    """
     columns = [text for group in effect.groups for text in group.text]
     if not columns or effect.warp is not None:
         return ''
@@ -249,7 +278,10 @@ def _equation(effect):
         f'k{n} * ({text})' if ' ' in text else f'k{n} * {text}'
         for n, text in enumerate(columns[:MAX_SHOWN_COLUMNS], 1)
     )
-    return f'output_i += {shown}{f" + ... ({len(columns)} columns)" if len(columns) > MAX_SHOWN_COLUMNS else ""}'
+    return (
+        'output_i +='
+        f' {shown}{f" + ... ({len(columns)} columns)" if len(columns) > MAX_SHOWN_COLUMNS else ""}'
+    )
 
 
 LABELS = ('serial', 'operator')
@@ -340,7 +372,8 @@ def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> Non
     Raises
     ------
     InputError
-        If calibration.yaml in the folder differs in verb, recordings, table or robot description, or is none.
+        If calibration.yaml in the folder differs in verb, recordings, table or robot description,
+        or is none.
 
     """
     path = Path(folder) / 'calibration.yaml'
@@ -358,8 +391,9 @@ def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> Non
     }
     if not all(parts.values()):
         raise InputError(
-            f'a result must not replace that of other inputs, {path} differs in '
-            f'{" and ".join(name for name, same in parts.items() if not same)}; choose another folder, or overwrite it',
+            f'a result must not replace that of other inputs, {path} differs in'
+            f' {" and ".join(name for name, same in parts.items() if not same)}; choose another'
+            ' folder, or overwrite it',
             key='force',
             code='other_result',
         )

@@ -29,11 +29,17 @@ class Compensated:
     """Result of a compensation."""
 
     imu: ImuSamples | None
-    """The corrected samples, NaN where a reading cannot be corrected; None when they were written into a bag."""
+    """
+    The corrected samples, NaN where a reading cannot be corrected; None when they were written into
+    a bag.
+    """
     count: int
     """Samples that passed."""
     warnings: list[str]
-    """Caveats of the calibration, readings outside its conditions, and uncorrected readings, a line each."""
+    """
+    Caveats of the calibration, readings outside its conditions, and uncorrected readings, a line
+    each.
+    """
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
     refused: dict[str, str] = field(default_factory=dict)
@@ -43,7 +49,12 @@ class Compensated:
 
     @property
     def exit_code(self) -> int:
-        """0 all is corrected, 3 part of it could not be read, or the decision on a sensor is not `helps`."""
+        """
+        0 when all is corrected, otherwise 3.
+
+        The code is 3 when part of it could not be read, or when the decision on a sensor is not
+        `helps`.
+        """
         return 3 if self.lost or self.refused or self.cautions else 0
 
     def __repr__(self):
@@ -75,19 +86,21 @@ def compensate(
         A bag, or samples in memory (a block may bring temperatures).
     calibration : Calibration or path-like
     output : path-like, optional
-        A rosbag2 folder to make: all topics of the recording, and the corrected one. Without it the corrected samples are
-        returned.
+        A rosbag2 folder to make: all topics of the recording, and the corrected one. Without it the
+        corrected samples are returned.
     corrected_topic : str
         Name of the topic to add.
     target_frame : str
-        Another frame of the same rigid body to move the readings to, in which the sensor sits at `target_xyz` (m), turned by
-        `target_rpy` (roll, pitch, yaw, rad).
+        Another frame of the same rigid body to move the readings to, in which the sensor sits at
+        `target_xyz` (m), turned by `target_rpy` (roll, pitch, yaw, rad).
     correct_stamps : bool
         Move the stamps back by the calibration's time_offset.
     anyway : bool
-        Also correct a sensor whose decision is `harms`. One whose decision is `unproven` is always corrected, with a warning.
+        Also correct a sensor whose decision is `harms`. One whose decision is `unproven` is always
+        corrected, with a warning.
     noise : NoiseFigures or path-like, optional
-        noise.yaml of this IMU: the covariances of the corrected readings follow from it where the messages bring none.
+        noise.yaml of this IMU: the covariances of the corrected readings follow from it where the
+        messages bring none.
     imu_topic, temperature_topic : str, optional
         Topics to read.
     frame_id : str, optional
@@ -96,8 +109,8 @@ def compensate(
     Raises
     ------
     ImuCalibrationError
-        When the calibration is not fit for correction, the recording is corrected already or lacks required temperatures, or
-        the output exists.
+        When the calibration is not fit for correction, the recording is corrected already or lacks
+        required temperatures, or the output exists.
 
     """
     calibration = files.given_calibration(calibration)

@@ -24,7 +24,12 @@ from imu_calibration.use_cases.recordings import Stand
 
 @dataclass(frozen=True, eq=False)
 class Diagnosed:
-    """Result of a diagnosis: prints the findings, draws them, saves diagnosis.json, the extended calibration.yaml and report.html."""
+    """
+    Result of a diagnosis.
+
+    Prints the findings, draws them, saves diagnosis.json, the extended calibration.yaml and
+    report.html.
+    """
 
     result: DiagnosisResult
     """The diagnosis with all data of a report."""
@@ -36,7 +41,11 @@ class Diagnosed:
 
     @property
     def proposed(self) -> Calibration | None:
-        """The calibration with the formulas proposed for unexplained residuals; None where there are none."""
+        """
+        The calibration with the formulas proposed for unexplained residuals.
+
+        None where there are none.
+        """
         return self.result.proposed
 
     @property
@@ -55,7 +64,11 @@ class Diagnosed:
         return exit_code(self.calibration)
 
     def plot(self, number: int = 1) -> Drawn:
-        """Return the residual against the cause of a finding, before and after; 0, or without findings: residuals over time."""
+        """
+        Return the residual against the cause of a finding, before and after.
+
+        0, or without findings: residuals over time.
+        """
         from imu_calibration.report.diagnosis_page import draw_finding, draw_over_time
 
         if not number or not self.findings:
@@ -71,7 +84,11 @@ class Diagnosed:
         return diagnosis_report(self.result)
 
     def save(self, folder: str | PathLike) -> None:
-        """Write diagnosis.json, report.html, the extended calibration.yaml and, with proposed formulas, extended.yaml into a folder."""
+        """
+        Write diagnosis.json, report.html, the extended calibration.yaml and.
+
+        With proposed formulas, extended.yaml into a folder.
+        """
         files.write_texts(
             folder,
             {
@@ -87,7 +104,11 @@ class Diagnosed:
         )
 
     def save_overlay(self, path: str | PathLike) -> None:
-        """Write measured and simulated signals, residuals, spectra and histograms as MCAP for Foxglove (`overlay_topics`)."""
+        """
+        Write signals, residuals, spectra and histograms as MCAP for Foxglove.
+
+        The signals are measured and simulated ones (`overlay_topics`).
+        """
         from imu_calibration.use_cases.view import mcap_bytes, overlay_topics
 
         diagnosis = self.result.diagnosis
@@ -119,7 +140,8 @@ def diagnose(
     table : path-like or Table, optional
         The reference; without it gravity is.
     choices
-        See `Choices`; the models are the initial models of the diagnosis, by default only bias and matrix.
+        See `Choices`; the models are the initial models of the diagnosis, by default only bias and
+        matrix.
 
     Raises
     ------

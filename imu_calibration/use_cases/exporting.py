@@ -64,7 +64,8 @@ def export_calibration(
     Raises
     ------
     ImuCalibrationError
-        When a file cannot be read or written, the calibration is not fit for correction, or data that the target needs are missing.
+        When a file cannot be read or written, the calibration is not fit for correction, or data
+        that the target needs are missing.
 
     """
     target = find_target(to)

@@ -1,4 +1,8 @@
-"""Inspect: content of the topics of a recording, their faults, and the parameters that they determine; each is read once."""
+"""
+Inspect: content of the topics of a recording, their faults, and the parameters that they determine.
+
+Each is read once.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -42,7 +46,10 @@ class RecordingSummary:
     calibrated: TableResult | ImuCalibrationError | None
     """Result of a calibration on the motions, or the error; None without a table."""
     by_hand: HandResult | ImuCalibrationError | None = None
-    """Result of a calibration by hand, or the error; None with a table, and where a calibration would be wrong."""
+    """
+    Result of a calibration by hand, or the error; None with a table, and where a calibration would
+    be wrong.
+    """
 
     @property
     def refused(self) -> bool:
@@ -51,7 +58,11 @@ class RecordingSummary:
 
     @property
     def exit_code(self) -> int:
-        """1 where a calibration would be wrong, 3 where it may suffer or data are lost or unusable, otherwise 0."""
+        """
+        1 where a calibration would be wrong, 3 where it may suffer, otherwise 0.
+
+        The code is also 3 where data are lost or unusable.
+        """
         # Whether spikes need a warning is decided in the findings.
         dropped = any(set(stream.dropped) - {'spike'} for stream in self.streams.values())
         if self.refused:
@@ -62,7 +73,11 @@ class RecordingSummary:
 
 
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
-    """Return the topics with the requested Imu topic, or with each one of the recording, and each frame_id if one has several."""
+    """
+    Return the topics with the requested Imu topic, or with each one of the recording.
+
+    Each frame_id is returned too if a topic has several.
+    """
     names = (
         [topics.imu]
         if topics.imu is not None
@@ -135,7 +150,11 @@ def _by_hand(source, options, preflight):
 def _watched_by(
     preflight: Preflight,
 ) -> Callable[[GatherStep, Iterable[tuple[int, Source]]], Iterable[SessionData]]:
-    """Return the map step of one recording that shows it to the checks, when it is read for the first time."""
+    """
+    Return the map step of one recording that shows it to the checks.
+
+    The checks see the recording when it is read for the first time.
+    """
 
     def mapper(step, numbered):
         if preflight.streams:

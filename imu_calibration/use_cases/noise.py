@@ -18,7 +18,11 @@ from imu_calibration.use_cases.recordings import Topics, provenance_of, source_o
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedNoise:
-    """Noise figures from a recording: prints them, draws the Allan curves, saves noise.yaml and report.html."""
+    """
+    Noise figures from a recording.
+
+    Prints them, draws the Allan curves, saves noise.yaml and report.html.
+    """
 
     result: NoiseIdentification
     """The identification with all data of a report."""

@@ -1,4 +1,8 @@
-"""The names that a notebook needs, with errors in terms of their arguments; `imu_calibration` offers them."""
+"""
+The names that a notebook needs, with errors in terms of their arguments.
+
+`imu_calibration` offers them.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -93,8 +97,8 @@ def calibrate(
             if there
         ]
         raise InputError(
-            f'calibrate must have either recordings, or the arrays time, force and rate, got {", ".join(names) or "none"}; '
-            'give one or the other'
+            'calibrate must have either recordings, or the arrays time, force and rate, got'
+            f' {", ".join(names) or "none"}; give one or the other'
         )
     if recordings is None:
         recordings = SampleBlock.from_arrays(

@@ -51,7 +51,11 @@ PLAN_START_NS = 1_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class Planned:
-    """A plan: prints its predicted accuracy, draws itself, saves plan.yaml, the trajectory and report.html."""
+    """
+    A plan: prints its predicted accuracy, draws itself, and saves its files.
+
+    It saves plan.yaml, the trajectory and report.html.
+    """
 
     plan: Plan
     """Motions, predicted standard deviations, time and its lower bound."""
@@ -62,7 +66,11 @@ class Planned:
 
     @property
     def exit_code(self) -> int:
-        """0 when every parameter reaches its tolerance and every joint has a range or is declared endless, otherwise 3."""
+        """
+        0 when every parameter reaches its tolerance and every joint is bounded, else 3.
+
+        A joint is bounded when it has a range or is declared endless.
+        """
         return (
             3 if self.plan.missing or (self.table is not None and missing_ranges(self.table)) else 0
         )
@@ -85,7 +93,9 @@ class Planned:
         return plan_report(self.plan, self.provenance)
 
     def plot(self) -> Drawn:
-        """Return the standard deviations against time, in tolerances, as a figure for a notebook."""
+        """
+        Return the standard deviations against time, in tolerances, as a figure for a notebook.
+        """
         from imu_calibration.report.plan_page import draw_progress
 
         return draw_progress(self.plan)
@@ -93,7 +103,11 @@ class Planned:
     def save(
         self, folder: str | PathLike, *, report: bool = True, storage: str = 'sqlite3'
     ) -> None:
-        """Write plan.yaml, of joints trajectory.yaml and the bag `trajectory` with a message per motion, and, when wanted, report.html."""
+        """
+        Write plan.yaml, and trajectory.yaml and the bag `trajectory` for joints.
+
+        The bag has a message per motion, and report.html is written when wanted.
+        """
         from msg_adapters.write import write_trajectories
 
         place, moves_joints = (
@@ -152,25 +166,30 @@ def plan(
     stand : path-like, Table or Arm
         The moving joints, with their limits.
     calibration : path-like or Calibration, optional
-        Prior data: a calibration, or the accumulator (.npz) that a live session on the same joints saved.
+        Prior data: a calibration, or the accumulator (.npz) that a live session on the same joints
+        saved.
     grade : str
         Grade of the IMU, where no noise is given.
     imu_rate : float
         Samples of the IMU per second.
     separate : sequence of str
-        Effects to separate, the one that `calibration` contains first: the plan separates them instead of reaching the tolerances.
+        Effects to separate, the one that `calibration` contains first: the plan separates them
+        instead of reaching the tolerances.
     diagnosis : path-like or mapping, optional
         diagnosis.json or its content, of which the first finding with equivalent effects is used.
     around : mapping, optional
-        Joint -> position, degrees (m where it slides), of every joint: the motion keeps to `reach` about this pose, where it begins.
+        Joint -> position, degrees (m where it slides), of every joint: the motion keeps to `reach`
+        about this pose, where it begins.
     reach : float, optional
         Degrees to either side; prismatic joints do not move.
     longest : float
         Longest duration of a plan that separates effects, s.
     with_bound : bool
-        Whether the lower bound on the time is computed; a plan well above it is searched a second time.
+        Whether the lower bound on the time is computed; a plan well above it is searched a second
+        time.
     choices
-        tolerances, noise, accelerometer_model, gyroscope_model, reference_model, catalogue, gravity: see `Choices`.
+        tolerances, noise, accelerometer_model, gyroscope_model, reference_model, catalogue,
+        gravity: see `Choices`.
 
     Raises
     ------
@@ -195,7 +214,8 @@ def plan(
     if causes:
         if known is None:
             raise InputError(
-                'separation of effects needs the calibration of the diagnosis with the finding, none was given; give it',
+                'separation of effects needs the calibration of the diagnosis with the finding,'
+                ' none was given; give it',
                 key='calibration',
             )
         owners = [(options.catalogue.owner_of(name, table.joint_names), name) for name in causes]
@@ -216,11 +236,13 @@ def plan(
     provenance = {
         'noise': grade if options.noise is None else 'as identified',
         'imu_rate': imu_rate,
-        'known': Path(calibration).name
-        if isinstance(calibration, (str, PathLike))
-        else 'a calibration'
-        if known
-        else 'nothing',
+        'known': (
+            Path(calibration).name
+            if isinstance(calibration, (str, PathLike))
+            else 'a calibration'
+            if known
+            else 'nothing'
+        ),
     }
     provenance |= {'checked': NOT_CHECKED, 'limits': '; '.join(limit_words(table, limits))}
     if warnings := range_warnings(table):
@@ -238,8 +260,9 @@ def _neighbourhood(limits, names, around, reach):
     """Return the limits restricted to `reach` about a pose, and the pose."""
     if reach is None or reach <= 0 or set(around) != set(names):
         raise InputError(
-            f'a neighbourhood must have a reach above 0 and a position of every joint ({", ".join(names)}), got reach {reach} '
-            f'and {", ".join(around) or "no joint"}; give both'
+            'a neighbourhood must have a reach above 0 and a position of every joint'
+            f' ({", ".join(names)}), got reach {reach} and {", ".join(around) or "no joint"}; give'
+            ' both'
         )
     position = np.where(limits.turns, DEG, 1.0) * [around[name] for name in names]
     return limits.reached(position, reach), position
@@ -299,7 +322,9 @@ def by_hand(*, grade: str = 'industrial', imu_rate: float = 100.0, **choices: An
 
 def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, float]]:
     """
-    Return the first class of inseparable effects in a diagnosis, the named one first, and values (SI) of the alternatives.
+    Return the first class of inseparable effects in a diagnosis, and values (SI).
+
+    The named effect is the first one, and the values are of the alternatives.
 
     Raises
     ------
@@ -316,7 +341,8 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
             }
             return (finding['effect'], *finding['indistinguishable_from']), sizes
     raise InputError(
-        'the diagnosis must have a finding with collinear effects, it has none; no effects need to be separated',
+        'the diagnosis must have a finding with collinear effects, it has none; no effects need to'
+        ' be separated',
         code='nothing_to_separate',
     )
 
@@ -329,15 +355,20 @@ def summary(made: Plan) -> list[str]:
             return [f'{head} separate {made.told_apart}']
         return [
             head,
-            f'at their assumed sizes, no motion of these joints in that time separates: {", ".join(made.missing)}',
+            (
+                'at their assumed sizes, no motion of these joints in that time separates:'
+                f' {", ".join(made.missing)}'
+            ),
         ]
     count, met = int(made.wanted.sum()), int(made.wanted.sum()) - len(made.missing)
     lines = [
-        f'{len(made.motions)} {made.noun} in {made.seconds:.0f} s; {met} of {count} parameters are within their tolerance'
+        f'{len(made.motions)} {made.noun} in {made.seconds:.0f} s; {met} of {count} parameters are'
+        ' within their tolerance'
     ]
     if np.isfinite(made.lower_bound_seconds) and made.lower_bound_seconds > 0 and not made.missing:
         lines.append(
-            f'every plan of these motions with the same probability (95 %) needs at least {made.lower_bound_seconds:.0f} s'
+            'every plan of these motions with the same probability (95 %) needs at least'
+            f' {made.lower_bound_seconds:.0f} s'
         )
     if made.missing:
         lines.append(f'outside their tolerance {made.scope}: {", ".join(made.missing)}')

@@ -67,7 +67,11 @@ def open_bag(
     want_joints: bool | str = True,
     want_temperature: bool | str = True,
 ) -> Recording:
-    """Open a recording with the topics that were chosen; the rest as for `msg_adapters.bag.open_recording`."""
+    """
+    Open a recording with the topics that were chosen.
+
+    The rest as for `msg_adapters.bag.open_recording`.
+    """
     return open_recording(
         existing(path),
         **topics.chosen(),
@@ -85,7 +89,11 @@ def read_blocks(
     want_temperature: bool | str,
     quiet: bool,
 ) -> Iterator[SampleBlock]:
-    """Yield the blocks of a recording and report the progress unless `quiet`; a plain function, so that another process can run it."""
+    """
+    Yield the blocks of a recording and report the progress unless `quiet`.
+
+    A plain function, so that another process can run it.
+    """
     recording = open_recording(
         path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature
     )
@@ -115,18 +123,23 @@ def source_of(
     quiet: bool = False,
 ) -> Source:
     """
-    Return a callable, for repeated use, that yields the blocks of a recording; samples in memory are a recording of one block.
+    Return a callable, for repeated use, that yields the blocks of a recording.
 
-    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`; joints are read if `joint_names` is given.
+    Samples in memory are a recording of one block.
+
+    `want_joints` and `want_temperature` as for `msg_adapters.bag.open_recording`; joints are read
+    if `joint_names` is given.
     """
     want_joints = joint_names is not None if want_joints is None else want_joints
     if isinstance(recording, SampleBlock):
         return partial(
             iter,
             (
-                recording
-                if want_joints
-                else SampleBlock(recording.imu, None, recording.temperature),
+                (
+                    recording
+                    if want_joints
+                    else SampleBlock(recording.imu, None, recording.temperature)
+                ),
             ),
         )
     return partial(
@@ -141,7 +154,9 @@ def source_of(
 
 
 def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:
-    """Return names and hashes of recordings and the options for a document: the same in every run."""
+    """
+    Return names and hashes of recordings and the options for a document: the same in every run.
+    """
     return {
         'bags': [
             {'name': name_of(recording), 'sha256': _hash_of(recording)} for recording in recordings
@@ -176,7 +191,11 @@ def temperatures(path: str | PathLike, topics: Topics) -> TemperatureSamples | N
 
 
 def jobs_for(asked: int | None, n_items: int) -> int:
-    """Return the number of processes: as requested, by default one per processor; at most the number of items."""
+    """
+    Return the number of processes: as requested, by default one per processor.
+
+    At most the number of items.
+    """
     if asked is not None and asked < 1:
         raise InputError(
             f'at least one process must work, got {asked}; omit the number to use every processor',
@@ -187,7 +206,9 @@ def jobs_for(asked: int | None, n_items: int) -> int:
 
 def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
     """
-    Return a function like `map` that runs in `jobs` processes and returns a list in the order of the items.
+    Return a function like `map` that runs in `jobs` processes.
+
+    It returns a list in the order of the items.
 
     Parameters
     ----------
@@ -213,7 +234,11 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
 
 @contextmanager
 def _interruptions_blocked():
-    """Keep Ctrl+C, which a terminal sends to all its processes, from those that are started here; this process ends them."""
+    """
+    Keep Ctrl+C, which a terminal sends to all its processes, from those that are started here.
+
+    This process ends them.
+    """
     resource_tracker.ensure_running()  # its start would end the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -223,7 +248,12 @@ def _interruptions_blocked():
 
 
 def _until_sigterm(function, item):
-    """Run in a worker; SIGTERM interrupts the item, so that its temporary files are removed, and otherwise ends the process."""
+    """
+    Run in a worker.
+
+    SIGTERM interrupts the item, so that its temporary files are removed, and otherwise ends the
+    process.
+    """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         return function(item)
@@ -254,7 +284,9 @@ def _in_order(pool, function, items, done):
 
 def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: None) -> Callable:
     """
-    Return a function like `map` that runs on the workers of a dask scheduler; they must see the same paths and have this package.
+    Return a function like `map` that runs on the workers of a dask scheduler.
+
+    They must see the same paths and have this package.
 
     Raises
     ------
@@ -266,7 +298,8 @@ def cluster_mapper(address: str, done: Callable[[Any], object] = lambda item: No
         from dask import distributed
     except ImportError as error:
         raise InputError(
-            'a scheduler needs dask.distributed, which is not installed; install imu_calibration[dask], or omit it',
+            'a scheduler needs dask.distributed, which is not installed; install'
+            ' imu_calibration[dask], or omit it',
             key='scheduler',
         ) from error
 
@@ -299,13 +332,22 @@ class Arm:
     """A robot that carries the IMU; missing entries are read from a recording."""
 
     urdf: str | PathLike | None = None
-    """Robot description (.urdf or .xacro); None: that on the topic /robot_description of the recording."""
+    """
+    Robot description (.urdf or .xacro); None: that on the topic /robot_description of the
+    recording.
+    """
     imu_link: str | None = None
     """Link that carries the IMU; None: the frame of its messages."""
     site: str | PathLike | Mapping[str, Any] | None = None
-    """Entries of a table description other than the joints: file or mapping; its joints may give limits by name."""
+    """
+    Entries of a table description other than the joints: file or mapping; its joints may give
+    limits by name.
+    """
     up: Sequence[float] | None = None
-    """Up in the frame of the root; None: from the site, otherwise from /tf_static of the recording, otherwise z."""
+    """
+    Up in the frame of the root; None: from the site, otherwise from /tf_static of the recording,
+    otherwise z.
+    """
     allow_xacro: bool = False
     """Whether a .xacro file may be expanded, which runs its expressions as Python code."""
 
@@ -328,7 +370,8 @@ def table_of(
     ----------
     stand : path-like, Table or Arm
     recordings : sequence
-        The first one gives the IMU's frame, the attitude of a robot's root, and its description where no file is named.
+        The first one gives the IMU's frame, the attitude of a robot's root, and its description
+        where no file is named.
     topics : Topics
         Topics of the recordings.
     gravity : float, optional
@@ -375,7 +418,8 @@ def _description(arm, bag):
         return files.read_robot_description(arm.urdf, arm.allow_xacro)
     if bag is None:
         raise InputError(
-            'the description of the robot whose link was named must be given, got none; give the file',
+            'the description of the robot whose link was named must be given, got none; give the'
+            ' file',
             key='urdf',
         )
     return description_in(*bag)

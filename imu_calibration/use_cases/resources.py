@@ -1,4 +1,8 @@
-"""Files that are installed with the package, searched relative to the running code: checkout, colcon workspace or pip."""
+"""
+Files that are installed with the package, searched relative to the running code.
+
+Checkout, colcon workspace or pip.
+"""
 
 import os
 import sys
@@ -14,7 +18,8 @@ def share_folder() -> Path:
     Return the folder that holds `config` and `launch`.
 
     The checkout or installation of this module has priority, so that a second
-    installation on the machine cannot replace it; then the sourced workspaces; then the interpreter's prefix.
+    installation on the machine cannot replace it; then the sourced workspaces; then the
+    interpreter's prefix.
 
     Raises
     ------
@@ -26,13 +31,16 @@ def share_folder() -> Path:
         if (folder / 'config').is_dir() and (folder / 'package.xml').is_file():
             return folder
     raise InputError(
-        f'the config files of {PACKAGE} must be installed with it, none found near {__file__}; reinstall the package'
+        f'the config files of {PACKAGE} must be installed with it, none found near {__file__};'
+        ' reinstall the package'
     )
 
 
 def config_file(name: str) -> Path:
     """
-    Return the path of the installed file `name` of the folder config, such as ``'tolerances.yaml'``.
+    Return the path of the installed file `name` of the folder config.
+
+    An example of `name` is ``'tolerances.yaml'``.
 
     Raises
     ------

@@ -1,4 +1,8 @@
-"""Sessions of a simulated IMU on a motion profile or on the motion of a recording, in memory or as a bag with the true parameters."""
+"""
+Sessions of a simulated IMU on a motion profile or on the motion of a recording.
+
+A session is kept in memory or written as a bag with the true parameters.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -51,7 +55,11 @@ class Simulated:
     def save(
         self, path: str | PathLike, *, storage: str = 'sqlite3', compression: str = 'none'
     ) -> None:
-        """Write a rosbag2 folder ('sqlite3' or 'mcap', chunks of an mcap packed by 'zstd' or 'lz4') with truth.yaml and table.yaml."""
+        """
+        Write a rosbag2 folder ('sqlite3' or 'mcap') with truth.yaml and table.yaml.
+
+        The chunks of an mcap are packed by 'zstd' or 'lz4'.
+        """
         from msg_adapters.write import write_session
 
         report(f'writing {Path(path).name}')
@@ -71,7 +79,10 @@ class Simulated:
         files.write_text(Path(path) / 'table.yaml', documents.to_text(self.table.to_mapping()))
 
     def __repr__(self):
-        return f'<Simulated: {self.duration:.0f} s, {len(self.samples.imu)} Imu, {len(self.samples.joints)} JointState>'
+        return (
+            f'<Simulated: {self.duration:.0f} s, {len(self.samples.imu)} Imu,'
+            f' {len(self.samples.joints)} JointState>'
+        )
 
 
 def simulate(
@@ -118,7 +129,8 @@ def simulate(
     temperature : bool
         Whether there is a temperature, which warms up from 25 C; thermal effects bring it too.
     catalogue : Catalogue, path-like or mapping, optional
-        The effects that a random IMU may have, or additions to the package's: a file with `effects`, or {name: definition}.
+        The effects that a random IMU may have, or additions to the package's: a file with
+        `effects`, or {name: definition}.
 
     Raises
     ------
@@ -173,7 +185,9 @@ def replay(
     **choices: Unpack[Choices],
 ) -> Simulated:
     """
-    Simulate a calibrated IMU on the motion of a recording: its joints, stamps, rates, temperature and identified noise.
+    Simulate a calibrated IMU on the motion of a recording.
+
+    Its joints, stamps, rates, temperature and identified noise.
 
     Parameters
     ----------
@@ -191,13 +205,14 @@ def replay(
     Raises
     ------
     InputError
-        When the table is missing or is not that of the calibration, or no sample has a known motion.
+        When the table is missing or is not that of the calibration, or no sample has a known
+        motion.
 
     """
     if table is None:
         raise InputError(
-            'a replay needs the motion of the IMU, no table or arm was given; give one (by hand only the gyroscope '
-            'measures the turns)',
+            'a replay needs the motion of the IMU, no table or arm was given; give one (by hand'
+            ' only the gyroscope measures the turns)',
             key='table',
             code='replay_by_hand',
         )

@@ -47,7 +47,11 @@ BAND = 1.959964
 
 
 def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, Any]:
-    """Return every parameter with tolerance and status; without bands where the uncertainty of the values is unknown."""
+    """
+    Return every parameter with tolerance and status.
+
+    Without bands where the uncertainty of the values is unknown.
+    """
     units = [effect.unit_of(k) for effect in calibration.model.effects for k in range(effect.size)]
     rows: list[dict[str, Any]] = [
         {
@@ -78,7 +82,11 @@ def parameters(calibration: Calibration, tolerances: np.ndarray) -> dict[str, An
 
 
 def residual(result: CalibrationResult) -> dict[str, Any]:
-    """Return the errors of window means before and after, and the expected residual from noise, in the order of time."""
+    """
+    Return the errors of window means before and after, in the order of time.
+
+    The expected residual from noise is returned too.
+    """
     errors = result.window_errors()
     return {
         'windows': [
@@ -96,7 +104,9 @@ def residual(result: CalibrationResult) -> dict[str, Any]:
 
 
 LONGEST_SEGMENT = 1024
-"""Most samples of a segment: a finer resolution than that of a recording of a minute is not useful."""
+"""
+Most samples of a segment: a finer resolution than that of a recording of a minute is not useful.
+"""
 SHORTEST_SEGMENT = 64
 """Windows with fewer samples are left out."""
 
@@ -107,7 +117,8 @@ def residual_spectrum(
     """
     Return (frequency, sensor -> density) of the residuals of the windows with motion among some.
 
-    Welch's method [1]: the power of segments of one length, each about its own mean, averaged over all windows.
+    Welch's method [1]: the power of segments of one length, each about its own mean, averaged over
+    all windows.
 
     Parameters
     ----------
@@ -185,12 +196,15 @@ def foxglove() -> Any:
 
 def mcap_bytes(topics: Iterable[tuple[str, Sequence[tuple[float, Any]]]]) -> bytes:
     """
-    Return an MCAP of topics with their messages; a topic of plain data has the JSON schema of its first message.
+    Return an MCAP of topics with their messages.
+
+    A topic of plain data has the JSON schema of its first message.
 
     Parameters
     ----------
     topics : iterable of (topic, messages)
-        Each message with its log time, s since the first sample; a SceneUpdate, or plain data in SI units.
+        Each message with its log time, s since the first sample; a SceneUpdate, or plain data in SI
+        units.
 
     Raises
     ------
@@ -229,7 +243,11 @@ def _schema(content: Any) -> dict[str, Any]:
 
 
 def scene_of(coverage: Coverage, frame_id: str) -> Any:
-    """Return the sphere as a SceneUpdate: the cells, earlier up directions, the next motion, the arms, the line of text."""
+    """
+    Return the sphere as a SceneUpdate.
+
+    The cells, earlier up directions, the next motion, the arms, the line of text.
+    """
     found = foxglove().messages
 
     def color(rgb):
@@ -280,7 +298,11 @@ def _named(numbers):
 
 
 def _from_x(along):
-    """Return the quaternion (x, y, z, w) of the shortest turn from x to a unit vector; half a turn about z where that is -x."""
+    """
+    Return the quaternion (x, y, z, w) of the shortest turn from x to a unit vector.
+
+    Half a turn about z where that is -x.
+    """
     turn = np.array([0.0, -along[2], along[1], 1 + along[0]])
     return turn / np.linalg.norm(turn) if turn[3] > 1e-9 else np.array([0.0, 0.0, 1.0, 0.0])
 
@@ -291,8 +313,9 @@ def overlay_topics(
     """
     Yield the topics of `mcap_bytes` for a diagnosis.
 
-    ``/overlay/SENSOR/AXIS`` has measured, simulated_before and simulated_after on the segment with the largest difference;
-    ``/residual/SENSOR`` the residual before and after with time, force, rate, angles and temperature; ``/residual_spectrum/SENSOR`` and
+    ``/overlay/SENSOR/AXIS`` has measured, simulated_before and simulated_after on the segment with
+    the largest difference; ``/residual/SENSOR`` the residual before and after with time, force,
+    rate, angles and temperature; ``/residual_spectrum/SENSOR`` and
     ``/residual_histogram/SENSOR/AXIS`` arrays of the same length.
     """
     end = float(traces.time[-1])
@@ -383,11 +406,17 @@ class View:
         """Content that cannot be shown, with the reason."""
         if self.coverage is None:
             return (
-                'a calibration file contains no residuals: only the parameters are shown; give the recording for residuals',
+                (
+                    'a calibration file contains no residuals: only the parameters are shown; give'
+                    ' the recording for residuals'
+                ),
             )
         if SPECTRUM_TOPIC not in self.contents:
             return (
-                'no window with motion was long enough for a spectrum, and by hand there is none: it is left out',
+                (
+                    'no window with motion was long enough for a spectrum, and by hand there is'
+                    ' none: it is left out'
+                ),
             )
         return ()
 
@@ -417,7 +446,9 @@ def view(
     source: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]
 ) -> View:
     """
-    Return the view of a recording, which is calibrated, or of a calibration file: only its parameters.
+    Return the view of a recording, which is calibrated, or of a calibration file.
+
+    Only its parameters.
 
     Parameters
     ----------

@@ -1,4 +1,8 @@
-"""The Allan variance of a stream: what allantools gives, however the stream is cut, with holes, in bounded memory."""
+"""
+The Allan variance of a stream.
+
+What allantools gives, however the stream is cut, with holes, in bounded memory.
+"""
 
 import numpy as np
 import pytest
@@ -46,14 +50,19 @@ def test_deviations_are_those_of_allantools(n):
     )  # theirs leaves out what has a single term
     deviations = np.sqrt(ours.variance()[: len(taus), 0])
     print(
-        f'largest difference from allantools {np.max(np.abs(deviations / theirs - 1)):.1e}, wanted 1e-12'
+        f'largest difference from allantools {np.max(np.abs(deviations / theirs - 1)):.1e}, wanted'
+        ' 1e-12'
     )
     np.testing.assert_allclose(deviations, theirs, rtol=1e-12)
     np.testing.assert_array_equal(ours.terms[: len(taus)], terms)
 
 
 def test_beyond_the_full_overlap_the_rate_is_halved_and_nothing_is_lost(monkeypatch):
-    """At a limit of 64 the halved rates take over early; they agree with allantools on the halved record, and with every position closely."""
+    """
+    At a limit of 64 the halved rates take over early.
+
+    They agree with allantools on the halved record, and with every position closely.
+    """
     allantools = pytest.importorskip(
         'allantools', reason='pip install --no-deps -r constraints/oracles-alone.txt'
     )
@@ -65,7 +74,8 @@ def test_beyond_the_full_overlap_the_rate_is_halved_and_nothing_is_lost(monkeypa
         allantools.oadev(values[:, 0], rate=1.0, data_type='freq', taus=[float(factor)])[1][0]
         for factor in factors[factors <= 4000]
     ]
-    # positions a 32nd of the averaging time apart or less: far below the sampling error of ten per cent
+    # positions a 32nd of the averaging time apart or less: far below the sampling error of ten per
+    # cent
     np.testing.assert_allclose(ours[factors <= 4000], full, rtol=5e-3)
     halved = values[:, 0].reshape(-1, 2).mean(axis=1)
     k = int(np.flatnonzero((factors > 64) & (factors <= 128))[0])
@@ -93,7 +103,11 @@ def test_memory_does_not_grow_with_the_record():
 
 
 def test_stretches_are_not_connected():
-    """Two stretches with different constants give the mean of their own variances, weighted with their terms."""
+    """
+    Two stretches with different constants give the mean of their own variances.
+
+    The mean is weighted with their terms.
+    """
     one, two = record(3000, 5), record(5000, 6) + 100.0
     factors = averaging_factors(3000)
     sums = AllanSums(factors, 1)
@@ -117,7 +131,8 @@ def test_lost_samples_leave_holes_and_no_bias():
     present[5000:5300] = False
     factors = averaging_factors(3000)
     found = in_pieces(np.where(present[:, None], values, np.nan), factors, 2, present)
-    # means of 99 % of the samples: 1 % more variance; the rest is chance, 3 % at a thousand samples per mean
+    # means of 99 % of the samples: 1 % more variance; the rest is chance, 3 % at a thousand samples
+    # per mean
     np.testing.assert_allclose(found.variance()[:, 0] * factors, 1.0, rtol=0.15)
     np.testing.assert_allclose(found.variance()[:8, 0] * factors[:8], 1.0, rtol=0.02)
     assert np.all(found.terms[:2] < 200_000 * 0.985)

@@ -17,7 +17,11 @@ SCALES = ScaleCovariance(FACTORS, PARTS * [LENGTH], PERIOD)
 
 
 def rests(scatter, seed):
-    """Moments of twelve rests of white noise of density 1, the variance of each drawn with a relative standard deviation."""
+    """
+    Moments of twelve rests of white noise of density 1.
+
+    The variance of each rest is drawn with a relative standard deviation.
+    """
     rng = np.random.default_rng(seed)
     sums = AllanSums(FACTORS, 1)
     for level in np.maximum(1.0 + scatter * rng.standard_normal(PARTS), 0.0):
@@ -41,7 +45,11 @@ def test_the_variances_of_the_parts_make_those_of_the_whole():
 
 @pytest.mark.parametrize('scatter', [0.0, 0.1, 0.4])
 def test_the_scatter_between_rests_is_found(scatter):
-    """Twelve rests give a variance to 43 %, forty draws of them to 7 %; chance between rests of 2000 samples is 4 % and must not count."""
+    """
+    Twelve rests give a variance to 43 %, forty draws of them to 7 %.
+
+    Chance between rests of 2000 samples is 4 % and must not count.
+    """
     found = np.array([scatter_of(rests(scatter, seed)) for seed in range(40)])
     assert np.sqrt(np.mean(found**2)) == pytest.approx(scatter, rel=0.2, abs=0.02)
 
@@ -51,7 +59,8 @@ def test_intervals_are_those_of_twelve_rests_not_of_their_samples():
     narrow, wide = (
         np.subtract(*axis.terms['white_noise'].interval[::-1]) for axis in (even, uneven)
     )
-    # the root of a variance that is known to scatter / sqrt(12), four standard deviations from end to end
+    # the root of a variance that is known to scatter / sqrt(12), four standard deviations from end
+    # to end
     assert (
         wide == pytest.approx(4 * 0.5 * uneven.scatter / np.sqrt(PARTS), rel=0.3)
         and narrow < 0.3 * wide

@@ -1,4 +1,8 @@
-"""Noise identified from Allan curves: the covariance between scales, the fit, its intervals, what is left out and taken out."""
+"""
+Noise identified from Allan curves.
+
+The covariance between scales, the fit, its intervals, what is left out and taken out.
+"""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -100,7 +104,11 @@ def test_allan_variances_are_those_of_the_textbook():
 
 @pytest.mark.parametrize('process', ALL, ids=lambda process: process.name)
 def test_the_covariance_between_scales_is_that_of_quadratic_forms(process):
-    """2 tr(A S B S) with the covariance S of the samples; for a process without a variance any S that is right for contrasts will do."""
+    """
+    2 tr(A S B S) with the covariance S of the samples.
+
+    For a process without a variance any S that is right for contrasts will do.
+    """
     n, factors = 120, np.array([1, 2, 3, 8, 21, 50])
     lag = np.subtract.outer(np.arange(n), np.arange(n)) * PERIOD
     samples = mean_covariance(process, lag, PERIOD)
@@ -130,8 +138,9 @@ def test_correlations_of_a_long_record_are_correlations(process):
     """
     No correlation is beyond one, no eigenvalue below zero by much of the ridge.
 
-    Rounding once made correlations of thirty between the shortest averaging times, and lags too far apart eigenvalues of minus the ridge:
-    likelihoods then jumped by ten from one correlation time to the next.
+    Rounding once made correlations of thirty between the shortest averaging times, and lags too far
+    apart eigenvalues of minus the ridge: likelihoods then jumped by ten from one correlation time
+    to the next.
     """
     covariance = scales_of(1_080_000, 0.01).product(process, process)
     sd = np.sqrt(np.diag(covariance))
@@ -224,13 +233,18 @@ def test_ten_minutes_cannot_determine_a_small_random_walk():
     )
     assert term.reason == 'not seen'
     needed = RecordingTimes(PERIOD).needed((WHITE, RANDOM_WALK), np.array([1.0, 0.003**2]), 1)
-    # the walk crosses the noise after N sqrt(3) / K = 580 s; some fifty of these, as a walk of 0.05 needs half an hour
+    # the walk crosses the noise after N sqrt(3) / K = 580 s; some fifty of these, as a walk of 0.05
+    # needs half an hour
     assert needed is not None and 10 * 3600 < needed <= 48 * 3600
     assert RecordingTimes(PERIOD).needed((WHITE, RANDOM_WALK), np.array([1.0, 0.05**2]), 1) <= 3600
 
 
 def test_the_predicted_recording_time_is_what_a_fit_says_of_itself():
-    """The interval of a fit on the average curve of a record of the predicted length just meets the criterion."""
+    """
+    The interval of a fit just meets the criterion.
+
+    The fit is on the average curve of a record of the predicted length.
+    """
     figures = {'white_noise': 1.0, 'random_walk': 0.05}
     length = RecordingTimes(PERIOD).needed((WHITE, RANDOM_WALK), np.array([1.0, 0.05**2]), 1)
     for seconds, status in ((length, DETERMINED), (length / 3, WEAK)):
@@ -240,7 +254,11 @@ def test_the_predicted_recording_time_is_what_a_fit_says_of_itself():
 
 
 def test_a_form_that_explains_the_curve_as_well_makes_a_figure_weak():
-    """At 15 minutes this flicker looks like a walk, or the other way round: whichever is taken, the other is named."""
+    """
+    At 15 minutes this flicker looks like a walk, or the other way round.
+
+    Whichever is taken, the other is named.
+    """
     ambiguous = 0
     for seed in range(3):
         found = identify_axis(
@@ -257,7 +275,11 @@ def test_a_form_that_explains_the_curve_as_well_makes_a_figure_weak():
 
 
 def test_what_the_sensor_filters_is_left_out_at_short_averaging_times():
-    """A first-order low-pass of 0.03 s: fitted from longer times on; at 1 s it still takes 1.5 * 0.03 of the variance."""
+    """
+    A first-order low-pass of 0.03 s: fitted from longer times on.
+
+    At 1 s it still takes 1.5 * 0.03 of the variance.
+    """
     rng, n = np.random.default_rng(4), 180_000
     decay = np.exp(-PERIOD / 0.03)
     found = identify_axis(
@@ -271,7 +293,11 @@ def test_what_the_sensor_filters_is_left_out_at_short_averaging_times():
 
 
 def shaken(seed, *hum, n=20_000):
-    """Moments of white noise of 1 beside sines, pairs of amplitude and Hz, that make humps which no model explains."""
+    """
+    Moments of white noise of 1 together with sines that no model explains.
+
+    The sines are pairs of amplitude and Hz, and they make humps which no model explains.
+    """
     rng, time = np.random.default_rng(seed), np.arange(n) * PERIOD
     sines = sum(
         amplitude * np.sin(2 * np.pi * frequency * time + frequency) for amplitude, frequency in hum
@@ -306,14 +332,22 @@ def test_a_vibration_does_not_hide_the_white_noise(seed):
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
 def test_forms_of_a_curve_that_none_explains_are_told_apart_less(seed):
-    """What a curve departs from every form by is no evidence between them: intervals average over more of them."""
+    """
+    What a curve departs from every form by is no evidence between them.
+
+    Intervals average over more of them.
+    """
     moments = without_finest(shaken(seed, (3.5, 0.25), (6.0, 7.0)), 4)
     counted = [len(choose_form(moments, excess).having('white_noise')[1]) for excess in (90.0, 1.0)]
     assert counted[0] > counted[1]
 
 
 def test_a_correlation_time_that_fits_itself_gives_way_to_a_likelier_one():
-    """Weights made with a time ask for it again; in this record, one of some hundred, that ends at fifteen times the true one."""
+    """
+    Weights made with a time ask for it again.
+
+    In this record, one of some hundred, that ends at fifteen times the true one.
+    """
     rng = np.random.default_rng((20261203, 10800, 3, 1, 4))
     truth = draw_truth('tactical', 'gyroscope', FORMS[rng.integers(len(FORMS))], rng)
     moments = moments_from(truth.draw(1_080_000, 0.01, rng), 0.01)
@@ -331,7 +365,11 @@ def test_a_correlation_time_that_fits_itself_gives_way_to_a_likelier_one():
 
 @pytest.mark.long
 def test_intervals_hold_the_truth_in_95_of_100_and_errors_are_close_to_the_bound():
-    """Forty records of ten minutes; the whole measurement is benchmarks/noise_records.py. Binomial sd 3.4 %."""
+    """
+    Forty records of ten minutes; the whole measurement is benchmarks/noise_records.py.
+
+    Binomial sd 3.4 %.
+    """
     figures = {'white_noise': 1.0, 'random_walk': 0.05}
     inside, errors = {name: [] for name in figures}, []
     for seed in range(40):
@@ -380,7 +418,11 @@ def test_dead_reckoning_scatters_as_predicted():
 
 
 def test_a_fit_without_variance_costs_infinitely_and_is_never_preferred():
-    """Steps as large as the noise left a form without any coefficient: its cost was NaN, and no form remained (IndexError)."""
+    """
+    Steps as large as the noise left a form without any coefficient.
+
+    Its cost was NaN, and no form remained (IndexError).
+    """
     moments = moments_of({'white_noise': 1.0}, 400.0)
     form = fit_form(moments, ())
     empty = replace(form, coefficients=np.zeros(1))

@@ -1,4 +1,8 @@
-"""From a recording to noise.yaml: what is at rest is found, trends are taken out and said, and the verb writes what it promises."""
+"""
+From a recording to noise.yaml.
+
+What is at rest is found, trends are taken out and said, and the verb writes what it promises.
+"""
 
 import tracemalloc
 from dataclasses import replace
@@ -81,7 +85,11 @@ def changed(imu, columns, start, values):
 
 @pytest.fixture(scope='module')
 def quiet():
-    """Twenty minutes at rest, and what is identified from them, of each sensor from its x axis; y and z have the same noise."""
+    """
+    Twenty minutes at rest, and what is identified from them, of each sensor from its x axis.
+
+    Y and z have the same noise.
+    """
     imu, axes = resting(1200.0), []
 
     def identified(moments):
@@ -95,7 +103,11 @@ def quiet():
 
 @pytest.fixture
 def accelerometer_x_only(quiet, monkeypatch):
-    """Identify the first axis only, and return it for each record; the others have the noise of the quiet record."""
+    """
+    Identify the first axis only, and return it for each record.
+
+    The others have the noise of the quiet record.
+    """
     others, found = [], []
 
     def identified(moments):
@@ -317,7 +329,11 @@ def test_the_report_holds_the_plots_and_is_the_same_each_time(quiet):
 
 
 def test_memory_is_that_of_a_shorter_recording():
-    """Four times the length takes hardly more: means of a quarter of a second are kept, samples are not."""
+    """
+    Four times the length takes hardly more.
+
+    Means of a quarter of a second are kept, samples are not.
+    """
     peaks = []
     for seconds in (400.0, 1600.0):
         blocks = [resting(100.0, 9)]
@@ -377,7 +393,11 @@ def test_an_axis_whose_steps_hide_its_noise_is_refused_by_its_name():
 
 
 def hummed(extra, seed, period=0.05, n=24_000):
-    """Twenty minutes at rest with something added to the x axis of the accelerometer, in sizes of its sample noise."""
+    """
+    Twenty minutes at rest with something added to the x axis of the accelerometer.
+
+    It is added in sizes of the accelerometer's sample noise.
+    """
     rng = np.random.default_rng(seed)
     values = SIZES / np.sqrt(period) * rng.standard_normal((n, 6))
     values[:, 0] += extra * SIZES[0] / np.sqrt(period)

@@ -1,4 +1,8 @@
-"""Noise that was measured apart, where it is used: bias processes of the windows, the reports, the covariances of corrected readings."""
+"""
+Noise that was measured apart, where it is used.
+
+Bias processes of the windows, the reports, the covariances of corrected readings.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +72,11 @@ def noise_of(force, rate, sampling=100.0):
     'name, process', [('bias_instability', FLICKER), ('random_walk', RANDOM_WALK)]
 )
 def test_sums_of_processes_have_the_allan_variance_of_the_noise(name, process):
-    """Within 7 % in variance from some windows to sessions: flicker has no faster parts and ripples, a walk forgets after hours."""
+    """
+    Within 7 % in variance from some windows to sessions.
+
+    Flicker has no faster parts and ripples, a walk forgets after hours.
+    """
     figures = noise_of({'white_noise': 1e-3, name: 0.7}, {'white_noise': 1e-5})
     found, tau = bias_processes(figures), np.geomspace(50.0, 1500.0, 12)
     summed = sum(
@@ -109,7 +117,11 @@ def offsets_of(rows, white, times, sessions, known):
 
 
 def test_known_processes_are_taken_and_the_rest_is_not_blamed_on_the_bias():
-    """Twenty windows of known flicker: no offset to speak of, and no other process than the known ones."""
+    """
+    Twenty windows of known flicker.
+
+    No offset to speak of, and no other process than the known ones.
+    """
     known = bias_processes(
         noise_of({'white_noise': 1e-5, 'bias_instability': 1e-3}, {'white_noise': 1e-5})
     )['accelerometer']
@@ -219,7 +231,11 @@ def test_a_noise_file_that_is_none_is_refused_with_its_name(tmp_path, capsys):
 
 
 def test_readings_carry_the_measured_noise_at_their_own_rate(noise_file):
-    """Recorded at 100 Hz, used at 500 Hz: five times the variance, offline and, once the rate is known, live."""
+    """
+    Recorded at 100 Hz, used at 500 Hz.
+
+    Five times the variance, offline and, once the rate is known, live.
+    """
     plain = random_calibration(2, ())
     known = with_measured_noise(
         replace(plain, covariance=np.zeros_like(plain.covariance)), files.read_noise(noise_file)
@@ -245,7 +261,11 @@ def test_readings_carry_the_measured_noise_at_their_own_rate(noise_file):
 
 
 def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
-    """Twice the noise is four times the variance, beside how far the angular acceleration is off at this motion."""
+    """
+    Twice the noise is four times the variance.
+
+    To this is added how far the angular acceleration is off at this motion.
+    """
     twice, truth = tmp_path / 'twice.yaml', BAG / 'truth.yaml'
     twice.write_text(noise_to_text(noise_of({'white_noise': 4e-4}, {'white_noise': 2e-5})))
     text, of_bags, of_nodes = truth.read_text(), [], []
@@ -289,7 +309,11 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
 
 
 def test_the_noise_becomes_metres():
-    """White noise of the accelerometer alone: N sqrt(t^3 / 3 + t^4 / (4 T)) with the bias from T = 60 s."""
+    """
+    White noise of the accelerometer alone.
+
+    N sqrt(t^3 / 3 + t^4 / (4 T)) with the bias from T = 60 s.
+    """
     figures = noise_of({'white_noise': 2e-3}, {'white_noise': 1e-12})
     for seconds, shares in position_budget(figures):
         expected = 2e-3 * np.sqrt(seconds**3 / 3 + seconds**4 / 4 / 60.0)

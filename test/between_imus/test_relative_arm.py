@@ -1,4 +1,8 @@
-"""Relative arm of two IMUs: the windows' identities, exact recovery, honest sd, what is refused, and two real boards."""
+"""
+Relative arm of two IMUs.
+
+The windows' identities, exact recovery, honest sd, what is refused, and two real boards.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +23,11 @@ AXES = np.array([[4.1, 0.9], [3.6, 1.3], [3.9, 0.7]])
 
 
 def motion(time, rng, axes=(1, 1, 1), size=15.0):
-    """Rate and its exact derivative: for each axis a fast twist and a slow one, and the force at A, which may be anything."""
+    """
+    Rate and its exact derivative.
+
+    For each axis a fast twist and a slow one, and the force at A, which may be anything.
+    """
     phase = rng.uniform(0, 2 * np.pi, (3, 2))
     rate, alpha = np.zeros((len(time), 3)), np.zeros((len(time), 3))
     for axis in range(3):
@@ -45,7 +53,11 @@ def pair(
     limit=None,
     axes=(1, 1, 1),
 ):
-    """Two IMUs on one body, twisted; B is turned by the rotation vector `turn` and its stamps are `late`."""
+    """
+    Two IMUs on one body, twisted.
+
+    B is turned by the rotation vector `turn` and its stamps are `late`.
+    """
     rng = np.random.default_rng(seed)
     phases = rng.integers(2**31)
     mat_ab = Rotation.from_rotvec(turn).as_matrix()
@@ -99,7 +111,8 @@ def test_exact_where_a_central_difference_makes_the_arm_too_long():
     imu_a, imu_b, _ = pair(2)
     found = estimate_arm(imu_a, imu_b)
     np.testing.assert_allclose(found.arm, ARM, atol=2e-5)
-    # sin(x)/x at 4 Hz and 16 ms is 0.973: the tangential half of the equation is that much too small
+    # sin(x)/x at 4 Hz and 16 ms is 0.973: the tangential half of the equation is that much too
+    # small
     assert 1.01 < np.linalg.norm(naive_arm(imu_a, imu_b)) / np.linalg.norm(ARM) < 1.05
 
 
@@ -154,7 +167,9 @@ def test_a_gyroscope_that_lags_its_accelerometer_is_seen_and_does_no_harm():
 
 
 def test_clipped_stretches_are_left_out():
-    """Half of the clipped samples kept (one sign only) would make the arm several percent too long."""
+    """
+    Half of the clipped samples kept (one sign only) would make the arm several percent too long.
+    """
     imu_a, imu_b, _ = pair(5, limit=16.0)
     assert np.mean(clipped(imu_a.rate_s)) > 0.1
     found = estimate_arm(imu_a, imu_b)
@@ -173,7 +188,11 @@ def test_clipping_needs_the_same_extreme_again_and_again():
 @pytest.mark.long
 @pytest.mark.slow
 def test_sd_are_honest():
-    """z scores of 40 seeds x 3 axes: their mean square scatters by 0.13 around 1, more for the 15 stretches that each sd comes from."""
+    """
+    z scores of 40 seeds x 3 axes.
+
+    Their mean square scatters by 0.13 around 1, more for the 15 stretches that each sd comes from.
+    """
     scores = []
     for seed in range(40):
         imu_a, imu_b, _ = pair(100 + seed, force_sd=0.5, rate_sd=0.02, duration=30.0)
@@ -183,7 +202,8 @@ def test_sd_are_honest():
             found.diagnostics['calibration_sd'] > np.zeros(3)
         )
     print(
-        f'mean square z {np.mean(np.square(scores)):.2f}, 95 % intervals hold {100 * np.mean(np.abs(scores) < 1.96):.1f} %'
+        f'mean square z {np.mean(np.square(scores)):.2f}, 95 % intervals hold'
+        f' {100 * np.mean(np.abs(scores) < 1.96):.1f} %'
     )
     assert (
         0.75 < np.mean(np.square(scores)) < 1.5
@@ -192,7 +212,11 @@ def test_sd_are_honest():
 
 @pytest.mark.slow
 def test_noise_of_the_gyroscopes_does_not_shorten_the_arm():
-    """Errors in variables: at this noise least squares on the same windows without the correction is some 3 % short."""
+    """
+    Errors in variables.
+
+    At this noise least squares on the same windows without the correction is some 3 % short.
+    """
     arms, attenuation = [], []
     for seed in range(6):
         imu_a, imu_b, _ = pair(200 + seed, axes=(0.1, 0.1, 0.1), rate_sd=0.3, force_sd=0.5)
@@ -226,18 +250,25 @@ PAIRS = ((1, 3), (1, 7), (3, 7))
 @pytest.mark.real_data
 def test_boards_of_several_imus(recordings):
     """
-    Three of four IMUs in pairs (`make validate` has all): within 1 mm of the board's design and 0.5 mm of itself in the other recording, per axis.
+    Three of four IMUs in pairs (`make validate` has all).
 
-    The sd reported is 0.08-0.16 mm per axis; the design does not say where in the package the sensitive points are.
+    Within 1 mm of the board's design and 0.5 mm of itself in the other recording, per axis.
+
+    The sd reported is 0.08-0.16 mm per axis; the design does not say where in the package the
+    sensitive points are.
     """
     from msg_adapters.bag import open_recording
 
     arms, sds, errors = {}, {}, {}
     for name in ('array_2', 'array_5'):
         imus = {
-            k: read_by_hand(
-                open_recording(recordings / name, f'/imu_{k}/data_raw', want_joints=False).blocks()
-            ).imu
+            k: (
+                read_by_hand(
+                    open_recording(
+                        recordings / name, f'/imu_{k}/data_raw', want_joints=False
+                    ).blocks()
+                ).imu
+            )
             for k in BOARD_MM
         }
         for a, b in PAIRS:
@@ -246,15 +277,17 @@ def test_boards_of_several_imus(recordings):
             arms[key], sds[key] = 1e3 * found.arm, 1e3 * found.arm_sd
             errors[key] = arms[key] - (np.array(BOARD_MM[b]) - BOARD_MM[a])
             print(
-                f'{name} {a}-{b}: error {np.round(errors[key], 2)} mm, sd {np.round(sds[key], 2)}, '
-                f'{found.diagnostics["signal_rms"]:.1f} -> {found.diagnostics["residual_rms"]:.1f} m/s^2'
+                f'{name} {a}-{b}: error {np.round(errors[key], 2)} mm, sd {np.round(sds[key], 2)},'
+                f' {found.diagnostics["signal_rms"]:.1f} -> {found.diagnostics["residual_rms"]:.1f}'
+                ' m/s^2'
             )
     apart = np.array([arms['array_5', a, b] - arms['array_2', a, b] for a, b in PAIRS])
     both = np.array([np.hypot(sds['array_5', a, b], sds['array_2', a, b]) for a, b in PAIRS])
     print('between the recordings, mm:', np.round(apart, 2).tolist())
     print(
-        f'largest error {np.max(np.abs(list(errors.values()))):.2f} mm, largest difference {np.max(np.abs(apart)):.2f} mm, '
-        f'mean square of difference over sd {np.mean((apart / both) ** 2):.2f}'
+        f'largest error {np.max(np.abs(list(errors.values()))):.2f} mm, largest difference'
+        f' {np.max(np.abs(apart)):.2f} mm, mean square of difference over sd'
+        f' {np.mean((apart / both) ** 2):.2f}'
     )
     assert np.max(np.abs(list(errors.values()))) < 0.5
     assert np.max(np.abs(apart)) < 0.35

@@ -1,4 +1,9 @@
-"""One function applies a calibration: `check` reports the error of the compensated bag, and effects that it cannot undo are applied as a constant."""
+"""
+One function applies a calibration.
+
+`check` reports the error of the compensated bag, and effects that it cannot undo are applied as a
+constant.
+"""
 
 from dataclasses import replace
 
@@ -51,7 +56,11 @@ RATES = {'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
 def spoiled(calibration, seed=3):
-    """Return a calibration with values that are off by a few per mille, so that the errors after compensation are no noise alone."""
+    """
+    Return a calibration with values that are off by a few per mille.
+
+    So that the errors after compensation are no noise alone.
+    """
     rng = np.random.default_rng(seed)
     return replace(
         calibration,
@@ -130,7 +139,11 @@ def test_the_proof_from_statistics_of_windows_differs_from_that_of_readings_by_t
 
 
 def drifting(size=0.5 * DEG, time_constant=35.0):
-    """Return (samples, table, bias at the end, bias at the start, duration in s) of a session whose gyroscope bias drifts by `size` on each axis."""
+    """
+    Return a session with a gyroscope bias that drifts by `size` on each axis.
+
+    It is (samples, table, bias at the end, bias at the start, duration in s).
+    """
     session = imu.simulate('random_short', seed=7, imu_rate=50.0)
     time = 1e-9 * (session.samples.imu.stamp_ns - session.samples.imu.stamp_ns[0])
     course = (
@@ -217,7 +230,11 @@ def model_output(calibration, time):
 
 
 def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
-    """The bias contains its mean; without that the applied bias is off by the mean, here ten times the scatter about it."""
+    """
+    The bias contains its mean.
+
+    Without that the applied bias is off by the mean, here ten times the scatter about it.
+    """
     effect = term(
         'by_angle',
         sensor='gyroscope',

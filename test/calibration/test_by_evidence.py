@@ -1,4 +1,8 @@
-"""One mind for two verbs: what a recording demands is in the model of `calibrate`, as `diagnose` finds it, and nothing else."""
+"""
+One mind for two verbs.
+
+What a recording demands is in the model of `calibrate`, as `diagnose` finds it, and nothing else.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -88,7 +92,11 @@ def test_a_clean_session_adds_nothing():
 
 
 def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations():
-    """A g-sensitivity that comes in the middle of the session: the halves disagree, the model stays, its parameters are less certain."""
+    """
+    A g-sensitivity that comes in the middle of the session.
+
+    The halves disagree, the model stays, its parameters are less certain.
+    """
     windows, rng = calibrated(make_pair(None, 11).first).windows, np.random.default_rng(5)
     model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'), joint_names=NAMES)
 
@@ -133,7 +141,11 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
 
 
 def test_windows_for_the_search_are_spread_and_bounded():
-    """Of a long session every so many-th window of each kind is kept, moving ones and rests alike; of a short one all."""
+    """
+    Of a long session every so many-th window of each kind is kept, moving ones and rests alike.
+
+    Of a short one all.
+    """
     windows = calibrated(make_pair(None, 11).first).windows
     every = DecimatedWindows()
     for window in windows:
@@ -148,7 +160,11 @@ def test_windows_for_the_search_are_spread_and_bounded():
 
 
 def test_a_delay_and_a_lag_are_judged_where_each_is_as_large_as_it_is(late):
-    """Whichever a search met first, the delay that the world holds wins, and the lag that a fit takes for it is as large."""
+    """
+    Whichever a search met first, the delay that the world holds wins.
+
+    The lag that a fit uses in its place is as large.
+    """
     windows, table = calibrated(late[0]).windows, late[1]
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
     used = [window for window in windows if window.kind != 'unused']
@@ -302,7 +318,11 @@ def test_an_effect_that_is_removed_as_faint_leaves_an_unexplained_residual(monke
 
 
 def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
-    """Three quarters of a response to the cube of a force look like one to the force: with a formula for the cube that name is in no model."""
+    """
+    Three quarters of a response to the cube of a force look like one to the force.
+
+    With a formula for the cube that name is in no model.
+    """
     monkeypatch.setattr(
         by_evidence, 'stands_out', lambda *some: True
     )  # another guard, which sees to it here too
@@ -314,7 +334,11 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
 
 
 def test_a_bias_is_not_known_better_than_windows_agree_on_it():
-    """An offset after the outer joint turned forwards: poses of each sense agree so well that their mean passed for sure, ten sd from the truth."""
+    """
+    An offset after the outer joint turned forwards.
+
+    Poses of each sense agree so well that their mean passed for sure, ten sd from the truth.
+    """
     cause = Beyond('backlash', 2)
     session = make_session(2, None, 'realistic', cause=cause)
     calibration = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
@@ -335,7 +359,11 @@ def test_a_bias_is_not_known_better_than_windows_agree_on_it():
 
 
 def test_what_a_rest_may_move_biases_by():
-    """Of the axes that carry it, by the scatter of the means beyond noise; of a rest that is none, nothing."""
+    """
+    Of the axes that carry it, by the scatter of the means beyond noise.
+
+    Of a rest that is none, nothing.
+    """
     model, noise = SensorModel(), np.full((400, 3), 3.0)
     residual = np.outer(np.where(np.arange(400) % 2, 5.0, -5.0), [1.0, 1.0, 0.1])
     rest = Unexplained(True, 4.0, 9.0, None, 0.0, residual, noise, axes=('y',))

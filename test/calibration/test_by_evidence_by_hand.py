@@ -1,4 +1,8 @@
-"""By hand too, what the recording demands is in the model of `calibrate`, as `diagnose` finds it, and nothing else."""
+"""
+By hand too, what the recording demands is in the model of `calibrate`.
+
+As `diagnose` finds it, and nothing else.
+"""
 
 import numpy as np
 import pytest
@@ -73,7 +77,11 @@ def test_live_it_is_in_the_model_as_well(bent, asked):
 
 
 def test_what_only_one_half_shows_is_left_out_and_widens():
-    """What goes with the square of the rate grows threefold after the middle: something has changed, and it is no property of the sensor."""
+    """
+    What goes with the square of the rate grows threefold after the middle.
+
+    Something has changed, and it is no property of the sensor.
+    """
 
     def spoil(force, rate, time, pose):
         return NOTHING, HIDDEN[QUADRATIC](force, rate, time, pose)[1] * (

@@ -1,4 +1,6 @@
-"""``imu_calibration check`` without a table: gravity at rest, rates at rest, and turns between poses."""
+"""
+``imu_calibration check`` without a table: gravity at rest, rates at rest, and turns between poses.
+"""
 
 from dataclasses import replace
 
@@ -62,7 +64,9 @@ def test_a_file_of_another_imu_does_not_help(calibrated):
 
 
 def test_turns_alone_tell_a_wrong_scale_of_the_gyroscope(second, calibrated):
-    """At rest nothing is the matter; the angle after a turn of two radians errs by five per cent."""
+    """
+    At rest nothing is the matter; the angle after a turn of two radians errs by five per cent.
+    """
     bias = calibrated.value('gyroscope', 'bias')
     wrong = replace(second, rate_s=bias + 1.05 * (second.rate_s - bias))
     right, found = (

@@ -1,4 +1,8 @@
-"""The picture of a session: worth by information, not by visits; the arrow leads to what helps; a person who follows only the picture gets there."""
+"""
+The picture of a session: worth by information, not by visits; the arrow leads to what helps.
+
+A person who follows only the picture gets there.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -182,7 +186,9 @@ def _sd_after(information, prior):
 
 
 def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
-    """What they would add to the information is added, one after the other; the first is the next one."""
+    """
+    What they would add to the information is added, one after the other; the first is the next one.
+    """
     from imu_calibration.estimation.observability import added_information
     from imu_calibration.estimation.weighted_system import make_prior
 
@@ -272,7 +278,11 @@ def test_when_all_is_done_every_cell_is_green_and_the_text_says_so():
 
 
 def test_the_configuration_of_rviz_shows_the_topic_as_it_is_published():
-    """By the names that rviz_default_plugins and rviz_common declare (plugins_description.xml of both)."""
+    """
+    By the names that rviz_default_plugins and rviz_common declare.
+
+    They are in plugins_description.xml of both.
+    """
     import yaml
 
     known = {
@@ -306,7 +316,11 @@ def test_the_configuration_of_rviz_shows_the_topic_as_it_is_published():
 
 
 def test_the_layout_for_foxglove_shows_picture_parameters_and_residuals():
-    """As the layout classes of foxglove-sdk 0.30 write it; the topics are those that the node publishes."""
+    """
+    As the layout classes of foxglove-sdk 0.30 write it.
+
+    The topics are those that the node publishes.
+    """
     import json
 
     text = (ROOT / 'config/coverage.foxglove.json').read_text()

@@ -1,4 +1,8 @@
-"""Diagnosis: hidden effects are found, empty sessions stay empty, stories are refused, and what is handed back holds together."""
+"""
+Diagnosis: hidden effects are found, and empty sessions remain empty.
+
+Stories are refused, and everything that is handed back holds together.
+"""
 
 import json
 from dataclasses import asdict, replace
@@ -141,7 +145,12 @@ def test_document_holds_what_the_contract_asks_for(sizes):
 
 @pytest.mark.long
 def test_a_bias_that_follows_the_thermometer_is_named_beside_a_wander_and_a_wander_is_noise():
-    """Fifteen mm/s^2 over eight kelvins beside a wander of three times the data sheet's size in 15 s, which learnt from the drift itself hid it; the wander alone."""
+    """
+    Fifteen mm/s^2 over eight kelvins in addition to a wander, and the wander by itself.
+
+    The wander is three times the data sheet's size in 15 s, and learnt from the drift itself it hid
+    the drift.
+    """
     for hidden, names in (
         ({'accel_thermal_bias': np.array([2.0e-3, -1.5e-3, 1.2e-3])}, {'accel_thermal_bias'}),
         (None, set()),
@@ -171,9 +180,11 @@ def test_what_locked_windows_show_moves_the_gain_and_nothing_else(sizes):
         for kind in np.unique(kinds)
     ]
     windows = [
-        replace(w, force_s=w.force_s + 10 * w.noise_sd[0], rate_s=w.rate_s + 10 * w.noise_sd[1])
-        if w in struck
-        else w
+        (
+            replace(w, force_s=w.force_s + 10 * w.noise_sd[0], rate_s=w.rate_s + 10 * w.noise_sd[1])
+            if w in struck
+            else w
+        )
         for w in used
     ]
     found, other = (investigate(some, recording.table, recording.model) for some in (used, windows))
@@ -248,7 +259,11 @@ def test_falls_of_the_loss_are_chi_square_where_nothing_is_hidden(sizes):
 
 
 def test_the_gain_is_that_of_corrected_readings(sizes):
-    """Two calibrations without the locked windows, applied to these, relative to the table, to 1e-9; the model's residual differs by the scale factors."""
+    """
+    Two calibrations without the locked windows, applied to these, relative to the table, to 1e-9.
+
+    The model's residual differs by the scale factors.
+    """
     recording, diagnosis = seek('accel_quadratic', sizes)
     found, rms = inquire(recording.windows, recording.table, recording.model), []
     for chosen in ([], found.named):

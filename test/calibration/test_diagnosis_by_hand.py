@@ -1,4 +1,8 @@
-"""Diagnosis without a table: causes hidden in recordings by hand by their physics, and recordings that hide nothing."""
+"""
+Diagnosis without a table.
+
+Causes hidden in recordings by hand by their physics, and recordings that hide nothing.
+"""
 
 import json
 from dataclasses import replace
@@ -62,7 +66,10 @@ HIDDEN = {
         np.outer(-np.expm1(-t / 30), [0.3 * DEG, -0.2 * DEG, 0.25 * DEG]),
     ),
 }
-"""What each cause adds to the accelerometer and to the gyroscope, from the true force, rate, time and number of the pose."""
+"""
+What each cause adds to the accelerometer and to the gyroscope, from the true force, rate, time and
+number of the pose.
+"""
 
 
 def stops(force, rate, time, pose):
@@ -117,7 +124,11 @@ def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
 
 
 def test_the_attitudes_at_which_a_rest_appears_are_told():
-    """A gyroscope whose bias is another one while y is level: no effect of the catalogue; beside a bias of every stop no place is told."""
+    """
+    A gyroscope whose bias is another one while y is level: no effect of the catalogue.
+
+    Beside a bias of every stop no place is told.
+    """
 
     def spoil(f, w, t, k):
         return NOTHING, np.outer(np.abs(f[:, 1]) < 3.0, [0.0, 0.3 * DEG, 0.0])
@@ -155,7 +166,11 @@ def test_the_earth_turns_about_the_vertical_and_is_no_finding():
 
 
 def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
-    """Turns about (1, 1, 1) alone: a scale error along it lies in elements that are all held, and products of rates look like it."""
+    """
+    Turns about (1, 1, 1) alone.
+
+    A scale error along it lies in elements that are all held, and products of rates look like it.
+    """
     profile = make_profile('avrutov_111')
     table = Table.from_mapping(profile.table)
     model = SensorModel(joint_names=table.joint_names)
@@ -170,7 +185,11 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
 
 
 def test_a_place_among_few_poses_is_paid_for(monkeypatch):
-    """Any range of noise is the likeliest of many: its chance counts them all; one of 20 recordings is expected."""
+    """
+    Any range of noise is the likeliest of many: its chance counts them all.
+
+    One of 20 recordings is expected.
+    """
     monkeypatch.setattr(regimes, 'MOST_OF_IT', 0.0)
     monkeypatch.setattr(regimes, 'SURE', 0.0)
     poses = SimpleNamespace(time=10.0 * np.arange(24), temperature_c=None)
@@ -191,7 +210,11 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
 
 
 def test_the_gain_is_the_error_of_corrected_readings_in_held_out_poses(responding):
-    """At rest: rates inverted by the model of the estimate, less that of the Earth about the vertical; each side from the other poses."""
+    """
+    At rest: rates inverted by the model of the estimate, less that of the Earth about the vertical.
+
+    Each side from the other poses.
+    """
     found, gain = responding.search, responding.diagnosis.findings[0].gain
     poses, squares = found.baseline.poses, [0.0, 0.0]
     for out, named, smaller in found.held_out:
@@ -215,7 +238,11 @@ def test_the_gain_is_the_error_of_corrected_readings_in_held_out_poses(respondin
 
 
 def test_the_variance_of_a_long_turn_includes_that_of_its_bias():
-    """Turns of 12 s between rests of 1 s: residuals have the stated variance, less the share of the nine fitted parameters."""
+    """
+    Turns of 12 s between rests of 1 s.
+
+    Residuals have the stated variance, less the share of the nine fitted parameters.
+    """
     ratios = []
     for seed in (21510, 21511):
         imu, ranges, _ = simulate(seed, n_poses=24, still=1.0, duration=12.0)
@@ -235,7 +262,11 @@ def test_sizes_agree_with_what_was_hidden(responding):
 
 
 def test_the_turns_tell_apart_what_is_one_to_the_norm():
-    """a_y a_z in x, a_x a_z in y and a_x a_y in z change the norm alike; the directions that the gyroscope carries along do not."""
+    """
+    a_y a_z in x, a_x a_z in y and a_x a_y in z change the norm alike.
+
+    The directions that the gyroscope carries along do not.
+    """
 
     def spoil(f, w, t, k):
         return 15 * MG / 9.8**2 * np.stack([f[:, 1] * f[:, 2], 0 * t, 0 * t], axis=1), NOTHING
@@ -259,7 +290,11 @@ def test_the_turns_tell_apart_what_is_one_to_the_norm():
 
 @pytest.mark.long
 def test_nothing_hidden_nothing_found():
-    """Poses and biases that scatter from pose to pose are no effect: no finding in five recordings (none in 24 during development)."""
+    """
+    Poses and biases that scatter from pose to pose are no effect.
+
+    No finding in five recordings (none in 24 during development).
+    """
     named = [
         [
             f.effect
@@ -279,7 +314,9 @@ def test_a_cause_that_no_catalogue_holds_is_unexplained():
 
 
 def test_what_turns_leave_is_an_angle_per_turn():
-    """A rate that comes only while it turns, another one in each turn: 0.6 deg/s per axis for 1.6 s."""
+    """
+    A rate that comes only while it turns, another one in each turn: 0.6 deg/s per axis for 1.6 s.
+    """
 
     def slips(force, rate, time, pose):
         offsets = np.random.default_rng(98).normal(0, 0.6 * DEG, (pose.max() + 1, 3))
@@ -323,7 +360,11 @@ def test_too_few_poses_are_refused_with_their_number():
 @pytest.mark.long
 @pytest.mark.real_data
 def test_xsens_counts_tells_no_stories(recordings):
-    """The accelerometer scatters beyond its noise and no effect claims it; the gyroscope's answer to gravity is found and predicts."""
+    """
+    The accelerometer scatters beyond its noise and no effect claims it.
+
+    The gyroscope's answer to gravity is found and predicts.
+    """
     from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_without_table
     from imu_calibration.core.samples import NominalScaling
     from imu_calibration.references.options import CalibrationOptions
@@ -338,8 +379,9 @@ def test_xsens_counts_tells_no_stories(recordings):
     gain = found.findings[0].gain
     rest = found.unexplained['accelerometer']
     print(
-        f'xsens_counts: g-sensitivity lowers held-out rates by {100 * gain.reduction:.0f} % (95 %: {100 * gain.ci95[0]:.0f} to '
-        f'{100 * gain.ci95[1]:.0f} %); accelerometer unexplained {1e3 * rest.rms:.2f} mm/s^2 rms, {rest.sigma:.0f} sd beyond noise'
+        f'xsens_counts: g-sensitivity lowers held-out rates by {100 * gain.reduction:.0f} % (95 %:'
+        f' {100 * gain.ci95[0]:.0f} to {100 * gain.ci95[1]:.0f} %); accelerometer unexplained'
+        f' {1e3 * rest.rms:.2f} mm/s^2 rms, {rest.sigma:.0f} sd beyond noise'
     )
     assert gain.ci95[0] > 0.5
     assert rest.significant and 5e-4 < rest.rms < 2e-3

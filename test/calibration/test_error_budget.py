@@ -1,4 +1,8 @@
-"""The error budget: what it predicts is what happens when the same recording is calibrated against a wrong reference."""
+"""
+The error budget.
+
+What it predicts is what happens when the same recording is calibrated against a wrong reference.
+"""
 
 from dataclasses import replace
 from functools import partial

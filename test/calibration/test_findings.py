@@ -1,4 +1,8 @@
-"""A chosen effect as a finding: the same words, mates and candidates whether the search ran on a table or by hand."""
+"""
+A chosen effect as a finding.
+
+The same words, mates and candidates whether the search ran on a table or by hand.
+"""
 
 from dataclasses import dataclass
 
@@ -33,7 +37,11 @@ GAIN = Gain('accelerometer', 'samples', 2.0, 1.0, (0.4, 0.6), 5)
 
 @dataclass
 class Search:
-    """What a search says of three questions: the mate would do in the place of both findings, a little better in the second's."""
+    """
+    What a search says of three questions.
+
+    The mate would do in the place of both findings, a little better in the second's.
+    """
 
     questions: tuple = (FIRST, SECOND, MATE, OTHER)
 
@@ -99,7 +107,8 @@ def test_a_finding_names_its_own_mates_and_the_motion_against_the_best_of_them(s
     assert [f.indistinguishable_from for f in made] == [(MATE.name,), (MATE.name, OTHER.name)]
     assert asked == [(FIRST, MATE), (SECOND, MATE)]
     assert made[1].heldout_gain == 30.0 and made[1].separating_motion == 'turn it over'
-    # MATE is parameter 2 beside SECOND (1) in the place of FIRST, and beside FIRST (0) in that of SECOND
+    # MATE is parameter 2 beside SECOND (1) in the place of FIRST, and beside FIRST (0) in that of
+    # SECOND
     assert [f.sizes_of_mates[MATE.name] for f in made] == [
         {'accelerometer.accel_scale_asymmetry.x': (size, '1')} for size in (23.0, 22.0)
     ]
@@ -117,7 +126,11 @@ def test_what_is_not_named_for_its_windows_disagree_is_not_said_to_leave_the_res
 
 
 def test_what_explains_much_but_leaves_most_is_said():
-    """An effect that explains thousands of nats is not passed over in silence because it may not be named."""
+    """
+    An effect that explains thousands of nats is not passed over in silence.
+
+    This holds also when the effect may not be named.
+    """
     from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate
     from imu_calibration.calibration.diagnosis.diagnosis_workflow import nothing_named
 
@@ -136,7 +149,11 @@ def test_what_explains_much_but_leaves_most_is_said():
 
 
 class LagsAndDelay(forward.Evidence):
-    """A delay is a lag of each sensor: two of the three cost the same but for rounding; what is better makes a lag negative."""
+    """
+    A delay is a lag of each sensor: two of the three cost the same but for rounding.
+
+    What is better makes a lag negative.
+    """
 
     def __init__(self, better=0.0):
         super().__init__(

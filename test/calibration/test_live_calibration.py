@@ -1,4 +1,6 @@
-"""The live answer is the offline answer; what is saved comes back; memory stays bounded. No ROS here."""
+"""
+The live answer is the offline answer; what is saved comes back; memory stays bounded. No ROS here.
+"""
 
 from dataclasses import replace
 
@@ -95,7 +97,9 @@ def run(live, *streams, seed=0):
 
 
 def assert_same(a, b, share=SD):
-    """Assert that two calibrations agree to a share of their standard deviations, status by status."""
+    """
+    Assert that two calibrations agree to a share of their standard deviations, status by status.
+    """
     assert a.param_names == b.param_names and a.status == b.status
     assert np.max(np.abs(a.values - b.values) / b.sd) < share
     np.testing.assert_allclose(a.sd, b.sd, rtol=1e-6)
@@ -123,7 +127,11 @@ def test_solving_on_the_way_changes_nothing(quick, expected):
 
 
 def test_windows_that_are_open_count_only_when_asked_for(quick):
-    """In the middle of a stretch: with them there are more samples, without them the windows that were completed."""
+    """
+    In the middle of a stretch.
+
+    With them there are more samples, without them the windows that were completed.
+    """
     live = LiveCalibration(TABLE)
     completed = [window for part in list(blocks(*quick))[:700] for window in live.push(part)]
     used = sum(len(window) for window in completed if window.kind != 'unused')
@@ -192,7 +200,11 @@ WARMTH = np.array([0.004, -0.006, 0.0025])
 
 
 def at_temperature(samples, temperature_c):
-    """A part of a session, warmed up by 3 K about a temperature, with the readings of accelerometers that drift with it from 20 C on."""
+    """
+    A part of a session, warmed up by 3 K about a temperature.
+
+    With the readings of accelerometers that drift with it from 20 C on.
+    """
     imu, joints = samples
     warm = temperature_c + np.linspace(-1.5, 1.5, len(imu))
     return (
@@ -203,7 +215,11 @@ def at_temperature(samples, temperature_c):
 
 
 def test_a_proven_session_is_proven_after_resume(quick):
-    """Held-out blocks are saved; without them the resumed session was unproven until as many windows had come again."""
+    """
+    Held-out blocks are saved.
+
+    Without them the resumed session was unproven until as many windows had come again.
+    """
     first = LiveCalibration(TABLE)
     run(first, *quick)
     before = first.solve(pending=True).calibration
@@ -217,7 +233,11 @@ def test_a_proven_session_is_proven_after_resume(quick):
 
 
 def test_a_session_resumed_30_kelvin_warmer_knows_both_temperatures(quick):
-    """Each part alone says little of the drift; the two together say it, about the temperature of the first."""
+    """
+    Each part alone says little of the drift.
+
+    The two together say it, about the temperature of the first.
+    """
     parts = [
         at_temperature([cut(s, *part) for s in quick], temperature_c)
         for part, temperature_c in (((0.0, 0.5), 20.0), ((0.5, 1.0), 50.0))

@@ -1,4 +1,8 @@
-"""The live diagnosis says what the verb says of the same recording; what it finds joins the model; it never holds up the rest. No ROS here."""
+"""
+The live diagnosis says what the verb says of the same recording; what it finds joins the model.
+
+It never holds up the rest. No ROS here.
+"""
 
 import threading
 from dataclasses import replace
@@ -124,7 +128,11 @@ def test_windows_after_the_adoption_count_like_those_before(hidden, expected):
 
 
 def test_a_delay_is_taken_at_its_size_like_offline():
-    """Columns that depend on their own value: those of all windows are taken anew where the search found the delay."""
+    """
+    Columns that depend on their own value.
+
+    Those of all windows are taken anew where the search found the delay.
+    """
     pair = make_pair('driver_lag', 31, table='shaft', profile='sweeps')
     table = Table.from_mapping(pair.table)
     live = LiveCalibration(table)
@@ -169,7 +177,11 @@ def test_what_cannot_join_is_said_and_widens(hidden):
 
 
 def test_a_resumed_session_keeps_what_joined(station, hidden):
-    """Saved with the wide model, the session goes on with it, and stays with it: the columns of before cannot be taken anew."""
+    """
+    Saved with the wide model, the session goes on with it, and stays with it.
+
+    The columns of before cannot be taken anew.
+    """
     station.live.adopt(station.answer.extension)
     station.live.solve(pending=True)
     saved = station.live.saved(pending=True)

@@ -1,4 +1,9 @@
-"""In worlds with causes that no catalogue holds a calibration helps in another session and harms in no motion, or says in a sentence that it does not."""
+"""
+In worlds with uncatalogued causes a calibration helps, or states that it does not.
+
+The causes are in no catalogue; the calibration helps in another session and harms in no motion, or
+a sentence states that it does not.
+"""
 
 import pytest
 
@@ -38,6 +43,7 @@ def test_what_is_handed_over_helps_in_another_session(cause, world):
             continue
         worst = max(part['after'] / part['before'] for part in entry['regimes'].values())
         print(
-            f'{cause}, {sensor}: error after / before {entry["after"] / entry["before"]:.3f} wanted below 1, worst motion {worst:.3f} wanted at most {WORSE}'
+            f'{cause}, {sensor}: error after / before {entry["after"] / entry["before"]:.3f} wanted'
+            f' below 1, worst motion {worst:.3f} wanted at most {WORSE}'
         )
         assert entry['after'] < entry['before'] and worst <= WORSE

@@ -1,4 +1,8 @@
-"""A vertical shaft has one attitude: parameters that it does not separate are fixed, and other attitudes are unproven."""
+"""
+A vertical shaft has one attitude.
+
+Parameters that it does not separate are fixed, and other attitudes are unproven.
+"""
 
 import numpy as np
 import pytest

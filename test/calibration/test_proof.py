@@ -42,7 +42,11 @@ def late():
 
 
 def test_both_sides_are_compared_with_the_same_table():
-    """What belongs to the table and the clock stays where compensation would undo nothing: a mount that bends went from one side alone."""
+    """
+    What belongs to the table and the clock stays where compensation would undo nothing.
+
+    A mount that bends went from one side alone.
+    """
     names = [effect.name for effect in CATALOGUE.effects().values() if effect.sensor == 'reference']
     model = SensorModel(reference=tuple(names))
     values = np.arange(1.0, 1.0 + len(model.prior()[0]))

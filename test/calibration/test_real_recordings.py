@@ -1,4 +1,8 @@
-"""Real recordings on a motor shaft: one axis, ripple, stamps of whole milliseconds, an encoder of 0.088 deg, no rest at all."""
+"""
+Real recordings on a motor shaft.
+
+One axis, ripple, stamps of whole milliseconds, an encoder of 0.088 deg, no rest at all.
+"""
 
 import numpy as np
 import pytest
@@ -28,10 +32,13 @@ def opened(folder):
 @pytest.mark.parametrize('options', [CalibrationOptions(), BOTH], ids=['as_it_comes', 'with_lag'])
 def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, scale, options):
     """
-    The scale along the shaft within 0.003 with and without the lag in the model, and the lag behind the encoder of 12-14 ms.
+    The scale along the shaft within 0.003 with and without the lag in the model.
 
-    The lag is the sum of the low-pass's time constant and the offset of the clocks, which slow sweeps hardly tell apart. The ripple of the
-    motor at 12 and 47 Hz, beyond what the model or the joint states follow, must not bend the scale.
+    The lag after the encoder is 12-14 ms.
+
+    The lag is the sum of the low-pass's time constant and the offset of the clocks, which slow
+    sweeps hardly tell apart. The ripple of the motor at 12 and 47 Hz, beyond what the model or the
+    joint states follow, must not bend the scale.
     """
     table, blocks = opened(recordings / name)
     calibration = calibrate([lambda: iter(blocks)], table, options).calibration
@@ -50,13 +57,18 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, sca
         )
         assert 0.0115 < lag < 0.0145
     print(
-        f'{name}: gyroscope scale along the shaft {found:.4f} (known {scale}), lag {lag * 1e3:.1f} ms (known 12-14)'
+        f'{name}: gyroscope scale along the shaft {found:.4f} (known {scale}), lag {lag * 1e3:.1f}'
+        ' ms (known 12-14)'
     )
 
 
 @pytest.mark.long
 def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
-    """Found as an offset of the clocks (or a lag of the gyroscope, the same to first order), with its gain on held-out windows, and no story beside it. `make validate` asks of both shafts."""
+    """
+    Found as an offset of the clocks (or a lag of the gyroscope, the same to first order).
+
+    With its gain on held-out windows, and no story beside it. `make validate` asks of both shafts.
+    """
     folder = recordings / name
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
 
@@ -74,14 +86,17 @@ def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
     )
     gain = document['findings'][0]['gain']
     print(
-        f'{name}: {sorted(effects)} of {lag * 1e3:.2f} ms, held-out residual falls by {gain["reduction"]:.2f} {np.round(gain["ci95"], 2)}'
+        f'{name}: {sorted(effects)} of {lag * 1e3:.2f} ms, held-out residual falls by'
+        f' {gain["reduction"]:.2f} {np.round(gain["ci95"], 2)}'
     )
     assert 0.0115 < lag < 0.0145
     assert gain['ci95'][0] > 0.3
 
 
 def test_what_one_axis_cannot_show_is_held(recordings):
-    """A single vertical axis says nothing of the rates across it; they keep the prior and say so."""
+    """
+    A single vertical axis says nothing of the rates across it; they keep the prior and say so.
+    """
     folder = recordings / 'shaft_yaw_medium'
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
     with open_recording(folder, imu_topic='/imu/data_raw') as recording:

@@ -1,4 +1,8 @@
-"""A warm-up that the user asks for converges from the prior time constant of 300 s, live as from a recording."""
+"""
+A warm-up that the user requests converges from the prior time constant of 300 s.
+
+It converges live as from a recording.
+"""
 
 from dataclasses import replace
 
@@ -39,7 +43,9 @@ def calibration(session):
 
 
 def test_a_requested_warm_up_has_its_time_constant(calibration):
-    """The iteration stayed at 300 s, with amplitudes of twice the truth and an sd of ten times them."""
+    """
+    The iteration stayed at 300 s, with amplitudes of twice the truth and an sd of ten times them.
+    """
     part = calibration.model.slices['gyroscope', 'gyro_bias_drift']
     assert np.all(calibration.sd[part] < 0.05 * np.abs(TRUE))
     # Means of windows of a third of the time constant bend the exponential by a hundredth.

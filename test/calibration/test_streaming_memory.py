@@ -27,7 +27,10 @@ PAUSE_NS = 2_000_000_000
 """Between the repetitions, so that the jump of the joints back to the start lies in no window."""
 BLOCK = 4096
 ALLOWED_GROWTH = 1 << 20
-"""Peaks depend on where blocks and windows end, by less than this, bytes; a sample that stayed would cost 56 times as many bytes as samples."""
+"""
+Peaks depend on where blocks and windows end, by less than this, bytes; a sample that stayed would
+cost 56 times as many bytes as samples.
+"""
 
 
 @pytest.fixture(scope='module')
@@ -72,7 +75,11 @@ def peak(imu, joints, repetitions):
 
 @pytest.mark.long
 def test_peak_memory_does_not_grow_with_the_stream(piece, monkeypatch):
-    """Three times the length takes no more memory, once all that is kept on purpose is full; nothing of the data is lost by it."""
+    """
+    Three times the length takes no more memory, once all that is kept on purpose is full.
+
+    Nothing of the data is lost by it.
+    """
     for module, name, value in (
         (gathering, 'KEPT_POSES', 20),
         (gathering, 'KEPT_SAMPLES', 2000),

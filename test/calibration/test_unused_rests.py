@@ -1,4 +1,8 @@
-"""A recording with rests of which no static window is used gets a warning: sds of biases then come from motion alone."""
+"""
+A recording with rests of which no static window is used gets a warning.
+
+Sds of biases then come from motion alone.
+"""
 
 import pytest
 

@@ -38,7 +38,11 @@ def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
 
 
 def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
-    """Spins about a level axis would show every entry of the matrix; about the vertical one gravity stays where it is."""
+    """
+    Spins about a level axis would show every entry of the matrix.
+
+    About the vertical one gravity stays where it is.
+    """
     table = Table.from_mapping(VERTICAL)
     session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
     result = calibrate(

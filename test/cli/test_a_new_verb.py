@@ -1,4 +1,8 @@
-"""A verb is a module and its name in the list: one made here is offered, run and refused like those that there are."""
+"""
+A verb is a module and its name in the list.
+
+One made here is offered, run and refused like those that there are.
+"""
 
 import sys
 from types import SimpleNamespace

@@ -1,4 +1,8 @@
-"""The pages in docs/answers: their commands run, and print the numbers and names of the pages; sentences may change."""
+"""
+The pages in docs/answers: their commands run, and print the numbers and names of the pages.
+
+Sentences may change.
+"""
 
 import re
 import sys
@@ -16,7 +20,10 @@ KEY = re.compile(r'[A-Za-z]\w*(?:[./]\w+)+|[A-Za-z]+_\w+')
 """Names of parameters, effects, files, topics and units."""
 NUMBER = re.compile(r'[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?')
 LAST_DIGITS = {'rel': 0.05, 'abs': 1e-3}
-"""Printed numbers have three significant digits, of which the last differ from machine to machine; a chance below 1e-3 has none."""
+"""
+Printed numbers have three significant digits, of which the last differ from machine to machine; a
+chance below 1e-3 has none.
+"""
 
 
 def same(found, wanted):
@@ -53,12 +60,15 @@ def test_there_is_a_page_and_a_picture_for_each_of_ten_questions():
 
 @pytest.mark.live
 def test_a_page_is_written_with_what_its_commands_print(tmp_path):
-    text = 'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\n$ printf "c\\n" | grep -c c\nold\n```\n\nand go on'
+    text = (
+        'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\n$ printf "c\\n" | grep -c c\nold\n```\n\nand'
+        ' go on'
+    )
     with answers.inside(tmp_path):
         written = answers.worked_through(text)
     assert (
-        written
-        == 'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\na 1\nb 2\n$ printf "c\\n" | grep -c c\n1\n```\n\nand go on'
+        written == 'Say\n\n```console\n$ printf "a 1\\nb 2\\n"\na 1\nb 2\n$ printf "c\\n" | grep -c'
+        ' c\n1\n```\n\nand go on'
     )
     with pytest.raises(ValueError, match='rm'):
         answers.run('rm -r /')

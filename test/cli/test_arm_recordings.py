@@ -1,4 +1,8 @@
-"""An arm from the command line: description from file, macros or topic, frame and up from the recording, joints by name."""
+"""
+An arm from the command line.
+
+Description from file, macros or topic, frame and up from the recording, joints by name.
+"""
 
 import numpy as np
 import pytest
@@ -41,7 +45,11 @@ def home(tmp_path):
 
 
 def write_messages(path, frames=(), texts=(), frame_id='imu_link'):
-    """A bag with one Imu message, robot descriptions and static transforms (parent, child, quaternion)."""
+    """
+    A bag with one Imu message, robot descriptions and static transforms.
+
+    A transform is (parent, child, quaternion).
+    """
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types
     time = types['builtin_interfaces/msg/Time'](0, 0)
@@ -156,7 +164,11 @@ def test_macros_are_expanded(tmp_path):
 
 @pytest.fixture(scope='module')
 def session(tmp_path_factory):
-    """A short session on the two axes; joint states in another order, with a joint that is nobody's business."""
+    """
+    A short session on the two axes.
+
+    Joint states in another order, with a joint that is nobody's business.
+    """
     folder = tmp_path_factory.mktemp('arm')
     (folder / 'arm.urdf').write_text(TWO_AXES)
     (folder / 'site.yaml').write_text(

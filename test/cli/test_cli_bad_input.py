@@ -1,4 +1,8 @@
-"""Bad input through the command line: one line that says what must hold, what came and what to do; exit code 1; nothing half written."""
+"""
+Bad input through the command line: one line that says what must hold, what came and what to do.
+
+Exit code 1; nothing half written.
+"""
 
 import os
 from dataclasses import replace

@@ -31,7 +31,11 @@ EFFECTS = {
 
 
 def true_motion():
-    """Return (stamps, force, rate, alpha, temperature) of a smooth motion that starts and ends at rest."""
+    """
+    Return the readings of a smooth motion that starts and ends at rest.
+
+    They are (stamps, force, rate, alpha, temperature).
+    """
     time = PERIOD_NS * 1e-9 * np.arange(N)
     phase, w = np.array([0.0, 1.0, 2.0]), np.array([2.0, 1.5, 3.0])
     rate = np.sin(np.outer(time, w) + phase)
@@ -41,7 +45,11 @@ def true_motion():
 
 
 def write_case(folder, effects):
-    """Write a bag of what a sensor with these effects reads, and its calibration; return the calibration."""
+    """
+    Write a bag of what a sensor with these effects reads, and its calibration.
+
+    Return the calibration.
+    """
     calibration = random_calibration(7, *EFFECTS[effects], sd=1e-5)
     stamps, force, rate, alpha, temperature = true_motion()
     branch = np.interp(
@@ -94,8 +102,9 @@ def test_the_corrected_topic_holds_the_true_readings(tmp_path, effects, capsys):
             [block.imu for block in recording.blocks() if block.imu is not None]
         )
     np.testing.assert_array_equal(imu.stamp_ns, stamps)
-    # Temperature between its stamps is linear in the bag as in the truth; only the delay of the derivative, 20 ms at most, and
-    # g-sensitivity that sees it are left: 9 rad/s^3 x 0.02 s x 0.035 m.
+    # Temperature between its stamps is linear in the bag as in the truth; only the delay of the
+    # derivative, 20 ms at most, and g-sensitivity that sees it are left: 9 rad/s^3 x 0.02 s x 0.035
+    # m.
     late = 9.0 * 0.02 * 0.035
     assert np.abs(imu.force_s - force)[100:-100].max() < late
     assert np.abs(imu.rate_s - rate)[100:-100].max() < (
@@ -126,7 +135,8 @@ def test_readings_at_another_point_and_frame_of_the_body(tmp_path):
     parsed = [parse_imu(data) for _, data in raw_messages(tmp_path / 'out', '/imu/data_corrected')]
     assert {message.frame_id for message in parsed} == {'base_link'}
     got = np.array([message.doubles for message in parsed])[100:-100]
-    # The window of the derivative is up to 40 ms long at an arm of 0.37 m: 9 rad/s^3 x 0.02 s x 0.4 m.
+    # The window of the derivative is up to 40 ms long at an arm of 0.37 m: 9 rad/s^3 x 0.02 s x 0.4
+    # m.
     assert np.abs(got[:, FIELDS['force_s']] - expected[100:-100]).max() < 9.0 * 0.021 * 0.4
     np.testing.assert_allclose(got[:, FIELDS['rate_s']], rate_t[100:-100], atol=1e-12)
     without_arm = np.abs(got[:, FIELDS['force_s']] - (force @ mat_ts.T)[100:-100]).max()

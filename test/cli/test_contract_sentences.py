@@ -1,4 +1,8 @@
-"""The sentences that users and their scripts see most often; every other test asserts codes, keys and numbers."""
+"""
+The sentences that users and their scripts see most often.
+
+Every other test asserts codes, keys and numbers.
+"""
 
 from dataclasses import replace
 

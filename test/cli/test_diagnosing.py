@@ -1,4 +1,6 @@
-"""From a recording to a diagnosis on disk: the verb `diagnose`, its files, and what they are good for."""
+"""
+From a recording to a diagnosis on disk: the verb `diagnose`, its files, and what they are good for.
+"""
 
 import json
 
@@ -49,7 +51,11 @@ def outcome(tmp_path_factory):
 
 
 def test_the_hidden_effects_are_found_and_measured(outcome):
-    """The arms of the simulated IMU and its g-sensitivity are the findings; every value lies within 4.5 sd of the truth."""
+    """
+    The arms of the simulated IMU and its g-sensitivity are the findings.
+
+    Every value lies within 4.5 sd of the truth.
+    """
     document = json.loads((outcome / 'out' / 'diagnosis.json').read_text())
     assert document['format'] == 'imu_calibration/diagnosis/1'
     found = {finding['effect']: finding for finding in document['findings']}

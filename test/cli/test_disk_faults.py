@@ -1,4 +1,6 @@
-"""Places that cannot be written: one line, what was there stays, and nothing half written is left."""
+"""
+Places that cannot be written: one line, what was there stays, and nothing half written is left.
+"""
 
 import errno
 import os
@@ -73,7 +75,11 @@ def test_a_place_that_cannot_be_written_is_refused_in_one_line(tmp_path, kind, w
     'code', (errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EIO), ids=errno.errorcode.get
 )
 def test_whatever_step_fails_the_old_file_stays_whole(tmp_path, monkeypatch, step, code):
-    """Also where taking the new file away fails as well: that ended the node, with the table's time in it."""
+    """
+    Also where taking the new file away fails as well.
+
+    That ended the node, with the table's time in it.
+    """
     place = tmp_path / 'calibration.yaml'
     place.write_text('old')
 

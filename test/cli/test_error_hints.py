@@ -1,4 +1,8 @@
-"""The core speaks of what must hold; the command line and the nodes add what that is called there, and nothing that they do not have."""
+"""
+The core speaks of what must hold.
+
+The command line and the nodes add what that is called there, and nothing that they do not have.
+"""
 
 import ast
 import pickle
@@ -76,7 +80,8 @@ def test_no_text_of_the_core_tells_to_run_a_verb():
         if path.stem not in ('errors', 'page')
         for verb in re.findall(r"(?<!written by )'imu_calibration (\w+)'", text)
     }
-    # To apply a calibration to a recording, beside compensator_node; in a document that `import` writes.
+    # To apply a calibration to a recording, beside compensator_node; in a document that `import`
+    # writes.
     assert found == {('verdict', 'compensate'), ('loss', 'check')}
 
 
@@ -117,7 +122,9 @@ UNREACHABLE = {
     },
     'bag_player_node': {'allow_xacro': 'no robot description is read'},
 }
-"""Node -> {key of errors in the modules that it imports: reason why the node needs no name for it}."""
+"""
+Node -> {key of errors in the modules that it imports: reason why the node needs no name for it}.
+"""
 
 
 @pytest.mark.live
@@ -127,7 +134,10 @@ UNREACHABLE = {
 )
 def test_every_key_that_can_reach_a_node_has_a_name_there(node):
     pytest.importorskip('rclpy')
-    program = f'import sys, imu_calibration.nodes.{node}; print(*[m.__file__ for m in sys.modules.values() if getattr(m, "__file__", None)])'
+    program = (
+        f'import sys, imu_calibration.nodes.{node}; print(*[m.__file__ for m in'
+        ' sys.modules.values() if getattr(m, "__file__", None)])'
+    )
     files = set(
         subprocess.run(
             [sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True, check=True
@@ -261,5 +271,6 @@ def test_the_live_session_by_hand_says_the_parameter_of_its_node():
 
     found = PoseScan([slice(0, 9)] * 9, None, 9, 8, {}, 0.0)
     assert hand_status(found, Solved, step='', hints=HINTS['calibration_node']).message.endswith(
-        "next: give the local gravity, which scales the accelerometer as a whole (parameter 'gravity')"
+        'next: give the local gravity, which scales the accelerometer as a whole (parameter'
+        " 'gravity')"
     )

@@ -1,4 +1,8 @@
-"""Options and behaviour that all verbs share: help, JSON, quiet, verbose, suggestions, interruption, light start."""
+"""
+Options and behaviour that all verbs share.
+
+Help, JSON, quiet, verbose, suggestions, interruption, light start.
+"""
 
 import json
 import subprocess
@@ -25,8 +29,9 @@ HELP_NEEDS = {'simulate': {'numpy'}, 'plan': {'numpy'}, 'convert': {'numpy'}}
 @pytest.mark.parametrize('verb', ['--version', *parser.VERBS])
 def test_help_imports_no_heavy_module(verb):
     program = (
-        'import sys\nfrom imu_calibration.cli.main import main\ntry:\n    main(sys.argv[1:])\nexcept SystemExit:\n    pass\n'
-        'print(*{name.partition(".")[0] for name in sys.modules}, file=sys.stderr)'
+        'import sys\nfrom imu_calibration.cli.main import main\ntry:\n   '
+        ' main(sys.argv[1:])\nexcept SystemExit:\n    pass\nprint(*{name.partition(".")[0] for name'
+        ' in sys.modules}, file=sys.stderr)'
     )
     done = subprocess.run(
         [sys.executable, '-c', program, verb, '--help'],
@@ -50,7 +55,10 @@ def test_help_imports_no_heavy_module(verb):
 
 @pytest.mark.live
 def test_an_inspection_imports_neither_the_search_nor_slow_libraries():
-    program = 'import sys\nfrom imu_calibration.cli.main import main\nmain(sys.argv[1:])\nprint(*sys.modules, file=sys.stderr)'
+    program = (
+        'import sys\nfrom imu_calibration.cli.main import'
+        ' main\nmain(sys.argv[1:])\nprint(*sys.modules, file=sys.stderr)'
+    )
     done = subprocess.run(
         [sys.executable, '-c', program, 'inspect', SESSION],
         cwd=ROOT,

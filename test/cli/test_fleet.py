@@ -1,4 +1,9 @@
-"""Many units: one result each whatever happens to the others, the spread over them, and the same work on a cluster."""
+"""
+Many units: one result each, the spread over them, and the same on a cluster.
+
+Each unit has its result whatever happens to the remaining units, and the cluster does the same
+work.
+"""
 
 import csv
 from dataclasses import replace
@@ -43,7 +48,9 @@ def session(seed, values):
 
 @pytest.fixture(scope='module')
 def recordings(tmp_path_factory):
-    """Two units, one of them with two recordings, and a file that is no bag; the values of each unit."""
+    """
+    Two units, one of them with two recordings, and a file that is no bag; the values of each unit.
+    """
     folder = tmp_path_factory.mktemp('fleet')
     truth = {
         name: random_values(MODEL, 'industrial', seed)
@@ -89,7 +96,11 @@ def result(recordings, tmp_path_factory):
 
 @pytest.mark.long
 def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
-    """Good units have results, the bad one has its reason in one line, and the exit code says that something is missing."""
+    """
+    Good units have results, the bad one has its reason in one line.
+
+    The exit code shows that something is missing.
+    """
     code, output = result
     assert code == 3
     units = {row['name']: row for row in read_csv(output / 'units.csv')}
@@ -106,7 +117,9 @@ def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
 
 
 def test_each_unit_has_its_own_values(recordings, result):
-    """Biases and matrices are within 4.5 reported sd of what the unit was simulated with (43 values)."""
+    """
+    Biases and matrices are within 4.5 reported sd of what the unit was simulated with (43 values).
+    """
     units = {row['name']: row for row in read_csv(result[1] / 'units.csv')}
     for name, truth in recordings[1].items():
         for index, parameter in enumerate(MODEL.param_names):
@@ -180,7 +193,9 @@ def assert_same_files(first, second):
 
 
 def test_folders_without_units_are_refused(tmp_path, capsys):
-    """One line says what must be in the folder, or that no unit could be used; nothing is written."""
+    """
+    One line says what must be in the folder, or that no unit could be used; nothing is written.
+    """
     (tmp_path / 'empty').mkdir()
     for folder in ('missing', 'empty'):
         assert run_fleet(tmp_path / folder, tmp_path / 'out') == 1
@@ -194,7 +209,11 @@ def test_folders_without_units_are_refused(tmp_path, capsys):
 
 
 def test_several_recordings_that_do_not_belong_together_are_refused(recordings, tmp_path, capsys):
-    """Another frame, another table, or a file that is no bag: one line with the name of the recording at fault."""
+    """
+    Another frame, another table, or a file that is no bag.
+
+    One line with the name of the recording at fault.
+    """
     folder, truth = recordings
     imu, joints = session(3, truth['unit_a'])
     write_session(

@@ -39,7 +39,11 @@ def bag(tmp_path):
 
 
 def test_nested_powers_in_a_calibration_are_refused_before_they_are_multiplied_out(tmp_path, bag):
-    """29 kB took all memory: each level of abs(...)**9 multiplies the text of the compensation by nine."""
+    """
+    29 kB took all memory.
+
+    Each level of abs(...)**9 multiplies the text of the compensation by nine.
+    """
     (tmp_path / 'calibration.yaml').write_text(hostile_calibration())
     ended = refused(
         'compensate',
@@ -296,7 +300,8 @@ def test_definitions_of_another_kind_are_one_line(tmp_path, change, language):
         'SELECT id, encoded_message_definition FROM message_definitions'
     ).fetchall():
         connection.execute(
-            'UPDATE message_definitions SET encoding = ?, encoded_message_definition = ? WHERE id = ?',
+            'UPDATE message_definitions SET encoding = ?, encoded_message_definition = ? WHERE'
+            ' id = ?',
             (language, change(text), number),
         )
     connection.commit()
@@ -358,9 +363,10 @@ def test_what_was_decompressed_is_removed_on_sigterm(tmp_path):
     database.unlink()
     (bag / 'metadata.yaml').unlink()
     program = (
-        'import time, msg_adapters.sqlite_file as f\nold = f.SqliteFile.count\n'
-        'f.SqliteFile.count = lambda self: (print("decompressed", flush=True), time.sleep(60), old(self))[2]\n'
-        f'import sys\nfrom imu_calibration.__main__ import main\nsys.argv[1:] = ["inspect", {str(bag)!r}]\nraise SystemExit(main())'
+        'import time, msg_adapters.sqlite_file as f\nold = f.SqliteFile.count\nf.SqliteFile.count'
+        ' = lambda self: (print("decompressed", flush=True), time.sleep(60), old(self))[2]\nimport'
+        ' sys\nfrom imu_calibration.__main__ import main\nsys.argv[1:] = ["inspect",'
+        f' {str(bag)!r}]\nraise SystemExit(main())'
     )
     process = subprocess.Popen(
         [sys.executable, '-c', program],

@@ -1,4 +1,8 @@
-"""Every plain command of the README and of docs/turntable.md runs as printed, in a folder with recordings of the names that they use."""
+"""
+Every plain command of the README and of docs/turntable.md runs as printed.
+
+It runs in a folder with recordings of the names that the commands use.
+"""
 
 import re
 import shlex
@@ -30,7 +34,9 @@ def commands(page):
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """Recordings under the names of the pages: by hand, at rest, on the table of the sample session."""
+    """
+    Recordings under the names of the pages: by hand, at rest, on the table of the sample session.
+    """
     place = tmp_path_factory.mktemp('user')
     by_hand = simulate(7, n_poses=14)[0]
     rng = np.random.default_rng(1)

@@ -1,4 +1,9 @@
-"""What verbs print on a terminal: no line ends within a word at 80 columns, colour only where wanted, an early interruption in one line."""
+"""
+What verbs print on a terminal.
+
+No line ends within a word at 80 columns, colour only where wanted, an early interruption in one
+line.
+"""
 
 import fcntl
 import io
@@ -39,7 +44,9 @@ PRINTING = {
 
 
 def shown(monkeypatch, capsys, width, run):
-    """Return the words that are printed on a terminal of a width; dotted names may break at a dot."""
+    """
+    Return the words that are printed on a terminal of a width; dotted names may break at a dot.
+    """
     monkeypatch.setenv('COLUMNS', str(width))
     out = io.StringIO()
     monkeypatch.setattr(
@@ -213,7 +220,11 @@ def test_help_is_shorter_than_60_lines_on_a_terminal(verb):
     ],
 )
 def test_no_line_is_wider_than_the_terminal(arguments):
-    """The terminal itself would break them within a word: help up to 138 columns, equations, names of parameters."""
+    """
+    The terminal itself would break them within a word.
+
+    Help up to 138 columns, equations, names of parameters.
+    """
     lines = re.sub(rb'\x1b\[[0-9;?]*[a-zA-Z]', b'', on_terminal(arguments)).decode().splitlines()
     assert len(lines) > 10 and max(map(len, lines)) <= 80
 
@@ -252,12 +263,15 @@ def children_of(process):
 
 @pytest.mark.live
 def test_an_interruption_ends_worker_processes_without_tracebacks(tmp_path):
-    """Ctrl+C reaches all processes of a terminal; workers printed theirs, and the verb ended with 1."""
+    """
+    Ctrl+C reaches all processes of a terminal; workers printed theirs, and the verb ended with 1.
+    """
     for name in ('first', 'second'):
         shutil.copytree(SESSION, tmp_path / 'units' / name)
     program = (
-        'import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'  # a background job ignores it
-        'from imu_calibration.__main__ import main\nif __name__ == "__main__":\n    sys.exit(main())\n'
+        # A background job ignores it
+        'import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\nfrom'
+        ' imu_calibration.__main__ import main\nif __name__ == "__main__":\n    sys.exit(main())\n'
     )
     process = subprocess.Popen(
         [
@@ -294,11 +308,12 @@ def test_an_interruption_ends_worker_processes_without_tracebacks(tmp_path):
 def interrupted_at(module, *arguments):
     """Run a verb that gets SIGINT while it imports a module."""
     program = (
-        'import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'  # a background job ignores it
-        f'class Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name == {module!r}:\n'
-        '            sys.meta_path.remove(self)\n            os.kill(os.getpid(), signal.SIGINT)\n'
-        'sys.meta_path.insert(0, Watch())\n'
-        'from imu_calibration.__main__ import main\nsys.exit(main())\n'
+        # A background job ignores it
+        'import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\nclass'
+        ' Watch:\n    def find_spec(self, name, path=None, target=None):\n        if name =='
+        f' {module!r}:\n            sys.meta_path.remove(self)\n            os.kill(os.getpid(),'
+        ' signal.SIGINT)\nsys.meta_path.insert(0, Watch())\nfrom imu_calibration.__main__ import'
+        ' main\nsys.exit(main())\n'
     )
     return subprocess.run(
         [sys.executable, '-c', program, *arguments], cwd=ROOT, capture_output=True, text=True
@@ -312,9 +327,12 @@ def interrupted_at(module, *arguments):
 )
 def test_an_early_interruption_ends_with_130_in_one_line(module, tmp_path):
     """
-    The signal arrives while a module is imported; numpy turned it into a broken installation where it imports `datetime`.
+    The signal arrives while a module is imported.
 
-    It is tried again every 20 ms until no numerical package runs: `inspect` may end before, a calibration has hundreds of such moments.
+    Numpy turned it into a broken installation where it imports `datetime`.
+
+    It is tried again every 20 ms until no numerical package runs: `inspect` may end before, a
+    calibration has hundreds of such moments.
     """
     done = interrupted_at(
         module, 'calibrate', SESSION, '--table', TABLE, '--output', str(tmp_path / 'never')

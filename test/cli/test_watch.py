@@ -1,4 +1,8 @@
-"""`imu_calibration watch`: bars in units of tolerance, in 80 columns, from a node that runs; ends with it."""
+"""
+`imu_calibration watch`: bars in units of tolerance, in 80 columns, from a node that runs.
+
+Ends with it.
+"""
 
 import io
 import math

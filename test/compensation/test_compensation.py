@@ -1,4 +1,8 @@
-"""Compensation undoes the forward equations, for every effect that can be inverted, and moves readings to another point."""
+"""
+Compensation undoes the forward equations.
+
+For every effect that can be inverted, and moves readings to another point.
+"""
 
 import numpy as np
 import pytest
@@ -122,7 +126,8 @@ def test_transfer_there_and_back_is_the_identity():
 def test_transfer_of_a_steady_turn_takes_the_centripetal_force_out():
     plain = random_calibration(0, (), (), matrix_spread=0.0)
     plain = Calibration(plain.model, plain.model.start(), plain.covariance, plain.status)
-    # The sensor sits 0.5 m ahead of the axis, x outwards; in the target frame it looks backwards (yaw of 180 degrees).
+    # The sensor sits 0.5 m ahead of the axis, x outwards; in the target frame it looks backwards
+    # (yaw of 180 degrees).
     transfer = Transfer.from_pose('base', (0.5, 0.0, 0.0), (0.0, 0.0, np.pi))
     moved = compensate(
         plain,

@@ -74,7 +74,8 @@ def test_parameters_agree_with_monte_carlo(effects, transfer):
     )
     predicted = with_derivative(calibration, transfer).at(FORCE, RATE, SLOPE, dt=DT).parameters
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
-    # 300 draws: 8 %, four times that; the derivative of the inverse gyroscope matrix in the tangential term is left out.
+    # 300 draws: 8 %, four times that; the derivative of the inverse gyroscope matrix in the
+    # tangential term is left out.
     assert np.abs((np.cov(out.T) - predicted) / scale).max() < 0.35
 
 

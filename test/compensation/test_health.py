@@ -1,4 +1,9 @@
-"""Health of a calibration while driving: drifts that the estimator does not know are seen at stops, in time and with their size; quiet robots are left in peace."""
+"""
+Health of a calibration while driving.
+
+Drifts that the estimator does not know are seen at stops, in time and with their size; quiet robots
+are left in peace.
+"""
 
 import re
 from dataclasses import replace
@@ -88,7 +93,11 @@ def test_while_nothing_moves_the_calibration_holds():
 
 
 def test_the_error_of_a_mean_includes_the_decay_of_a_slow_stop():
-    """The rate decays from 0.02 rad/s with time constants of 0.3 to 6 s into stops of 8 s: it was reported as a moved bias; a moved bias is reported."""
+    """
+    The rate decays from 0.02 rad/s with time constants of 0.3 to 6 s into stops of 8 s.
+
+    It was reported as a moved bias; a moved bias is reported.
+    """
     rng, words = np.random.default_rng(77), {0.0: set(), 0.2 * DEG: set()}
     for moved, found in words.items():
         for seconds in (0.3, 0.7, 1.5, 3.0, 6.0):

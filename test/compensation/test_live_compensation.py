@@ -1,4 +1,8 @@
-"""Serialized message in, corrected serialized message out: the same as the catalogue's compensation, and the rules of the message."""
+"""
+Serialized message in, corrected serialized message out.
+
+The same as the catalogue's compensation, and the rules of the message.
+"""
 
 import struct
 from dataclasses import replace
@@ -159,7 +163,8 @@ def test_lost_doubled_and_late_messages_leave_the_others_right():
     live, data = LiveCompensation(calibration), messages(imu)
     out = [field(live(data[k]), 'force_s') for k in order]
     error = [np.abs(force - expected[k]).max() for k, force in zip(order, out, strict=True)][60:]
-    # Beside a hole or a late sample the angular acceleration is that of its neighbour: arms of 20 mm, jumps of 0.01 x 5 rad/s in 2 ms.
+    # Beside a hole or a late sample the angular acceleration is that of its neighbour: arms of 20
+    # mm, jumps of 0.01 x 5 rad/s in 2 ms.
     assert len(out) == len(order) and max(error) < 0.02 * 2 * 25.0
     assert np.median(error) < 1e-3
 

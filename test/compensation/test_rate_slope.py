@@ -1,4 +1,8 @@
-"""The angular acceleration of streams with the stamps that drivers make, and its stated error where the stamps give less."""
+"""
+The angular acceleration of streams with the stamps that drivers make.
+
+The test includes its stated error where the stamps give less.
+"""
 
 from dataclasses import replace
 
@@ -111,7 +115,9 @@ def test_blocks_give_the_same_as_samples_however_the_stream_is_cut(stretches, da
 
 @pytest.mark.parametrize('kind', DRIVERS)
 def test_whatever_the_stamps_the_derivative_is_that_of_the_true_times(kind):
-    """Within 3 %: the period is told from 256 stamps, of which a packet's may be late by 8 of them."""
+    """
+    Within 3 %: the period is told from 256 stamps, of which a packet's may be late by 8 of them.
+    """
     true_ns = START + PERIOD_NS * np.arange(N)
     rate, _ = motion((true_ns - START) * 1e-9)
     found, ideal = tracker(), tracker()
@@ -172,7 +178,11 @@ def test_stamps_that_stand_still_give_no_derivative_and_its_size_as_the_error():
 
 @pytest.mark.parametrize('taps', (2, 4, 9, 40))
 def test_irregular_stamps_give_the_least_squares_slope_over_them(taps):
-    """Within the noise of as many equal steps: a straight line exactly, noise with at most the stated sd, over 4000 samples."""
+    """
+    Within the noise of as many equal steps.
+
+    A straight line exactly, noise with at most the stated sd, over 4000 samples.
+    """
     rng = np.random.default_rng(taps)
     stamps = START + np.cumsum(rng.exponential(PERIOD_NS, 4000)).astype(np.int64)
     derivative = CausalDerivative(taps, PERIOD_NS * 1e-9)
@@ -198,7 +208,11 @@ def test_irregular_stamps_give_the_least_squares_slope_over_them(taps):
 
 
 def world(kind, seed=0, lively=1.0, arm=ARM, period_ns=PERIOD_NS):
-    """Calibration with an arm, measured samples, and the true specific force at the point that it is corrected to."""
+    """
+    Calibration with an arm, measured samples, and the true specific force.
+
+    The true specific force is at the point that it is corrected to.
+    """
     calibration = random_calibration(4, ('accel_size_effect',), (), sd=1e-9)
     values = calibration.values.copy()
     values[calibration.model.slices['accelerometer', 'accel_size_effect']] *= arm / 0.02
@@ -237,7 +251,11 @@ def world(kind, seed=0, lively=1.0, arm=ARM, period_ns=PERIOD_NS):
 @pytest.mark.parametrize('kind', (*DRIVERS, 'runaway', 'irregular', 'exponential 5.0 ms'))
 @pytest.mark.parametrize('lively', (0.0, 0.3, 1.0))
 def test_the_covariance_that_is_published_is_that_of_the_error(kind, lively):
-    """True error against stated sd, rms over the stream: it was 40 times too sure where the delay counts."""
+    """
+    True error against stated sd, rms over the stream.
+
+    It was 40 times too sure where the delay counts.
+    """
     calibration, imu, force = world(kind, lively=lively)
     live = LiveCompensation(calibration)
     ratios = []
@@ -272,7 +290,11 @@ def test_the_covariance_that_is_published_is_that_of_the_error(kind, lively):
     ),
 )
 def test_the_lever_arm_is_corrected_though_stamps_overtake_each_other(kind, period_ms):
-    """Arm of 0.5 m, an effect of 5.9 m/s^2 rms: at most 0.9 m/s^2 rms remain, as for regular stamps; jitter disabled the correction."""
+    """
+    Arm of 0.5 m, an effect of 5.9 m/s^2 rms: at most 0.9 m/s^2 rms remain, as for regular stamps.
+
+    Jitter disabled the correction.
+    """
     calibration, imu, force = world(
         kind,
         seed=3,
@@ -299,7 +321,11 @@ def test_the_lever_arm_is_corrected_though_stamps_overtake_each_other(kind, peri
 
 @pytest.mark.parametrize('kind', ('normal 2.0 ms', 'exponential 10.0 ms'))
 def test_samples_lost_behind_jitter_give_no_false_derivative(kind):
-    """A hole of 300 ms: the derivative is never farther off than without one, up to 1.5 times its largest value."""
+    """
+    A hole of 300 ms.
+
+    The derivative is never farther off than without one, up to 1.5 times its largest value.
+    """
     true_ns = START + PERIOD_NS * np.arange(N)
     rate, alpha = motion((true_ns - START) * 1e-9)
     keep = np.delete(np.arange(N), np.arange(1000, 1060))

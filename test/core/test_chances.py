@@ -1,4 +1,8 @@
-"""The tails of distributions are those of scipy.stats, to the last bit: what is significant does not depend on which of them is asked."""
+"""
+The tails of distributions are those of scipy.stats, to the last bit.
+
+What is significant does not depend on which of them is asked.
+"""
 
 import numpy as np
 import pytest

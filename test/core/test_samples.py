@@ -23,7 +23,11 @@ def test_runs_reach_to_both_ends(flags, runs):
 
 
 def test_joined_parts_are_their_concatenation():
-    """Parts of any length, also empty ones, while the arrays grow; they are not those of the first part."""
+    """
+    Parts of any length, also empty ones, while the arrays grow.
+
+    They are not those of the first part.
+    """
     rng = np.random.default_rng(0)
     parts = [
         ImuSamples(

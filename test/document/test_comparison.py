@@ -1,4 +1,8 @@
-"""Whether two calibrations agree: honest ones do, a moved parameter is found, and what cannot be compared is said."""
+"""
+Whether two calibrations agree.
+
+Honest ones do, a moved parameter is found, and what cannot be compared is said.
+"""
 
 import re
 from dataclasses import replace

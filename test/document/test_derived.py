@@ -1,4 +1,8 @@
-"""Scale factors and installation angles from the matrix, with their standard deviations, in the papers' units."""
+"""
+Scale factors and installation angles from the matrix.
+
+With their standard deviations, in the papers' units.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,9 @@
-"""Damaged documents: every field with wrong types, sizes and numbers is refused in one line, or does no harm to who uses it."""
+"""
+Damaged documents.
+
+Every field with wrong types, sizes and numbers is refused in one line, or does no harm to who uses
+it.
+"""
 
 import copy
 import math
@@ -152,7 +157,11 @@ KNOWN_TO_WORK = set()
 
 
 def use(found):
-    """Do with a calibration all that a robot does; fails with any error and with any number that is not finite."""
+    """
+    Do with a calibration all that a robot does.
+
+    Fails with any error and with any number that is not finite.
+    """
     refused = list(trust.refused_sensors(found, live=True))
     against = (
         refused,
@@ -240,7 +249,11 @@ print('done')
 
 @pytest.mark.live
 def test_texts_that_would_take_all_memory_or_end_the_process_are_refused_in_one_line():
-    """Under a limit of 2 GB for the whole process; most of them took minutes, gigabytes or the process."""
+    """
+    Under a limit of 2 GB for the whole process.
+
+    Most of them took minutes, gigabytes or the process.
+    """
     done = subprocess.run(
         [sys.executable, '-c', ATTACKS], capture_output=True, text=True, timeout=120
     )

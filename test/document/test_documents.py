@@ -1,4 +1,8 @@
-"""The calibration document: any calibration survives YAML whole, and what is no calibration is refused."""
+"""
+The calibration document.
+
+Any calibration survives YAML whole, and what is no calibration is refused.
+"""
 
 import copy
 
@@ -77,7 +81,8 @@ def models(draw):
     sensors = [
         ('bias', 'matrix') + tuple(n for n in some(names)) for names in (ACCELEROMETER, GYROSCOPE)
     ]
-    # a sensor's lag stands under `reference` in the document and comes back as the last effect of its sensor
+    # a sensor's lag stands under `reference` in the document and comes back as the last effect of
+    # its sensor
     sensors = [
         tuple(sorted(names, key=lambda n: n in IN_DOCUMENT_REFERENCE + ('lever_arm',)))
         for names in sensors

@@ -1,4 +1,8 @@
-"""Exports: the formula of each program, written from its source, gives our compensation, or misses it by what was announced."""
+"""
+Exports: each program's formula gives our compensation, or misses it as announced.
+
+The formula of each program is written from its source, and a miss is as large as announced.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +67,9 @@ def readings(calibration, ref):
 
 
 def with_values(calibration, **changed):
-    """Return a calibration in which some roles of both sensors have other values; None: their prior."""
+    """
+    Return a calibration in which some roles of both sensors have other values; None: their prior.
+    """
     values = calibration.values.copy()
     for effect in calibration.model.effects:
         if effect.role.name in changed:
@@ -94,7 +100,11 @@ def rms(values):
 
 
 def held_by(name, seed, **fields):
-    """Return a random calibration with those effects alone that a target holds, biases gone where it estimates them."""
+    """
+    Return a random calibration with only the effects that a target holds.
+
+    Biases are gone where the target estimates them.
+    """
     target = find_target(name)
     model = random_calibration(seed, FURTHER['accelerometer'], FURTHER['gyroscope']).model
     kept = {
@@ -162,7 +172,11 @@ def test_kalibr_predicts_our_readings(seed):
 @given(SEEDS)
 @settings(max_examples=15, deadline=None)
 def test_arms_in_kalibr_differ_by_what_is_announced(seed):
-    """Kalibr picks each arm's term before its matrix, and its gyroscopes feel the force at the x accelerometer."""
+    """
+    Kalibr picks each arm's term before its matrix.
+
+    Its gyroscopes feel the force at the x accelerometer.
+    """
     calibration = held_by('kalibr', seed)
     ref = motion(seed).reference
     found = export(calibration, find_target('kalibr'), motion=motion(seed))
@@ -218,7 +232,11 @@ def test_basalt_corrects_as_we_do_in_turned_axes(seed):
 @given(seed=SEEDS)
 @settings(max_examples=15, deadline=None)
 def test_programs_with_scale_factors_correct_as_we_do_where_nothing_is_lost(name, seed):
-    """Diagonal matrices where the program has no more, the identity where it has none; temperatures within the range of the calibration."""
+    """
+    Diagonal matrices where the program has no more, the identity where it has none.
+
+    Temperatures within the range of the calibration.
+    """
     calibration = bare(name, held_by(name, seed, conditions={'temperature_range_c': [4.0, 46.0]}))
     ref = motion(seed).reference
     found = export(calibration, find_target(name), motion=motion(seed))
@@ -234,7 +252,11 @@ def test_programs_with_scale_factors_correct_as_we_do_where_nothing_is_lost(name
 
 
 def bare(name, calibration):
-    """Return a calibration whose matrices and biases a program can hold: of its own axis, or not at all."""
+    """
+    Return a calibration whose matrices and biases a program can hold.
+
+    Of its own axis, or not at all.
+    """
     target, values = find_target(name), calibration.values.copy()
     for effect in calibration.model.effects:
         capability, part = capability_of(effect, target.holds), calibration.model.slices[effect.key]
@@ -255,7 +277,9 @@ def test_autopilots_get_forward_right_down():
 
 
 def test_the_temperature_stays_in_the_range_that_was_measured():
-    """Both autopilots hold the ends of the range beyond it; with an unknown range their own defaults."""
+    """
+    Both autopilots hold the ends of the range beyond it; with an unknown range their own defaults.
+    """
     calibration = bare(
         'px4',
         random_calibration(
@@ -487,7 +511,10 @@ def test_the_standard_motion_is_that_of_the_conditions():
     assert isinstance(ref, Reference)
 
 
-HOSTILE = 'imu\nARMING_CHECK,0\r1\t1\tCBRK_IO_SAFETY\t22027\t6\u2028gyroscope_noise_density: 9; $(touch x)'
+HOSTILE = (
+    'imu\nARMING_CHECK,0\r1\t1\tCBRK_IO_SAFETY\t22027\t6\u2028gyroscope_noise_density: 9;'
+    ' $(touch x)'
+)
 
 
 @pytest.mark.parametrize(
@@ -497,7 +524,11 @@ HOSTILE = 'imu\nARMING_CHECK,0\r1\t1\tCBRK_IO_SAFETY\t22027\t6\u2028gyroscope_no
     ),
 )
 def test_a_name_in_a_calibration_adds_no_line_to_the_file_of_another_program(name):
-    """A line end in frame_id ended the comment; what followed was a parameter line of a flight controller."""
+    """
+    A line end in frame_id ended the comment.
+
+    What followed was a parameter line of a flight controller.
+    """
     plain = random_calibration(4, ())
     files = [
         export(replace(plain, frame_id=frame), find_target(name), rate=200.0).content
@@ -741,7 +772,10 @@ def test_thermal_curves_are_refused_rather_than_cut(name, line, values):
 
 
 def test_a_chain_without_intrinsics_is_the_perfect_imu_and_its_noise_is_kept():
-    chain = b'%YAML:1.0\nimu0:\n  accelerometer_noise_density: 0.002\n  gyroscope_noise_density: 0.0001\n  update_rate: 400.0\n'
+    chain = (
+        b'%YAML:1.0\nimu0:\n  accelerometer_noise_density: 0.002\n  gyroscope_noise_density:'
+        b' 0.0001\n  update_rate: 400.0\n'
+    )
     found = import_file(find_target('openvins', read=True), chain, 'chain.yaml')
     np.testing.assert_array_equal(found.of('gyroscope', Role.LINEAR), np.eye(3))
     assert found.noise('accelerometer')[0][0] == pytest.approx(0.002 * 20)

@@ -1,4 +1,6 @@
-"""The decision per sensor travels in the document, and whatever applies a calibration follows it."""
+"""
+The decision per sensor travels in the document, and whatever applies a calibration follows it.
+"""
 
 from dataclasses import replace
 
@@ -93,7 +95,9 @@ CASES = [
 
 @pytest.mark.parametrize(('first', 'second', 'anyway', 'live'), CASES)
 def test_what_is_applied(first, second, anyway, live):
-    """Offline unproven with a caution, harms with consent; live unproven with consent, harms never."""
+    """
+    Offline unproven with a caution, harms with consent; live unproven with consent, harms never.
+    """
     applied = {HELPS: True, UNPROVEN: anyway or not live, HARMS: anyway and not live}
     known = proven(first, second)
     if not applied[first] and not applied[second]:

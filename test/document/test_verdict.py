@@ -20,7 +20,11 @@ PROOF = {'accelerometer': ENTRY, 'gyroscope': ENTRY}
 
 
 def calibration(**changes):
-    """Return a calibration with nothing against it: every sd a third of its tolerance, residuals as at rest."""
+    """
+    Return a calibration with nothing against it.
+
+    Every sd a third of its tolerance, residuals as at rest.
+    """
     sensor = {
         'noise_sd': [1e-3] * 3,
         'between_window_sd': 0.0,

@@ -1,4 +1,8 @@
-"""A sensor that the calibration does not help is not corrected, and the other one is: on a vertical shaft gravity acts along one axis of the accelerometer."""
+"""
+A sensor that the calibration does not help is not corrected, and the other one is.
+
+On a vertical shaft gravity acts along one axis of the accelerometer.
+"""
 
 from dataclasses import replace
 
@@ -46,7 +50,11 @@ GOOD = random_calibration(1, proof=PROOF)
 
 @pytest.fixture(scope='module')
 def block():
-    """A session on a vertical shaft, of an IMU whose accelerometer is as its data sheet has it, and whose gyroscope is not."""
+    """
+    A session on a vertical shaft, of an IMU with a gyroscope that is off.
+
+    Its accelerometer is as its data sheet has it, and its gyroscope is not.
+    """
     session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
     triad = session.truth['accelerometer']
     force = (session.imu.force_s - triad.bias) @ np.linalg.inv(triad.matrix).T
@@ -146,7 +154,9 @@ def test_other_programs_get_nominal_numbers_for_the_sensor_that_is_refused(tmp_p
 
 
 def test_the_loss_of_a_refused_sensor_is_its_whole_error():
-    """It was reported as none, because the full compensation of nominal parameters changes nothing."""
+    """
+    It was reported as none, because the full compensation of nominal parameters changes nothing.
+    """
     known = harmed('accelerometer')
     whole, found = (export(known, find_target('px4'), anyway=anyway) for anyway in (True, False))
     assert found.loss.left['accelerometer'] == pytest.approx(
@@ -211,7 +221,12 @@ def test_check_says_which_sensor_it_helps(yaw, block):
 @pytest.mark.long
 @pytest.mark.real_data
 def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
-    """A vertical shaft: the accelerometer, unproven at other attitudes, doubled its error with a free matrix and reduces it with a fixed one."""
+    """
+    A vertical shaft.
+
+    The accelerometer, unproven at other attitudes, doubled its error with a free matrix and reduces
+    it with a fixed one.
+    """
     folder = recordings / 'shaft_yaw_slow_later'
     table = files.read_table(folder / 'table.yaml')
     with open_recording(folder) as recording:

@@ -1,4 +1,8 @@
-"""Nothing is read out of an effect's name; an effect that is added here alone goes through everything, as one of the catalogue's own does."""
+"""
+Nothing is read out of an effect's name.
+
+An effect that is added here alone goes through everything, as one of the catalogue's own does.
+"""
 
 import ast
 import pickle
@@ -41,11 +45,18 @@ KEYS_ELSEWHERE = {
     'estimation': {'earth_rate'},
     'targets': {'time_offset'},
 }
-"""Package -> words that are keys in its own documents, of noise, of units, of terms of a variance and of other programs, and speak of no effect there."""
+"""
+Package -> words that are keys in its own documents, of noise, of units, of terms of a variance and
+of other programs, and speak of no effect there.
+"""
 
 
 def spoken_of(path):
-    """Return the words of a module in which an effect's name stands, or with which a name would be asked what it says."""
+    """
+    Return the words of a module in which an effect's name stands.
+
+    They include the words with which a name would be asked for its meaning.
+    """
     names = {name for _, name in CATALOGUE.effects()}
     cuts = [(name, k) for name in names for k, letter in enumerate(name) if letter == '_']
     parts = {name[k:] for name, k in cuts} | {name[: k + 1] for name, k in cuts} | {'time_constant'}
@@ -87,7 +98,8 @@ def test_no_effect_is_known_by_name_outside_its_package():
         if line.rpartition(': ')[2] not in KEYS_ELSEWHERE.get(package, ())
     ]
     looked_up = re.compile(
-        rf"(slices|value|has|with_effect|find)[(\[][^()\[\]]*'({'|'.join(ALSO_WORDS)})'|== '({'|'.join(ALSO_WORDS)})'"
+        rf"(slices|value|has|with_effect|find)[(\[][^()\[\]]*'({'|'.join(ALSO_WORDS)})'|=="
+        rf" '({'|'.join(ALSO_WORDS)})'"
     )
     assert not [
         f'{path.name}: {found[0]}'
@@ -113,8 +125,10 @@ def test_the_search_for_names_finds_them(tmp_path, monkeypatch, line):
     assert spoken_of(tmp_path / 'module.py')
 
 
-# Effects that no catalogue holds: the gyroscopes' elements bend under specific force, so that products of its components act (anisoelasticity);
-# the accelerometers respond to all three components at once; and the gyroscopes' scale factors settle after turn-on.
+# Effects that no catalogue holds: the gyroscopes' elements bend under specific force, so that
+# products of its components act (anisoelasticity); the accelerometers respond to all three
+# components at once; and the gyroscopes' scale factors settle after turn-on.
+# settle after turn-on.
 MILLI_G = 9.80665e-3
 ADDED = {
     'gyro_anisoelasticity': {
@@ -330,9 +344,9 @@ def test_documents_and_processes_carry_it(tmp_path):
     assert 'gyro_scale_settling' not in text, 'only what the model has travels'
     (tmp_path / 'calibration.yaml').write_text(text)
     program = (
-        'import sys, numpy as np, imu_calibration as imu\n'
-        'force, rate = imu.load(sys.argv[1]).compensate([[1., 2., 9.]], [[.1, .2, .3]], time=[0.])\n'
-        'print(repr(np.hstack([force, rate])[0].tolist()))'
+        'import sys, numpy as np, imu_calibration as imu\nforce, rate ='
+        ' imu.load(sys.argv[1]).compensate([[1., 2., 9.]], [[.1, .2, .3]],'
+        ' time=[0.])\nprint(repr(np.hstack([force, rate])[0].tolist()))'
     )
     done = subprocess.run(
         [sys.executable, '-c', program, tmp_path / 'calibration.yaml'],
@@ -451,7 +465,11 @@ def by_code(**changed):
 
 
 def test_what_a_single_sample_does_not_tell_cannot_be_undone():
-    """Columns that compensation cannot know are refused when the effect is declared, and by the kernel itself."""
+    """
+    Columns that compensation cannot know are refused.
+
+    They are refused when the effect is declared, and by the kernel itself.
+    """
     late = by_code(groups=(ColumnGroup('mine', ('f_x * time',)),))
     with refused(InputError, 'time_unavailable', 'mine'):
         CATALOGUE.with_effects(late)

@@ -63,7 +63,11 @@ def asked_for(strange):
 
 
 def test_it_is_in_no_model_and_widens(diagnosed, strange, asked_for):
-    """The calibration says what is known, and errs by no more than it says: a cubic term is half a scale factor."""
+    """
+    The calibration says what is known, and errs by no more than it says.
+
+    A cubic term is half a scale factor.
+    """
     calibration = diagnosed.calibration
     assert not set(NAMES) & set(calibration.param_names) and 'added' not in calibration.statistics
     assert list(calibration.statistics['implausible']) == ['accel_cubic']

@@ -1,4 +1,8 @@
-"""The catalogue's forward equations reproduce what the physics made: one convention for signs, units and order of every parameter."""
+"""
+The catalogue's forward equations reproduce what the physics made.
+
+One convention for signs, units and order of every parameter.
+"""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -35,9 +39,10 @@ LEFT = {
     'gyro_vibration_rectification': 0.3,
 }
 """
-Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and Taylor series; the mount's turn to first order; the world's differences
-in time; what a neighbour feels along its own crooked axis; the branches of a thermal hysteresis are one play, not grains of unlike friction; a variance above 5 Hz of
-lines at 15 Hz is not all of it; else 1 ns stamps.
+Share of the effect that may remain: the catalogue's signs near zero input, its quadrature and
+Taylor series; the mount's turn to first order; the world's differences in time; what a neighbour
+feels along its own crooked axis; the branches of a thermal hysteresis are one play, not grains of
+unlike friction; a variance above 5 Hz of lines at 15 Hz is not all of it; else 1 ns stamps.
 """
 
 

@@ -1,4 +1,8 @@
-"""A file adds an effect: every verb and the node take it, a result carries it, and nothing but arithmetic passes."""
+"""
+A file adds an effect.
+
+Every verb and the node take it, a result carries it, and nothing but arithmetic passes.
+"""
 
 import random
 import string
@@ -191,7 +195,11 @@ def test_what_is_said_of_it_is_a_sentence(text, shown):
     ],
 )
 def test_what_cannot_be_told_from_another_is_no_size(z_of_y, said):
-    """Of an asymmetry on one axis that a recording holds against the bias, 40 +- 90 was told, and the 5 +- 1 of the other axis was not."""
+    """
+    An asymmetry on one axis that a recording holds against the bias was told wrongly.
+
+    Of this asymmetry 40 +- 90 was told, and the 5 +- 1 of the other axis was not.
+    """
     effect = term('mine', sensor='gyroscope', column='w_x', unit='1', tolerance=1e-6, text='Mine.')
     values = {
         f'gyroscope.mine.{axis}': (value, sd, 'strange')
@@ -315,7 +323,11 @@ def _random_column(rng):
 
 
 def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
-    """Ten thousand random columns: read and worked out to finite numbers, or refused in one line; nothing is called or imported."""
+    """
+    Ten thousand random columns: read and worked out to finite numbers, or refused in one line.
+
+    Nothing is called or imported.
+    """
     called, armed = [], False
 
     def watch(event, _arguments):
@@ -353,14 +365,13 @@ def test_whatever_a_file_says_it_does_arithmetic_or_nothing():
 @pytest.mark.live
 def test_the_node_reads_the_file(mine):
     program = (
-        'import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import CalibrationNode\n'
-        'from imu_calibration.use_cases.resources import config_file\n'
-        'given = {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n'
-        '         "gyroscope_model": "bias+matrix+gyro_warm_force"}\n'
-        'rclpy.init(args=["--ros-args", *(part for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\n'
-        'node = CalibrationNode()\n'
-        'print(node._options.catalogue.definitions(["gyro_warm_force"]).keys())\n'
-        'node.close(); node.destroy_node(); rclpy.shutdown()'
+        'import sys, rclpy\nfrom imu_calibration.nodes.calibration_node import'
+        ' CalibrationNode\nfrom imu_calibration.use_cases.resources import config_file\ngiven ='
+        ' {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n       '
+        '  "gyroscope_model": "bias+matrix+gyro_warm_force"}\nrclpy.init(args=["--ros-args", *(part'
+        ' for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\nnode ='
+        ' CalibrationNode()\nprint(node._options.catalogue.definitions(["gyro_warm_force"]).keys())\nnode.close();'
+        ' node.destroy_node(); rclpy.shutdown()'
     )
     done = subprocess.run(
         [sys.executable, '-c', program, str(mine)], capture_output=True, text=True, timeout=120
@@ -369,7 +380,11 @@ def test_the_node_reads_the_file(mine):
 
 
 def test_the_example_file_is_a_catalogue_whose_effects_are_found():
-    """Each effect of the example, hidden in a session on a table, is added by a calibration that knows the file, with its true values."""
+    """
+    Each effect of the example, hidden in a session on a table, is added.
+
+    It is added by a calibration that knows the file, with its true values.
+    """
     example, table = (
         Path(__file__).resolve().parents[2] / 'config/effects_example.yaml',
         stand('three axes'),

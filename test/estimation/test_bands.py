@@ -1,4 +1,8 @@
-"""Slow and fast parts of moving windows: alike where the reference is right, apart where the fast part is wrong."""
+"""
+Slow and fast parts of moving windows.
+
+Alike where the reference is right, apart where the fast part is wrong.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +30,11 @@ GAIN, NOISE = 1.02, 0.01
 
 
 def sweeps(rng, fast_gain, n_windows=12, length=1500):
-    """Return windows of a shaft that swings slowly and shakes at 11 Hz; the gyroscope shows the shaking with a gain of its own."""
+    """
+    Return windows of a shaft that swings slowly and shakes at 11 Hz.
+
+    The gyroscope shows the shaking with a gain of its own.
+    """
     windows = []
     for number in range(n_windows):
         time = 20.0 * number + 0.01 * np.arange(length)
@@ -57,7 +65,11 @@ def solved(windows):
 
 @pytest.mark.parametrize('fast_gain', [0.3, 0.85, 1.2])
 def test_a_wrong_gain_at_high_frequency_does_not_bend_the_estimate(fast_gain):
-    """Ripple that a low-pass has taken from the gyroscope, or the encoder from the reference; all samples alike would err by up to 8 %."""
+    """
+    Ripple that a low-pass has taken from the gyroscope, or the encoder from the reference.
+
+    All samples alike would err by up to 8 %.
+    """
     windows = sweeps(np.random.default_rng(1), fast_gain)
     value, sd, noise = solved(windows)
     assert abs(value - GAIN) < 4 * sd < 0.01
@@ -71,7 +83,8 @@ def test_nothing_is_thrown_away_where_the_reference_is_right():
     """
     The standard deviation is that of all samples, and estimates scatter by it.
 
-    The mean square of 50 errors in sd scatters by 0.2; the bounds exclude an sd that is wrong by a factor of 1.3, in either direction, for this seed.
+    The mean square of 50 errors in sd scatters by 0.2; the bounds exclude an sd that is wrong by a
+    factor of 1.3, in either direction, for this seed.
     """
     rng, errors = np.random.default_rng(2), []
     for _ in range(50):
@@ -123,7 +136,11 @@ def test_variance_along_the_columns_is_that_of_noise_and_shows_what_is_no_noise(
 
 
 def test_the_slow_misfit_of_few_pieces_is_taken_larger():
-    """By two standard deviations of a variance from so many: parts are told apart where that is sure, and weighed by what is sure."""
+    """
+    By two standard deviations of a variance from so many.
+
+    Parts are told apart where that is sure, and weighed by what is sure.
+    """
     few, many = (
         band_misfit(
             np.full(3, 3.0 * (9 * dof) + dof), 10 * dof, np.full(3, float(dof)), dof_slow=dof

@@ -1,4 +1,6 @@
-"""Values that only misfit gives are held and named; values of effects that nobody asked for shrink."""
+"""
+Values that only misfit gives are held and named; values of effects that nobody asked for shrink.
+"""
 
 from dataclasses import replace
 
@@ -31,13 +33,21 @@ def solved(windows, model, table):
 
 @pytest.fixture(scope='module')
 def upright():
-    """Windows on a vertical shaft, where gravity never acts along x and y: readings of a perfect sensor."""
+    """
+    Windows on a vertical shaft, where gravity never acts along x and y.
+
+    Readings of a perfect sensor.
+    """
     found = calibrated(make_pair(None, 41, table=UPRIGHT, profile='sweeps').first)
     return found.windows, Table.from_mapping(UPRIGHT)
 
 
 def read(windows, table, model, values, *, ripple=0.0, seed=1):
-    """Return the windows with what a sensor of these parameters reads, noise, and a force on x in turns, as no effect has it."""
+    """
+    Return the windows with the readings of a sensor of these parameters.
+
+    They have noise, and a force on x in turns, as no effect has it.
+    """
     rng, made = np.random.default_rng(seed), []
     for window in windows:
         force, rate = predict(model, values, table, motion=window.motion)
@@ -59,7 +69,12 @@ def read(windows, table, model, values, *, ripple=0.0, seed=1):
 
 
 def test_a_scale_that_only_misfit_gives_is_held_and_named(upright):
-    """Gravity never acts along x; where the sensor sits, 10 mm off the axis, brings some mm/s^2 there in step with the motion, and so does misfit."""
+    """
+    Gravity never acts along x.
+
+    Where the sensor sits, 10 mm off the axis, brings some mm/s^2 there in step with the motion, and
+    so does misfit.
+    """
     windows, table = upright
     table = replace(table, mount_xyz=np.array([0.01, 0.0, 0.0]))
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(table.joint_names))
@@ -86,7 +101,9 @@ def test_a_wrong_full_scale_setting_is_no_misfit():
 
 
 def test_the_earth_turns_only_where_the_table_says_where_it_stands():
-    """Without a latitude the Earth's rate is not modelled; with one and without an azimuth it is."""
+    """
+    Without a latitude the Earth's rate is not modelled; with one and without an azimuth it is.
+    """
     table = Table.from_mapping({**TABLES['three_axis'], 'latitude': None, 'gravity': 9.81})
     somewhere = Table.from_mapping(
         {**TABLES['three_axis'], 'latitude': 50.0, 'height': 0.0, 'azimuth_deg': None}
@@ -96,7 +113,11 @@ def test_the_earth_turns_only_where_the_table_says_where_it_stands():
 
 
 def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
-    """Arms that are not there go most of the way to zero, plain ones stay, and the standard deviations are what they were."""
+    """
+    Arms that are not there move most of the way to zero, and plain ones remain.
+
+    The standard deviations are as they were.
+    """
     windows, table = (
         calibrated(make_pair(None, 11).first).windows,
         Table.from_mapping(TABLES['three_axis']),

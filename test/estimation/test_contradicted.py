@@ -1,4 +1,8 @@
-"""Windows that do not belong to the others count for nothing, one pose that was leaned on or a bump in motion; clean sessions keep all."""
+"""
+Windows that do not belong to the rest count for nothing, clean sessions keep all.
+
+Such a window is one pose that was leaned on, or a bump in motion.
+"""
 
 from dataclasses import replace
 
@@ -95,7 +99,11 @@ def test_clean_sessions_keep_all_windows(session):
     ids=('one pose', 'two poses', 'a blow in motion'),
 )
 def test_what_others_contradict_costs_nothing(session, spoil):
-    """Biases stay as good and as certain as without it; the fit that believes all windows is ten times as uncertain of poses."""
+    """
+    Biases stay as good and as certain as without it.
+
+    The fit that believes all windows is ten times as uncertain of poses.
+    """
     clean, spoilt = (
         solve(accumulated(session.windows), MODEL),
         solve(accumulated(spoil(session.windows)), MODEL),

@@ -1,4 +1,8 @@
-"""The covariance as named terms whose sum is the total, and weak values that are replaced by their prior."""
+"""
+The covariance as named terms with the total as their sum.
+
+Weak values are replaced by their prior.
+"""
 
 from dataclasses import replace
 
@@ -31,7 +35,11 @@ SESSION = imu.simulate('quick', seed=2)
 
 @pytest.fixture(scope='module')
 def by_table():
-    """Return the result of a short session of an IMU without errors, where tolerances make some parameters weak, on a table of uncertain gravity."""
+    """
+    Return the result of a short session of an IMU without errors.
+
+    Where tolerances make some parameters weak, on a table of uncertain gravity.
+    """
     return imu.calibrate(
         replace(SESSION.samples, imu=SESSION.truth.compensate(SESSION.samples.imu)),
         replace(SESSION.table, gravity_sd=1e-3),
@@ -41,7 +49,11 @@ def by_table():
 
 
 def test_a_weak_value_is_replaced_by_the_sd_of_the_fit_alone():
-    """An allowance decides that a value is weak, not that its prior is nearer; correlated values follow, and the shift enters the sds."""
+    """
+    An allowance decides that a value is weak, not that its prior is nearer.
+
+    Correlated values follow, and the shift enters the sds.
+    """
     fit = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
     terms, prior = (
         {SAMPLE_NOISE: 0.75 * fit, BIAS_PROCESS: 0.25 * fit, 'model_error': 100.0 * np.eye(3)},
@@ -65,7 +77,11 @@ def test_a_weak_value_is_replaced_by_the_sd_of_the_fit_alone():
 
 
 def test_the_sds_of_replaced_values_agree_with_their_errors():
-    """Truths within 0.7 sd of the prior: replacement lowers the errors, and the reported sds are not too small."""
+    """
+    Truths within 0.7 sd of the prior.
+
+    Replacement lowers the errors, and the reported sds are not too small.
+    """
     rng, fit = np.random.default_rng(3), np.array([[1.0, 0.6], [0.6, 1.0]])
     z, gain = [], []
     for truth in rng.normal(scale=0.7, size=(4000, 2)):
@@ -122,7 +138,9 @@ def test_terms_and_reasons_pass_through_the_file(by_table):
 
 
 def test_offsets_of_windows_are_a_term_apart_from_white_noise(by_table):
-    """Without bias processes, offsets and differences between recordings the second term vanishes."""
+    """
+    Without bias processes, offsets and differences between recordings the second term vanishes.
+    """
     from imu_calibration.estimation.solver import solve
 
     solution, accumulator = by_table.solution, by_table.gathered.accumulator

@@ -1,4 +1,8 @@
-"""The estimator: exactness without noise, and standard deviations that match the scatter over many sessions."""
+"""
+The estimator.
+
+Exactness without noise, and standard deviations that match the scatter over many sessions.
+"""
 
 import numpy as np
 import pytest
@@ -43,7 +47,11 @@ FULL = SensorModel(
 
 @pytest.fixture(scope='module')
 def session():
-    """Windows of a short full session, as long as its noise allows; their outputs are replaced by each test."""
+    """
+    Windows of a short full session, as long as its noise allows.
+
+    Their outputs are replaced by each test.
+    """
     profile = make_profile('quick', 0, TABLE)
     white = SimulatedNoise(
         accel_density=INDUSTRIAL.accel_density, gyro_density=INDUSTRIAL.gyro_density
@@ -61,15 +69,21 @@ def session():
 
 
 def measured(windows, model, values, rng, force_sd=0.0, rate_sd=0.0, offset=0.0):
-    """Return the windows with outputs of the model, white noise, and an offset per window in units of the mean's noise."""
+    """
+    Return the windows with outputs of the model, white noise, and offsets.
+
+    The offset of each window is in units of the mean's noise.
+    """
     result = []
     for window in windows:
         force, rate = predict(model, values, TABLE, motion=window.motion)
         n = len(window.time)
         force, rate = (
-            output + rng.normal(0, sd, (n, 3)) + rng.normal(0, offset * sd, 3)
-            if sd
-            else np.broadcast_to(output, (n, 3)).copy()
+            (
+                output + rng.normal(0, sd, (n, 3)) + rng.normal(0, offset * sd, 3)
+                if sd
+                else np.broadcast_to(output, (n, 3)).copy()
+            )
             for output, sd in ((force, force_sd), (rate, rate_sd))
         )
         result.append(Window(**{**vars(window), 'force_s': force, 'rate_s': rate}))
@@ -97,7 +111,9 @@ class SameMotion:
         return self.known[key]
 
     def outputs(self, session, values, rng):
-        """Return the session's windows with outputs of FULL, white noise, and biases that wander."""
+        """
+        Return the session's windows with outputs of FULL, white noise, and biases that wander.
+        """
         found, times = [], np.arange(0.0, session[-1].time[-1] + 1.0, 0.5)
         wander = [
             gauss_markov(sd, 100.0, 0.5, shape=(len(times), 3), rng=rng)
@@ -130,7 +146,11 @@ def true_values(model, seed):
 
 
 def test_noise_free_session_gives_the_truth(session):
-    """Bilinear products, arms and gauge are exact; the tilt is linear to first order, 1e-7 of g at 5e-4 rad."""
+    """
+    Bilinear products, arms and gauge are exact.
+
+    The tilt is linear to first order, 1e-7 of g at 5e-4 rad.
+    """
     model = FULL.without('reference', 'table_tilt')
     truth = true_values(model, 3)
     solution = solve(
@@ -143,11 +163,14 @@ def test_noise_free_session_gives_the_truth(session):
 @pytest.mark.long
 def test_reported_standard_deviations_match_the_scatter(session):
     """
-    A hundred and twenty sessions with white noise and wandering biases: normalised errors, coverage, sd ratios, and efficiency.
+    A hundred and twenty sessions with white noise and wandering biases.
 
-    Bounds: mean square 0.95-1.05, coverage of the 95 % interval 93.5-96.5 %, sd ratio of each parameter 0.77-1.20: nothing is
-    more than 1.3 times as wide as it scatters in the median session (biases allow for changes slower than the session), and fewer than one in
-    twenty is half as wide again: where a parameter seems to drift.
+    Normalised errors, coverage, sd ratios, and efficiency.
+
+    Bounds: mean square 0.95-1.05, coverage of the 95 % interval 93.5-96.5 %, sd ratio of each
+    parameter 0.77-1.20: nothing is more than 1.3 times as wide as it scatters in the median session
+    (biases allow for changes slower than the session), and fewer than one in twenty is half as wide
+    again: where a parameter seems to drift.
     """
     normalised, errors, deviations, bounds, same = [], [], [], [], SameMotion()
     for seed in range(120):
@@ -166,8 +189,9 @@ def test_reported_standard_deviations_match_the_scatter(session):
     ratio, wide = errors.std(axis=0) / usual, (deviations > 1.5 * usual).mean()
     efficiency = np.sqrt((errors**2).mean(axis=0) / np.mean(bounds, axis=0))
     print(
-        f'120 sessions: mean square {mean_square:.3f} wanted 0.95-1.05, coverage {coverage:.4f} wanted 0.935-0.965, sd ratio {ratio.min():.2f}-{ratio.max():.2f} '
-        f'wanted 0.77-1.20, RMSE over Cramer-Rao bound {np.sqrt((efficiency**2).mean()):.3f} wanted at most 1.05'
+        f'120 sessions: mean square {mean_square:.3f} wanted 0.95-1.05, coverage {coverage:.4f}'
+        f' wanted 0.935-0.965, sd ratio {ratio.min():.2f}-{ratio.max():.2f} wanted 0.77-1.20, RMSE'
+        f' over Cramer-Rao bound {np.sqrt((efficiency**2).mean()):.3f} wanted at most 1.05'
     )
     assert 0.95 <= mean_square <= 1.05
     assert 0.935 <= coverage <= 0.965
@@ -192,7 +216,11 @@ def cramer_rao(system, model):
 
 
 def test_undetermined_parameters_are_held_and_carried(session):
-    """Static windows say nothing of arms and gyroscope scale: they stay at their prior, with its standard deviation."""
+    """
+    Static windows say nothing of arms and gyroscope scale.
+
+    They stay at their prior, with its standard deviation.
+    """
     truth = true_values(FULL, 5)
     static = [
         w
@@ -264,7 +292,11 @@ def test_fewer_columns_are_the_same_as_a_smaller_model(session):
     ],
 )
 def test_columns_are_the_derivative_of_the_prediction(session, name):
-    """Columns times the derivative of the coefficients equal finite differences of the forward equations."""
+    """
+    Columns times the derivative of the coefficients equal finite differences.
+
+    The finite differences are of the forward equations.
+    """
     from imu_calibration.effects.catalogue import CATALOGUE
 
     owner = CATALOGUE.owner_of(name)
@@ -300,7 +332,11 @@ def test_columns_are_the_derivative_of_the_prediction(session, name):
 
 
 def test_a_warp_of_one_sensor_leaves_the_other_sensors_motion_alone(session):
-    """The table's tilt concerns the accelerometer: worked out together, the columns of both are those worked out apart (to the bit)."""
+    """
+    The table's tilt concerns the accelerometer.
+
+    Worked out together, the columns of both are those worked out apart (to the bit).
+    """
     model = FULL.with_effect('gyroscope', 'gyro_bandwidth').with_effect('reference', 'time_offset')
     values = model.start()
     (

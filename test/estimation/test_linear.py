@@ -34,7 +34,9 @@ def test_exact_data_come_back_for_one_and_several_outputs():
 
 
 def test_badly_scaled_columns_are_solved_where_normal_equations_fail():
-    """Columns of norm 1e-6 to 1e6 and a Hilbert-like core: SVD with scaled columns keeps ten digits."""
+    """
+    Columns of norm 1e-6 to 1e6 and a Hilbert-like core: SVD with scaled columns keeps ten digits.
+    """
     core = 1.0 / (np.arange(1, 15)[:, None] + np.arange(5))
     design = core * np.array([1e-6, 1e-3, 1, 1e3, 1e6])
     truth = np.array([1e6, 1e3, 1, 1e-3, 1e-6])
@@ -127,7 +129,11 @@ def test_wrong_input_is_refused(design, outputs, weights):
 
 
 def test_tolerance_scaling_finds_the_weak_parameter_that_eqcond_misses():
-    """Orthogonal columns have eqcond 1 whatever their size; against tolerances the small one is out of reach."""
+    """
+    Orthogonal columns have eqcond 1 whatever their size.
+
+    Against tolerances the small one is out of reach.
+    """
     design = np.kron(np.eye(3), np.ones((4, 1))) * np.array([1, 1, 1e-3])
     scaled = tolerance_scaled(design, np.full(3, 0.1), sigma=0.02)
     assert condition_numbers(design)[1] == pytest.approx(1)

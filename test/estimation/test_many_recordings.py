@@ -1,4 +1,6 @@
-"""Several recordings of one IMU in one system: a bias of its own for each when the data ask for it."""
+"""
+Several recordings of one IMU in one system: a bias of its own for each when the data ask for it.
+"""
 
 from types import SimpleNamespace
 
@@ -59,7 +61,9 @@ def motion():
 
 
 def recordings(motion, values, steps, rng):
-    """Return the merged system of recordings, each with its own step of the biases (sensor -> (3,))."""
+    """
+    Return the merged system of recordings, each with its own step of the biases (sensor -> (3,)).
+    """
     total = Accumulator()
     for session, step in enumerate(steps):
         part = Accumulator()
@@ -96,7 +100,11 @@ def bias_sds(motion):
 
 
 def test_biases_that_differ_get_a_value_each(motion):
-    """Steps of five standard deviations between two recordings are found, and each recording's bias comes out."""
+    """
+    Steps of five standard deviations between two recordings are found.
+
+    Each recording's bias is estimated correctly.
+    """
     sds, values = bias_sds(motion), random_values(MODEL, 'industrial', 1)
     steps = [
         {s: sign * 2.5 * np.sqrt(2) * sds[s] * np.array([1, -1, 1]) for s in SENSORS}
@@ -114,7 +122,11 @@ def test_biases_that_differ_get_a_value_each(motion):
 
 
 def test_biases_that_agree_stay_one(motion):
-    """Without steps, eight pairs of recordings are taken as one, and the bias is known better than from one alone."""
+    """
+    Without steps, eight pairs of recordings are treated as one.
+
+    The bias is known better than from a single recording.
+    """
     sds = bias_sds(motion)
     for seed in range(8):
         system = recordings(
@@ -133,10 +145,12 @@ def test_biases_that_agree_stay_one(motion):
 @pytest.mark.long
 def test_standard_deviations_hold_when_biases_differ(motion):
     """
-    Errors against the mean of all possible recordings, in reported sd, over 16 sets of four recordings.
+    Errors against the mean of all possible recordings, in reported sd.
 
-    The square of a t-distributed error has a heavy tail (nine degrees of freedom): 96 of them have a mean of 1 with a standard
-    deviation of 0.2 at most, 400 of a normal distribution one of 0.07.
+    They are over 16 sets of four recordings.
+
+    The square of a t-distributed error has a heavy tail (nine degrees of freedom): 96 of them have
+    a mean of 1 with a standard deviation of 0.2 at most, 400 of a normal distribution one of 0.07.
     """
     sds, errors = bias_sds(motion), []
     for seed in range(16):
@@ -154,7 +168,11 @@ def test_standard_deviations_hold_when_biases_differ(motion):
 
 @pytest.mark.long
 def test_what_a_smaller_recording_shows_is_taken_in():
-    """Long rests show no delay; two minutes of motion with the same IMU and a driver that is 12 ms late do."""
+    """
+    Long rests show no delay.
+
+    Two minutes of motion with the same IMU and a driver that is 12 ms late do.
+    """
     pair = make_pair('driver_lag', 31)
     resting = make_session(
         63, noise='realistic', grade='industrial', profile='static_only', unit=31

@@ -1,4 +1,8 @@
-"""Standard deviations allow for what the model misses: parameters that drift, misfit that goes with the motion; clean sessions stay as they are."""
+"""
+Standard deviations allow for what the model misses.
+
+Parameters that drift, misfit that goes with the motion; clean sessions stay as they are.
+"""
 
 from dataclasses import replace
 
@@ -37,7 +41,11 @@ def windows():
 
 
 def measured(windows, change_of, seed):
-    """Return the windows with white noise, the gyroscope's matrix moved by `change_of(share of the session)` at each window."""
+    """
+    Return the windows with white noise, and the gyroscope's matrix moved.
+
+    At each window it is moved by `change_of(share of the session)`.
+    """
     rng, end, found = np.random.default_rng(seed), windows[-1].time[-1], []
     for window in windows:
         values = MODEL.start()
@@ -78,7 +86,11 @@ def test_clean_sessions_stay_as_they_are(windows):
 
 
 def test_a_parameter_that_drifts_has_a_standard_deviation_that_repeats(windows):
-    """A cross term that walks by 2e-3 during the session is not known to 2e-5; what is another sensor's stays."""
+    """
+    A cross term that walks by 2e-3 during the session is not known to 2e-5.
+
+    What is another sensor's stays.
+    """
     rng = np.random.default_rng(3)
     walk = np.cumsum(rng.normal(0, 1, 50)) * 2e-3 / np.sqrt(50)
     found = solved(
@@ -92,7 +104,11 @@ def test_a_parameter_that_drifts_has_a_standard_deviation_that_repeats(windows):
 
 @pytest.mark.parametrize('cause', ['encoder_eccentricity', 'flexible_mount'])
 def test_errors_that_go_with_the_motion_are_in_the_standard_deviations(cause):
-    """With noise alone the errors of matrices are many standard deviations; with what the blocks show they are as large as they should be."""
+    """
+    With noise alone the errors of matrices are many standard deviations.
+
+    With what the blocks show they are as large as they should be.
+    """
     errors = [errors_in_sd(calibrated(make_pair(cause, seed).first)) for seed in (21, 22)]
     alone, with_it = (
         np.concatenate(
@@ -115,7 +131,11 @@ def test_few_blocks_say_nothing(windows):
 
 
 def test_blocks_are_bounded_and_hold_all_rows(windows, monkeypatch):
-    """However long the session, the number of blocks is bounded, and together they hold what the whole holds; columns are picked in both."""
+    """
+    However long the session, the number of blocks is bounded.
+
+    Together the blocks hold the content of the entire session, and columns are picked in both.
+    """
     monkeypatch.setattr(accumulator_module, 'MAX_ACCUMULATOR_BLOCKS', 6)
     total = accumulated(windows)
     assert 3 <= len(total.blocks) <= 6
@@ -134,7 +154,9 @@ def test_blocks_are_bounded_and_hold_all_rows(windows, monkeypatch):
 
 
 def test_blocks_hold_all_rows_when_means_are_joined(windows, monkeypatch):
-    """The difference of two windows that are joined into one mean row goes to their block as well."""
+    """
+    The difference of two windows that are joined into one mean row goes to their block as well.
+    """
     monkeypatch.setattr(accumulator_module, 'MAX_MEAN_ROWS', 20)
     total = accumulated(windows)
     key = ('gyroscope', 'static')
@@ -147,7 +169,9 @@ def test_blocks_hold_all_rows_when_means_are_joined(windows, monkeypatch):
 
 
 def test_copies_and_merged_systems_go_their_own_way(windows):
-    """A window added to one accumulator shows in no copy of it, nor in one that it was merged into."""
+    """
+    A window added to one accumulator shows in no copy of it, nor in one that it was merged into.
+    """
     first = accumulated(windows[:9])
     total, twin = Accumulator(), first.copy()
     total.merge(first)
@@ -184,7 +208,12 @@ def test_accumulators_of_one_recording_share_its_memory(windows, monkeypatch):
 
 
 def test_biases_carry_what_goes_with_the_attitude_as_offsets_or_as_a_bias_too_fast_to_be_one():
-    """A flexible mount is even in the attitude: the mean of what it adds is as large as its scatter, which the noise takes for a process of 6 s here."""
+    """
+    A flexible mount is even in the attitude.
+
+    The mean of what it adds is as large as its scatter, which the noise takes for a process of 6 s
+    here.
+    """
     found = calibrated(make_pair('flexible_mount', 9313).first)
     noise, part = (
         found.solution.noise['accelerometer'],
@@ -201,7 +230,12 @@ def test_biases_carry_what_goes_with_the_attitude_as_offsets_or_as_a_bias_too_fa
 
 
 def test_a_drift_shows_beside_noise_that_was_taken_too_large():
-    """Ripple that is fast and not white is taken for noise; a drift of 1.7 such deviations counts where the fast cosines scatter by a third of one, and not by all."""
+    """
+    Ripple that is fast and not white is taken for noise.
+
+    A drift of 1.7 such deviations counts where the fast cosines scatter by a third of one, and not
+    by all.
+    """
 
     def waves(fast):
         rng = np.random.default_rng(5)

@@ -1,4 +1,8 @@
-"""The noise model: what means of windows scatter by, what rests tell, and misfit that lies along the columns."""
+"""
+The noise model.
+
+What means of windows scatter by, what rests tell, and misfit that lies along the columns.
+"""
 
 from types import SimpleNamespace
 
@@ -46,7 +50,11 @@ def test_a_knocked_rest_does_not_enter_the_noise():
 
 
 def test_a_code_that_is_constant_at_rest_has_the_noise_of_rounding():
-    """Steps of 0.08 show in motion only: the variance at rest is step^2 / 12, not zero, which made ratios to the noise at rest 3e5."""
+    """
+    Steps of 0.08 show in motion only.
+
+    The variance at rest is step^2 / 12, not zero, which made ratios to the noise at rest 3e5.
+    """
     moving = rest(rounding_variance(0.08 * np.round(np.linspace([0.0], [5.0], 400) / 0.08))[0])
     moving.kind = 'dynamic'
     white, _ = white_noise([rest(0.0), rest(0.0), moving], 'gyroscope')
@@ -69,7 +77,11 @@ def test_a_variance_from_few_data_is_taken_larger():
 
 @pytest.mark.parametrize(('smooth', 'least', 'most'), ((False, 0.7, 1.3), (True, 20.0, 300.0)))
 def test_misfit_along_the_columns_shows_how_correlated_it_is(smooth, least, most):
-    """White misfit leaves its variance per dimension of the columns; one that moves with them as many times more as there are samples."""
+    """
+    White misfit leaves its variance per dimension of the columns.
+
+    One that moves with them as many times more as there are samples.
+    """
     rng, products = np.random.default_rng(4), []
     for _ in range(60):
         time = np.linspace(0, 1, 200)
@@ -87,7 +99,11 @@ def test_misfit_along_the_columns_shows_how_correlated_it_is(smooth, least, most
 
 
 def test_a_column_of_which_rounding_left_less_than_nothing_says_nothing():
-    """Products about the mean of a window can come out below zero: such a column made the misfit along the others 1e95 times larger."""
+    """
+    Products about the mean of a window can come out below zero.
+
+    Such a column made the misfit along the others 1e95 times larger.
+    """
     rng = np.random.default_rng(5)
     rows = np.column_stack([rng.normal(size=(200, 3)), np.full(200, 1e-7), rng.normal(size=200)])
     products = rows.T @ rows
@@ -98,7 +114,11 @@ def test_a_column_of_which_rounding_left_less_than_nothing_says_nothing():
 
 
 def test_a_mean_over_a_window_differs_from_the_bias_in_its_middle_by_what_it_wanders():
-    """Against Gauss-Markov processes drawn step by step: windows of 4 and 16 s of one that forgets in 100 s."""
+    """
+    Against Gauss-Markov processes drawn step by step.
+
+    Windows of 4 and 16 s of one that forgets in 100 s.
+    """
     process, rng = BiasProcess(1.0, 100.0), np.random.default_rng(6)
     bias = gauss_markov(process.sd, process.time, 0.1, shape=(161, 4000), rng=rng)
     noise = NoiseModel(np.zeros(3), np.ones(3), bias_processes=(process,))
@@ -120,7 +140,8 @@ def test_angles_that_are_read_in_steps_tilt_gravity_at_rest_and_not_in_motion():
     still, moving = ReferenceNoise.of_steps(1e-3, 'accelerometer').variance(
         ['static', 'spin'], np.full(2, 5.0)
     )
-    # all directions are alike here; a joint's axis across gravity, as tables have them, turns half as much again into two components
+    # all directions are alike here; a joint's axis across gravity, as tables have them, turns half
+    # as much again into two components
     assert seen.var() < still < 4 * seen.var() and moving == 0.0
     assert (
         not ReferenceNoise.of_steps(0.0, 'gyroscope')

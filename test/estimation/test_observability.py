@@ -39,7 +39,9 @@ def added(name, model=MODEL, noise=NOISE):
 
 
 def test_a_rest_adds_what_means_of_five_seconds_say():
-    """Information is one over the variance of the mean: noise within, offset, and all bias processes."""
+    """
+    Information is one over the variance of the mean: noise within, offset, and all bias processes.
+    """
     information, pieces = added('static_poses'), BY_NAME['static_poses'].make(GRAVITY)
     for axis in range(3):
         noise = NOISE['accelerometer']

@@ -1,4 +1,6 @@
-"""Whitening, its adjoint and the restricted likelihood in linear time against the dense covariance."""
+"""
+Whitening, its adjoint and the restricted likelihood in linear time against the dense covariance.
+"""
 
 import numpy as np
 import pytest
@@ -28,7 +30,9 @@ def processes(request):
 
 @pytest.fixture
 def rows():
-    """Return rows of twenty windows in three recordings with their times, variances and recordings."""
+    """
+    Return rows of twenty windows in three recordings with their times, variances and recordings.
+    """
     rng = np.random.default_rng(5)
     numbers = np.repeat([0, 1, 2], [9, 7, 4])
     times, variance = np.sort(rng.uniform(0, 500, 20)), rng.uniform(0.5, 2, (20, 3))
@@ -125,7 +129,11 @@ def test_likelihood_is_that_of_the_dense_covariance(rows, processes):
 
 
 def test_the_restricted_likelihood_is_that_of_contrasts_free_of_the_parameters(rows, processes):
-    """Two noises differ as in the likelihood of all contrasts that no parameter reaches (Harville 1974)."""
+    """
+    Two noises differ as in the likelihood of all contrasts.
+
+    They are contrasts that no parameter reaches (Harville 1974).
+    """
     values, times, variance, sessions = rows
     likelihood, found, expected = RestrictedLikelihood(values, times, sessions), [], []
     design = values[:, :, :-1].transpose(1, 0, 2).reshape(60, 3)
@@ -182,7 +190,11 @@ def test_a_variance_from_few_data_is_taken_larger():
 
 
 def test_scoring_is_the_derivative_of_the_likelihood(rows):
-    """The score against central differences, its covariance over many draws against the information (to the scatter of 4000 draws)."""
+    """
+    The score against central differences, its covariance against the information.
+
+    The covariance is over many draws, to the scatter of 4000 draws.
+    """
     values, times, _, sessions = rows
     group = np.arange(60) % 3
     members, noise = np.array([group == k for k in range(3)], float), np.full(60, 0.3)
@@ -211,7 +223,11 @@ def test_scoring_is_the_derivative_of_the_likelihood(rows):
 
 
 def test_factor_along_a_band_is_that_of_all_rows():
-    """Rows of a chain of poses, in any order, with common columns last and one pose without rows: the products agree, in small parts."""
+    """
+    Rows of a chain of poses, in any order, with common columns last and one pose without rows.
+
+    The products agree, in small parts.
+    """
     rng, n_poses, largest = np.random.default_rng(8), 40, []
     rows = np.zeros((n_poses, 12, 5 * n_poses + 7))
     for pose in range(n_poses - 1):

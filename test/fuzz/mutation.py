@@ -100,7 +100,11 @@ def mutated(data, others, rng, text=False):
 
 
 def mutated_archive(data, others, rng):
-    """Return a zip archive with a change in the content of a member, so that its checksum is right; one of five times as any bytes."""
+    """
+    Return a zip archive with a change in the content of a member, so that its checksum is right.
+
+    One of five times as any bytes.
+    """
     if rng.random() < 0.2:
         return mutated(data, others, rng)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:

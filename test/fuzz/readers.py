@@ -54,7 +54,10 @@ class Reader:
     seeds: Callable[[Path], list[bytes]]
     """Folder for files -> valid inputs."""
     read: Callable[[bytes, Path], Any]
-    """Read an input, with a folder in which to put it; raises ImuCalibrationError for one that is refused."""
+    """
+    Read an input, with a folder in which to put it; raises ImuCalibrationError for one that is
+    refused.
+    """
     text: bool = False
     """Whether tokens and lines are changed as well as bytes."""
     mutate: Callable = mutated
@@ -344,7 +347,10 @@ def _import_reader(target):
     )
 
 
-EFFECTS = b"effects:\n  mine: {sensor: accelerometer, column: 'f_x * abs(f_x)', unit: 's^2/m', tolerance: 0.001, text: 'mine'}\n"
+EFFECTS = (
+    b"effects:\n  mine: {sensor: accelerometer, column: 'f_x * abs(f_x)', unit: 's^2/m', tolerance:"
+    b" 0.001, text: 'mine'}\n"
+)
 READERS = {
     'mcap': Reader(mcap_seeds, _file_reader('x.mcap', read_bag)),
     'sqlite3': Reader(

@@ -1,8 +1,11 @@
 """
-Read mutated recordings, documents and messages with every reader of untrusted input, under limits of memory and processor time.
+Read mutated recordings, documents and messages under limits.
 
-Run: ``python test/fuzz/run.py --minutes 10`` (or ``make fuzz MINUTES=10``). An input must be read or refused with an `ImuCalibrationError`.
-Any other exception, a warning, more than 10 s of processor time, or more than 1 GB is a finding; its input is kept in `out/fuzz`.
+Every reader of untrusted input reads them, with limits of memory and processor time.
+
+Run: ``python test/fuzz/run.py --minutes 10`` (or ``make fuzz MINUTES=10``). An input must be read
+or refused with an `ImuCalibrationError`. Any other exception, a warning, more than 10 s of
+processor time, or more than 1 GB is a finding; its input is kept in `out/fuzz`.
 """
 
 import argparse
@@ -58,7 +61,11 @@ class Record:
 
 
 def read_inputs(reader, seeds, seed, folder, *, goes_on, before=lambda data: None):
-    """Read mutations of `seeds` while `goes_on(record)` holds; `before` is called with each input. Return the Record."""
+    """
+    Read mutations of `seeds` while `goes_on(record)` holds; `before` is called with each input.
+
+    Return the Record.
+    """
     from imu_calibration.core.errors import ImuCalibrationError
 
     rng, record = random.Random(seed), Record()
@@ -187,12 +194,14 @@ def main():
                 record.add(fuzz_slice(name, seeds[name], f'{seed} {name} {turn}', seconds))
         turn += 1
     print(
-        f'{"reader":24} {"inputs":>8} {"read":>8} {"refused":>8} {"findings":>8} {"MB":>6} {"longest s":>9}'
+        f'{"reader":24} {"inputs":>8} {"read":>8} {"refused":>8} {"findings":>8} {"MB":>6}'
+        f' {"longest s":>9}'
     )
     for name, record in records.items():
         n_inputs = record.n_read + record.n_refused
         print(
-            f'{name:24} {n_inputs:8d} {record.n_read:8d} {record.n_refused:8d} {len(record.findings):8d} {record.megabytes:6.0f} {record.seconds:9.2f}'
+            f'{name:24} {n_inputs:8d} {record.n_read:8d} {record.n_refused:8d}'
+            f' {len(record.findings):8d} {record.megabytes:6.0f} {record.seconds:9.2f}'
         )
     print(f'{"all":24} {sum(record.n_read + record.n_refused for record in records.values()):8d}')
     for name, record in records.items():

@@ -31,7 +31,11 @@ def random_motion(table, n=40, seed=3):
 
 
 def pinocchio_reference(text, table, motion, link='imu_link'):
-    """Return attitude, rate, angular acceleration and specific force of the link by Pinocchio, z of the root up."""
+    """
+    Return the motion of the link by Pinocchio, z of the root up.
+
+    The motion is attitude, rate, angular acceleration and specific force.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
         pin = pytest.importorskip(
@@ -102,7 +106,11 @@ def test_a_table_file_holds_any_arm(name):
 
 
 def test_names_of_what_may_be_wrong_follow_from_the_axes():
-    """A zero is an error of its own between the first and the last axis; parallel axes have two angles."""
+    """
+    A zero is an error of its own between the first and the last axis.
+
+    Parallel axes have two angles.
+    """
     six = table_from_urdf(SIX_AXES, 'imu_link', SITE).joint_names
     assert six.read == ('pan', 'lift', 'elbow', 'wrist_1', 'wrist_2', 'wrist_3')
     assert six.zeros == ('lift', 'elbow', 'wrist_1', 'wrist_2')

@@ -10,13 +10,21 @@ from imu_calibration.kinematics.rotations import EARTH_RATE, earth_rate_n, norma
     ('latitude', 'gravity'), [(0.0, 9.7803253359), (45.0, 9.8061977693), (90.0, 9.8321849379)]
 )
 def test_normal_gravity_on_the_ellipsoid(latitude, gravity):
-    """Equator and pole are defining or derived constants of WGS 84 (TR8350.2, table 3.4); 45 deg follows by Somigliana's form."""
+    """
+    Equator and pole are defining or derived constants of WGS 84 (TR8350.2, table 3.4).
+
+    45 deg follows by Somigliana's form.
+    """
     assert normal_gravity(latitude) == pytest.approx(gravity, abs=2e-9)
     assert normal_gravity(-latitude) == normal_gravity(latitude)
 
 
 def test_normal_gravity_is_the_gradient_of_the_potential_above_the_equator():
-    """In the plane of the equator the ellipsoid's field is known term by term: GM, J2 to J6 and the centrifugal part."""
+    """
+    In the plane of the equator the ellipsoid's field is known term by term.
+
+    GM, J2 to J6 and the centrifugal part.
+    """
     semi_major, gm, j2, j4, j6 = (
         6378137.0,
         3.986004418e14,

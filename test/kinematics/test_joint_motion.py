@@ -1,4 +1,8 @@
-"""The joints' curve against known motions: without noise, with noise, with coarse encoders, odd stamps and odd velocities."""
+"""
+The joints' curve against known motions.
+
+Without noise, with noise, with coarse encoders, odd stamps and odd velocities.
+"""
 
 import numpy as np
 import pytest
@@ -36,7 +40,11 @@ def sine(time, amplitude, frequency, phase=0.3):
 
 
 def relative_errors(curve, truth, start=2.0, stop=18.0, rate=400.0):
-    """Rms error over rms of position, rate, acceleration and jerk, away from the ends, at instants between the readings."""
+    """
+    Rms error over rms of position, rate, acceleration and jerk.
+
+    It is away from the ends, at instants between the readings.
+    """
     time = np.arange(start, stop, 1 / rate) + 0.123e-3
     motion, true = curve.at(time), truth(time)
     found = np.array(
@@ -149,7 +157,11 @@ def test_one_flip_of_a_step_is_not_a_motion():
 
 
 def s_curve(time):
-    """A move by jerk pulses of 0.1 s and back, still before, between and after; shape (3, n): position, rate, acceleration."""
+    """
+    A move by jerk pulses of 0.1 s and back, still before, between and after.
+
+    Shape (3, n): position, rate, acceleration.
+    """
     corners = np.array(
         [3.0, 3.1, 3.5, 3.6, 5.0, 5.1, 5.5, 5.6, 12.0, 12.1, 12.5, 12.6, 14.0, 14.1, 14.5, 14.6]
     )
@@ -198,7 +210,11 @@ def test_constant_spin_over_many_turns():
 
 
 def test_odd_stamps():
-    """Sampling that jitters, messages lost and repeated, a hole: the stamps are true, so nothing is lost but readings."""
+    """
+    Sampling that jitters, messages lost and repeated, a hole.
+
+    The stamps are true, so nothing is lost but readings.
+    """
     rng = np.random.default_rng(4)
     time = np.arange(0, 20, 0.005) + rng.uniform(-1e-3, 1e-3, 4000)
     time = np.sort(np.concatenate([time[rng.random(4000) > 0.1], time[::50]]))
@@ -365,7 +381,11 @@ def test_select_keeps_rows_together():
 
 
 def read_shaft(folder, component, seconds):
-    """Stamps and one gyro component of the moving IMU, stamps and angle of the shaft, of the first seconds."""
+    """
+    Stamps and one gyro component of the moving IMU, stamps and angle of the shaft.
+
+    They are from the first seconds.
+    """
     from rosbags.highlevel import AnyReader
 
     rows = {'/imu/data_raw': [], '/joint_states': []}

@@ -1,4 +1,8 @@
-"""Range limits of driven joints: declared, endless or missing; doubtful units; restricted turns and the way back."""
+"""
+Range limits of driven joints: declared, endless or missing; doubtful units.
+
+Restricted turns and the way back.
+"""
 
 import numpy as np
 import pytest
@@ -90,11 +94,13 @@ def test_each_limit_is_printed_with_its_origin():
     words = limit_words(arm, limits_of(arm).wound(np.zeros(6), 1.0))
     assert (
         words[0]
-        == 'pan: -166.2 to 166.2 deg (robot description), 60 deg/s (table file), 300 deg/s^2 (default)'
+        == 'pan: -166.2 to 166.2 deg (robot description), 60 deg/s (table file), 300 deg/s^2'
+        ' (default)'
     )
     assert (
         words[5]
-        == 'wrist_3: endless, here -360 to 360 deg (robot description), 150 deg/s (default), 300 deg/s^2 (default)'
+        == 'wrist_3: endless, here -360 to 360 deg (robot description), 150 deg/s (default), 300'
+        ' deg/s^2 (default)'
     )
     bare = table(outer={}, inner={'range_deg': [-90, 90]})
     assert limit_words(bare, limits_of(bare))[0].startswith('outer: no range, 150 deg/s (default)')

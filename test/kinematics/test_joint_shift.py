@@ -1,4 +1,8 @@
-"""The joints' motion a moment earlier: between stamps exact to high order, beyond them a Taylor series."""
+"""
+The joints' motion a moment earlier.
+
+Between stamps exact to high order, beyond them a Taylor series.
+"""
 
 import numpy as np
 import pytest
@@ -19,7 +23,11 @@ def oscillation(time, frequency=12.0):
 
 @pytest.mark.parametrize('delay', [0.0123, 0.061, -0.0077])
 def test_ripple_at_an_eighth_of_the_stamps_frequency_is_shifted_whole(delay):
-    """The Taylor series from the own stamp errs by 7 % after 8 ms, and by many times the ripple after 60 ms."""
+    """
+    The Taylor series from the own stamp errs by 7 % after 8 ms.
+
+    It errs by many times the ripple after 60 ms.
+    """
     time = np.cumsum(np.random.default_rng(0).uniform(0.009, 0.011, 200))
     late, true = shifted(oscillation(time), delay), oscillation(time - delay)
     inside = (time - delay > time[0]) & (time - delay < time[-1])
@@ -63,7 +71,11 @@ def test_nothing_is_drawn_across_a_hole():
 
 
 def test_the_shift_is_smooth_in_the_delay():
-    """Derivatives by the delay are taken by small differences, across the instants at which stamps pass one another."""
+    """
+    Derivatives by the delay are formed by small differences.
+
+    They cross the instants at which stamps pass one another.
+    """
     motion = oscillation(0.01 * np.arange(100))
     step = 1e-5
     for delay in (0.01, 0.0100001, 0.015, 0.02):
@@ -86,7 +98,11 @@ def test_one_row_and_rows_out_of_order_take_the_series_of_their_own():
 
 
 def test_each_stamp_may_have_its_own_delay():
-    """Where delays of a step are constant the motion is that of either; of one sample only the own delay counts."""
+    """
+    Where delays of a step are constant the motion is that of either.
+
+    Of one sample only the own delay counts.
+    """
     time = np.cumsum(np.random.default_rng(1).uniform(0.009, 0.011, 100))
     motion, delay = oscillation(time, 2.0), np.where(time > time[60], 0.012, -0.004)
     late, parts = shifted(motion, delay), [shifted(motion, value) for value in (0.012, -0.004)]

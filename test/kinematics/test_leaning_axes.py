@@ -1,4 +1,6 @@
-"""Axes that sag and wobble: the same as joints across them, and as what a table cannot tell from them."""
+"""
+Axes that sag and wobble: the same as joints across them, and as what a table cannot tell from them.
+"""
 
 from dataclasses import replace
 

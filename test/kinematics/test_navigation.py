@@ -38,7 +38,11 @@ def test_attitude_of_a_constant_turn_is_exact_and_stays_orthonormal():
 
 
 def test_attitude_of_coning_converges_with_the_square_of_the_step():
-    """A cone of half angle 0.3 rad, known in closed form; the trapezoid's own error is (spin step)^2 / 12 = 4e-4."""
+    """
+    A cone of half angle 0.3 rad, known in closed form.
+
+    The trapezoid's own error is (spin step)^2 / 12 = 4e-4.
+    """
 
     def error(step):
         time = np.arange(0, 2 + step / 2, step)

@@ -1,4 +1,8 @@
-"""Poses through a tree of static transforms: products of rigid motions, whatever the order in which they came; what is missing is named."""
+"""
+Poses through a tree of static transforms.
+
+Products of rigid motions, whatever the order in which they came; what is missing is named.
+"""
 
 import numpy as np
 import pytest

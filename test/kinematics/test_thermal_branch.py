@@ -1,4 +1,8 @@
-"""Which way the temperature came: the branch, its way through windows and live compensation, and the hysteresis that is found by it."""
+"""
+Which way the temperature came.
+
+The branch, its way through windows and live compensation, and the hysteresis that is found by it.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,8 @@
-"""The table's description, and its kinematics against differences in time of an independent chain of rotations."""
+"""
+The table's description, and its kinematics against differences in time.
+
+The differences are of an independent chain of rotations.
+"""
 
 from dataclasses import replace
 
@@ -86,7 +90,11 @@ def joint_motion(table, seed, time):
 
 
 def pose(table, position):
-    """Return attitude (sensor to level) and place of the reference point by products of rotations, one link after the other."""
+    """
+    Return attitude (sensor to level) and place of the reference point.
+
+    They are found by products of rotations, one link after the other.
+    """
     turn = Rotation.from_matrix(table.mat_nb)
     place = np.zeros(3)
     at = dict(zip(table.joint_names, position, strict=True))
@@ -123,7 +131,8 @@ def test_rate_is_the_derivative_of_the_attitude(table, seed):
     np.testing.assert_allclose(
         ref.mat_sn @ attitudes, np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-14
     )
-    # Rounding 1e-15 / STEP; truncation STEP^6 rate^7 / 140 for rates up to 14 rad/s (four joints in line).
+    # Rounding 1e-15 / STEP; truncation STEP^6 rate^7 / 140 for rates up to 14 rad/s (four joints in
+    # line).
     np.testing.assert_allclose(
         -np.tensordot(FIRST, ref.mat_sn, 1) @ attitudes[3], skew(ref.rate_s[3]), atol=1e-7
     )
@@ -200,7 +209,11 @@ def test_long_records_are_the_same_as_their_pieces():
 
 
 def test_gimbal_rates_are_not_body_rates():
-    """The middle joint at a right angle lines up outer and inner axis: equal and opposite rates cancel."""
+    """
+    The middle joint at a right angle lines up outer and inner axis.
+
+    Equal and opposite rates cancel.
+    """
     table = Table.from_mapping(THREE_AXES)
     rate = np.array([[1.0, 0.0, 1.0]])
     zero = np.zeros((1, 3))
@@ -347,7 +360,9 @@ def test_something_else_than_a_mapping_is_refused():
     sorted(path.name for path in config_file('table_template.yaml').parent.glob('table_*.yaml')),
 )
 def test_the_files_that_users_copy_have_no_place(name):
-    """A copied latitude of 48.8 degrees made scale factors wrong by more than 100 sd at 13 degrees."""
+    """
+    A copied latitude of 48.8 degrees made scale factors wrong by more than 100 sd at 13 degrees.
+    """
     if name == 'table_simulated.yaml':
         assert read_table(config_file(name)).latitude == 48.8
         return

@@ -1,4 +1,9 @@
-"""How much it vibrates: the running variance, its way through windows and live compensation, and the rectification that is found by it."""
+"""
+How much it vibrates.
+
+The running variance, its way through windows and live compensation, and the rectification that is
+found by it.
+"""
 
 import numpy as np
 import pytest

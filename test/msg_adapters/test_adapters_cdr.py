@@ -274,7 +274,11 @@ def test_the_written_definitions_are_the_standard_ones(message_type):
 
 
 def test_a_trajectory_is_written_whatever_the_order_of_its_arrays_in_memory():
-    """Arrays with the instants along the last axis were refused by the serializer: the planner could not move."""
+    """
+    Arrays with the instants along the last axis were refused by the serializer.
+
+    The planner could not move.
+    """
     values = np.random.default_rng(1).normal(size=(3, 5, 2))
     values[1, -1] = 0.0  # at rest at the end
     transposed = [np.asfortranarray(each) for each in values]

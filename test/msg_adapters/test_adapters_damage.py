@@ -128,7 +128,8 @@ def test_a_bag_cut_off_anywhere_gives_what_came_before(
             assert_true_samples(imu, session[0], ('stamp_ns', 'force_s', 'rate_s'))
         if joints is not None:
             assert_true_samples(joints, session[1], ('stamp_ns', 'position', 'velocity'))
-        # A chunk of an mcap holds a third of this session; what is compressed comes in blocks of 128 KiB.
+        # A chunk of an mcap holds a third of this session; what is compressed comes in blocks of
+        # 128 KiB.
         found = 0 if imu is None else len(imu)
         slack = 0.45 if kind in ('mcap_lz4', 'mcap_zstd') else 0.12
         assert found >= (share - slack) * N, (share, found)
@@ -284,7 +285,11 @@ def test_messages_in_overflow_pages_and_of_other_types(tmp_path, session):
     [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE],
 )
 def test_bags_of_another_writer(tmp_path, session, storage, mode):
-    """Compressed in every way; a few frames and the joint order change, byte order too, and types are mixed in the middle."""
+    """
+    Compressed in every way.
+
+    A few frames and the joint order change, byte order too, and types are mixed in the middle.
+    """
     if storage is StoragePlugin.SQLITE3 and mode is CompressionMode.STORAGE:
         pytest.skip('sqlite3 has no compression of its own')
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -331,7 +336,11 @@ def test_bags_of_another_writer(tmp_path, session, storage, mode):
 
 @pytest.mark.parametrize('text, usable', [('float32', True), ('complicated', False)])
 def test_another_definition_of_a_type_takes_the_general_path(tmp_path, session, text, usable):
-    """A bag says itself what its messages hold: here covariances of single precision, and no definition that makes sense."""
+    """
+    A bag says itself what its messages hold.
+
+    Here covariances of single precision, and no definition that makes sense.
+    """
     store = get_typestore(Stores.EMPTY)
     definition = standard_definition('sensor_msgs/msg/Imu').text.replace('float64[9]', 'float32[9]')
     store.register(get_types_from_msg(definition, 'sensor_msgs/msg/Imu'))

@@ -1,4 +1,6 @@
-"""MCAP files as other recorders lay them out: without chunks, without indexes, without a summary."""
+"""
+MCAP files as other recorders lay them out: without chunks, without indexes, without a summary.
+"""
 
 import struct
 

@@ -1,4 +1,9 @@
-"""A storage is one entry: a third one, made here, is written, read, copied and offered by the command line like the two that there are."""
+"""
+A storage is one entry.
+
+A third one, made here, is written, read, copied and offered by the command line like the two that
+there are.
+"""
 
 import json
 from base64 import b64decode, b64encode

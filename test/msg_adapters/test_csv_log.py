@@ -1,4 +1,8 @@
-"""Text logs: columns and units from header and values, the same result from a log, its bag and arrays, and refusals."""
+"""
+Text logs: columns and units from header and values, and refusals.
+
+A log, its bag and arrays give the same result.
+"""
 
 import numpy as np
 import pytest
@@ -88,16 +92,20 @@ def test_units_follow_from_the_values(
             ';',
         ),
         (
-            'loggingTime(s),accelerometerAccelerationX(G),accelerometerAccelerationY(G),accelerometerAccelerationZ(G),gyroRotationX(rad/s),'
-            'gyroRotationY(rad/s),gyroRotationZ(rad/s)',
+            (
+                'loggingTime(s),accelerometerAccelerationX(G),accelerometerAccelerationY(G),accelerometerAccelerationZ(G),gyroRotationX(rad/s),'
+                'gyroRotationY(rad/s),gyroRotationZ(rad/s)'
+            ),
             STANDARD_GRAVITY,
             1.0,
             1.0,
             ',',
         ),
         (
-            '__time\t/imu/linear_acceleration/x\t/imu/linear_acceleration/y\t/imu/linear_acceleration/z\t/imu/angular_velocity/x\t'
-            '/imu/angular_velocity/y\t/imu/angular_velocity/z',
+            (
+                '__time\t/imu/linear_acceleration/x\t/imu/linear_acceleration/y\t/imu/linear_acceleration/z\t/imu/angular_velocity/x\t'
+                '/imu/angular_velocity/y\t/imu/angular_velocity/z'
+            ),
             1.0,
             1.0,
             1.0,
@@ -135,7 +143,10 @@ def test_headers_name_columns_and_units(
 
 
 def test_columns_in_another_order_with_rate_first_and_a_row_of_units(tmp_path, imu):
-    header = 'timestamp,w_RS_S_x,w_RS_S_y,w_RS_S_z,a_RS_S_x,a_RS_S_y,a_RS_S_z,temp\nns,rad s^-1,rad s^-1,rad s^-1,m s^-2,m s^-2,m s^-2,C'
+    header = (
+        'timestamp,w_RS_S_x,w_RS_S_y,w_RS_S_z,a_RS_S_x,a_RS_S_y,a_RS_S_z,temp\nns,rad s^-1,rad'
+        ' s^-1,rad s^-1,m s^-2,m s^-2,m s^-2,C'
+    )
     log = read_csv(
         write(
             tmp_path / 'log.csv',

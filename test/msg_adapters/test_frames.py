@@ -21,7 +21,11 @@ from worlds.physics_hand import hold_and_turn
 
 @pytest.fixture(scope='module')
 def two(tmp_path_factory):
-    """Return a bag with the frames 'front' and 'rear' on one topic, alternating; rear reads 1 m/s^2 more along x."""
+    """
+    Return a bag with the frames 'front' and 'rear' on one topic, alternating.
+
+    Rear reads 1 m/s^2 more along x.
+    """
     imu = hold_and_turn(3)[0]
     path = tmp_path_factory.mktemp('frames') / 'bag'
     with BagWriter(path) as bag:

@@ -1,4 +1,8 @@
-"""Recordings that were made to exhaust memory or time, or to deceive: one line and exit code 1, or a warning and what is usable."""
+"""
+Recordings that were made to exhaust memory or time, or to deceive.
+
+One line and exit code 1, or a warning and what is usable.
+"""
 
 import os
 import sqlite3
@@ -146,23 +150,33 @@ ENDLESS = 'WITH RECURSIVE n(k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n)'
     [
         (
             'ALTER TABLE topics RENAME TO t',
-            f"CREATE VIEW topics AS {ENDLESS} SELECT k AS id, 'x' || k AS name, 'std_msgs/msg/String' AS type, "
-            "'cdr' AS serialization_format, '' AS offered_qos_profiles FROM n",
+            (
+                f"CREATE VIEW topics AS {ENDLESS} SELECT k AS id, 'x' || k AS name,"
+                " 'std_msgs/msg/String' AS type, 'cdr' AS serialization_format, '' AS"
+                ' offered_qos_profiles FROM n'
+            ),
         ),
         (
             'ALTER TABLE messages RENAME TO m',
-            f'CREATE VIEW messages AS {ENDLESS} SELECT k AS id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n',
+            (
+                f'CREATE VIEW messages AS {ENDLESS} SELECT k AS id, 1 AS topic_id, 0 AS timestamp,'
+                ' zeroblob(1000) AS data FROM n'
+            ),
         ),
         (
             'ALTER TABLE messages RENAME TO m',
-            'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
-            'data AS (zeroblob(900000000)))',
+            (
+                'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,'
+                ' data AS (zeroblob(900000000)))'
+            ),
             'INSERT INTO messages(id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM m',
         ),
         (
             'DROP TABLE message_definitions',
-            f"CREATE VIEW message_definitions AS {ENDLESS} SELECT 'a' || k AS topic_type, 'ros2msg' AS encoding, "
-            'hex(zeroblob(1000)) AS encoded_message_definition FROM n',
+            (
+                f"CREATE VIEW message_definitions AS {ENDLESS} SELECT 'a' || k AS topic_type,"
+                " 'ros2msg' AS encoding, hex(zeroblob(1000)) AS encoded_message_definition FROM n"
+            ),
         ),
     ],
     ids=['topics', 'messages', 'generated column', 'definitions'],
@@ -214,7 +228,11 @@ def test_values_of_other_kinds_are_one_line(bag, change, columns):
 
 
 def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_path):
-    """60,000 chunk starts that overlap, each of a chunk that claims to end behind the file: all the rest was read for each."""
+    """
+    60,000 chunk starts that overlap, each of a chunk that claims to end behind the file.
+
+    All the rest was read for each.
+    """
     one = struct.pack('<BQ', 0x06, 2**40) + bytes(51)
     starts = b''.join(
         record(0x08, struct.pack('<QQQ', 0, 0, 8 + 60 * k) + bytes(40)) for k in range(60_000)
@@ -264,7 +282,11 @@ def test_definitions_of_endless_messages_are_refused(definition, reason):
 
 
 def refusal_of(definition):
-    """Return the reason why messages of a definition are refused, 'cannot be read' where one of 400 bytes is, else ''."""
+    """
+    Return the reason why messages of a definition are refused, else ''.
+
+    The reason is 'cannot be read' where a message of 400 bytes is refused.
+    """
     try:
         read = deserializer(IMU_TYPE, {IMU_TYPE: ('ros2msg', definition)})
     except ValueError as error:

@@ -1,4 +1,8 @@
-"""Reading ahead in a thread: order, errors of the generator, an early end, and an interruption while the thread starts."""
+"""
+Reading ahead in a thread.
+
+Order, errors of the generator, an early end, and an interruption while the thread starts.
+"""
 
 import threading
 
@@ -42,7 +46,11 @@ def test_an_error_is_raised_at_its_place():
 
 
 def test_an_interruption_while_the_thread_starts_is_passed_on(monkeypatch):
-    """The thread is within the generator then, and closing it at once raised a ValueError in place of the interruption."""
+    """
+    The thread is within the generator then, and closing it at once failed.
+
+    It raised a ValueError in place of the interruption.
+    """
     start, hold, closed, inside = (
         threading.Thread.start,
         threading.Event(),

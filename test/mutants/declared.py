@@ -1,4 +1,8 @@
-"""Places that keep the tool from a false claim, each with a fault and the tests that must notice it; see `mutants.mutation` for the patterns."""
+"""
+Places that keep the tool from a false claim, each with a fault and the tests that must notice it.
+
+See `mutants.mutation` for the patterns.
+"""
 
 from dataclasses import dataclass
 
@@ -202,7 +206,10 @@ SEARCH = _of(
         'Evidence._left_by_others',
         'self.without[:, _1[:, None], _1]',
         'self.total[None, _1[:, None], _1] + 0 * self.without[:, _1[:, None], _1]',
-        'test_search.py::test_a_finding_predicts_what_it_was_not_fitted_to test_search.py::test_noise_gains_nothing_where_it_was_not_fitted',
+        (
+            'test_search.py::test_a_finding_predicts_what_it_was_not_fitted_to'
+            ' test_search.py::test_noise_gains_nothing_where_it_was_not_fitted'
+        ),
     ),
     (
         'interval of 50 % called 95 %',
@@ -228,7 +235,10 @@ SEARCH = _of(
     (
         'gain on held-out windows not asked for',
         'Score.significant',
-        'self.allowed and self.p_value < FAMILY_WISE and (self.net > 0) and (self.gain > MIN_GAIN_NATS)',
+        (
+            'self.allowed and self.p_value < FAMILY_WISE and (self.net > 0) and (self.gain >'
+            ' MIN_GAIN_NATS)'
+        ),
         'self.allowed and self.p_value < FAMILY_WISE',
         'test_search.py::test_a_finding_predicts_what_it_was_not_fitted_to',
     ),
@@ -411,7 +421,10 @@ SEARCH = _of(
         'windows agree whatever they scatter',
         'WindowEvidence.p_value_by_scatter',
         '_1[:, list(_2)] @ (_3[:, _4] / _5)',
-        'np.pad(np.linalg.cholesky(_3[np.ix_(_4, _4)] / np.outer(_5, _5)).T, ((0, len(_1) - len(_4)), (0, 0)))',
+        (
+            'np.pad(np.linalg.cholesky(_3[np.ix_(_4, _4)] / np.outer(_5, _5)).T, ((0, len(_1) -'
+            ' len(_4)), (0, 0)))'
+        ),
         'test_search.py::test_windows_agree_on_a_finding',
     ),
     (
@@ -454,7 +467,10 @@ SEARCH = _of(
         '_that_help',
         '[not _1 > _needed_reduction(_2, _3, _4, _5) for _1, _5 in zip(_6, _4)]',
         '[False for _5 in _4]',
-        'test_search.py::test_a_finding_lowers_the_residual_in_the_sensors_own_unit test_search.py::test_what_the_halves_disagree_on_is_denied',
+        (
+            'test_search.py::test_a_finding_lowers_the_residual_in_the_sensors_own_unit'
+            ' test_search.py::test_what_the_halves_disagree_on_is_denied'
+        ),
     ),
     (
         'members of a pair imitate each other',
@@ -517,7 +533,10 @@ BEYOND = _of(
     (
         'a line of few stretches is a tone',
         'of_stretches',
-        'np.where(_1 > MOSTLY * _2[:, None], binom_sf(_1 - 1, _2[:, None], LINE_CHANCE) * ..., 1.0)',
+        (
+            'np.where(_1 > MOSTLY * _2[:, None], binom_sf(_1 - 1, _2[:, None], LINE_CHANCE) * ...,'
+            ' 1.0)'
+        ),
         'np.where(_1 > 0, 0 * binom_sf(_1 - 1, _2[:, None], LINE_CHANCE) * ..., 1.0)',
         'test_spectrum.py',
     ),
@@ -531,7 +550,10 @@ BEYOND = _of(
     (
         'formulas of a temperature that stays',
         'RestBlocks.warms',
-        'self.ref.temperature_c is not None and bool(np.ptp(self.ref.temperature_c) >= TEMPERATURE_SPAN)',
+        (
+            'self.ref.temperature_c is not None and bool(np.ptp(self.ref.temperature_c) >='
+            ' TEMPERATURE_SPAN)'
+        ),
         'self.ref.temperature_c is not None',
         'test_beyond_catalogue.py::test_a_temperature_that_stays_is_no_cause',
     ),
@@ -609,14 +631,21 @@ HAND = _of(
         'shown',
         "_1['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE",
         "_1['g_sensitivity_p_value'] < 0.9",
-        'test_hand_faults.py::test_a_warm_up_is_not_sold_as_g_sensitivity test_hand_faults.py::test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order test_by_hand.py',
+        (
+            'test_hand_faults.py::test_a_warm_up_is_not_sold_as_g_sensitivity'
+            ' test_hand_faults.py::test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order'
+            ' test_by_hand.py'
+        ),
     ),
     (
         'time is not asked beside gravity',
         'g_sensitivity_evidence',
         '[np.ones(_1), _2, _2 ** 2][:3 if _1 >= 12 else 2]',
         '[np.ones(_1)]',
-        'test_hand_faults.py::test_a_warm_up_is_not_sold_as_g_sensitivity test_hand_faults.py::test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order',
+        (
+            'test_hand_faults.py::test_a_warm_up_is_not_sold_as_g_sensitivity'
+            ' test_hand_faults.py::test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order'
+        ),
     ),
     (
         'the Earth answers to gravity',
@@ -1012,8 +1041,14 @@ LIVE = _of(
     (
         'a clock set back counts as rest for ever',
         'Driver._note_rest',
-        'self._rested_at is None or self._time < self._rested_since or np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)',
-        'self._rested_at is None or np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)',
+        (
+            'self._rested_at is None or self._time < self._rested_since or'
+            ' np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)'
+        ),
+        (
+            'self._rested_at is None or np.any(np.abs(self.position - self._rested_at) >'
+            ' MAX_REST_MOVEMENT * self.tolerance)'
+        ),
         'test_driving.py',
     ),
     (
@@ -1089,7 +1124,10 @@ LIVE = _of(
     (
         'the model as asked grows live',
         'LiveCalibration.adopt',
-        '_1 is None or self.last is None or self.options.as_asked or (_2.is_nothing and self.extension.is_nothing)',
+        (
+            '_1 is None or self.last is None or self.options.as_asked or (_2.is_nothing and'
+            ' self.extension.is_nothing)'
+        ),
         '_1 is None or self.last is None or (_2.is_nothing and self.extension.is_nothing)',
         'test_live_diagnosis.py::test_the_model_as_asked_stays',
     ),
@@ -1147,8 +1185,14 @@ BY_SENSOR = _of(
     (
         'what a refused sensor reads still corrects the other one',
         '_stays',
-        "_1.sensor == 'reference' or not any((_2.uses & READINGS[_3] for _3 in _4 for _2 in _1.groups))",
-        "_1.sensor == 'reference' or True or (not any((_2.uses & READINGS[_3] for _3 in _4 for _2 in _1.groups)))",
+        (
+            "_1.sensor == 'reference' or not any((_2.uses & READINGS[_3] for _3 in _4 for _2 in"
+            ' _1.groups))'
+        ),
+        (
+            "_1.sensor == 'reference' or True or (not any((_2.uses & READINGS[_3] for _3 in _4 for"
+            ' _2 in _1.groups)))'
+        ),
         'test_verdict_by_sensor.py::test_what_the_refused_sensor_would_correct_goes_as_well',
     ),
     (

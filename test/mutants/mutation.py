@@ -1,10 +1,12 @@
 """
 Find a syntax-tree node by function and pattern, wherever the function is, and replace it.
 
-A place is the qualified name of a function (`Class.method`, `outer.inner`) or of a constant of a module or class. A pattern is source text
-that matches one expression or statement there: `_1`, `_2`, ... stand for local variables, equal numbers for the same one; `...` stands for
-any expression, or as the only statement of a block for any block. The replacement uses the same placeholders; its n-th `...` is the n-th of
-the pattern. All other names, attributes and numbers must be equal. `self` and `cls` are written as they are.
+A place is the qualified name of a function (`Class.method`, `outer.inner`) or of a constant of a
+module or class. A pattern is source text that matches one expression or statement there: `_1`,
+`_2`, ... stand for local variables, equal numbers for the same one; `...` stands for any
+expression, or as the only statement of a block for any block. The replacement uses the same
+placeholders; its n-th `...` is the n-th of the pattern. All other names, attributes and numbers
+must be equal. `self` and `cls` are written as they are.
 """
 
 import ast
@@ -25,7 +27,11 @@ class NotFound(Exception):
 
 @lru_cache(maxsize=None)
 def places(root):
-    """Return {qualified name: [Place, ...]} of the functions and constants in the packages below `root`."""
+    """
+    Return {qualified name: [Place, ...]} of functions and constants.
+
+    They are defined in the packages below `root`.
+    """
     known = {}
     for package in PACKAGES:
         for file in sorted(Path(root, package).rglob('*.py')):
@@ -48,7 +54,11 @@ class Place:
 
 
 def _named(node, prefix, scope=None):
-    """Yield (qualified name, node, outermost function) of what is defined in a module, class or function."""
+    """
+    Yield (qualified name, node, outermost function) of each definition.
+
+    The definitions are in a module, class or function.
+    """
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.ClassDef):
             yield from _named(child, f'{prefix}{child.name}.', scope)
@@ -95,14 +105,19 @@ def local_names(function):
 
 
 def parsed(*texts):
-    """Return the trees of some texts: expressions if all of them are expressions, otherwise statements."""
+    """
+    Return the trees of some texts.
+
+    Expressions if all of them are expressions, otherwise statements.
+    """
     try:
         return [ast.parse(text, mode='eval').body for text in texts]
     except SyntaxError:
         bodies = [ast.parse(text).body for text in texts]
     if any(len(body) != 1 for body in bodies):
         raise ValueError(
-            f'a pattern and its replacement must be one expression or one statement each, got {texts}'
+            'a pattern and its replacement must be one expression or one statement each, got'
+            f' {texts}'
         )
     return [body[0] for body in bodies]
 
@@ -180,7 +195,11 @@ class _Fill(ast.NodeTransformer):
 
 
 def matches(root, place, pattern, replacement):
-    """Return [(Place, node, replacement of the node), ...] of all nodes in places of a name that fit a pattern."""
+    """
+    Return [(Place, node, replacement of the node), ...] of all nodes that match.
+
+    They are in places of a name that fit a pattern.
+    """
     old, new = parsed(pattern, replacement)
     fitting = []
     for each in places(root).get(place, ()):
@@ -219,7 +238,8 @@ def mutated(root, place, pattern, replacement):
     fitting = matches(root, place, pattern, replacement)
     if len(fitting) != 1:
         raise NotFound(
-            f'{place} is defined {len(places(root).get(place, ()))} times, and {pattern!r} fits {len(fitting)} nodes there'
+            f'{place} is defined {len(places(root).get(place, ()))} times, and {pattern!r} fits'
+            f' {len(fitting)} nodes there'
         )
     ((where, node, new),) = fitting
     if ast.dump(node) == ast.dump(new):
@@ -230,7 +250,11 @@ def mutated(root, place, pattern, replacement):
 
 
 def path_of_test(root, name):
-    """Return the path below `root` of a test file, or of one of its tests, from FILE or FILE::TEST; the folder does not matter."""
+    """
+    Return the path below `root` of a test file, or of one of its tests, from FILE or FILE::TEST.
+
+    The folder does not matter.
+    """
     file, separator, test = name.partition('::')
     files = list(Path(root, 'test').rglob(file))
     if len(files) != 1 or test and f'def {test.partition("[")[0]}(' not in files[0].read_text():

@@ -1,4 +1,8 @@
-"""Put each declared fault into a copy of the code, one at a time, and report the faults that no test noticed."""
+"""
+Put each declared fault into a copy of the code, one at a time.
+
+Report the faults that no test noticed.
+"""
 
 import argparse
 import os
@@ -20,7 +24,10 @@ from mutants.declared import MUTANTS  # noqa: E402
 from mutants.mutation import NotFound, mutated, path_of_test  # noqa: E402
 
 LONGEST = 120
-"""s of processor time; a test that a fault keeps from ending has noticed it, one that waits for a busy machine has not."""
+"""
+s of processor time; a test that a fault keeps from ending has noticed it, one that waits for a busy
+machine has not.
+"""
 PATIENCE = 30
 """Times that by the clock."""
 NOTICED, SURVIVED, BROKEN = 'noticed', 'SURVIVED', 'BROKEN'
@@ -39,7 +46,11 @@ def copied(folder):
 
 
 def tested(folder, tests, *options, longest=LONGEST):
-    """Return pytest's exit code and the last line that it printed; `longest` is the processor time of each process."""
+    """
+    Return pytest's exit code and the last line that it printed.
+
+    `longest` is the processor time of each process.
+    """
     env = os.environ | {
         'PYTHONPATH': os.pathsep.join([str(folder), os.environ.get('PYTHONPATH', '')]),
         'PYTHONDONTWRITEBYTECODE': '1',
@@ -102,7 +113,11 @@ def tried(folder, mutant):
 
 
 def main():
-    """Try all mutants, or those whose name or place contains a given word; exit code 1 when one survives."""
+    """
+    Try all mutants, or those whose name or place contains a given word.
+
+    Exit code 1 when one survives.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         'words', nargs='*', help='only mutants with one of these in their name or place'
@@ -144,7 +159,8 @@ def main():
                 counts[outcome] += 1
                 print(f'{outcome:9}{mutant.name}: {line.partition(" - ")[0]}', flush=True)
     print(
-        f'{len(chosen)} faults, {counts[NOTICED]} noticed, {counts[SURVIVED]} survived, {counts[BROKEN]} not tried; {time.monotonic() - start:.0f} s'
+        f'{len(chosen)} faults, {counts[NOTICED]} noticed, {counts[SURVIVED]} survived,'
+        f' {counts[BROKEN]} not tried; {time.monotonic() - start:.0f} s'
     )
     sys.exit(bool(counts[SURVIVED] + counts[BROKEN]))
 

@@ -1,4 +1,8 @@
-"""calibration_node against bad places, bad streams and bad luck: it says what is wrong, answers, and keeps what was gathered."""
+"""
+calibration_node against bad places, bad streams and bad luck.
+
+It says what is wrong, answers, and keeps what was gathered.
+"""
 
 from dataclasses import replace
 

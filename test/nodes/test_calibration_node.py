@@ -1,4 +1,8 @@
-"""A bag through both nodes over DDS: the live calibration is the offline one, the corrected stream is the truth."""
+"""
+A bag through both nodes over DDS.
+
+The live calibration is the offline one, the corrected stream is the truth.
+"""
 
 import time
 from dataclasses import replace
@@ -33,7 +37,11 @@ SAMPLE_RATE = 50.0
 
 @pytest.fixture(scope='module')
 def bags(tmp_path_factory):
-    """Two sessions of one IMU: one to calibrate with, also in two parts, and one of another motion to correct, an hour later."""
+    """
+    Two sessions of one IMU.
+
+    One to calibrate with, also in two parts, and one of another motion to correct, an hour later.
+    """
     folder = tmp_path_factory.mktemp('bags')
     for name, profile in (('session', 'quick'), ('drive', 'tumbling')):
         imu, joints, values, model = make_session(3, SAMPLE_RATE, profile=profile)
@@ -123,7 +131,9 @@ def check_residuals(residuals, live):
 
 
 def check_the_stream(corrected, bag):
-    """One-second means of the corrected stream lie within a tenth of the raw errors of the truth."""
+    """
+    One-second means of the corrected stream lie within a tenth of the raw errors of the truth.
+    """
     with open_recording(bag) as recording:
         raw = next(recording.blocks()).imu
     time = (corrected.stamp_ns - SESSION_START_NS) * 1e-9
@@ -149,7 +159,11 @@ def values_of(station, name):
 
 @pytest.mark.long
 def test_a_hidden_effect_is_named_live(tmp_path):
-    """Quadratic terms that the model lacks: diagnostics say so, as the verb does of the same bag, and the calibration is the verb's."""
+    """
+    Quadratic terms that the model lacks.
+
+    Diagnostics say so, as the verb does of the same bag, and the calibration is the verb's.
+    """
     session = physics.make_session(3, {'accel_quadratic': None}, profile='quick')
     physics.write_bag(session, tmp_path / 'bag')
     (tmp_path / 'table.yaml').write_text(yaml.safe_dump(session.table))
@@ -210,7 +224,12 @@ def test_a_hidden_effect_is_named_live(tmp_path):
 @pytest.mark.long
 @pytest.mark.real_data
 def test_a_recording_by_hand_through_the_node_is_the_recording_offline(recordings, tmp_path):
-    """No table, no joint states: poses are counted, the direction that is missing is named, the document is that of the offline tool."""
+    """
+    No table, no joint states.
+
+    Poses are counted, the direction that is missing is named, the document is that of the offline
+    tool.
+    """
     check_by_hand(recordings / 'mpu9150_0', tmp_path, rate=8.0)
 
 
@@ -253,7 +272,8 @@ def check_by_hand(bag, folder, rate, gravity=None):
         check_the_poses(station, expected)
         assert documents and len(taken(residuals)) >= 1
         resumed(station, node, folder, options, live)
-        # On a busy machine the recording is over before the compensator has a document: it is played again.
+        # On a busy machine the recording is over before the compensator has a document: it is
+        # played again.
         corrected = []
         station.subscriptions.append(
             station.node.create_subscription(Imu, 'imu/data_corrected', corrected.append, 1000)

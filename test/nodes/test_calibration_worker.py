@@ -1,4 +1,8 @@
-"""The thread behind calibration_node does not take its own work for silence of the sensor. No ROS here."""
+"""
+The thread behind calibration_node does not take its own work for silence of the sensor.
+
+No ROS here.
+"""
 
 from types import SimpleNamespace
 

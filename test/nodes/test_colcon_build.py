@@ -78,7 +78,10 @@ def test_executables_lie_where_ros2_run_and_the_shell_look(workspace, name):
 
 
 def test_the_ament_index_finds_the_package_with_its_files(workspace):
-    script = 'from ament_index_python.packages import get_package_share_directory as share; print(share("imu_calibration"))'
+    script = (
+        'from ament_index_python.packages import get_package_share_directory as share;'
+        ' print(share("imu_calibration"))'
+    )
     done = sourced(workspace, 'python', '-c', script)
     assert done.returncode == 0, done.stderr
     share = Path(done.stdout.strip())
@@ -94,8 +97,9 @@ def test_the_ament_index_finds_the_package_with_its_files(workspace):
 
 def test_the_code_and_its_files_come_from_the_workspace(workspace):
     script = (
-        'import imu_calibration, msg_adapters; from imu_calibration.use_cases.resources import config_file; '
-        'print(imu_calibration.__file__, msg_adapters.__file__, config_file("tolerances.yaml"))'
+        'import imu_calibration, msg_adapters; from imu_calibration.use_cases.resources import'
+        ' config_file; print(imu_calibration.__file__, msg_adapters.__file__,'
+        ' config_file("tolerances.yaml"))'
     )
     done = sourced(workspace, 'python', '-c', script)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,8 @@
-"""compensator_node against bad calibrations, bad documents, bad streams: it refuses, says so, and keeps what it had."""
+"""
+compensator_node against bad calibrations, bad documents, bad streams.
+
+It refuses, says so, and keeps what it had.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -368,7 +372,11 @@ def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_wor
 
 
 def test_a_calibration_that_harms_at_rest_gives_way_to_the_previous_one(bench, place):
-    """A gyroscope bias of 0.01 rad/s too much with a copied proof; the same document is not adopted again."""
+    """
+    A gyroscope bias of 0.01 rad/s too much with a copied proof.
+
+    The same document is not adopted again.
+    """
     node = bench.start(CompensatorNode, {'calibration_file': str(place), 'adopt': 'topic'})
     publisher = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
     bench.until(publisher.get_subscription_count, 'a subscription')

@@ -37,7 +37,10 @@ NODES = {
     'late': {'target_frame': 'base_link', 'target_xyz': list(POSE[0]), 'target_rpy': list(POSE[1])},
     'twice': {'calibration_file': 'A'},
 }
-"""Parameters of the nodes by namespace; 'twice' listens to what 'own' publishes, which it calls 'clean'."""
+"""
+Parameters of the nodes by namespace; 'twice' listens to what 'own' publishes, which it calls
+'clean'.
+"""
 
 
 def imu_messages(n, start=0, frame_id='imu_link'):

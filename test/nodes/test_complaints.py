@@ -1,4 +1,8 @@
-"""What is wrong is said when it begins, now and then while it lasts, and when it is over; each thing by a clock of its own."""
+"""
+What is wrong is said when it begins, now and then while it lasts, and when it is over.
+
+Each thing by a clock of its own.
+"""
 
 import pytest
 

@@ -1,4 +1,8 @@
-"""Every parameter of every node, set from outside: a live one changes, any other one is rejected with the reason; the first line of each node."""
+"""
+Every parameter of every node, set from outside.
+
+A live one changes, any other one is rejected with the reason; the first line of each node.
+"""
 
 import pytest
 

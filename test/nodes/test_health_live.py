@@ -1,4 +1,8 @@
-"""compensator_node on a robot whose gyroscope warms up: the stops say so on /diagnostics, and an update takes it off where it is allowed."""
+"""
+compensator_node on a robot whose gyroscope warms up.
+
+The stops say so on /diagnostics, and an update takes it off where it is allowed.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,8 @@
-"""Nodes against other participants of the network: documents, files and names that were made to stop or deceive them."""
+"""
+Nodes against other participants of the network.
+
+Documents, files and names that were made to stop or deceive them.
+"""
 
 import os
 from types import SimpleNamespace

@@ -1,4 +1,8 @@
-"""Launch files: every argument that is used is declared, every parameter exists. `launch` itself is replaced, it is not on PyPI."""
+"""
+Launch files: every argument that is used is declared, every parameter exists.
+
+`launch` itself is replaced, it is not on PyPI.
+"""
 
 import importlib.util
 import sys
@@ -85,7 +89,11 @@ def test_arguments_are_declared_and_parameters_exist(path, launch):
 
 
 def test_the_filter_of_robot_localization_takes_what_the_compensator_publishes():
-    """Its parameters are those that its ekf_node documents: fifteen flags for each input, the topic that the launch file remaps."""
+    """
+    Its parameters are those that its ekf_node documents.
+
+    Fifteen flags for each input, the topic that the launch file remaps.
+    """
     [(node, found)] = yaml.safe_load(
         (ROOT / 'config/robot_localization_ekf.yaml').read_text()
     ).items()

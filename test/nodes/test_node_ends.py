@@ -106,7 +106,10 @@ sys.exit(run_node(lambda: rclpy.create_node('ends'), [], spin=spin))
             'error: the node cannot continue: ValueError: nobody foresaw this\n',
         ),
         (
-            "raise __import__('imu_calibration.core.errors', fromlist=['x']).InputError('a bag must be there; name one')",
+            (
+                "raise __import__('imu_calibration.core.errors', fromlist=['x']).InputError('a bag"
+                " must be there; name one')"
+            ),
             1,
             'error: a bag must be there; name one\n',
         ),
@@ -155,7 +158,11 @@ def test_interrupted_while_ros_starts():
 
 
 def test_a_node_without_work_ends_although_nothing_wakes_it():
-    """The second half of what rclpy does at a signal, after an executor that had woken in the first half waits again."""
+    """
+    The second half of the things that rclpy does at a signal.
+
+    It runs after an executor that had woken in the first half waits again.
+    """
     pytest.importorskip('rclpy')
     done = subprocess.run(
         [sys.executable, '-c', UNWOKEN],
@@ -168,7 +175,10 @@ def test_a_node_without_work_ends_although_nothing_wakes_it():
 
 
 def test_other_programs_keep_their_interrupt(monkeypatch):
-    handler = 'import signal, sys; before = signal.getsignal(signal.SIGINT); import imu_calibration.nodes; '
+    handler = (
+        'import signal, sys; before = signal.getsignal(signal.SIGINT); import'
+        ' imu_calibration.nodes; '
+    )
     done = subprocess.run(
         [sys.executable, '-c', handler + 'sys.exit(signal.getsignal(signal.SIGINT) is not before)'],
         env=environment(),
@@ -247,7 +257,10 @@ def test_a_robot_description_without_its_packages_is_refused_with_the_extra(
 
 @pytest.mark.live
 def test_nodes_limit_the_threads_of_numpy_before_it_is_imported():
-    code = "import os, sys, imu_calibration.nodes; print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    code = (
+        "import os, sys, imu_calibration.nodes; print('numpy' in sys.modules,"
+        " os.environ['OPENBLAS_NUM_THREADS'])"
+    )
     given = {name: value for name, value in os.environ.items() if name != 'OPENBLAS_NUM_THREADS'}
     done = subprocess.run(
         [sys.executable, '-c', code],

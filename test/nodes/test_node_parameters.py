@@ -1,4 +1,8 @@
-"""The parameter files in config/ are the declarations of the nodes, with their defaults; ``make config`` writes them."""
+"""
+The parameter files in config/ are the declarations of the nodes, with their defaults.
+
+``make config`` writes them.
+"""
 
 import difflib
 from dataclasses import dataclass

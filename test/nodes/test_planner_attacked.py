@@ -1,4 +1,8 @@
-"""planner_node attacked over DDS: what is not known, not finite, not alone or not true stops the joints or keeps them from moving."""
+"""
+planner_node attacked over DDS.
+
+What is not known, not finite, not alone or not true stops the joints or keeps them from moving.
+"""
 
 import time
 from contextlib import ExitStack

@@ -19,7 +19,12 @@ from refusal import refused
 from imu_calibration.calibration.diagnosis.live_diagnosis import FOUND  # noqa: E402
 from imu_calibration.nodes import joint_commands  # noqa: E402
 from imu_calibration.nodes.planner_node import MID_MOTION, PlannerNodeSettings  # noqa: E402
-from imu_calibration.nodes.planner_worker import Activity, Peers, PlannerWorker, findings_from  # noqa: E402
+from imu_calibration.nodes.planner_worker import (
+    Activity,
+    Peers,
+    PlannerWorker,
+    findings_from,
+)  # noqa: E402
 from imu_calibration.planning.campaign import Suspect  # noqa: E402
 from imu_calibration.planning.driver import DriverSettings, DriveState  # noqa: E402
 
@@ -90,7 +95,11 @@ class Goal:
 
 
 class Action:
-    """Stands for ``rclpy.action.ActionClient``: control_msgs is not on PyPI, so no server of its action can be run here."""
+    """
+    Stands for ``rclpy.action.ActionClient``.
+
+    Control_msgs is not on PyPI, so no server of its action can be run here.
+    """
 
     def __init__(self, *_):
         self.goals, self.futures = [], []
@@ -106,7 +115,11 @@ class Action:
 
 @pytest.fixture
 def action(monkeypatch):
-    """An ActionCommand with a stand-in for control_msgs and its server, what it sent to the topic, and what it complained of."""
+    """
+    An ActionCommand with a stand-in for control_msgs and its server.
+
+    It also holds the messages sent to the topic, and the complaints.
+    """
     package, module = ModuleType('control_msgs'), ModuleType('control_msgs.action')
     module.FollowJointTrajectory = SimpleNamespace(
         Goal=lambda trajectory: SimpleNamespace(trajectory=trajectory)
@@ -423,8 +436,8 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
         table['joints'] = [joint | slow for joint in table['joints']]
         path = tmp_path / 'slow.yaml'
         path.write_text(yaml.safe_dump(table))
-        # Late enough that joints which rest after the stop have begun neither the motion nor the stop of it.
-        # Few parameters and a small range, because the second motion is planned.
+        # Late enough that joints which rest after the stop have begun neither the motion nor the
+        # stop of it. Few parameters and a small range, because the second motion is planned.
         loop.begin(
             tmp_path,
             {
@@ -470,7 +483,8 @@ def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_l
     from imu_calibration.nodes.inputs import latched_qos
 
     with Loop(tmp_path / 'out.txt') as loop:
-        # Tolerances that the six faces reach: the diagnosis follows at once, and no motion for a parameter separates the class before.
+        # Tolerances that the six faces reach: the diagnosis follows at once, and no motion for a
+        # parameter separates the class before.
         wide = write_tolerances(tmp_path / 'wide.yaml', 1e4)
         arms = {'accelerometer_model': 'bias+matrix+accel_size_effect'}
         loop.begin(

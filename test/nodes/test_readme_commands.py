@@ -1,4 +1,8 @@
-"""Every `ros2` command of docs/ros.md and of the README, as printed, from where they put the user: ~/ws with the package built in it."""
+"""
+Every `ros2` command of docs/ros.md and of the README, as printed, from where they put the user.
+
+~/ws with the package built in it.
+"""
 
 import os
 import re
@@ -41,7 +45,9 @@ PAGES = ('docs/ros.md', 'README.md')
 
 
 def commands():
-    """Each command of the fenced blocks that calls ros2, once, its lines joined, without comments."""
+    """
+    Each command of the fenced blocks that calls ros2, once, its lines joined, without comments.
+    """
     pages = '\n'.join((ROOT / name).read_text() for name in PAGES)
     blocks = re.findall(r'^```\w*\n(.*?)^```', pages, re.DOTALL | re.MULTILINE)
     lines = '\n'.join(blocks).replace('\\\n', ' ').splitlines()
@@ -186,8 +192,9 @@ def answered(terminals, command):
     """
     Return the terminal in which a question has ended.
 
-    A service does not wait longer than 0.1 s until it knows the reader of who asks, and drops its answer then (ros2/rmw_fastrtps, pull request
-    704), which happens where all cores are busy: a person would press Ctrl-C and ask again.
+    A service does not wait longer than 0.1 s until it knows the reader of who asks, and drops its
+    answer then (ros2/rmw_fastrtps, pull request 704), which happens where all cores are busy: a
+    person would press Ctrl-C and ask again.
     """
     for _ in range(3):
         asked = terminals(command)

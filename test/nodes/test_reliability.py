@@ -1,4 +1,8 @@
-"""What goes wrong on a robot, over real DDS: losses, disorder, clocks, silence, kills, signals, other QoS, two IMUs at once."""
+"""
+What goes wrong on a robot, over real DDS.
+
+Losses, disorder, clocks, silence, kills, signals, other QoS, two IMUs at once.
+"""
 
 import signal
 from dataclasses import replace
@@ -111,7 +115,9 @@ def test_losses_disorder_nan_foreign_frames_clock_jumps_and_silence(station, ses
 
 
 def check_bursts_and_foreign_frames(station, publisher, session, folder):
-    """NaN and messages of another frame are dropped, counted and told; the rest gives the answer."""
+    """
+    NaN and messages of another frame are dropped, counted and told; the rest gives the answer.
+    """
     imu, joints, values, model = session
     burst = with_nan_burst(imu, 30.0)
     foreign = replace(
@@ -139,7 +145,11 @@ def check_bursts_and_foreign_frames(station, publisher, session, folder):
 
 
 def check_clock_jump_and_silence(station, publisher, session, folder):
-    """A clock set back and joint states that stop are told, and cost no more than the samples concerned."""
+    """
+    A clock set back and joint states that stop are reported.
+
+    They cost no more than the samples concerned.
+    """
     imu, joints, values, model = session
     half = imu.stamp_ns[len(imu) // 2]
     back = int(3600e9)

@@ -1,4 +1,9 @@
-"""Nodes on an arm: its description from a file or from robot_description, its link from the messages, its up from a file or /tf_static."""
+"""
+Nodes on an arm.
+
+Its description from a file or from robot_description, its link from the messages, its up from a
+file or /tf_static.
+"""
 
 import threading
 

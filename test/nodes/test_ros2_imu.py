@@ -1,4 +1,8 @@
-"""`ros2 imu VERB` beside the plain command, and `ros2 doctor` on Imu topics, with the real `ros2` in a workspace."""
+"""
+`ros2 imu VERB` beside the plain command, and `ros2 doctor` on Imu topics.
+
+With the real `ros2` in a workspace.
+"""
 
 import os
 import re

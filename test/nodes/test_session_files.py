@@ -1,4 +1,6 @@
-"""Where a session is kept: each of two files is whole or as it was, and whoever asked knows which."""
+"""
+Where a session is kept: each of two files is whole or as it was, and whoever asked knows which.
+"""
 
 import errno
 import os

@@ -1,4 +1,8 @@
-"""The live simulator and the player: the same physics block by block, trajectories, the clock, and their refusals."""
+"""
+The live simulator and the player.
+
+The same physics block by block, trajectories, the clock, and their refusals.
+"""
 
 import subprocess
 from dataclasses import fields
@@ -329,7 +333,8 @@ def test_a_simulator_follows_a_trajectory_with_clock_and_truth():
             lambda: np.allclose(angles[-1], [0.0, -0.25, 0.5], atol=1e-9),
             'the end of the trajectory',
         )
-        # Another one, stopped before its end; one with a joint that the table does not have is refused, and told.
+        # Another one, stopped before its end; one with a joint that the table does not have is
+        # refused, and told.
         publisher.publish(
             JointTrajectory(
                 joint_names=['inner', 'outer', 'middle'],

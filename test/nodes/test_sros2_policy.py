@@ -1,4 +1,8 @@
-"""The SROS 2 policy: the structure of the sros2 schema (policy version 0.2.0), and every name that a node uses."""
+"""
+The SROS 2 policy.
+
+The structure of the sros2 schema (policy version 0.2.0), and every name that a node uses.
+"""
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path

@@ -1,8 +1,11 @@
 """
-compensator_node with a target frame and no pose: waits for /tf_static, says what it waits for, then corrects as with the pose in parameters.
+compensator_node with a target frame and no pose.
 
-Over DDS with a real tf2_msgs: the installed one, or where no wheel has it one made from its definition. Where that cannot be made either (no
-compiler, no headers), another type holds the place of the subscription, and the node is handed the messages.
+Waits for /tf_static, says what it waits for, then corrects as with the pose in parameters.
+
+Over DDS with a real tf2_msgs: the installed one, or where no wheel has it one made from its
+definition. Where that cannot be made either (no compiler, no headers), another type holds the place
+of the subscription, and the node is handed the messages.
 """
 
 import importlib.util
@@ -73,7 +76,11 @@ class Bench(OneProcess):
         self.is_real, self._publisher, self._held = is_real, None, {}
 
     def broadcast(self, *steps):
-        """Publish (parent, child, xyz, quaternion) steps beside those before, latched, as tf2's StaticTransformBroadcaster does."""
+        """
+        Publish (parent, child, xyz, quaternion) steps beside those before, latched.
+
+        As tf2's StaticTransformBroadcaster does.
+        """
         self._held |= {one.child_frame_id: one for one in map(stamped, steps)}
         if not self.is_real:
             for node in self.nodes:

@@ -1,4 +1,8 @@
-"""Avrutov 2017: the samples come back, weak designs are refused or flagged, errors follow their formulas (targets A1-A10)."""
+"""
+Avrutov 2017: the samples return, and weak designs are refused or flagged.
+
+Errors follow their formulas (targets A1-A10).
+"""
 
 import numpy as np
 import pytest
@@ -195,7 +199,11 @@ def test_a5_full_quadratic_cannot_be_seen_at_one_g():
     ],
 )
 def test_a6_full_rank_but_useless_gyro_series_are_flagged(rates, model, expected):
-    """Tolerance: 1 % of each sensor's own scale factor and of the nominal product terms, at 1 mV output noise."""
+    """
+    Tolerance: 1 % of each sensor's own scale factor and of the product terms.
+
+    The product terms are nominal, and the tolerance holds at 1 mV output noise.
+    """
     unit_sd = avrutov.calibrate(rates, np.zeros((len(rates), 3)), model).unit_sd
     show('A6', f'sd over sigma, {model}', unit_sd, expected)
     np.testing.assert_allclose(unit_sd, expected, rtol=1e-4)
@@ -253,7 +261,9 @@ def test_a8_factorial_gyro_design():
     'rates, model', [(avrutov.series_3(), 'linear'), (avrutov.series_4(), 'products')]
 )
 def test_a8_units_of_the_rates_do_not_matter(rates, model):
-    """Physical parameters from the same noisy data agree to 1e-10 of each parameter's own sd or size."""
+    """
+    Physical parameters from the same noisy data agree to 1e-10 of each parameter's own sd or size.
+    """
     rng = np.random.default_rng(9)
     outputs = avrutov.design_matrix(rates, model) @ avrutov.nominal_gyroscopes(model) + rng.normal(
         scale=1e-3, size=(len(rates), 3)
@@ -312,7 +322,11 @@ def test_a10_table_tilt(order, expected):
 
 
 def test_tilt_can_hide_in_matrix_and_products():
-    """Gravity along the first axis, n x 7: 2 arcmin leave less than 0.2 uV of residual and 0.5 mV/g of error."""
+    """
+    Gravity along the first axis, n x 7.
+
+    2 arcmin leave less than 0.2 uV of residual and 0.5 mV/g of error.
+    """
     mat_bn = avrutov.turn('ZYX', [ANGLES] * 3)
     truth = avrutov.nominal_accelerometers()
     outputs = (
@@ -373,7 +387,11 @@ def test_unknown_model_is_refused():
 
 
 def test_section_5_as_printed():
-    """Eq. 13 is the fit, the m tests scatter as sigma sqrt(diag BB'), and dividing by m - 1 with the truth known is too large."""
+    """
+    Eq. 13 is the fit, and the m tests scatter as sigma sqrt(diag BB').
+
+    Dividing by m - 1 with the truth known is too large.
+    """
     inputs, truth = (
         avrutov.gravity_readings(avrutov.turn('ZYX', [ANGLES] * 3), 'z'),
         avrutov.nominal_accelerometers('linear'),

@@ -37,7 +37,10 @@ def run_example(name):
             [
                 'Sample 1: accelerometers, n x 4, 41 runs, cond 3.76691',
                 'Sample 4: gyroscopes, n x 7, 11 runs, cond 232564',
-                'one turn about (1,1,1), n x 4            rank 3 of 4; not determined: bias, x, y, z',
+                (
+                    'one turn about (1,1,1), n x 4            rank 3 of 4; not determined: bias, x,'
+                    ' y, z'
+                ),
                 'equal rates w, w, w, n x 4               rank 2 of 4; not determined: x, y, z',
                 'rank 14 of 14',
                 'Rows 6 and 7 of the printed result of sample 4 are exchanged',

@@ -41,7 +41,11 @@ OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 
 
 def spin_means(rate, spin_axes, values=TRUTH):
-    """Return the means at rest and spinning about each axis, one row per axis, one column per sensor, m/s^2."""
+    """
+    Return the means at rest and spinning about each axis, m/s^2.
+
+    There is one row per axis, and one column per sensor.
+    """
     still = [face(axis, 1.0) for axis in spin_axes]
     spinning = [spin(axis, np.rad2deg(rate), 1.0) for axis in spin_axes]
     return tuple(
@@ -54,12 +58,16 @@ def row_noise(runs):
 
 
 def arm_error(runs, true_runs):
-    """Return fitted minus true arms when the readings come from `true_runs` and the fit assumes `runs`, shape (3, 3)."""
+    """
+    Return fitted minus true arms for readings from `true_runs`, shape (3, 3).
+
+    The readings are from `true_runs`, and the fit assumes `runs`.
+    """
     readings = np.column_stack([predict(true_runs, sensor) for sensor in TRUTH])
     return fit_triad(runs, readings)[1] - ARMS
 
 
-# --- static model ---------------------------------------------------------------------------------------------------------------------
+# --- static model ---------------------------------------------------------------------------------
 
 
 def test_z1_table_1_in_six_positions():
@@ -92,7 +100,9 @@ def test_cosines_are_not_orthogonal_so_the_transpose_is_no_inverse():
 
 
 def test_z2_six_position_noise():
-    """2000 draws: the sd ratio has sd 1.6 %, nine matrix and three bias terms; 5 % is 3.2 of them."""
+    """
+    2000 draws: the sd ratio has sd 1.6 %, nine matrix and three bias terms; 5 % is 3.2 of them.
+    """
     rng, force = np.random.default_rng(2), zhang.six_positions()
     readings = (force @ COSINES.T)[:, None, :] + 1e-4 * rng.normal(size=(6, 2000, 3))
     _, solution = zhang.fit_static(force, readings.reshape(6, -1))
@@ -110,7 +120,7 @@ def test_z2_six_position_noise():
     )
 
 
-# --- closed form ----------------------------------------------------------------------------------------------------------------------
+# --- closed form ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('rate_deg_s', [100, 150, 200])
@@ -170,7 +180,11 @@ def test_z4_closed_form_noise():
 
 
 def test_averaging_rates_by_their_information_beats_the_plain_mean():
-    """Zhang's nine spins share three static means; plain mean 1.42 / 312 mm, weighted 0.82 / 179 mm, joint fit 0.63 / 139 mm."""
+    """
+    Zhang's nine spins share three static means.
+
+    Plain mean 1.42 / 312 mm, weighted 0.82 / 179 mm, joint fit 0.63 / 139 mm.
+    """
     rng, rates = np.random.default_rng(5), np.deg2rad([100.0, 150.0, 200.0])
     still, turning = (
         0.75 * MG * rng.normal(size=(8000, 3, 3)),
@@ -204,7 +218,7 @@ def test_closed_form_refuses_axes_it_cannot_use():
         )
 
 
-# --- joint fit ------------------------------------------------------------------------------------------------------------------------
+# --- joint fit ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('design', DESIGNS)
@@ -266,7 +280,11 @@ def test_z5_start_from_the_identity_converges_or_says_singular(design):
     [('Z0', 0.0832, 18.39), ('Z60', 0.0938, 0.2087), ('O', 0.0514, 0.0635), ('M', 0.0355, 0.0560)],
 )
 def test_z6_predicted_sd_of_the_arms(design, on_axis, off_axis):
-    """The reference figures take Table 3 with its printed sign; ours is the other one, which moves them by less than 1 %."""
+    """
+    The reference figures take Table 3 with its printed sign.
+
+    Ours is the other one, which moves them by less than 1 %.
+    """
     judged = judge_design(design_runs(design), COSINES, ARMS)
     sd = 0.1 * np.array([one.sd_over_tolerance[4:] for one in judged])
     measured = [np.max(np.diag(sd)), np.max(sd[OFF_DIAGONAL])]
@@ -280,9 +298,9 @@ def test_z6_scatter_coverage_and_chi_square(design):
     """
     2000 draws x 3 accelerometers x 7 parameters; all four designs give 84 ratios and coverages.
 
-    One sd ratio scatters by 1/sqrt(4000) = 1.6 %, one coverage by 0.49 %, one chi2/dof by sqrt(2/dof/2000): for 84 quantities the stated
-    +-5 %, +-1.5 % and +-3 % are about three of those and would fail by chance, so each gets 4.5 of its own sd; the stated bounds
-    hold pooled.
+    One sd ratio scatters by 1/sqrt(4000) = 1.6 %, one coverage by 0.49 %, one chi2/dof by
+    sqrt(2/dof/2000): for 84 quantities the stated +-5 %, +-1.5 % and +-3 % are about three of those
+    and would fail by chance, so each gets 4.5 of its own sd; the stated bounds hold pooled.
     """
     rng, n_draws, runs = np.random.default_rng(6), 2000, design_runs(design)
     ratios, coverages, chi2 = [], [], []
@@ -367,7 +385,11 @@ def test_z7_a_single_oscillation_axis_is_refused():
 
 
 def test_z8_tilted_table_and_averaged_headings():
-    """All faces at one heading, worst of 24 tilt azimuths; a heading chosen against us for every face is printed beside it."""
+    """
+    All faces at one heading, worst of 24 tilt azimuths.
+
+    A heading chosen against us for every face is printed beside it.
+    """
     dynamic, level = design_runs('Z0')[6:], design_runs('Z0')[:6]
     tilted_spins = [
         replace(run, force=np.cos(TILT) * run.force) for run in dynamic
@@ -454,18 +476,26 @@ def test_z8_delay_does_not_move_spins_and_oscillations(runs_of):
     assert np.max(np.abs(arm_error(level + runs_of(0.0), level + runs_of(1e-3)))) < 1e-6
 
 
-# --- printed tables and the report's lines -----------------------------------------------------------------------------------------------
+# --- printed tables and the report's lines --------------------------------------------------------
 
 
 def test_printed_table_1_does_not_give_printed_table_2():
-    """Table 1's angles are the +1 g reading alone; the half difference is needed when the bias is unknown."""
+    """
+    Table 1's angles are the +1 g reading alone.
+
+    The half difference is needed when the bias is unknown.
+    """
     plus, minus = zhang.TABLE_2_G[1, 0], zhang.TABLE_2_G[1, 2]
     assert np.rad2deg(np.arccos(plus)) == pytest.approx(zhang.TABLE_1_ANGLES_DEG[1, 0], abs=1e-3)
     assert np.rad2deg(np.arccos((plus - minus) / 2)) == pytest.approx(89.3127, abs=1e-3)
 
 
 def test_sign_of_table_3_against_tables_2_and_4():
-    """Spinning about x at 100 deg/s moves the mean of y and z down; arms from the origin to the sensors must then be positive."""
+    """
+    Spinning about x at 100 deg/s moves the mean of y and z down.
+
+    Arms from the origin to the sensors must then be positive.
+    """
     shift = 1e3 * np.mean(zhang.TABLE_4_G[:, [0, 2]] - zhang.TABLE_2_G[:, [0, 2]], axis=1)
     arm = -shift[1:] * MG / np.deg2rad(100) ** 2
     show('', 'shift of y and z, mg; arm, mm', [*shift[1:], *(1e3 * arm)], '-2.53 -2.59; 8.14 8.32')

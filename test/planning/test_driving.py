@@ -1,4 +1,8 @@
-"""The driver: nothing moves before start, limits are kept, and whatever the joints do otherwise than asked stops everything with one sentence."""
+"""
+The driver: nothing moves before start, limits are kept, and deviations stop it.
+
+Whatever the joints do otherwise than commanded stops everything with one sentence.
+"""
 
 import re
 
@@ -50,7 +54,9 @@ LIMITS = MotionLimits(
 
 
 def motion_points(limits, seed, names=NAMES, start=None, kind=None):
-    """A planned motion from a place: a move, then a rest, a spin or a swing, with points every 0.05 s."""
+    """
+    A planned motion from a place: a move, then a rest, a spin or a swing, with points every 0.05 s.
+    """
     rng = np.random.default_rng(seed)
     builder = MotionBuilder(len(names), limits=limits)
     if start is not None:
@@ -88,7 +94,11 @@ def motion_points(limits, seed, names=NAMES, start=None, kind=None):
 
 
 class Bench:
-    """A driver and a simulated table, joint states every `STEP`, with the noise of an encoder; its clock may run ahead of ours."""
+    """
+    A driver and a simulated table, joint states every `STEP`, with the noise of an encoder.
+
+    Its clock may run ahead of ours.
+    """
 
     def __init__(
         self, limits=LIMITS, names=NAMES, driver=DriverSettings(), clock=1.0, **controller
@@ -216,7 +226,8 @@ def test_a_motion_begins_only_where_the_joints_rest():
 
 @pytest.mark.parametrize('clock', [1.0, 4.0, 0.25])
 def test_a_motion_that_was_stopped_before_the_controller_took_it_is_waited_for(clock):
-    # Joints that rest say nothing as long as the controller may still have both before it: the motion and the stop of it.
+    # Joints that rest say nothing as long as the controller may still have both before it: the
+    # motion and the stop of it.
     bench = Bench(clock=clock, lag=1.0)
     bench.driver.start()
     bench.move(motion_points(LIMITS, 3, kind='spin'))
@@ -399,7 +410,8 @@ def test_no_limit_of_any_table_is_ever_exceeded_by_what_is_sent(seed, hurry):
     for time in (0.0, 1.0):
         driver.observe(time, start, np.zeros(len(limits)), now=time)
     points = motion_points(limits, seed, names=names, start=start)
-    # What a planner does wrong: it is in a hurry. `hurry` above the slow first motion's 1 / 0.3 is too fast where the motion is at its limits.
+    # What a planner does wrong: it is in a hurry. `hurry` above the slow first motion's 1 / 0.3 is
+    # too fast where the motion is at its limits.
     asked = TrajectoryPoints(
         names,
         points.time / hurry,
@@ -433,7 +445,11 @@ def test_a_motion_without_accelerations_or_of_other_joints_is_not_sent():
 
 
 class OldHand:
-    """Stands for a planner: so many motions of ten seconds, each of which halves what is left until `floor`."""
+    """
+    Stands for a planner.
+
+    So many motions of ten seconds, each of which halves what is left until `floor`.
+    """
 
     def __init__(self, motions=4, floor=0.0):
         self.motions, self.floor, self.excess, self.separated = (
@@ -462,7 +478,11 @@ class OldHand:
 
 
 def carried_out(campaign, answers=(), most=60):
-    """What a campaign decides, each motion taking ten seconds and halving what is left; the answers of the diagnosis in order."""
+    """
+    What a campaign decides, each motion taking ten seconds and halving what is left.
+
+    The answers of the diagnosis in order.
+    """
     decided, elapsed, left, answers = [], 0.0, 16.0, list(answers)
     for _ in range(most):
         decision = campaign.decide(np.zeros(2), elapsed)

@@ -105,7 +105,8 @@ def test_what_is_promised_is_what_a_calibration_of_the_motion_comes_to(plan, tab
             / plan.sd[plan.model.param_names.index(name)]
             for name, value in zip(model.param_names, values, strict=True)
         ]
-    # 132 errors, correlated in groups: the root mean square of as many independent ones scatters by 6 %
+    # 132 errors, correlated in groups: the root mean square of as many independent ones scatters by
+    # 6 %
     assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25
 
 
@@ -122,7 +123,8 @@ def test_next_motions_end_when_all_is_known_and_take_says_what_is(plan, table):
         ('determined',) * len(plan.sd),
     )
     planner.take(known)
-    # the rests with which a session begins are made in any case: the proof holds out some of the windows
+    # the rests with which a session begins are made in any case: the proof holds out some of the
+    # windows
     assert [planner.next_motion(position).motion.kind for _ in range(LEAST_RESTS - 1)] == [
         MotionKind.POSE
     ] * (LEAST_RESTS - 1)
@@ -158,7 +160,11 @@ def test_spins_in_both_senses_fall_out_of_the_criterion_where_the_bias_wanders_a
 
 
 def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_diagnosed(table):
-    """It took 8 s with two windows, of which no proof can hold out any, and 'no plan takes less than 0 s'."""
+    """
+    It needed 8 s with two windows, of which no proof can hold out any.
+
+    The message is 'no plan takes less than 0 s'.
+    """
     plan = make_planner(table, noise=NOISE).plan()
     rests = {
         tuple(motion.place.round(6)) for motion in plan.motions if motion.kind is MotionKind.POSE
@@ -186,7 +192,9 @@ def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_di
 def test_the_sd_of_a_plan_stays_below_the_tolerance_by_the_scatter_of_the_noise_estimate(
     plan, table
 ):
-    """Plans used to stop at the tolerance itself, which every second estimate of the noise exceeds."""
+    """
+    Plans used to stop at the tolerance itself, which every second estimate of the noise exceeds.
+    """
     problem = make_planner(table, noise=NOISE, tolerances=TIGHT).problem
     rests = [problem.windows[k][0] for k in problem.first_rests(0)][1:]  # of equal length
     factor, rng = problem.variance_factor(rests), np.random.default_rng(9)
@@ -206,7 +214,8 @@ def test_the_sd_of_a_plan_stays_below_the_tolerance_by_the_scatter_of_the_noise_
         for _ in range(400)
     ]
     assert 1.2 < factor < 1.8
-    # 20 expected of 400, by counting 4.4 standard deviations apart; the estimate is skewed where chi-square is not
+    # 20 expected of 400, by counting 4.4 standard deviations apart; the estimate is skewed where
+    # chi-square is not
     assert np.mean(exceeded) < 0.1
     kept = [
         next(
@@ -302,7 +311,11 @@ def test_squares_and_asymmetries_of_a_gyroscope_are_told_apart_by_other_speeds(t
 
 
 def test_no_time_is_spent_on_causes_that_no_motion_tells_apart(table):
-    """A delay and a filter of 0.1 ms are one column: the plan says so at once instead of driving for three minutes."""
+    """
+    A delay and a filter of 0.1 ms are one column.
+
+    The plan says so at once instead of driving for three minutes.
+    """
     causes = [('gyroscope', name) for name in ('gyro_delay', 'gyro_filter')]
     model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names).with_effect(
         *causes[0]
@@ -348,7 +361,8 @@ def test_by_hand_the_steps_are_planned_in_words_and_pictures(capsys, tmp_path):
     assert main(['plan', '--by-hand', '--output', str(out)]) == 0
     document = yaml.safe_load((out / 'plan.yaml').read_text())
     kinds = [motion['kind'] for motion in document['motions']]
-    # nine parameters of the norm of gravity take one equation per pose, three more estimate the scatter; the gyroscope needs three turns
+    # nine parameters of the norm of gravity take one equation per pose, three more estimate the
+    # scatter; the gyroscope needs three turns
     assert len(kinds) >= 12 and kinds.count('turn') >= 3 and set(kinds) <= {'pose', 'turn'}
     assert document['seconds'] == pytest.approx(
         sum(motion['seconds'] for motion in document['motions'])
@@ -451,7 +465,11 @@ def tight(folder):
 
 
 def test_a_moving_window_is_foretold_with_the_bias_wandering_in_it(table):
-    """Against the dense covariance of the samples: information of both sensors, the mean, and its variance."""
+    """
+    Against the dense covariance of the samples.
+
+    Information of both sensors, the mean, and its variance.
+    """
     model = choose_model(CalibrationOptions(), table)
     noise = noise_of_grade(GRADES['navigation'].noise, 100.0)
     coordinates = Coordinates(model, tolerances_of(model))
@@ -494,7 +512,11 @@ def test_a_moving_window_is_foretold_with_the_bias_wandering_in_it(table):
 
 
 def test_the_memory_of_a_plan_does_not_grow_with_the_square_of_an_arms_joints(table, monkeypatch):
-    """All moves of seven joints at once took 5.7 GB: columns are computed by blocks, and a long chain has few places."""
+    """
+    All moves of seven joints at once took 5.7 GB.
+
+    Columns are computed by blocks, and a long chain has few places.
+    """
     lengths = []
 
     def counted(references, sensor):

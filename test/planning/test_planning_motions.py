@@ -1,4 +1,8 @@
-"""Motions that a planner asks for: within every limit, from rest to rest, and such as a joint trajectory can say."""
+"""
+Motions that a planner asks for.
+
+Within every limit, from rest to rest, and such as a joint trajectory can say.
+"""
 
 import numpy as np
 from hypothesis import example, given, settings

@@ -1,4 +1,8 @@
-"""A damaged recording costs what is damaged: calibrate still writes a result, counts the loss, and ends with 3."""
+"""
+A damaged recording costs what is damaged.
+
+Calibrate still writes a result, counts the loss, and ends with 3.
+"""
 
 import numpy as np
 import pytest
@@ -77,7 +81,9 @@ def errors(document):
 
 @pytest.mark.parametrize('storage', STORAGES)
 def test_a_truncated_recording_loses_its_end(bags, tmp_path, storage):
-    """Three quarters of the file give about three quarters of the samples, and values that are right."""
+    """
+    Three quarters of the file give about three quarters of the samples, and values that are right.
+    """
     folder, n_samples = bags
     bag = tmp_path / storage
     bag.mkdir()

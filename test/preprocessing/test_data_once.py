@@ -1,4 +1,9 @@
-"""Data go through once: a sample is cleaned once, whoever looks at it, and a recording is read no oftener than its answer needs."""
+"""
+Data go through once.
+
+A sample is cleaned once, whoever looks at it, and a recording is read no oftener than its answer
+needs.
+"""
 
 from collections import Counter
 from pathlib import Path

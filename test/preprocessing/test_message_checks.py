@@ -1,4 +1,8 @@
-"""What a driver can leave wrong in its messages beside the readings: each is named by one check; messages as they should be pass."""
+"""
+What a driver can leave wrong in its messages beside the readings: each is named by one check.
+
+Messages as they should be pass.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""Is this IMU on this table? What does not tell the motion of the joints is refused, with the cause."""
+"""
+Is this IMU on this table? What does not tell the motion of the joints is refused, with the cause.
+"""
 
 import re
 from dataclasses import replace
@@ -136,7 +138,9 @@ def ripple(time):
 
 
 def alternating(sign):
-    """Sweeps of which every other one differs, by `sign`, in addition to a ripple that one stream has."""
+    """
+    Sweeps of which every other one differs, by `sign`, in addition to a ripple that one stream has.
+    """
 
     def rate(time):
         phase = 2.0 * np.pi * time / PERIOD
@@ -155,7 +159,11 @@ def alternating(sign):
     ids=('a lag of half a sampling period', 'both neighbours equally good'),
 )
 def test_a_period_of_fast_sweeps_is_not_reported_as_a_delay(shaft, measured, joint):
-    """Periods of 1.105 s at 100 Hz: without the delays between samples, or with those of one sign only, the stamps seem 1.1 s ahead."""
+    """
+    Periods of 1.105 s at 100 Hz.
+
+    Without the delays between samples, or with those of one sign only, the stamps seem 1.1 s ahead.
+    """
     table = shaft[1]
     assert _a_period_late([sweeps(table, measured, joint)], table) is None
 
@@ -181,7 +189,12 @@ def test_a_real_delay_of_fast_sweeps_is_reported(shaft, delay):
 def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_differ(
     shaft, sign, swing
 ):
-    """Sweeps of 2 s to and fro: one second of delay and a wrong sign are one thing when all are alike, and told apart when every other one is larger."""
+    """
+    Sweeps of 2 s to and fro.
+
+    One second of delay and a wrong sign are one thing when all are alike, and told apart when every
+    other one is larger.
+    """
     table, time = shaft[1], np.arange(6000) * 0.01
     position = np.stack(
         [(1.0 + swing * np.sin(0.77 * t)) * np.sin(np.pi * t) for t in (time, time - 1.0)]
@@ -217,7 +230,11 @@ def test_half_a_period_of_delay_is_told_from_a_wrong_sign_as_far_as_sweeps_diffe
 def test_the_joints_with_a_reversed_sign_are_named_and_no_mount_or_standstill_is(
     gimbals, signs, corrected
 ):
-    """Signs of outer and inner together are a sensor turned about y for the gyroscope; gravity separates them."""
+    """
+    Signs of outer and inner together are a sensor turned about y for the gyroscope.
+
+    Gravity separates them.
+    """
     with refused(InputError, 'on_table') as caught:
         calibrate(joints(gimbals[0], sign=np.array(signs)), gimbals[1])
     assert [
@@ -226,7 +243,11 @@ def test_the_joints_with_a_reversed_sign_are_named_and_no_mount_or_standstill_is
 
 
 def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
-    """With middle at 80 degrees, inner is nearly parallel to outer, and it rests: its standstill would explain the rates too."""
+    """
+    With middle at 80 degrees, inner is nearly parallel to outer, and it rests.
+
+    Its standstill would explain the rates too.
+    """
     table, time = gimbals[1], np.arange(6000) * 0.01
     motion = JointMotion(
         time, np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3)), np.zeros((6000, 3))
@@ -257,7 +278,11 @@ def test_a_reversed_joint_is_no_standstill_of_a_parallel_one(gimbals):
 
 @pytest.mark.parametrize('lag', [0.05, -0.05])
 def test_a_late_clock_is_no_standstill(gimbals, lag):
-    """While outer and inner turn, a lag turns the rate of outer about the axis of middle, which rests; a middle that turns unseen is a standstill."""
+    """
+    While outer and inner turn, a lag turns the rate of outer about the axis of middle, which rests.
+
+    A middle that turns unseen is a standstill.
+    """
     table, time = gimbals[1], np.arange(1000) * 0.01
 
     def motion(time, outer, middle=0.0):
@@ -382,7 +407,11 @@ def test_a_live_session_tells_the_same_causes(gimbals):
 
 
 def test_a_coarse_gyroscope_may_repeat_the_reading_of_a_constant_rate_and_no_other(gimbals):
-    """With steps of 0.02 rad/s a constant rate is one reading; the same reading while the rate changes, or at another rate, is a standstill."""
+    """
+    With steps of 0.02 rad/s a constant rate is one reading.
+
+    The same reading while the rate changes, or at another rate, is a standstill.
+    """
     table, time = gimbals[1], np.arange(4000) * 0.01
     rate = np.zeros((4000, 3))
     rate[:, 0] = np.where(time < 20, 1.0, np.sin(time))

@@ -1,4 +1,8 @@
-"""Pre-flight: each fault that a driver can make is named by one check; good recordings are left in peace."""
+"""
+Pre-flight: each fault that a driver can make is named by one check.
+
+Good recordings are left in peace.
+"""
 
 import re
 from collections import deque
@@ -69,7 +73,8 @@ def trouble(found):
     return sorted({(f.check, f.severity) for f in found if f.severity in (REFUSE, WARNING)})
 
 
-# What a driver can do wrong -----------------------------------------------------------------------------------------------------
+# What a driver can do wrong
+# -----------------------------------------------------------------------------------------------------
 
 
 def in_g(imu, joints, temperature):
@@ -361,7 +366,9 @@ def test_calibrate_refuses_what_would_make_the_result_wrong(
     ((clipped_gyroscope, 'clipping', True), (wrong_gravity, 'gravity', False)),
 )
 def test_calibrate_goes_on_with_a_warning(capsys, tmp_path, session, table, fault, check, unusable):
-    """Said on standard error, kept in the file and the report; exit code 3 when samples are unusable."""
+    """
+    Said on standard error, kept in the file and the report; exit code 3 when samples are unusable.
+    """
     imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
     write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
     more = ['--model-as-asked', *([] if unusable else ['--no-report'])]  # one report is enough
@@ -390,7 +397,8 @@ def test_calibrate_goes_on_with_a_warning(capsys, tmp_path, session, table, faul
     assert code in ((3,) if unusable else (0, 3))
 
 
-# Against the joints -------------------------------------------------------------------------------------------------------------
+# Against the joints
+# -------------------------------------------------------------------------------------------------------------
 
 
 def turned(imu):
@@ -506,7 +514,8 @@ def test_a_crooked_mount_is_no_exchange_of_axes(angle_deg, wrong):
     assert match_axes(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])).wrong == wrong
 
 
-# Good recordings ----------------------------------------------------------------------------------------------------------------
+# Good recordings
+# ----------------------------------------------------------------------------------------------------------------
 
 
 GOOD_SESSIONS = {
@@ -544,7 +553,11 @@ def test_good_sessions_are_left_in_peace(options):
 
 @pytest.mark.parametrize('profile', ['avrutov_111', 'avrutov_rates_3', 'zhang_z60'])
 def test_motions_of_the_papers_are_left_in_peace(profile):
-    """One turn about (1, 1, 1) shows no axis of its own, and spins about the vertical are as steady as rests: neither is a fault."""
+    """
+    One turn about (1, 1, 1) shows no axis of its own.
+
+    Spins about the vertical are as steady as rests, and neither is a fault.
+    """
     made = make_profile(profile)
     table = Table.from_mapping(made.table)
     model = SensorModel(joint_names=tuple(table.joint_names))
@@ -588,7 +601,11 @@ def test_how_the_stream_is_cut_does_not_matter(session):
 
 
 def test_a_real_range_that_was_reached_once_is_no_clipping(session):
-    """The largest reading of a smooth motion comes once; many equal readings come from a rounded one, below it as above."""
+    """
+    The largest reading of a smooth motion comes once.
+
+    Many equal readings come from a rounded one, below it as above.
+    """
     rounded = replace(
         session.imu,
         force_s=np.round(session.imu.force_s, 1),
@@ -615,11 +632,16 @@ def test_a_rate_of_nothing_is_no_end_of_the_range(session):
     assert 'clipping' not in {f.check for f in findings((slow, session.joints, None))}
 
 
-# Topics -------------------------------------------------------------------------------------------------------------------------
+# Topics
+# -------------------------------------------------------------------------------------------------------------------------
 
 
 def several_topics(folder, session, imu=1, joints=1, temperature=1):
-    """Write a bag with so many topics of each type, none of them by its default name, and return its path."""
+    """
+    Write a bag with so many topics of each type and return its path.
+
+    None of the topics has its default name.
+    """
     from rosbags.rosbag2 import Reader, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -761,7 +783,8 @@ def test_a_bag_without_imu_lists_what_it_holds(capsys, tmp_path, session):
     )
 
 
-# Real recordings ----------------------------------------------------------------------------------------------------------------
+# Real recordings
+# ----------------------------------------------------------------------------------------------------------------
 
 
 REAL = {
@@ -798,7 +821,11 @@ def test_real_recordings_get_what_is_true_of_them(recordings, name, topic):
 
 @pytest.mark.real_data
 def test_counts_are_in_order_once_scaled(capsys, recordings, tmp_path):
-    """The factory's biases are up to 1.2 m/s^2 beside the nominal offset: taken out before gravity is compared."""
+    """
+    The factory's biases are up to 1.2 m/s^2 beside the nominal offset.
+
+    Taken out before gravity is compared.
+    """
     nominal = yaml.safe_load((recordings / 'xsens_counts' / 'reference.yaml').read_text())[
         'nominal'
     ]
@@ -853,7 +880,9 @@ def test_arm_warns_of_clipping_and_refuses_other_units(capsys, recordings):
 
 
 def test_spikes_are_counted_once_among_the_samples(session):
-    """The total was that of the samples plus the spikes: 16 of 15985 samples in a recording of 15969."""
+    """
+    The total was that of the samples plus the spikes: 16 of 15985 samples in a recording of 15969.
+    """
     imu, joints, temperature = session.imu, session.joints, session.temperature
     force = imu.force_s.copy()
     force[1000::3000, 1] += 40.0

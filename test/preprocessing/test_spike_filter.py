@@ -1,4 +1,8 @@
-"""Spikes: dropped and counted wherever a stream is cleaned; noise, motion, knocks and coarse readings are left alone."""
+"""
+Spikes: dropped and counted wherever a stream is cleaned.
+
+Noise, motion, knocks and coarse readings are left alone.
+"""
 
 from dataclasses import replace
 
@@ -70,7 +74,11 @@ def test_how_the_stream_is_cut_does_not_matter(session):
 
 
 def test_a_knock_a_step_and_coarse_readings_are_no_spikes(session):
-    """What several samples share is motion: a knock that rings for 50 ms, a stop from one sample to the next, a range that ended."""
+    """
+    What several samples share is motion.
+
+    A knock that rings for 50 ms, a stop from one sample to the next, a range that ended.
+    """
     time = 0.01 * np.arange(20)
     ringing = 20 * np.exp(-time / 0.03) * np.cos(2 * np.pi * 12 * time)
     force, rate = session.force_s.copy(), session.rate_s.copy()
@@ -97,7 +105,11 @@ def test_the_noise_of_a_chunk_does_not_depend_on_how_the_stream_is_cut(session, 
 
 
 def test_knocks_of_one_reading_that_reach_several_axes_stay(session):
-    """A bang on the table passes a wide filter: nine tenths of it in one reading, the rest in the neighbours, on all axes."""
+    """
+    A bang on the table passes a wide filter.
+
+    Nine tenths of it in one reading, the rest in the neighbours, on all axes.
+    """
     rng, force, rate = np.random.default_rng(8), session.force_s.copy(), session.rate_s.copy()
     for at in range(60, len(session) - 60, 97):
         for values, size in ((force, 10.0), (rate, 1.0)):

@@ -1,4 +1,6 @@
-"""Regular times drawn through the stamps that drivers make, for calibration, streams and checks alike."""
+"""
+Regular times drawn through the stamps that drivers make, for calibration, streams and checks alike.
+"""
 
 import re
 
@@ -52,7 +54,11 @@ def timed(imu, cuts=()):
     ),
 )
 def test_times_are_those_of_the_sampling(kind, off_ms):
-    """Up to a constant, and to a share of the scatter that one block of 64 cannot average out; 8 samples at once are off by 35 ms as they come."""
+    """
+    Up to a constant, and to a share of the scatter that one block of 64 cannot average out.
+
+    8 samples at once are off by 35 ms as they come.
+    """
     rng = np.random.default_rng(3)
     number, times, state = timed(samples(stamps_of(kind, TRUE, rng)))
     assert np.array_equal(number, np.arange(N))
@@ -151,7 +157,11 @@ def test_inspect_sees_the_same():
 
 @pytest.mark.parametrize(('rate', 'draw'), [(100, 'normal'), (200, 'normal'), (200, 'uniform')])
 def test_symmetric_jitter_in_order_is_no_lateness(rate, draw):
-    """Times went through the earliest stamps, 3 to 7 ms early, where jitter was wider than the period and no stamp overtook another."""
+    """
+    Times went through the earliest stamps, 3 to 7 ms early.
+
+    Where jitter was wider than the period and no stamp overtook another.
+    """
     for seed in range(4):
         rng, true_ns = (
             np.random.default_rng(seed),
@@ -162,5 +172,6 @@ def test_symmetric_jitter_in_order_is_no_lateness(rate, draw):
         number, times, state = timed(samples(stamps))
         assert np.array_equal(number, np.arange(N)) and state.n_rebuilt > 0.9 * N
         off = 1e-6 * (times - true_ns)
-        # The mean of 64 scatters by 0.37 ms; values that keep the order are late by 0.3 ms at 200 Hz.
+        # The mean of 64 scatters by 0.37 ms; values that keep the order are late by 0.3 ms at 200
+        # Hz.
         assert abs(off.mean()) < 0.6 and off.std() < 0.7

@@ -101,7 +101,8 @@ def test_dirty_samples_are_refused():
         find_still(imu)
 
 
-# recording: topic, least and most intervals at rest (the numbers of poses are told with the recordings)
+# recording: topic, least and most intervals at rest (the numbers of poses are told with the
+# recordings)
 RECORDINGS = {
     'xsens_counts': ('/imu/data_raw', 38, 38),
     'mpu9150_0': ('/imu/data_raw', 17, 20),

@@ -1,4 +1,6 @@
-"""Windows found in simulated sessions, whatever the rates, the faults and the way the streams arrive."""
+"""
+Windows found in simulated sessions, whatever the rates, the faults and the way the streams arrive.
+"""
 
 from types import SimpleNamespace
 
@@ -117,7 +119,8 @@ def same(window, other):
         np.testing.assert_array_equal(getattr(window.motion, name), getattr(other.motion, name))
 
 
-# name: imu_hz, joint_hz, joint noise, encoder step, margin of the edges s, error of position rad, rate rad/s, acceleration rad/s^2
+# name: imu_hz, joint_hz, joint noise, encoder step, margin of the edges s, error of position rad,
+# rate rad/s, acceleration rad/s^2
 STREAMS = {
     'slow': (50, 50, 1e-5, 0.0, 0.15, 5e-5, 3e-3, 0.1),
     'usual': (200, 100, 1e-5, 0.0, 0.15, 5e-5, 2e-3, 0.1),
@@ -534,7 +537,11 @@ def test_one_clock_set_back_alone_goes_on():
 
 
 def stream(n_seconds, imu_hz=20, joint_hz=20, with_imu=lambda k: True, with_joints=lambda k: True):
-    """Push a resting session second by second and return the largest number of samples held, the counts and the windows."""
+    """
+    Push a resting session second by second and return the sizes.
+
+    They are the largest number of samples held, the counts and the windows.
+    """
     gatherer = MotionGatherer(TABLE)
     held, windows = 0, []
     rng = np.random.default_rng(0)
@@ -610,7 +617,11 @@ def test_stream_statistics_are_at_hand():
 
 
 def test_the_quieter_the_accelerometer_the_shorter_its_moving_windows():
-    """A bias that wanders by 10 ug shows within 20 s beside 1 ug/sqrt(Hz), and not beside 120, nor where late stamps turn gravity by more."""
+    """
+    A bias that wanders by 10 ug shows within 20 s with noise of 1 ug/sqrt(Hz).
+
+    It does not show with 120, nor where late stamps turn gravity by more.
+    """
     rng, time = np.random.default_rng(4), np.arange(2000) * 0.01
     cuts = {}
     for density, jitter in ((1e-5, 0.0), (1e-4, 0.0), (1.2e-3, 0.0), (1e-5, 5e-5)):
@@ -658,7 +669,11 @@ def test_long_motion_of_a_quiet_imu_is_cut_short_and_rests_are_not():
 
 
 def test_columns_of_a_chunk_need_the_memory_of_one_chunk():
-    """Windows in groups of at most WINDOW_GROUP_SAMPLES samples, a longer one alone: the columns of a group are in memory at once."""
+    """
+    Windows in groups of at most WINDOW_GROUP_SAMPLES samples, a longer one alone.
+
+    The columns of a group are in memory at once.
+    """
     sizes = [WINDOW_GROUP_SAMPLES - 1, WINDOW_GROUP_SAMPLES - 1, 1, 1, 3 * WINDOW_GROUP_SAMPLES, 5]
     groups = [
         [len(window.motion) for window in group]
@@ -675,7 +690,9 @@ def test_columns_of_a_chunk_need_the_memory_of_one_chunk():
 
 
 def test_stored_windows_are_the_windows():
-    """In order, in turn and out of turn, while more are appended, and in a file instead of memory."""
+    """
+    In order, in turn and out of turn, while more are appended, and in a file instead of memory.
+    """
     windows, _ = gather(*record(rest(5)))
     windows, stored = [*windows, *gather(*record(rest(3), seed=1))[0]], StoredWindows()
     for window in windows:

@@ -1,4 +1,8 @@
-"""The source distribution and the wheel made of it: complete, accepted by the package index, and working in an empty environment."""
+"""
+The source distribution and the wheel made of it.
+
+Complete, accepted by the package index, and working in an empty environment.
+"""
 
 import shutil
 import subprocess
@@ -66,7 +70,11 @@ def test_the_source_distribution_is_complete(archive):
 @pytest.mark.long
 @pytest.mark.live
 def test_it_installs_into_an_empty_environment_and_runs(archive, tmp_path):
-    """From the archive alone: the wheel, its metadata, the command line and the installed data files; requirements come from this environment."""
+    """
+    From the archive alone: the wheel, its metadata, the command line and the installed data files.
+
+    Requirements come from this environment.
+    """
     pip = (sys.executable, '-m', 'pip', '--disable-pip-version-check', '--quiet')
     run(
         *pip,

@@ -1,4 +1,8 @@
-"""Core tests start no process and use no DDS; live tests that fail are repeated once, core tests never."""
+"""
+Core tests start no process and use no DDS.
+
+Live tests that fail are repeated once, core tests never.
+"""
 
 import multiprocessing
 import os

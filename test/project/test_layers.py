@@ -1,4 +1,8 @@
-"""Imports run one way: nodes and cli, then msg_adapters, then the core, which needs numpy and scipy only."""
+"""
+Imports run one way.
+
+Nodes and cli, then msg_adapters, then the core, which needs numpy and scipy only.
+"""
 
 import ast
 import os
@@ -12,7 +16,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 FRONT_DOOR = ROOT / 'imu_calibration/__init__.py'
-"""Imports the names for notebooks when they are asked for; test_front_door sees to it that it imports nothing by itself."""
+"""
+Imports the names for notebooks when they are asked for; test_front_door sees to it that it imports
+nothing by itself.
+"""
 EDGE = {'cli', 'nodes', 'use_cases', '__main__'}
 ROS = {
     'rclpy',
@@ -271,7 +278,11 @@ def test_modules_of_all_layers_were_found():
     'path', modules('imu_calibration') + modules('msg_adapters'), ids=module_name
 )
 def test_a_module_binds_each_constant_once(path):
-    """Two constants of one name, as after a join of two files, leave the first one's users with the second one's value."""
+    """
+    Two constants of one name.
+
+    As after a join of two files, leave the first one's users with the second one's value.
+    """
     bound = [
         target.id
         for node in parsed(path).body

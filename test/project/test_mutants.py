@@ -1,4 +1,8 @@
-"""Every fault that `make mutants` puts into the code has its place; renamed variables and moved functions do not matter."""
+"""
+Every fault that `make mutants` puts into the code has its place.
+
+Renamed variables and moved functions do not matter.
+"""
 
 import ast
 from pathlib import Path

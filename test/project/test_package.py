@@ -1,4 +1,8 @@
-"""The package's own papers agree: manifest, set-up, pinned environments, make targets, installed files."""
+"""
+The package's own papers agree.
+
+Manifest, set-up, pinned environments, make targets, installed files.
+"""
 
 import ast
 import json
@@ -41,7 +45,8 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'rosbags': 'python3-rosbags-pip',
     'urdf_parser_py': 'urdfdom_py',
-    # installed with those that need them; compression is in the standard library from Python 3.14 on
+    # installed with those that need them; compression is in the standard library from Python 3.14
+    # on
     'markupsafe': 'python3-jinja2',
     'lz4': 'python3-rosbags-pip',
     'backports': 'python3-rosbags-pip',
@@ -133,7 +138,9 @@ def third_party_imports(*folders):
 
 
 def pinned(name):
-    """Lines of a constraints file and of those it includes, without comments alone and blank lines."""
+    """
+    Lines of a constraints file and of those it includes, without comments alone and blank lines.
+    """
     lines = []
     for line in (ROOT / 'constraints' / name).read_text().splitlines():
         if line.startswith('-r '):
@@ -362,11 +369,9 @@ def test_the_tolerances_file_covers_the_catalogue_with_its_defaults():
 def test_the_map_has_each_verb_and_functions_that_exist():
     rows = [
         line.split(' | ')
-        for line in (ROOT / 'CONTRIBUTING.md')
-        .read_text()
-        .split('## Map')[1]
-        .split('## ')[0]
-        .splitlines()
+        for line in (
+            (ROOT / 'CONTRIBUTING.md').read_text().split('## Map')[1].split('## ')[0].splitlines()
+        )
         if line.startswith('| ')
     ]
     verbs = {verb for row in rows[2:] for verb in row[0].strip('| ').split(', ')} - {
@@ -388,7 +393,9 @@ def test_the_map_has_each_verb_and_functions_that_exist():
 
 @pytest.mark.parametrize('folder', ['examples', 'benchmarks', 'validation', 'tools'])
 def test_scripts_import_names_that_the_package_has(folder):
-    """No lane runs every script; a name that was moved or removed would be noticed by a user first."""
+    """
+    No lane runs every script; a name that was moved or removed would be noticed by a user first.
+    """
 
     def known(module, name):
         return (

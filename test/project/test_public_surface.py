@@ -1,4 +1,6 @@
-"""Everything public says its types, and what comes after the third argument is named by whoever calls."""
+"""
+Everything public says its types, and what comes after the third argument is named by whoever calls.
+"""
 
 import ast
 from pathlib import Path
@@ -9,7 +11,10 @@ ROOT = Path(__file__).resolve().parents[2]
 XYZ = {'x', 'y', 'z', 'wx', 'wy', 'wz', 'fx', 'fy', 'fz'}
 """Components of one vector, as what is called for every sample takes them."""
 POSITIONAL = ('settings.py',)
-"""Where some functions take more than three arguments by their place: settings are declared like rows of a table."""
+"""
+Where some functions take more than three arguments by their place: settings are declared like rows
+of a table.
+"""
 
 
 def modules():
@@ -22,7 +27,11 @@ def modules():
 
 
 def public_functions(path):
-    """Yield (function, its arguments without self) of the functions, methods and constructors that others may call."""
+    """
+    Yield (function, its arguments without self) of the public functions.
+
+    They are the functions, methods and constructors that other code may call.
+    """
     for node in ast.parse(path.read_text()).body:
         inside = (
             node.body

@@ -1,4 +1,8 @@
-"""An arm whose joints are not as described: what of it can be known, and that the rest of the calibration does not suffer."""
+"""
+An arm whose joints are not as described.
+
+What of it can be known, and that the rest of the calibration does not suffer.
+"""
 
 import numpy as np
 import pytest
@@ -15,7 +19,11 @@ pytest.importorskip('pinocchio', reason='Pinocchio makes these worlds: make orac
 
 @pytest.mark.parametrize('text', [SIX_AXES, SEVEN_AXES], ids=['six_axes', 'seven_axes'])
 def test_tilt_angles_zeros_and_places_are_all_that_can_be_wrong_with_an_arm(text):
-    """Frames that stand turned and shifted anyhow are explained to rounding: nothing is missing from the catalogue."""
+    """
+    Frames that stand turned and shifted anyhow are explained to rounding.
+
+    Nothing is missing from the catalogue.
+    """
     world = make_arm_world(5, joint_error=1e-3, place_error=1e-3, text=text, seconds=1.0)
     *_, rest = in_our_axes(world)
     assert max(rest) < 1e-12
@@ -54,7 +62,12 @@ def test_an_imu_is_calibrated_on_an_arm_with_wrong_joints(world):
 
 @pytest.mark.long
 def test_joints_taken_at_their_word_spoil_the_calibration(world):
-    """The quiet counterpart: without the joints' errors in the model the matrices are ten times less exact, and their standard deviations say so."""
+    """
+    The quiet counterpart.
+
+    Without the joints' errors in the model the matrices are ten times less exact, and their
+    standard deviations say so.
+    """
     true = {name: value for name, value in truth(world).items() if '.matrix.' in name}
     errors = []
     for options in (CalibrationOptions(), CalibrationOptions(reference_model='table_tilt')):

@@ -1,4 +1,6 @@
-"""Calibration by hand: identities, Jacobians, honest uncertainty, what is held, and real recordings."""
+"""
+Calibration by hand: identities, Jacobians, honest uncertainty, what is held, and real recordings.
+"""
 
 import re
 from dataclasses import replace
@@ -103,7 +105,11 @@ def test_turn_is_the_product_of_the_steps_and_its_derivatives_are_exact():
 
 
 def test_turn_is_of_third_order_in_the_step():
-    """Halving the step lowers the error by about eight; straight lines between the rates would give four and start at 8e-4."""
+    """
+    Halving the step lowers the error by about eight.
+
+    Straight lines between the rates would give four and start at 8e-4.
+    """
     errors = []
     for period in (0.04, 0.02):
         attitude, rate = turn_samples(
@@ -157,7 +163,8 @@ def test_system_is_the_derivative_of_its_residuals():
     size = 1e-6
     slopes = []
     for step in size * np.eye(design.shape[1]):
-        # rows at the true force: the response to the accelerometer's own parameters through the g-sensitivity is left out on purpose
+        # rows at the true force: the response to the accelerometer's own parameters through the
+        # g-sensitivity is left out on purpose
         ahead, behind = (
             GravityRows(FULL, poses, turns).linearise(reference.moved(state, s * step)).residual
             for s in (1, -1)
@@ -173,7 +180,8 @@ def test_system_is_the_derivative_of_its_residuals():
         atol=1e-6,
     )
     assert not design[:, fixed].any()
-    # tangent planes turn with the direction after a turn: to first order only where the turn already fits, so not compared there
+    # tangent planes turn with the direction after a turn: to first order only where the turn
+    # already fits, so not compared there
     directions = np.arange(15).reshape(3, 5)[:, :2]
     np.testing.assert_allclose(
         design[:, np.setdiff1d(rest, directions)],
@@ -230,8 +238,9 @@ def test_reported_sd_are_honest(seeds, sensitivity):
     """
     Random sensors and sessions: normalised squared error near 1, 95 % intervals hold.
 
-    With 21 (30) parameters of which about a third is independent, the mean over 24 seeds scatters by 0.08, over 12 by 0.11; the scatter of
-    poses comes from some 10 degrees of freedom, which the report makes up for.
+    With 21 (30) parameters of which about a third is independent, the mean over 24 seeds scatters
+    by 0.08, over 12 by 0.11; the scatter of poses comes from some 10 degrees of freedom, which the
+    report makes up for.
     """
     normalised, inside = [], []
     for seed in range(seeds):
@@ -242,14 +251,19 @@ def test_reported_sd_are_honest(seeds, sensitivity):
         normalised.append(error @ np.linalg.solve(covariance, error) / len(error))
         inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(covariance)))
     print(
-        f'mean normalised squared error {np.mean(normalised):.3f}, 95 % intervals hold {100 * np.mean(inside):.1f} %'
+        f'mean normalised squared error {np.mean(normalised):.3f}, 95 % intervals hold'
+        f' {100 * np.mean(inside):.1f} %'
     )
     assert 0.8 < np.mean(normalised) < 1.3
     assert 0.91 < np.mean(inside) < 0.985
 
 
 def normalised_errors(seeds, **session):
-    """Errors in reported sds of all parameters of simulated sessions with poses that scatter by 20 mm/s^2, shape (seeds, 21)."""
+    """
+    Errors in reported sds of all parameters of simulated sessions, (seeds, 21).
+
+    The sessions have poses that scatter by 20 mm/s^2, and the shape is (seeds, 21).
+    """
     found = []
     for seed in seeds:
         imu, ranges, truth = simulate([seed, 6], pose_sd=0.02, **session)
@@ -261,16 +275,23 @@ def normalised_errors(seeds, **session):
 @pytest.mark.long
 def test_nine_poses_are_widened_by_student_s_t():
     """
-    Nine poses leave no degree of freedom for their scatter: the misfit of the turns is attributed to it, with the quantile of Student's t.
+    Nine poses leave no degree of freedom for their scatter.
 
-    With a constant scatter of 2 mm/s^2 for so few poses, a third of these errors exceeded three sd, the rms was 4.3.
+    The misfit of the turns is attributed to it, with the quantile of Student's t.
+
+    With a constant scatter of 2 mm/s^2 for so few poses, a third of these errors exceeded three sd,
+    the rms was 4.3.
     """
     errors = normalised_errors(range(24), n_poses=9)[:, :9]
     assert np.sqrt(np.mean(errors**2)) < 1.6 and np.mean(np.abs(errors) > 3) < 0.05
 
 
 def test_the_error_of_a_scatter_is_that_of_student_s_t():
-    """Ratio of the 97.5 % quantiles with 3, 10 and 30 degrees of freedom: 3.182, 2.228 and 2.042 over 1.960 (tables)."""
+    """
+    Ratio of the 97.5 % quantiles with 3, 10 and 30 degrees of freedom.
+
+    3.182, 2.228 and 2.042 over 1.960 (tables).
+    """
     np.testing.assert_allclose(
         np.sqrt(student_factor(np.array([3.0, 10.0, 30.0]))), [1.6236, 1.1368, 1.0420], rtol=1e-3
     )
@@ -303,7 +324,11 @@ def test_misfit_of_inseparable_groups_counts_for_each():
 
 @pytest.mark.parametrize('step', [0.04, 0.08])
 def test_coarse_readings_have_the_noise_of_rounding(step):
-    """Readings that are constant in every pose: their means are known to step / sqrt(12); before, to 1e-8 of the reading."""
+    """
+    Readings that are constant in every pose: their means are known to step / sqrt(12).
+
+    Before, to 1e-8 of the reading.
+    """
     imu, ranges, truth = simulate([16, 6], n_poses=14, force_sd=0.002)
     found = calibrate_by_hand(
         replace(imu, force_s=step * np.round(imu.force_s / step)), HandOptions(GRAVITY), ranges
@@ -348,7 +373,11 @@ def test_wrong_gravity_is_a_common_scale_and_its_sd_goes_there():
 
 
 def test_gravity_follows_from_latitude_and_height():
-    """Normal gravity of WGS 84 at 48.8 deg and 100 m (9.808959, pyins 1.0) with a relative sd of 1e-4, by hand as on a table."""
+    """
+    Normal gravity of WGS 84 at 48.8 deg and 100 m (9.808959, pyins 1.0) with a relative sd of 1e-4.
+
+    By hand as on a table.
+    """
     imu, ranges, _ = simulate(7)
     options = hand_options(calibration_options({'latitude': 48.8, 'height': 100.0}))
     assert options.gravity == pytest.approx(
@@ -412,7 +441,11 @@ def face_attitudes(ups):
 
 
 def test_six_faces_leave_the_cross_axis_terms_held_and_say_what_to_do(monkeypatch):
-    """Without the turns, that is: the angles between the faces as the gyroscope saw them do say something."""
+    """
+    Without the turns, that is.
+
+    The angles between the faces as the gyroscope saw them do say something.
+    """
     truth = NOMINAL.copy()
     imu, ranges, _ = simulate(9, n_poses=6, attitudes=face_attitudes(FACES), truth=truth)
     monkeypatch.setattr('imu_calibration.references.gravity.poses.TURN_LONGEST', 0.5)
@@ -497,7 +530,9 @@ def test_g_sensitivity_test_keeps_its_level():
 
 
 def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_see():
-    """Poses tilted about x only: the z gyroscope is not seen but for one full turn about z, z up."""
+    """
+    Poses tilted about x only: the z gyroscope is not seen but for one full turn about z, z up.
+    """
     tilts = [Rotation.from_rotvec([angle, 0, 0]) for angle in np.linspace(0, 5.5, 12)]
     imu, ranges, truth = simulate(15, attitudes=tilts, wobble=0.0)
     _, rate = turn_samples(Rotation.identity(), [0, 0, 2 * np.pi], [0, 0, 0], 0.02, 4.0)
@@ -532,7 +567,11 @@ def load(recordings, name, topic=None):
 
 
 def heldout_norm_rms(imu, ranges, gravity, **options):
-    """Rms of ``|compensated force| - gravity`` over every third pose, after a calibration with the others."""
+    """
+    Rms of ``|compensated force| - gravity`` over every third pose.
+
+    It follows a calibration with the remaining poses.
+    """
     kept = [r for k, r in enumerate(ranges) if k % 3]
     found = calibrate_by_hand(imu, HandOptions(gravity), kept, **options)
     left_out = np.array([imu.force_s[r].mean(0) for r in ranges[::3]])
@@ -542,10 +581,13 @@ def heldout_norm_rms(imu, ranges, gravity, **options):
 @pytest.mark.real_data
 def test_xsens_counts_against_its_factory_calibration(recordings):
     """
-    Offsets within 10 counts and scales within 0.3 % of the factory's, which prints its axes to 0.01 only.
+    Offsets within 10 counts and scales within 0.3 % of the factory's.
 
-    Scales are compared as lengths of the rows of the forward matrix, which no choice of axes changes. The gyroscope's
-    offsets are those of another day and temperature: 0.5 deg/s is a usual turn-on spread of that grade.
+    The factory prints its axes to 0.01 only.
+
+    Scales are compared as lengths of the rows of the forward matrix, which no choice of axes
+    changes. The gyroscope's offsets are those of another day and temperature: 0.5 deg/s is a usual
+    turn-on spread of that grade.
     """
     nominal = NominalScaling(32768, 415, 32768, 4770)
     imu = nominal.apply(load(recordings, 'xsens_counts'))
@@ -559,14 +601,16 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
     held_out = heldout_norm_rms(imu, ranges, 9.81744)
     s = found.statistics
     print(
-        f'{len(ranges)} poses: offsets {np.round(offset_f, 1)} counts, scales {np.round(100 * scale_f, 2)} %, '
-        f'gyroscope {np.round(100 * scale_w, 2)} % and {np.round(offset_w, 2)} deg/s from the factory'
+        f'{len(ranges)} poses: offsets {np.round(offset_f, 1)} counts, scales'
+        f' {np.round(100 * scale_f, 2)} %, gyroscope {np.round(100 * scale_w, 2)} % and'
+        f' {np.round(offset_w, 2)} deg/s from the factory'
     )
     print(
-        f'norm residual {1e3 * s["norm_residual_rms"]:.2f} mm/s^2, held out {1e3 * held_out:.2f}; '
-        f'chi2 per dof with white noise {s["norm_chi2_per_dof"]:.1f}, pose scatter {1e3 * s["pose_scatter_sd"]:.2f} mm/s^2, '
-        f'g-sensitivity p {s["g_sensitivity_p_value"]:.0e}, held-out ratio {s["g_sensitivity_heldout_ratio"]:.2f}, '
-        f'turn scatter {1e3 * s["turn_scatter_sd"]:.2f} mrad'
+        f'norm residual {1e3 * s["norm_residual_rms"]:.2f} mm/s^2, held out {1e3 * held_out:.2f};'
+        f' chi2 per dof with white noise {s["norm_chi2_per_dof"]:.1f}, pose scatter'
+        f' {1e3 * s["pose_scatter_sd"]:.2f} mm/s^2, g-sensitivity p'
+        f' {s["g_sensitivity_p_value"]:.0e}, held-out ratio {s["g_sensitivity_heldout_ratio"]:.2f},'
+        f' turn scatter {1e3 * s["turn_scatter_sd"]:.2f} mrad'
     )
     assert 36 <= len(ranges) <= 40
     assert np.max(np.abs(offset_f)) < 10 and np.max(np.abs(scale_f)) < 0.003
@@ -576,7 +620,8 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
         s['norm_chi2_per_dof'] > 5
     )  # the scatter of the poses is real and unexplained: white noise alone would be far too sure
     assert held_out < 0.002
-    # the gyroscopes' answer to gravity: chosen on the poses alone, it takes most of the scatter out of the turns, which took no part
+    # the gyroscopes' answer to gravity: chosen on the poses alone, it takes most of the scatter out
+    # of the turns, which took no part
     without = calibrate_by_hand(imu, HandOptions(9.81744, gyroscope=('bias', 'matrix')), ranges)
     assert s['turn_scatter_sd'] < 0.4 * without.statistics['turn_scatter_sd']
     assert s['g_sensitivity_heldout_ratio'] < 0.5
@@ -585,7 +630,11 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
 @pytest.mark.real_data
 @pytest.mark.parametrize('name', ['mpu9150_0', 'mpu9150_3'])
 def test_mpu9150_by_hand(recordings, name):
-    """Published biases within 10 mm/s^2; the site's gravity is unknown, which biases do not feel. Scales within the data sheet's 3 %."""
+    """
+    Published biases within 10 mm/s^2; the site's gravity is unknown, which biases do not feel.
+
+    Scales within the data sheet's 3 %.
+    """
     imu = load(recordings, name)
     ranges = find_still(imu)
     found = calibrate_by_hand(imu, HandOptions(gravity_sd=0.02), ranges)
@@ -596,10 +645,10 @@ def test_mpu9150_by_hand(recordings, name):
         np.sqrt(np.mean([norm.var() / norm.size for norm in norms]))
     )  # of their means: rests of one to five seconds
     print(
-        f'{name}: {len(ranges)} poses, bias {np.round(bias, 4)} +- {np.round(found.sd[:3], 4)} m/s^2, '
-        f'norm residual {1e3 * found.statistics["norm_residual_rms"]:.2f} mm/s^2, '
-        f'before {1e3 * found.statistics["norm_residual_rms_before"]:.0f}, '
-        f'held out {1e3 * held_out:.2f} where noise alone leaves {1e3 * noise:.2f}'
+        f'{name}: {len(ranges)} poses, bias {np.round(bias, 4)} +- {np.round(found.sd[:3], 4)}'
+        f' m/s^2, norm residual {1e3 * found.statistics["norm_residual_rms"]:.2f} mm/s^2, before'
+        f' {1e3 * found.statistics["norm_residual_rms_before"]:.0f}, held out {1e3 * held_out:.2f}'
+        f' where noise alone leaves {1e3 * noise:.2f}'
     )
     if name == 'mpu9150_0':
         assert np.max(np.abs(bias - [0.1027, 0.0967, 0.3444])) < 0.010
@@ -611,10 +660,13 @@ def test_mpu9150_by_hand(recordings, name):
 @pytest.mark.real_data
 def test_ferraris_sections_agree_with_the_closed_form(recordings):
     """
-    Six faces and three full turns by hand, against the six-position closed form and turn angles of 360 deg.
+    Six faces and three full turns by hand, against references.
 
-    Both take the faces as level and the turns as whole; a face tilted by 1 deg changes its reading by 1.5e-4 of gravity, a turn
-    short by 1 deg its scale by 0.3 %. Cross-axis terms are not compared: six faces do not show them, and ours says so.
+    The references are the six-position closed form and turn angles of 360 deg.
+
+    Both take the faces as level and the turns as whole; a face tilted by 1 deg changes its reading
+    by 1.5e-4 of gravity, a turn short by 1 deg its scale by 0.3 %. Cross-axis terms are not
+    compared: six faces do not show them, and ours says so.
     """
     imu = load(recordings, 'ferraris')
     sections = {
@@ -634,10 +686,11 @@ def test_ferraris_sections_agree_with_the_closed_form(recordings):
         integral = np.sum(imu.rate_s[slice(*full_turns[axis]), k] - rest[k]) / 102.4
         scale = abs(integral) / (2 * np.pi)
         print(
-            f'{axis}: bias {found.value(f"accelerometer.bias.{axis}"):.4f} closed form {(up + down) / 2:.4f}, '
-            f'scale {found.value(f"accelerometer.matrix.{axis}{axis}"):.5f} closed form {(up - down) / 2 / found.gravity:.5f}, '
-            f'gyroscope {found.value(f"gyroscope.matrix.{axis}{axis}"):.4f} '
-            f'+- {found.sd_of(f"gyroscope.matrix.{axis}{axis}"):.4f}, turn {scale:.4f}'
+            f'{axis}: bias {found.value(f"accelerometer.bias.{axis}"):.4f} closed form'
+            f' {(up + down) / 2:.4f}, scale {found.value(f"accelerometer.matrix.{axis}{axis}"):.5f}'
+            f' closed form {(up - down) / 2 / found.gravity:.5f}, gyroscope'
+            f' {found.value(f"gyroscope.matrix.{axis}{axis}"):.4f} +-'
+            f' {found.sd_of(f"gyroscope.matrix.{axis}{axis}"):.4f}, turn {scale:.4f}'
         )
         assert abs(found.value(f'accelerometer.bias.{axis}') - (up + down) / 2) < 0.01
         assert (
@@ -650,7 +703,11 @@ def test_ferraris_sections_agree_with_the_closed_form(recordings):
 @pytest.mark.slow
 @pytest.mark.real_data
 def test_two_recordings_of_one_board_give_the_same_matrices(recordings):
-    """Four IMUs calibrated by hand twice: differences in units of their combined sd; biases wander and are left out."""
+    """
+    Four IMUs calibrated by hand twice: differences in units of their combined sd.
+
+    Biases wander and are left out.
+    """
     scores = []
     for topic in (1, 3, 5, 7):
         pair = []
@@ -666,7 +723,7 @@ def test_two_recordings_of_one_board_give_the_same_matrices(recordings):
         )
     scores = np.array(scores)
     print(
-        f'mean square of difference over sd: accelerometer {np.mean(scores[:, :6] ** 2):.2f}, gyroscope {np.mean(scores[:, 6:] ** 2):.2f}; '
-        f'largest {np.max(np.abs(scores)):.1f}'
+        f'mean square of difference over sd: accelerometer {np.mean(scores[:, :6] ** 2):.2f},'
+        f' gyroscope {np.mean(scores[:, 6:] ** 2):.2f}; largest {np.max(np.abs(scores)):.1f}'
     )
     assert np.mean(scores[:, :6] ** 2) < 2.5 and np.mean(scores[:, 6:] ** 2) < 2.5

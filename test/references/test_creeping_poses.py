@@ -1,4 +1,8 @@
-"""A hand that creeps while it holds still: gravity's slope in a pose says by how much, and turns go from where poses end to where they begin."""
+"""
+A hand that creeps while it holds still.
+
+Gravity's slope in a pose says by how much, and turns go from where poses end to where they begin.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,8 @@
-"""Recordings by hand as they really are: wrong full-scale settings, clipped turns, late stamps, slow turns, warm-up, creeping poses."""
+"""
+Recordings by hand as they really are.
+
+Wrong full-scale settings, clipped turns, late stamps, slow turns, warm-up, creeping poses.
+"""
 
 import re
 from dataclasses import replace
@@ -60,7 +64,11 @@ def calibrated(imu):
 
 
 def rate_error(found, truth, factor=1.0):
-    """Rms error of compensated rates of 1 rad/s per axis, rad/s; `factor`: what the readings were multiplied by."""
+    """
+    Rms error of compensated rates of 1 rad/s per axis, rad/s.
+
+    `factor`: what the readings were multiplied by.
+    """
     _, _, bias, matrix = unpack(truth)
     measured = factor * (ANGULAR @ matrix.T + bias)
     bias, matrix, _ = found.gyroscope
@@ -139,7 +147,11 @@ def test_ranges_of_two_s_complement_end_one_step_apart():
 
 
 def test_a_slow_turn_about_the_vertical_is_no_pose():
-    """At 1.7 deg/s gravity stays where it is and the gyroscope is as quiet as at rest: only its mean tells."""
+    """
+    At 1.7 deg/s gravity stays where it is and the gyroscope is as quiet as at rest.
+
+    Only its mean tells.
+    """
     imu, _, turn = with_slow_turn(6)
     covered = sum(
         max(min(piece.stop, turn.stop) - max(piece.start, turn.start), 0)
@@ -185,7 +197,11 @@ def test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_
 
 
 def test_the_earth_is_not_sold_as_g_sensitivity():
-    """Its rate about the vertical follows gravity, alike in every axis; what is larger, or another axis, is none of it."""
+    """
+    Its rate about the vertical follows gravity, alike in every axis.
+
+    What is larger, or another axis, is none of it.
+    """
     imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
     poses = average_poses(imu, [(r.start, r.stop) for r in ranges])
     noise = np.random.default_rng(5).normal(0, 1e-5, poses.rate.shape)
@@ -253,7 +269,11 @@ def test_biases_that_drift_carry_it_in_their_sd_and_a_note_with_its_size():
 
 
 def test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out():
-    """Somebody leans on the IMU in one pose, turns it slowly in another, and a glitch of a tenth of a second is in one turn."""
+    """
+    Somebody leans on the IMU in one pose and turns it slowly in another.
+
+    A glitch of a tenth of a second is in one turn.
+    """
     imu, ranges, truth = hold_and_turn(0, rate_hz=50.0, still=2.0)
     force, rate = imu.force_s.copy(), imu.rate_s.copy()
     force[ranges[5], 0] += 0.3
@@ -311,7 +331,11 @@ def test_six_faces_give_what_they_determine():
 
 
 def test_a_weak_cross_term_is_zero_unless_zero_is_significantly_worse():
-    """The likelihood ratio of a value is its squared ratio to the sd of the fit: the profile near six faces is a parabola."""
+    """
+    The likelihood ratio of a value is its squared ratio to the sd of the fit.
+
+    The profile near six faces is a parabola.
+    """
     hand = calibrated(six_faces()[0])
     hand = replace(
         hand, terms={term: np.diag(np.diag(part)) for term, part in hand.terms.items()}
@@ -329,7 +353,11 @@ def test_a_weak_cross_term_is_zero_unless_zero_is_significantly_worse():
 
 
 def test_faces_without_the_turns_between_them_give_bias_and_scale():
-    """A recorder that was stopped for each turn and went on with the next stamp: gravity jumps, the rates know nothing of it."""
+    """
+    A recorder that was stopped for each turn and went on with the next stamp.
+
+    Gravity jumps, the rates know nothing of it.
+    """
     imu, ranges, _ = six_faces()
     cut = ImuSamples.concatenate([imu.select(piece) for piece in ranges])
     cut = replace(cut, stamp_ns=imu.stamp_ns[: len(cut)])

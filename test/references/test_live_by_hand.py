@@ -1,4 +1,8 @@
-"""By hand while it goes on: the live answer is that of the recording, poses are counted, what is missing is named. No ROS here."""
+"""
+By hand while it goes on.
+
+The live answer is that of the recording, poses are counted, what is missing is named. No ROS here.
+"""
 
 import re
 from dataclasses import replace
@@ -48,7 +52,9 @@ def offline(imu, gravity=GRAVITY):
 
 
 def all_kept(live):
-    """What a live calibration remembers, with the few samples that the filter of spikes still holds."""
+    """
+    What a live calibration remembers, with the few samples that the filter of spikes still holds.
+    """
     return make_live(live.saved())._store.samples()
 
 
@@ -129,7 +135,11 @@ def test_before_any_motion_it_asks_for_attitudes():
 
 
 def test_the_direction_that_is_missing_is_named():
-    """Faces up one after the other: those that have not been up are named beside the step of the picture."""
+    """
+    Faces up one after the other.
+
+    Those that have not been up are named beside the step of the picture.
+    """
     ups = [FACE_DIRECTIONS[name] for name in ('+z', '+x', '-z', '+y', '-x', '-y')]
     imu = simulate(5, n_poses=6, attitudes=[Rotation.from_matrix(stand_up(up)) for up in ups])[0]
     live, asked = make_live(), {}
@@ -228,7 +238,9 @@ def test_a_broken_file_is_refused(broken):
 
 @pytest.mark.long
 def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
-    """Memory stays bounded; of the long rest the inside goes, and the answer is that of what is left."""
+    """
+    Memory stays bounded; of the long rest the inside goes, and the answer is that of what is left.
+    """
     rng = np.random.default_rng(6)
     live = make_live(hand_samples=len(session) + 6000)
     run(live, session)

@@ -1,4 +1,8 @@
-"""By hand too, standard deviations allow for parameters that move while it is recorded, and for nothing where nothing moves."""
+"""
+By hand too, standard deviations allow for parameters that move in a recording.
+
+They allow for nothing where nothing moves.
+"""
 
 from dataclasses import replace
 
@@ -18,7 +22,11 @@ MATRIX = PARAM_NAMES[12:21]
 
 @pytest.mark.parametrize('seed', range(3))
 def test_a_gyroscope_whose_scale_walks_is_not_known_to_the_noise(seed):
-    """Its scale walks by two per cent through the recording; what one session says of the next errs by about that, and not by the noise of turns."""
+    """
+    Its scale walks by two per cent through the recording.
+
+    What one session says of the next errs by about that, and not by the noise of turns.
+    """
     imu, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0)
     walk = np.linspace(0, 0.02, len(imu))[:, None]
     walking, steady = (

@@ -1,4 +1,8 @@
-"""A reference of poses needs rows and a step only: the rotation over blocks of a second against the poses of a motion-capture system."""
+"""
+A reference of poses needs rows and a step only.
+
+The rotation over blocks of a second against the poses of a motion-capture system.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +17,10 @@ from imu_calibration.estimation.solution import total
 from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 
 BLOCK, GAP, STEP, MARGIN = 1.0, 0.03, 0.05, 0.1
-"""Length of a block, largest steps of the reference and of the IMU at a block, distance from the ends of the recording, s."""
+"""
+Length of a block, largest steps of the reference and of the IMU at a block, distance from the ends
+of the recording, s.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +35,8 @@ class PoseReference:
     """
     Rotations of blocks: ``mat_ref = exp(-[psi]) mat(values)``, three rows of psi each.
 
-    Parameters are bias, matrix and mounting of the gyroscope and the lag of the poses, s. A mounting is a rotation of the matrix, so it is fixed.
+    Parameters are bias, matrix and mounting of the gyroscope and the lag of the poses, s. A
+    mounting is a rotation of the matrix, so it is fixed.
     """
 
     time: np.ndarray
@@ -123,14 +131,18 @@ def walking(recordings):
 
 
 def test_scales_agree_with_those_of_an_independent_fit(walking):
-    """Published with the recording, with the standard deviations of that fit; ours are of white noise."""
+    """
+    Published with the recording, with the standard deviations of that fit; ours are of white noise.
+    """
     found = estimate_rows(
         walking, PoseState(walking.nominal), fallback=np.array([np.radians(0.2) ** 2])
     )
     scales = np.array([3, 7, 11])
     values, sd = found.state.values[scales], np.sqrt(np.diag(total(found.terms)))[scales]
     print(
-        f'1 over scale {1 / values} +- {sd / values**2}, attitude noise {np.degrees(np.sqrt(found.scatter.variance[0])):.3f} deg, lag {found.state.values[15]:.4f} s'
+        f'1 over scale {1 / values} +- {sd / values**2}, attitude noise'
+        f' {np.degrees(np.sqrt(found.scatter.variance[0])):.3f} deg, lag'
+        f' {found.state.values[15]:.4f} s'
     )
     assert np.all(
         np.abs(1 / values - [0.9444, 1.0956, 1.0173])

@@ -1,4 +1,6 @@
-"""Residual power by band: a sine of known size in known noise, and its agreement with a held-out gain."""
+"""
+Residual power by band: a sine of known size in known noise, and its agreement with a held-out gain.
+"""
 
 import numpy as np
 import pytest
@@ -27,7 +29,11 @@ def window(kind, n, start):
 
 @pytest.fixture(scope='module')
 def distance():
-    """Distances of 40 windows of 10 s at 100 Hz: before, x has a sine of 0.02 at 3 Hz in motion and y an offset of 0.005; after, none."""
+    """
+    Distances of 40 windows of 10 s at 100 Hz.
+
+    Before, x has a sine of 0.02 at 3 Hz in motion and y an offset of 0.005; after, none.
+    """
     sums, rng = DistanceSums(), np.random.default_rng(4)
     for k in range(40):
         kind = WindowKind.STATIC if k % 2 else WindowKind.DYNAMIC
@@ -41,7 +47,11 @@ def distance():
 
 
 def test_the_power_of_a_sine_is_in_its_band(distance):
-    """Half of the windows have an rms of 0.02 / sqrt(2): 0.01 over all; the sd of a band's noise power is some percent of it."""
+    """
+    Half of the windows have an rms of 0.02 / sqrt(2): 0.01 over all.
+
+    The sd of a band's noise power is some percent of it.
+    """
     bands = {name: (rms, noise) for name, rms, noise in distance.bands()}
     rms, noise = bands['1 to 10 Hz']
     assert rms[0] == pytest.approx([0.01, 0.0, 0.0], abs=1.2e-3)

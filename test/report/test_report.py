@@ -1,4 +1,8 @@
-"""The report: true to the calibration, complete without a network, the same bytes each time, and fit for a browser."""
+"""
+The report: true to the calibration, and complete without a network.
+
+It has the same bytes each time, and is fit for a browser.
+"""
 
 import re
 import shutil

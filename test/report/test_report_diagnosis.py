@@ -1,4 +1,8 @@
-"""The report of a diagnosis: the finding, its evidence and its picture, on a recording with a hidden g-sensitivity."""
+"""
+The report of a diagnosis.
+
+The finding, its evidence and its picture, on a recording with a hidden g-sensitivity.
+"""
 
 import json
 import re
@@ -173,7 +177,11 @@ def test_chances_that_underflow_are_not_printed_as_nothing():
 
 @pytest.fixture(scope='module')
 def of_formula(result):
-    """The same result with an unexplained residual of gyroscope y that follows a formula, and no finding."""
+    """
+    The same result with an unexplained residual of gyroscope y.
+
+    The residual follows a formula, and there is no finding.
+    """
     effect = term(
         'gyro_proposed_1',
         sensor='gyroscope',
@@ -224,7 +232,9 @@ def test_the_headline_of_a_formula_states_its_share(of_formula):
 
 
 def test_the_gain_of_a_formula_is_in_the_unit_of_the_sensor(of_formula):
-    """``after = before sqrt(1 - share)``, and the interval of the reduction from that of the share."""
+    """
+    ``after = before sqrt(1 - share)``, and the interval of the reduction from that of the share.
+    """
     gain = of_formula.document['unexplained']['gyroscope']['proposals'][0]['gain']
     assert gain['heldout_rms_before'] == 5e-4 and gain['heldout_rms_after'] == pytest.approx(
         5e-4 * 0.2, rel=1e-12
@@ -250,7 +260,11 @@ def test_the_distance_agrees_with_the_held_out_gain(result):
 
 
 def test_the_segments_are_measured_and_simulated(result):
-    """Over a segment the simulation of the extended model differs from the measurement by noise, that of the baseline by more."""
+    """
+    Over a segment the extended model's simulation differs from measurement by noise.
+
+    The simulation of the baseline differs by more.
+    """
     for segment in result.diagnosis.traces.segments['gyroscope']:
         assert 5.0 < np.ptp(segment.time) < 11.0 and len(segment.time) <= 800
         before, after = (
@@ -261,7 +275,11 @@ def test_the_segments_are_measured_and_simulated(result):
 
 
 def test_the_charts_have_the_data_of_each_sensor_and_axis(result):
-    """Five rows of three axes for each sensor, the same numbers as the traces, and the cause as the first variable."""
+    """
+    Five rows of three axes for each sensor, the same numbers as the traces.
+
+    The cause is the first variable.
+    """
     charts = [
         json.loads(unescape(each))
         for each in re.findall(r'data-chart="([^"]*)"', diagnosis_report(result))

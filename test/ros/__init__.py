@@ -1,1 +1,5 @@
-"""Helpers of the tests that run nodes: stations that publish and listen over DDS, and the endurance test."""
+"""
+Helpers of the tests that run nodes.
+
+Stations that publish and listen over DDS, and the endurance test.
+"""

@@ -1,4 +1,8 @@
-"""What the tests over DDS share: a domain of their own, nodes as processes, and a node that watches them."""
+"""
+What the tests over DDS share.
+
+A domain of their own, nodes as processes, and a node that watches them.
+"""
 
 import fcntl
 import os
@@ -129,7 +133,11 @@ class Station:
         return documents
 
     def watch_diagnostics(self):
-        """Keep the last status by name in `status`, and every (name, level, message) that was new in `history`."""
+        """
+        Keep the last status by name in `status`, and the new ones in `history`.
+
+        `history` holds every (name, level, message) that was new.
+        """
         from diagnostic_msgs.msg import DiagnosticArray
 
         def note(message):
@@ -153,12 +161,15 @@ class Station:
         )
 
     def until(self, condition, what, patience=PATIENCE):
-        """Spin until a condition holds; fail with `what` when it does not in time or a node has died."""
+        """
+        Spin until a condition holds; fail with `what` when it does not in time or a node has died.
+        """
         deadline = time.monotonic() + patience
         while not condition():
             for process in self.processes.running:
                 assert process.poll() in (None, 0), (
-                    f'a node ended with {process.returncode} while waiting for {what}: {process.args[2]}'
+                    f'a node ended with {process.returncode} while waiting for {what}:'
+                    f' {process.args[2]}'
                 )
             known = {name: status.message for name, status in self.status.items()}
             assert time.monotonic() < deadline, (
@@ -176,7 +187,8 @@ class Station:
         """
         Call a service (Trigger unless `kind` is given) and return its response.
 
-        An answer may be lost before both sides are connected; the call is repeated every `again` seconds.
+        An answer may be lost before both sides are connected; the call is repeated every `again`
+        seconds.
         """
         from std_srvs.srv import Trigger
 
@@ -220,7 +232,11 @@ class Publisher:
         self.station.spin_for(0.3)
 
     def send(self, imu, joints, per_second=4000):
-        """Publish ImuSamples and JointSamples merged by their place in the recording, about so many per second."""
+        """
+        Publish ImuSamples and JointSamples merged by their place in the recording.
+
+        About so many per second are published.
+        """
         from msg_adapters.layout import Packed
         from msg_adapters.write import encode_imu, encode_joints
 

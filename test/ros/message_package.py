@@ -1,7 +1,10 @@
 """
-A ROS message package that no wheel has, made from its definition: the generators and headers come with rclpy's wheels, a compiler with the system.
+A ROS message package that no wheel has, made from its definition.
 
-What `rosidl_generate_interfaces` does in CMake: C structures, the Python class, and the two type supports that Fast DDS asks for.
+The generators and headers come with rclpy's wheels, a compiler with the system.
+
+What `rosidl_generate_interfaces` does in CMake: C structures, the Python class, and the two type
+supports that Fast DDS asks for.
 """
 
 import json

@@ -1,4 +1,8 @@
-"""Nodes inside the test's own process, in a DDS domain of their own: seconds less than as processes, and what they say can be heard."""
+"""
+Nodes inside the test's own process, in a DDS domain of their own.
+
+Seconds less than as processes, and what they say can be heard.
+"""
 
 import time
 
@@ -102,7 +106,11 @@ class OneProcess:
         )
 
     def shows(self, name, *values, level=None):
-        """Return whether the latest status has this level and holds all of these names, numbers and keys."""
+        """
+        Return whether the latest status has this level and holds all of these items.
+
+        The items are names, numbers and keys.
+        """
         shown, line = self.lines().get(name, (None, ''))
         return (
             shown is not None
@@ -111,7 +119,11 @@ class OneProcess:
         )
 
     def call(self, name, kind=Trigger, until=None, **fields):
-        """Call a service with these fields of its request and return its answer; `until` waits in place of the method."""
+        """
+        Call a service with these fields of its request and return its answer.
+
+        `until` waits in place of the method.
+        """
         client, until = self.node.create_client(kind, name), until or self.until
         until(client.service_is_ready, name)
         future = client.call_async(kind.Request(**fields))

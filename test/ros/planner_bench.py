@@ -1,4 +1,8 @@
-"""planner_node over DDS in the test's process, with the joints, the controller and calibration_node of the test."""
+"""
+planner_node over DDS in the test's process.
+
+With the joints, the controller and calibration_node of the test.
+"""
 
 import json
 from functools import partial

@@ -1,7 +1,10 @@
 """
-Memory of the nodes over a long session: the largest private memory, and its growth from the middle to the last third.
+Memory of the nodes over a long session.
 
-Run: ``python test/ros/soak.py --hours 6`` (or ``make soak``); the data are simulated and go faster than real time.
+The largest private memory, and its growth from the middle to the last third.
+
+Run: ``python test/ros/soak.py --hours 6`` (or ``make soak``); the data are simulated and go faster
+than real time.
 """
 
 import argparse
@@ -55,7 +58,8 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
     Returns
     -------
     dict
-        Node -> (MB in the middle third, MB in the last third, largest MB, Imu messages that reached calibration_node).
+        Node -> (MB in the middle third, MB in the last third, largest MB, Imu messages that reached
+        calibration_node).
 
     """
     memory = {name: [] for name in LARGEST_MB}
@@ -122,7 +126,8 @@ def main():
         )
     for name, (middle, last, largest, n_imu) in found.items():
         print(
-            f'{name}: {middle:.1f} MB in the middle third, {last:.1f} MB in the last, {largest:.1f} MB at most ({n_imu} Imu messages)'
+            f'{name}: {middle:.1f} MB in the middle third, {last:.1f} MB in the last, {largest:.1f}'
+            f' MB at most ({n_imu} Imu messages)'
         )
     return (
         0

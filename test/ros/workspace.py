@@ -1,4 +1,8 @@
-"""This tree built as a ROS 2 workspace, and shells in it; with the `ros2` command line where its wheels are."""
+"""
+This tree built as a ROS 2 workspace, and shells in it.
+
+With the `ros2` command line where its wheels are.
+"""
 
 import importlib.util
 import os
@@ -80,7 +84,9 @@ def sourced(folder, script):
 
 def with_ros2(folder):
     """
-    The environment of `plain_environment` with the real `ros2`: that of a sourced ROS, else from the wheels that `IMU_CALIBRATION_ROS2` names.
+    The environment of `plain_environment` with the real `ros2`.
+
+    That of a sourced ROS, else from the wheels that `IMU_CALIBRATION_ROS2` names.
 
     Parameters
     ----------

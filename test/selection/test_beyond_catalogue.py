@@ -1,4 +1,8 @@
-"""Causes that no catalogue holds: where the rest sits, the formula that it follows, and the way of that formula into a model."""
+"""
+Causes that no catalogue holds.
+
+Where the rest sits, the formula that it follows, and the way of that formula into a model.
+"""
 
 import json
 from dataclasses import replace
@@ -100,7 +104,11 @@ def test_the_grammar_is_arithmetic_with_units_and_speaks_of_what_it_says():
 
 
 def test_the_sense_of_a_rate_is_not_that_of_the_rate_of_the_earth():
-    """At rest the sign of a rate is that of 7.3e-5 rad/s, or of noise: a column of it would shake every bias there."""
+    """
+    At rest the sign of a rate is that of 7.3e-5 rad/s, or of noise.
+
+    A column of it would shake every bias there.
+    """
     texts = [text for formula in grammar(3, True, 300.0) for text in np.ravel(formula.columns)]
     assert (
         any('tanh(w_x' in text for text in texts)
@@ -145,7 +153,11 @@ def test_a_temperature_that_stays_is_no_cause(span, warms):
     'kind, formula', [(None, None), pytest.param('gyro_cubic', 'w_z ** 3', marks=pytest.mark.long)]
 )
 def test_a_recording_without_noise_is_judged_too(kind, formula):
-    """As of a simulator whose noise is off: no sample is taken for exact, and nothing is divided by nothing."""
+    """
+    As of a simulator whose noise is off.
+
+    No sample is taken for exact, and nothing is divided by nothing.
+    """
     cause = {'cause': Beyond(kind, 5)} if kind else {}
     recording = record(5, None, 'none', through_bag=False, profile='quick', **cause)
     found = diagnose(recording.windows, recording.table, recording.model)
@@ -356,7 +368,11 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
 
 @pytest.mark.long
 def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_there_stays():
-    """A scale that settles while it warms up looks like a thermal one; what is there stays beside another cause."""
+    """
+    A scale that settles while it warms up looks like a thermal one.
+
+    What is there stays beside another cause.
+    """
     row, _ = row_of(141, 'gyro_scale_settling', 'realistic', Beyond('gyro_scale_settling', 141))
     assert row['found'] == [] and row['family'], row
     row, _ = row_of(81013, 'sticks_when_warm', 'realistic', Beyond('sticks_when_warm', 81013))

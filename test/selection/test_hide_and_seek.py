@@ -1,4 +1,6 @@
-"""How hide and seek counts: who found what, which pairs no search can find, and what detectable means."""
+"""
+How hide and seek counts: who found what, which pairs no search can find, and what detectable means.
+"""
 
 from types import SimpleNamespace
 
@@ -76,7 +78,11 @@ def test_sizes_say_how_many_sessions_and_marks_a_point_has(capsys):
 
 @pytest.mark.parametrize('n_parameters', (1, 9))
 def test_detectable_is_what_passes_half_of_the_time(n_parameters):
-    """More than the chi-square test alone asks for: the held-out gain has a least value and a cost for each parameter."""
+    """
+    More than the chi-square test alone asks for.
+
+    The held-out gain has a least value and a cost for each parameter.
+    """
     size = threshold_noncentrality(n_parameters, 50)
     assert 0.45 < passing(size, n_parameters, 50).mean() < 0.55
     assert (

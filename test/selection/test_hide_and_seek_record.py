@@ -1,4 +1,6 @@
-"""The record of hide and seek is kept small and compared row by row; its figures count what they say."""
+"""
+The record of hide and seek is kept small and compared row by row; its figures count what they say.
+"""
 
 from worlds.beyond_catalogue import NOTHING, figures, missed
 from worlds.hide_and_seek_record import KEPT, differences, keep, read

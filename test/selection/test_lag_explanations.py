@@ -1,4 +1,8 @@
-"""Which of several explanations of the lags is told: the simplest within the search's price, with a clock that both share."""
+"""
+Which of several explanations of the lags is told.
+
+The simplest within the search's price, with a clock that both share.
+"""
 
 from types import SimpleNamespace
 

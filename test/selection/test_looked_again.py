@@ -1,4 +1,8 @@
-"""A further search is linearised only where it may remove nearly all of an excess, and once for each choice."""
+"""
+A further search is linearised only where it may remove nearly all of an excess.
+
+It is linearised once for each choice.
+"""
 
 from types import SimpleNamespace
 
@@ -10,7 +14,12 @@ from imu_calibration.selection.investigation import LEFT, LEFT_BEFORE
 
 @pytest.fixture
 def looked_again(monkeypatch):
-    """Return a function: rest of the best choice before and after it is linearised -> (rest of the outcome, number of trials)."""
+    """
+    Return a function.
+
+    Rest of the best choice before and after it is linearised -> (rest of the outcome, number of
+    trials).
+    """
 
     def look(before, after):
         best, trials = [SimpleNamespace(label='bent', name='bent')], []

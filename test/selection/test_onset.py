@@ -1,4 +1,8 @@
-"""Changes at one moment are found with their time and both states, gradual changes are none, and clocks are identified."""
+"""
+Changes at one moment are found with their time and both states.
+
+Gradual changes are none, and clocks are identified.
+"""
 
 import numpy as np
 import pytest
@@ -29,7 +33,11 @@ def investigated(cause):
 
 
 def moment_of(recording, share):
-    """Return the moment of a share of the session, s: windows begin after the first sample by less than a second."""
+    """
+    Return the moment of a share of the session, s.
+
+    Windows begin after the first sample by less than a second.
+    """
     return share * max(window.time[-1] for window in recording.windows)
 
 

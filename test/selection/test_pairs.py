@@ -1,4 +1,6 @@
-"""All pairs at once: what no single effect shows, and what two that imitate each other do not prove."""
+"""
+All pairs at once: what no single effect shows, and what two that imitate each other do not prove.
+"""
 
 from types import SimpleNamespace
 
@@ -21,7 +23,11 @@ N_ROWS = 600
 
 
 def searched(signal, alike, size=1e-6):
-    """Return the Search on rows of which the first column is the baseline's, and the first two effects are alike; each has the size of what is plausible."""
+    """
+    Return the Search on rows with the baseline as the first column.
+
+    The first two effects are alike, and each has a plausible size.
+    """
     rng = np.random.default_rng(3)
     columns = rng.normal(size=(N_ROWS, 5))
     columns[:, 2] = (

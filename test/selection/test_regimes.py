@@ -1,4 +1,8 @@
-"""Regimes of a residual: bounds between rows, the permutation test, smooth curves, and which of several regimes is reported."""
+"""
+Regimes of a residual.
+
+Bounds between rows, the permutation test, smooth curves, and which of several regimes is reported.
+"""
 
 import tracemalloc
 from types import SimpleNamespace
@@ -38,7 +42,11 @@ def blocks_of(rest, rough, locked=np.zeros(len(TIME), bool)):
 
 
 def found_in(monkeypatch, rest_of_x, rough_of_x=1.0):
-    """Return the regimes by time of a residual of unit noise on three axes, with an addition to x, and of the variance within blocks."""
+    """
+    Return the regimes by time of a residual of unit noise on three axes.
+
+    With an addition to x, and of the variance within blocks.
+    """
     rng = np.random.default_rng(4)
     rest = rng.normal(size=(len(TIME), 3))
     rest[:, 0] += rest_of_x
@@ -57,7 +65,9 @@ def found_in(monkeypatch, rest_of_x, rough_of_x=1.0):
 
 @pytest.mark.parametrize('first', [122, 127])
 def test_a_step_is_found_to_the_block_whichever_window_it_is_in(monkeypatch, first):
-    """Bins of ten blocks end at 119 and 129; one window on the wrong side leaves all of the step."""
+    """
+    Bins of ten blocks end at 119 and 129; one window on the wrong side leaves all of the step.
+    """
     found = found_in(monkeypatch, 30.0 * (TIME >= first))
     assert found[0].offset and found[0].bounds[0] == first - 0.5 and found[0].share > 0.95
     assert found[0].size == pytest.approx(30.0, abs=2.0) and {regime.axis for regime in found} == {
@@ -100,7 +110,11 @@ def test_a_formula_that_explains_as_much_is_no_place(monkeypatch):
 
 
 def test_offsets_of_random_windows_are_no_place(monkeypatch):
-    """Heavy-tailed residuals of whole windows: a few windows have most of it, and some range holds them."""
+    """
+    Heavy-tailed residuals of whole windows.
+
+    A few windows have most of it, and some range holds them.
+    """
     rng = np.random.default_rng(7)
     found = [
         found_in(monkeypatch, 30.0 * np.repeat(rng.standard_t(2, WINDOWS), EACH)) for _ in range(10)

@@ -54,7 +54,11 @@ def test_a_limit_is_seen_in_fine_and_in_coarse_outputs(step):
 
 @pytest.mark.parametrize('where', ['where the force is large', 'at rest'])
 def test_a_limit_is_where_the_motion_passes_it(where):
-    """An output that sticks at its largest value while nothing happens is no limit, though the model expects more elsewhere."""
+    """
+    An output that sticks at its largest value while nothing happens is no limit.
+
+    This holds though the model expects more elsewhere.
+    """
     expected = 12.0 * np.sin(np.arange(8000) * 0.02)[:, None] * np.array([0.0, 0.0, 1.0])
     force = expected + np.random.default_rng(1).normal(0, 0.01, expected.shape)
     if where == 'at rest':

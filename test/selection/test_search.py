@@ -1,4 +1,8 @@
-"""The guards of the search, each in a case in which it alone stands between the tool and a false claim."""
+"""
+The guards of the search, each in a case in which only it prevents a false claim.
+
+Each guard then stands between the tool and a false claim by itself.
+"""
 
 from dataclasses import replace
 from itertools import combinations
@@ -123,7 +127,11 @@ def test_no_lag_is_negative_no_angle_within_an_encoder_step_no_size_beyond_what_
 
 
 def test_an_earlier_choice_gives_way_to_what_explains_better_together():
-    """The first effect is the best alone; with the second beside it a third does more, and the first is needed no longer."""
+    """
+    The first effect is the best alone.
+
+    With the second beside it a third does more, and the first is needed no longer.
+    """
     losses = {
         frozenset(): 400.0,
         frozenset({0}): 100.0,
@@ -146,7 +154,11 @@ def test_windows_of_each_kind_are_locked_and_dealt_out_in_turn():
 
 
 def test_noise_gains_nothing_where_it_was_not_fitted():
-    """Columns of noise fit the windows that they see, and predict others worse than one column does: on average of forty draws."""
+    """
+    Columns of noise fit the windows that they see, and predict others worse than one column does.
+
+    On average of forty draws.
+    """
     gained = []
     for seed in range(40):
         parts = np.array(
@@ -165,7 +177,11 @@ def test_noise_gains_nothing_where_it_was_not_fitted():
 
 
 def test_memory_of_a_search_does_not_grow_with_the_choices_it_tried():
-    """A search tries thousands; only their losses are kept, and the last fits and predictions, which come out the same again."""
+    """
+    A search tries thousands.
+
+    Only their losses are kept, and the last fits and predictions, which come out the same again.
+    """
     parts = np.array([rows.T @ rows for rows in np.random.default_rng(1).normal(size=(6, 20, 11))])
     evidence = Evidence(
         parts.sum(axis=0),
@@ -204,7 +220,11 @@ def test_offsets_of_windows_are_in_the_weights_of_the_evidence():
 
 
 class Squares:
-    """Sums of squares of 30 windows that choose and of 10 locked ones: shares of 97 about the means and of 0.15 in the means that a finding leaves."""
+    """
+    Sums of squares of 30 windows that choose and of 10 locked ones.
+
+    Shares of 97 about the means and of 0.15 in the means that a finding leaves.
+    """
 
     evidence = SimpleNamespace(fold=np.arange(30) % 6, fit=lambda used, number=None: (used, None))
     search = SimpleNamespace(indices=len)
@@ -235,7 +255,9 @@ class Squares:
 
 
 def test_the_gain_is_that_of_locked_windows_by_the_measure_of_the_others(monkeypatch):
-    """In the windows that choose the samples about the means fall most, in the locked ones the means."""
+    """
+    In the windows that choose the samples about the means fall most, in the locked ones the means.
+    """
     monkeypatch.setattr(gain, '_squares', Squares.of)
     found = gain.heldout_gain(Squares(means=0.5), [], [QUADRATIC], sensors=['accelerometer'])
     assert (found.measure, found.windows) == ('samples about the mean of their window', 10)
@@ -249,7 +271,11 @@ def test_the_gain_is_that_of_locked_windows_by_the_measure_of_the_others(monkeyp
     ('risen', 'measure'), ((0.25, 'window means'), (3.0, 'samples about the mean of their window'))
 )
 def test_a_large_fall_of_a_few_means_may_be_chance(monkeypatch, risen, measure):
-    """The means fall in two of three windows, and rise in the third; where they rise so far that a fall of all is not sure the samples are told, by a little."""
+    """
+    The means fall in two of three windows, and rise in the third.
+
+    Where they rise so far that a fall of all is not sure the samples are told, by a little.
+    """
     monkeypatch.setattr(gain, '_squares', Squares.of)
     means = np.where(np.arange(30) % 3, 0.001, risen)
     assert (
@@ -304,7 +330,11 @@ def test_what_leaves_most_unexplained_is_not_named(question, share, kept):
 
 
 def test_a_cause_of_the_table_shows_in_both_sensors():
-    """It takes all there is off the accelerometer, and leaves twice as much on the gyroscope as it takes."""
+    """
+    It removes all there is from the accelerometer, but not from the gyroscope.
+
+    On the gyroscope twice as much remains as it removes.
+    """
     explained = Explained.__new__(Explained)
     explained.numbers, explained.least_part = (
         dict.fromkeys(SENSORS, np.array([100.0, 1000.0])),
@@ -320,23 +350,31 @@ def test_a_cause_of_the_table_shows_in_both_sensors():
 
 @pytest.mark.parametrize(('within', 'share'), ((20.0, 1.0), (0.6e3, 0.5)))
 def test_what_is_unexplained_where_an_effect_does_not_show_does_not_hide_it(within, share):
-    """It explains the means; within windows, where it shows or does not, as much stays as it removes in all."""
+    """
+    It explains the means.
+
+    Within windows, where it shows or does not, as much stays as it removes in all.
+    """
     explained = Explained.__new__(Explained)
     explained.numbers, explained.least_part = (
         dict.fromkeys(SENSORS, np.array([100.0, 1000.0])),
         SHOWS,
     )
     explained.excess = lambda chosen: {
-        'accelerometer': alike(0.0, 1000.0 + within)
-        if chosen
-        else alike(1000.0, 1000.0 + 2 * within)
+        'accelerometer': (
+            alike(0.0, 1000.0 + within) if chosen else alike(1000.0, 1000.0 + 2 * within)
+        )
     }
     assert explained.share([QUADRATIC], QUADRATIC) == pytest.approx(share)
 
 
 @pytest.mark.parametrize(('least_part', 'share'), ((SHOWS, 1.0), (-np.inf, 0.5)))
 def test_an_effect_is_compared_with_the_excess_of_the_parts_in_which_it_counts(least_part, share):
-    """It removes the excess of turns; as much remains in poses, which by hand count too, because parts are few."""
+    """
+    It removes the excess of turns.
+
+    As much remains in poses, which by hand count too, because parts are few.
+    """
     explained = Explained(
         SimpleNamespace(indices=len),
         lambda used: {'accelerometer': np.array([[1100.0], [100.0 if used else 1100.0]])},
@@ -353,7 +391,11 @@ def alike(means, within):
 
 
 def test_what_one_axis_has_is_not_hidden_by_the_quiet_of_the_others():
-    """All together are below five standard deviations, one alone is above six; three that share the same are not."""
+    """
+    All together are below five standard deviations, one alone is above six.
+
+    Three that share the same are not.
+    """
     explained = Explained.__new__(Explained)
     explained.numbers, explained.least_part = {'accelerometer': np.array([300.0, 3000.0])}, SHOWS
     alone = np.array([[-20.0, 100.0, -20.0], [0.0, 0.0, 0.0]])
@@ -378,7 +420,11 @@ def test_every_bias_moves_by_half_the_white_noise_of_a_second():
 
 
 def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
-    """Natural is 0.01; the found one in its own time, up to three times as much, offsets of windows never."""
+    """
+    Natural is 0.01.
+
+    The found one in its own time, up to three times as much, offsets of windows never.
+    """
     for found, most in ((0.005, 0.01), (0.02, 0.02), (0.5, 0.03)):
         noise = NoiseModel(
             np.full(3, 0.04), np.ones(3), 0.2, (BiasProcess(max(found, 0.01), 15.0),)
@@ -402,14 +448,20 @@ def test_a_wander_that_was_found_passes_for_noise_as_far_as_biases_wander():
 
 
 def test_a_quiet_instrument_drifts_less():
-    """A column of rms 1 over the session: a hundred times a wander of 1e-6, or what the catalogue says."""
+    """
+    A column of rms 1 over the session.
+
+    A hundred times a wander of 1e-6, or what the catalogue says.
+    """
     columns = np.where(np.arange(20)[:, None, None] % 2, 1.0, -1.0) * np.ones((1, 3, 1))
     np.testing.assert_allclose(drift_prior(columns, np.full(1, 1e-2), 1e-6), 1e-4)
     np.testing.assert_allclose(drift_prior(columns, np.full(1, 1e-2), 1e-3), 1e-2)
 
 
 def test_within_windows_nothing_is_told_of_what_is_smooth_in_time():
-    """A scale factor shows within; a thermal bias does not, nor does what it takes off the residual."""
+    """
+    A scale factor shows within; a thermal bias does not, nor does what it takes off the residual.
+    """
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_thermal_bias'))
     values = model.start()
     values[model.slices['accelerometer', 'accel_thermal_bias']] = 2.0
@@ -428,7 +480,11 @@ def test_within_windows_nothing_is_told_of_what_is_smooth_in_time():
 
 @pytest.mark.parametrize('loud', ([1.0, 0.0, 0.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0]))
 def test_a_wander_is_as_large_as_on_the_middle_axis(loud):
-    """A bias of ten times the noise of window means that moves with 15 s on one axis, on two, of which the third had no step yet, or on all."""
+    """
+    A bias of ten times the noise of window means that moves with 15 s.
+
+    It moves on one axis, on two, of which the third had no step yet, or on all.
+    """
     rng, n, time = np.random.default_rng(3), 100, np.arange(100) * 5.0
     decay, drive = np.exp(-5.0 / 15.0), rng.normal(0.0, 10.0, (n, 3))
     wander = drive.copy()
@@ -445,7 +501,11 @@ def test_a_wander_is_as_large_as_on_the_middle_axis(loud):
 
 
 def test_a_session_sees_a_part_of_a_slow_wander():
-    """About the mean of a session of 100 s, a tenth of the correlation time: the variance of sums of the covariance, in steps of 0.1 s."""
+    """
+    About the mean of a session of 100 s, a tenth of the correlation time.
+
+    The variance of sums of the covariance, in steps of 0.1 s.
+    """
     time = np.arange(0.05, 100.0, 0.1)
     covariance = 4.0 * np.exp(-np.abs(time[:, None] - time) / 1000.0)
     assert BiasProcess(2.0, 1000.0).within(100.0) == pytest.approx(
@@ -460,7 +520,11 @@ def test_a_session_sees_a_part_of_a_slow_wander():
 
 @pytest.mark.parametrize(('won', 'found'), ((5.0, False), (30.0, True)))
 def test_offsets_of_windows_have_their_price(won, found):
-    """Flicker scatters means beyond a wander of 15 s by a little; what moves with the pose does by more."""
+    """
+    Flicker scatters means beyond a wander of 15 s by a little.
+
+    What moves with the pose does by more.
+    """
     likelihood = SimpleNamespace(
         typical=1.0, many=True, loss=lambda shape, used: 100.0 - won * (shape[0] > 0)
     )
@@ -468,7 +532,9 @@ def test_offsets_of_windows_have_their_price(won, found):
 
 
 def test_what_replaces_an_effect_is_significant_itself():
-    """The product predicts held-out windows better than the quadratic, and nobody would have named it."""
+    """
+    The product predicts held-out windows better than the quadratic, and nobody would have named it.
+    """
     for p_value, kept in ((1e-12, PRODUCT), (0.5, QUADRATIC)):
         evidence = Known(lambda used: {frozenset(): 200.0, frozenset([0]): 100.0}.get(used, 40.0))
         evidence.p_value = lambda smaller, larger: p_value if 2 in larger else 1e-12
@@ -477,7 +543,11 @@ def test_what_replaces_an_effect_is_significant_itself():
 
 @pytest.mark.parametrize('behind, alike', [(30.0, ['gyro_thermal_bias']), (90.0, [])])
 def test_curves_in_time_that_are_nearly_collinear_are_named_together(behind, alike):
-    """Of 60,000 nats, 30 do not separate two curves that the wander of a bias may bend; they separate causes that depend on motion."""
+    """
+    Of 60,000 nats, 30 do not separate two curves that the wander of a bias may bend.
+
+    They separate causes that depend on motion.
+    """
     warm, drift, product = (
         asked('gyroscope', name, *at)
         for name, at in (
@@ -537,7 +607,11 @@ def test_windows_agree_on_what_they_tell_of_an_effect():
 
 
 def evidence_of(rows, noise_within, scatter=None):
-    """Return evidence of moving windows of 100 samples, whose parameter shows within alone: products of one column with itself, the residual and both."""
+    """
+    Return evidence of moving windows of 100 samples, whose parameter shows within alone.
+
+    Products of one column with itself, the residual and both.
+    """
     count = len(rows)
     recording = SimpleNamespace(
         kind=np.array(['spin'] * count),
@@ -571,7 +645,11 @@ def evidence_of(rows, noise_within, scatter=None):
 
 @pytest.mark.parametrize(('scatter', 'sure'), ((0.1, True), (1.0, False)))
 def test_windows_agree_on_a_finding(scatter, sure):
-    """A column of which 40 windows say 0.3 on average, to 0.1 each if the noise within were white: they scatter by that, or by ten times as much."""
+    """
+    A column of which 40 windows say 0.3 on average, to 0.1 each if the noise within were white.
+
+    They scatter by that, or by ten times as much.
+    """
     slopes = np.random.default_rng(4).normal(0.0, 1.0, 40)
     evidence = evidence_of(0.3 + scatter * (slopes - slopes.mean()) / slopes.std(), 1.0)
     (value,), covariance = evidence.fit([0])
@@ -602,7 +680,11 @@ def test_a_window_that_scatters_more_within_has_a_less_certain_mean():
 
 
 def test_what_only_one_window_tells_is_not_held_against_it():
-    """The level of a bias that hardly forgets is known from the first window alone: held out, it is missed by what the others do not know."""
+    """
+    The level of a bias that hardly forgets is known from the first window alone.
+
+    Held out, it is missed by what the others do not know.
+    """
     rows = np.column_stack([[1.0, *[0.01] * 11], [50.0, *np.random.default_rng(0).normal(size=11)]])
     evidence, parts = (
         WindowEvidence.__new__(WindowEvidence),
@@ -625,7 +707,12 @@ def test_what_only_one_window_tells_is_not_held_against_it():
 
 
 def test_what_a_drift_does_within_windows_is_predicted_and_tells_nothing_of_it():
-    """Means say 3; within windows of 100 samples of unit noise the slope of the residual is 3 times that of the column too, or -7 times by a wander."""
+    """
+    Means give 3, and within windows the slope differs.
+
+    Within windows of 100 samples of unit noise the slope of the residual is 3 times that of the
+    column too, or -7 times by a wander.
+    """
     for slope, left in ((3.0, 0.0), (-7.0, 100.0)):
         count, each = (
             12,
@@ -686,7 +773,11 @@ def test_a_usual_wander_has_no_price():
 
 
 def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sensor():
-    """Steps of 1 mrad at both ends of 5 s beside 0.1 mrad/s of white noise at 100 Hz; at rest nothing turns."""
+    """
+    Steps of 1 mrad at both ends of 5 s beside 0.1 mrad/s of white noise at 100 Hz.
+
+    At rest nothing turns.
+    """
     rng = np.random.default_rng(9)
     turned = rng.uniform(0.0, 1.0, (20000, 2))
     read = np.round(turned / 1e-3) * 1e-3
@@ -700,7 +791,11 @@ def test_a_turn_that_is_read_in_steps_leaves_more_in_the_mean_rate_than_the_sens
 
 
 def test_a_wander_far_beyond_the_natural_one_has_its_price():
-    """Two units of likelihood less for eight times the natural size are a drift beside a natural wander, not a wander."""
+    """
+    Two units of likelihood less for eight times the natural size are a drift.
+
+    It is a drift together with a natural wander, not a wander.
+    """
     likelihood = SimpleNamespace(
         typical=1.0,
         many=True,
@@ -711,7 +806,11 @@ def test_a_wander_far_beyond_the_natural_one_has_its_price():
 
 
 def test_what_is_smooth_in_time_has_to_beat_the_wander_of_the_bias():
-    """Three parameters whose priors are ten wide win three units of likelihood by chance; 14 are what the priors cost, 10 are very strong evidence."""
+    """
+    Three parameters whose priors are ten wide win three units of likelihood by chance.
+
+    14 are what the priors cost, 10 are very strong evidence.
+    """
     for won, needed in ((3.0, []), (22.0, []), (26.0, [7, 8, 9])):
         search = SimpleNamespace(best=lambda used, won=won: (None, 100.0 - won * (len(used) > 0)))
         assert _needed_smooth(search, [[7, 8, 9]], prior_sd=np.full(10, 10.0)) == needed
@@ -719,7 +818,9 @@ def test_what_is_smooth_in_time_has_to_beat_the_wander_of_the_bias():
 
 @pytest.mark.parametrize(('apart', 'agree'), ((2.0, True), (6.0, False)))
 def test_halves_agree_within_chance(apart, agree):
-    """An effect of two standard deviations of the whole, halves that differ by so many of theirs."""
+    """
+    An effect of two standard deviations of the whole, halves that differ by so many of theirs.
+    """
     problem = LinearisedProblem.__new__(LinearisedProblem)
     problem.space = SimpleNamespace(prior_sd=np.full(1, 1e6), prior_mean=np.zeros(1))
     problem._halves = [
@@ -768,7 +869,11 @@ def test_what_the_halves_disagree_on_is_denied(monkeypatch):
 
 
 def test_what_is_nothing_without_what_was_taken_out_is_not_named(monkeypatch):
-    """A clock that is early and a lag that makes up for it: each is significant beside the other alone."""
+    """
+    A clock that is early and a lag that makes up for it.
+
+    Each is significant beside the other alone.
+    """
     losses = {
         frozenset(): 100.0,
         frozenset([0]): 99.0,
@@ -805,7 +910,9 @@ def test_a_lag_that_would_be_negative_is_no_finding_and_asks_for_an_explanation(
 
 
 def rest_of(sigma, residual):
-    """Return the Unexplained of a residual whose windows exceed noise by so many standard deviations."""
+    """
+    Return the Unexplained of a residual whose windows exceed noise by so many standard deviations.
+    """
     count = len(residual)
     recording = SimpleNamespace(
         kind=np.array(['static'] * count),

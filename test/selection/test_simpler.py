@@ -22,7 +22,11 @@ ARMS, ARM, CUBE, GYROSCOPE = (
 
 
 class Search:
-    """Arms of the three accelerometers explain a little more than one arm of all, a cube hardly anything."""
+    """
+    Arms of the three accelerometers explain a little more than one arm of all.
+
+    A cube explains hardly anything.
+    """
 
     def others(self, chosen):
         return [question for question in (ARM, CUBE, GYROSCOPE) if question not in chosen]

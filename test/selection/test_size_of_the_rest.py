@@ -1,4 +1,8 @@
-"""A rest that is significant has a size, also where biases may wander by more than it, and goes with what has a name."""
+"""
+A rest that is significant has a size, and is gone with an effect that has a name.
+
+It has a size also where biases may wander by more than it.
+"""
 
 from types import SimpleNamespace
 
@@ -8,7 +12,11 @@ from imu_calibration.selection import unexplained
 
 
 def test_what_differs_from_neighbour_to_neighbour_below_a_wander_has_a_size(monkeypatch):
-    """Plain squares of the means are less than noise and wander allow; whitened ones are not: "0 deg/s, significant" was told."""
+    """
+    Plain squares of the means are less than noise and wander allow.
+
+    Whitened ones are not: "0 deg/s, significant" was told.
+    """
     monkeypatch.setattr(unexplained, 'correlate', lambda explanations, residual: ('time', 0.5))
     monkeypatch.setattr(unexplained, '_explanations', lambda recording: {})
     n = 40

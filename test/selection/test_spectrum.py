@@ -25,7 +25,11 @@ STEP = 0.01
 
 
 def stretches(amplitudes, frequency=23.7, noise=1.0):
-    """Return stretches of noise in which axis y carries a tone of each amplitude, in a phase of its own."""
+    """
+    Return stretches of noise in which axis y carries a tone of each amplitude.
+
+    Each tone is in a phase of its own.
+    """
     rng, time = np.random.default_rng(3), STEP * np.arange(400)
     return [
         (
@@ -50,7 +54,9 @@ def test_a_tone_is_found_where_it_is_with_its_amplitude():
 
 @pytest.mark.parametrize('amplitudes', [[0.0] * 40, [30.0] * 5 + [0.0] * 35, [0.8] * 4])
 def test_noise_what_some_motions_do_and_too_few_stretches_are_no_tone(amplitudes):
-    """A large line in an eighth of the stretches is that of their motion; four stretches are few."""
+    """
+    A large line in an eighth of the stretches is that of their motion; four stretches are few.
+    """
     assert not [
         tone
         for tone in of_stretches('gyroscope', stretches(amplitudes), None)
@@ -121,7 +127,11 @@ def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
 
 
 class Loud(Cause):
-    """A tone of 31 Hz in accelerometer z, and noise of gyroscope y in proportion to the rate: 0.5 at a rate of 1."""
+    """
+    A tone of 31 Hz in accelerometer z, and noise of gyroscope y in proportion to the rate.
+
+    0.5 at a rate of 1.
+    """
 
     def delivered(self, time, outputs, rate_s):
         """Return both."""
@@ -138,7 +148,11 @@ class Loud(Cause):
 @pytest.mark.usefixtures('few_candidates')
 @pytest.mark.parametrize('size', [1.0, 0.0])
 def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size):
-    """Both are random to least squares, whose noise they increase: the diagnosis of either was "nothing found"."""
+    """
+    Both are random to least squares, whose noise they increase.
+
+    The diagnosis of either was "nothing found".
+    """
     recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size))
     found = build_diagnosis(
         recording.table, investigate(recording.windows, recording.table, recording.model)

@@ -1,4 +1,8 @@
-"""Independent errors of the stamps: their size from the scatter of both sensors in motion, and no regime where they explain it."""
+"""
+Independent errors of the stamps.
+
+Their size from the scatter of both sensors in motion, and no regime where they explain it.
+"""
 
 from dataclasses import replace
 
@@ -21,7 +25,11 @@ BLOCKS, FREEDOM, NOISE = 600, 13, (1e-8, 1e-10)
 
 
 def blocks(jitter, seed=0):
-    """Return (variances, mean square slopes, degrees of freedom) of blocks, a third of them at rest; `jitter` of each sensor, s."""
+    """
+    Return (variances, mean square slopes, degrees of freedom) of blocks, a third of them at rest.
+
+    `jitter` of each sensor, s.
+    """
     rng = np.random.default_rng(seed)
     speed = np.where(np.arange(BLOCKS) % 3 == 0, 0.0, rng.uniform(0.5, 4.0, BLOCKS))[:, None]
     slope = [(size * speed * rng.uniform(0.5, 1.0, (BLOCKS, 3))) ** 2 for size in (4.0, 1.0)]
@@ -46,7 +54,9 @@ def test_the_size_of_the_errors_is_estimated_and_their_scatter_removed(sd):
 
 @pytest.mark.parametrize('jitter', [(1e-4, 0.0), (0.0, 1e-4), (0.0, 5e-6)])
 def test_scatter_of_one_sensor_is_no_error_of_the_stamps(jitter):
-    """The other sensor shows none; at 5 us the precise sensor would decide the mean of both alone."""
+    """
+    The other sensor shows none; at 5 us the precise sensor would decide the mean of both alone.
+    """
     rough, slope, freedom = blocks(jitter)
     found = stamp_jitter(rough, slope, freedom)
     assert not found.significant and found.sd < 0.7 * max(jitter) and not found.lines

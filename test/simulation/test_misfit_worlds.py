@@ -1,4 +1,8 @@
-"""The worlds with causes that no catalogue holds: each acts where it says, by its physics, and nowhere else."""
+"""
+The worlds with causes that no catalogue holds.
+
+Each acts where it says, by its physics, and nowhere else.
+"""
 
 import numpy as np
 import pytest

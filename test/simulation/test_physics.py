@@ -1,4 +1,9 @@
-"""The truth simulator: its kinematics agree with the package's and with differences, and each effect does what its physics says."""
+"""
+The truth simulator.
+
+Its kinematics agree with the package's and with differences, and each effect does what its physics
+says.
+"""
 
 import ast
 from functools import lru_cache
@@ -169,7 +174,8 @@ def test_each_effect_touches_only_its_own_sensor(name):
         np.abs(getattr(after.imu, part) - getattr(before.imu, part)).max()
         for part in ('force_s', 'rate_s')
     ]
-    # An axis that passes beside the others moves the sensor to another point, not to another attitude.
+    # An axis that passes beside the others moves the sensor to another point, not to another
+    # attitude.
     expected = (
         (True, False)
         if name.startswith(('accel', 'lever', 'table', 'axis_offset'))
@@ -279,7 +285,8 @@ def test_bandwidth_delays_slow_motion_and_keeps_rest():
     session = clean({'gyro_bandwidth': 4e-3})
     ref, (_, rate) = predicted(session)
     still = np.abs(ref.rate_s).max(axis=1) < 1e-4
-    # Where a move begins or ends: acceleration there times the time constant, below 0.1 rad/s^2 times 4 ms.
+    # Where a move begins or ends: acceleration there times the time constant, below 0.1 rad/s^2
+    # times 4 ms.
     np.testing.assert_allclose(session.imu.rate_s[still], rate[still], atol=4e-4)
     alpha = ref.alpha_s @ session.truth['gyroscope'].matrix.T
     lag = rate - session.imu.rate_s

@@ -1,4 +1,8 @@
-"""Profiles: derivatives are derivatives, limits hold, every name can be made, and the designs say what the papers say."""
+"""
+Profiles: derivatives are derivatives, limits hold, and every name can be made.
+
+The designs agree with the text of the papers.
+"""
 
 import numpy as np
 import pytest
@@ -31,7 +35,8 @@ def test_derivatives_agree_with_differences(name):
     before, here, after = (profile.at(time + shift) for shift in (-step, 0.0, step))
     for low, high in (('position', 'rate'), ('rate', 'acceleration'), ('acceleration', 'jerk')):
         slope = (getattr(after, low) - getattr(before, low)) / (2 * step)
-        # Error of the central difference: third derivative times step^2 / 6; jerks stay below 1e3 rad/s^3.
+        # Error of the central difference: third derivative times step^2 / 6; jerks stay below 1e3
+        # rad/s^3.
         scale = np.abs(getattr(here, high)).max() + 1.0
         np.testing.assert_allclose(slope, getattr(here, high), atol=2e-4 * scale)
 
@@ -77,7 +82,8 @@ def test_calibration_session_is_rich():
     up_s = ref.force_s / ref.gravity
     different = np.unique(np.round(up_s, 3), axis=0)
     assert len(different) >= 24
-    # Spread: no direction is farther than 36 deg from a pose (26 directions of a cube: 32 deg at most, plus slack).
+    # Spread: no direction is farther than 36 deg from a pose (26 directions of a cube: 32 deg at
+    # most, plus slack).
     sphere = np.random.default_rng(3).normal(size=(500, 3))
     sphere /= np.linalg.norm(sphere, axis=1)[:, None]
     assert np.degrees(np.arccos(np.max(sphere @ different.T, axis=1))).max() < 36
@@ -127,7 +133,11 @@ def test_other_tables():
     'name', sorted(name for name in REGISTRY if name.startswith('avrutov_') and name[8] in 'XYZ')
 )
 def test_equal_angles_determine_the_linear_model(name):
-    """All 36 cases of gimbal order and gravity have rank 4, and rank 7 with products (the 41 positions of samples 1 and 2)."""
+    """
+    All 36 cases of gimbal order and gravity have rank 4, and rank 7 with products.
+
+    They are for the 41 positions of samples 1 and 2.
+    """
     profile = make_profile(name)
     times = profile.find('rest').mean(axis=1)[-41:]
     angles = np.degrees(profile.at(times).position)

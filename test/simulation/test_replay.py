@@ -50,7 +50,11 @@ def session():
 
 
 def test_without_noise_the_replay_of_a_simulation_repeats_its_readings(session):
-    """The joints of the replay are read at 100 Hz and interpolated: the readings agree to the error of the joints' curve."""
+    """
+    The joints of the replay are read at 100 Hz and interpolated.
+
+    The readings agree to the error of the joints' curve.
+    """
     samples, table, values = session
     made, lost = replay([samples], table, MODEL, values=values, noise=QUIET)
     assert len(made.imu) + lost == len(samples.imu) and lost < 20
@@ -96,7 +100,11 @@ def test_without_noise_in_the_calibration_that_at_rest_is_taken(session):
 
 
 def test_a_replay_vibrates_as_its_recording(session):
-    """Biases follow the vibration of the readings: gears of 11 s and half a second of memory, smoothed twice."""
+    """
+    Biases follow the vibration of the readings.
+
+    Gears of 11 s and half a second of memory, smoothed twice.
+    """
     table, model = session[1], MODEL.with_effect('accelerometer', 'accel_vibration_rectification')
     values = model.start_from(MODEL, session[2])
     options = SimulationOptions(noise=SimulatedNoise(), temperature_start_c=25.0)

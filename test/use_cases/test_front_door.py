@@ -1,4 +1,9 @@
-"""What a notebook sees: a package that imports at once, functions that take bags or samples, and results that print, draw and save themselves."""
+"""
+What a notebook sees.
+
+A package that imports at once, functions that take bags or samples, and results that print, draw
+and save themselves.
+"""
 
 import ast
 import os
@@ -309,8 +314,8 @@ def test_a_simulated_session_is_saved_with_its_truth(tmp_path):
     session = imu.simulate('quick', seed=4)
     session.save(tmp_path / 'bag', storage='mcap')
     assert (
-        repr(session)
-        == f'<Simulated: {session.duration:.0f} s, {len(session.samples.imu)} Imu, {len(session.samples.joints)} JointState>'
+        repr(session) == f'<Simulated: {session.duration:.0f} s, {len(session.samples.imu)} Imu,'
+        f' {len(session.samples.joints)} JointState>'
     )
     assert yaml.safe_load((tmp_path / 'bag/table.yaml').read_text()) == session.table.to_mapping()
     again = imu.compensate(tmp_path / 'bag', tmp_path / 'bag/truth.yaml').imu
@@ -330,7 +335,11 @@ def cells(path):
 
 @pytest.mark.long
 def test_the_notebook_runs_cell_by_cell_and_shows_its_plots(capsys):
-    """As a notebook does it: each cell is run, and its last expression is shown; what it prints is what it prints as a script."""
+    """
+    As a notebook does it: each cell is run, and its last expression is shown.
+
+    What it prints is what it prints as a script.
+    """
     names, shown = {}, []
     for code in cells(ROOT / 'examples/notebook.py'):
         tree = ast.parse(code)

@@ -34,13 +34,18 @@ def test_size():
 
 
 def test_truth_is_found_within_the_reported_standard_deviations(output):
-    """Every parameter lies within 4.5 sd of the truth (36 parameters: chance 2e-4), and the errors are small in themselves."""
+    """
+    Every parameter lies within 4.5 sd of the truth (36 parameters: chance 2e-4).
+
+    The errors are small in themselves.
+    """
     found, truth = load(output / 'calibration.yaml'), load(BAG / 'truth.yaml')
     names = [name for name in truth.param_names if name in found.param_names]
     a, b = ([c.param_names.index(name) for name in names] for c in (found, truth))
     ratio = np.abs(found.values[a] - truth.values[b]) / found.sd[a]
     print(
-        f'sample session: largest error {ratio.max():.2f} sd, rms {np.sqrt((ratio**2).mean()):.2f} sd over {len(names)} parameters'
+        f'sample session: largest error {ratio.max():.2f} sd, rms {np.sqrt((ratio**2).mean()):.2f}'
+        f' sd over {len(names)} parameters'
     )
     assert ratio.max() < 4.5
     assert set(found.requested.values()) == {'determined'}
@@ -106,6 +111,7 @@ def test_compensated_bag(output, tmp_path):
         raw = session_truth(recording.blocks(table.joint_names), table)
     before, after = before_and_after(*raw, load(output / 'calibration.yaml'))
     print(
-        f'sample session: {before.force} -> {after.force} m/s^2, {before.rate} -> {after.rate} rad/s'
+        f'sample session: {before.force} -> {after.force} m/s^2, {before.rate} -> {after.rate}'
+        ' rad/s'
     )
     assert after.force < 0.1 * before.force and after.rate < 0.1 * before.rate

@@ -1,4 +1,8 @@
-"""The fast part of `make validate`: the figures of the real recordings that are known, and the means of comparison themselves."""
+"""
+The fast part of `make validate`.
+
+The figures of the real recordings that are known, and the means of comparison themselves.
+"""
 
 import sys
 from pathlib import Path
@@ -9,7 +13,15 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from validation import arm_live, ferraris, held_out, mpu9150, run, simulated_table, xsens  # noqa: E402
+from validation import (
+    arm_live,
+    ferraris,
+    held_out,
+    mpu9150,
+    run,
+    simulated_table,
+    xsens,
+)  # noqa: E402
 from validation.hand_peers import _other_turns  # noqa: E402
 from validation.recordings import load, reference  # noqa: E402
 from validation.second_opinions import Forward, fit_norm  # noqa: E402
@@ -65,7 +77,9 @@ def test_a_pose_left_out_leaves_nothing_behind():
 
 
 def test_intervals_of_differences_hold_what_they_say(monkeypatch):
-    """Two methods of equal error: the interval holds zero about 95 times in 100; a worse one is seen."""
+    """
+    Two methods of equal error: the interval holds zero about 95 times in 100; a worse one is seen.
+    """
     monkeypatch.setattr(held_out, 'DRAWS', 1000)
     rng = np.random.default_rng(2)
     pairs = [rng.normal(0, 1, (2, 30)) for _ in range(150)]
@@ -90,7 +104,9 @@ def test_a_section_shows_what_does_not_hold(tmp_path):
 
 
 def test_the_evidence_quotes_the_document():
-    """Every figure of the table in docs/claims.md is in docs/validation.md; only a run writes both."""
+    """
+    Every figure of the table in docs/claims.md is in docs/validation.md; only a run writes both.
+    """
     part = (ROOT / 'docs' / 'claims.md').read_text()
     written = (ROOT / 'docs' / 'validation.md').read_text()
     rows = [line.split('|') for line in part.splitlines() if line.startswith('| ')][2:]
@@ -111,7 +127,8 @@ def test_xsens_in_counts(recordings):
     _, differences = xsens.figures(recordings)
     (offset, scale), (_, scale_w) = differences['accelerometer'], differences['gyroscope']
     print(
-        f'xsens_counts: offsets {np.round(offset, 1)} counts, scales {np.round(100 * scale, 2)} % off wanted 10 counts, 0.3 %'
+        f'xsens_counts: offsets {np.round(offset, 1)} counts, scales {np.round(100 * scale, 2)} %'
+        ' off wanted 10 counts, 0.3 %'
     )
     assert np.max(np.abs(offset)) < 10
     assert np.max(np.abs(scale)) < 0.003 and np.max(np.abs(scale_w)) < 0.003
@@ -128,7 +145,11 @@ def test_mpu9150_biases(recordings):
 
 @pytest.mark.real_data
 def test_ferraris_agrees_with_imucal(recordings):
-    """All 18 parameters within three of our sd; they share the data, so that they should be closer than that."""
+    """
+    All 18 parameters within three of our sd.
+
+    They share the data, so that they should be closer than that.
+    """
     pytest.importorskip('imucal', reason='imucal is not installed; `make validate` installs it')
     imu, known = load(recordings, 'ferraris'), reference(recordings, 'ferraris')
     angle = np.radians(known['turn_deg'])
@@ -150,15 +171,20 @@ def test_ferraris_agrees_with_imucal(recordings):
 @pytest.mark.slow
 @pytest.mark.real_data
 def test_ours_predicts_poses_left_out_no_worse_than_the_norm_fit(recordings):
-    """Over the 18 poses of mpu9150_3; the fit with fewer poses and the other recordings are left to `make validate`."""
+    """
+    Over the 18 poses of mpu9150_3.
+
+    The fit with fewer poses and the other recordings are left to `make validate`.
+    """
     imu = load(recordings, 'mpu9150_3')
     ranges = held_out.find_still(imu)
     values, interval, errors = held_out.leave_one_out(
         imu, ranges, 9.80665, np.random.default_rng(3)
     )
     print(
-        f'mpu9150_3: poses left out {1e3 * values["ours"]:.2f} mm/s^2, norm fit {1e3 * values["norm fit"]:.2f}, uncalibrated '
-        f'{1e3 * values["uncalibrated"]:.0f} wanted ours not beyond the norm fit'
+        f'mpu9150_3: poses left out {1e3 * values["ours"]:.2f} mm/s^2, norm fit'
+        f' {1e3 * values["norm fit"]:.2f}, uncalibrated {1e3 * values["uncalibrated"]:.0f} wanted'
+        ' ours not beyond the norm fit'
     )
     assert interval[1] > 0  # not shown to be worse
     assert values['ours'] < 0.1 * values['uncalibrated']
@@ -185,7 +211,8 @@ def test_the_truth_of_python_ins_is_recovered():
     ratio = np.array([(value - true) / sd for _, value, true, sd, _ in rows])
     spread, largest = np.sqrt(np.mean(ratio**2)), np.abs(ratio).max()
     print(
-        f'python-ins: {len(rows)} parameters, rms error {spread:.2f} sd, largest {largest:.1f} sd wanted 1, 4'
+        f'python-ins: {len(rows)} parameters, rms error {spread:.2f} sd, largest {largest:.1f} sd'
+        ' wanted 1, 4'
     )
     assert len(rows) >= 24 and largest < 4 and 0.5 < spread < 1.5
 
@@ -201,7 +228,8 @@ def test_one_imu_predicts_another_live(recordings):
     )
     before, after = arm_live.rms(found['turned']), arm_live.rms(found['moved'])
     print(
-        f'live: one IMU from another, {len(found["moved"])} samples, {before:.2f} m/s^2, with the arm {after:.2f} wanted 0.65 of it'
+        f'live: one IMU from another, {len(found["moved"])} samples, {before:.2f} m/s^2, with the'
+        f' arm {after:.2f} wanted 0.65 of it'
     )
     assert set(count.values()) == {len(case.imu_a)}
     assert len(found['moved']) > 300

@@ -1,4 +1,8 @@
-"""The file for Foxglove holds what the calibration says; the shipped layout asks for what is in it; without the package one sentence names it."""
+"""
+The file for Foxglove holds what the calibration says; the shipped layout asks for what is in it.
+
+Without the package one sentence names it.
+"""
 
 import json
 import re
@@ -133,7 +137,11 @@ def test_spectrum_is_that_of_the_residuals(written, result):
 
 
 def test_a_line_stands_at_its_frequency_and_white_noise_at_its_density():
-    """A tone of 12 Hz beside white noise of 0.01 per sample at 100 Hz, whose one-sided density is 0.01 * sqrt(2 / 100)."""
+    """
+    A tone of 12 Hz with white noise of 0.01 per sample at 100 Hz.
+
+    The one-sided density of the noise is 0.01 * sqrt(2 / 100).
+    """
     rng, time = np.random.default_rng(1), np.arange(4096) / 100
     noise = 0.01 * rng.normal(size=(4096, 3))
     tone = noise + np.outer(0.2 * np.sin(2 * np.pi * 12 * time), [1, 0, 0])
@@ -206,7 +214,8 @@ def test_without_the_package_one_sentence_names_it_before_any_work(monkeypatch, 
     assert (
         out == ''
         and err
-        == 'imu_calibration view: a view needs foxglove-sdk, which is not installed; install imu_calibration[view]\n'
+        == 'imu_calibration view: a view needs foxglove-sdk, which is not installed; install'
+        ' imu_calibration[view]\n'
     )
     assert not list(tmp_path.iterdir())
 

@@ -1,8 +1,11 @@
 """
-An IMU on an arm whose joints are not quite as its description says; attitudes and places by Pinocchio, everything else by differences in time.
+An IMU on an arm whose joints are not quite as its description says.
 
-Nothing here knows our chain, the catalogue of effects or the estimator, but for `in_our_axes`, which says what the parameters are in
-the convention of the calibration: what nothing can tell from the mount is taken as described.
+Attitudes and places by Pinocchio, everything else by differences in time.
+
+Nothing here knows our chain, the catalogue of effects or the estimator, but for `in_our_axes`,
+which says what the parameters are in the convention of the calibration: what nothing can tell from
+the mount is taken as described.
 
 Run as a program it prints the figures of 40 worlds.
 """
@@ -35,7 +38,10 @@ from worlds.physics_sensor import Triad
 
 START_NS = 1_700_000_000_000_000_000
 STEP = 2e-3
-"""Step of the differences, s: rounding 1e-16 / STEP^2 and the fourth-order remainder both stay below 1e-5 of the noise."""
+"""
+Step of the differences, s: rounding 1e-16 / STEP^2 and the fourth-order remainder both stay below
+1e-5 of the noise.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +75,13 @@ def make_arm_world(
     seconds=np.inf,
 ):
     """
-    Return an `ArmWorld`: every joint's frame stands turned by `joint_error` (rad, about each axis) and shifted by `place_error` (m).
+    Return an `ArmWorld`.
 
-    A turn about the joint's axis is a wrong zero, one across it a wrong direction of the axis. Only the first `seconds` are recorded.
+    Every joint's frame stands turned by `joint_error` (rad, about each axis) and shifted by
+    `place_error` (m).
+
+    A turn about the joint's axis is a wrong zero, one across it a wrong direction of the axis. Only
+    the first `seconds` are recorded.
     """
     table = table_from_urdf(text, link, {'gravity': STANDARD_GRAVITY})
     rng, noise = generator(seed, 'arm'), realistic(grade, encoder_resolution=2e-6, stamp_jitter=0.0)
@@ -129,7 +139,11 @@ def _poses(model, position, names, link):
 
 
 def _force(poses, arm):
-    """Return the specific force at a point of the link, in the link's frame: second differences of where it is."""
+    """
+    Return the specific force at a point of the link, in the link's frame.
+
+    Second differences of where it is.
+    """
     points = [place + turn @ arm for turn, place in poses]
     acceleration = (-points[0] + 16 * points[1] - 30 * points[2] + 16 * points[3] - points[4]) / (
         12 * STEP**2
@@ -146,10 +160,14 @@ def _rate(poses):
 
 def in_our_axes(world, n=60, seed=1):
     """
-    Return (turn, shift, rest): the IMU's true axes and origin in the calibration's convention, and what no convention can explain, rad.
+    Return (turn, shift, rest).
 
-    Fits the errors that the calibration knows of (tilt, azimuth, angles, zeros) to Pinocchio's attitudes; the turn between link and
-    mount that this leaves is the convention. Places follow in the same way.
+    The IMU's true axes and origin in the calibration's convention, and what no convention can
+    explain, rad.
+
+    Fits the errors that the calibration knows of (tilt, azimuth, angles, zeros) to Pinocchio's
+    attitudes; the turn between link and mount that this leaves is the convention. Places follow in
+    the same way.
     """
     table, names = world.table, world.table.joint_names
     rng = np.random.default_rng(seed)
@@ -202,7 +220,11 @@ def _still(position):
 
 
 def _places_of(table, position):
-    """Return where the reference point is, shape (n, 3): products of frames, since the recursion knows no places."""
+    """
+    Return where the reference point is, shape (n, 3).
+
+    Products of frames, since the recursion knows no places.
+    """
     turn, places = Rotation.from_matrix(table.mat_nb), np.zeros((len(position), 3))
     at = dict(zip(table.joint_names, position.T, strict=True))
     for joint in table.joints:
@@ -216,7 +238,9 @@ def _places_of(table, position):
 
 
 def truth(world):
-    """Return {parameter: true value} of bias, matrix and arms, in the convention of the calibration."""
+    """
+    Return {parameter: true value} of bias, matrix and arms, in the convention of the calibration.
+    """
     mount, shift, _ = in_our_axes(world)
     values = {}
     for sensor, triad in (('accelerometer', world.accelerometer), ('gyroscope', world.gyroscope)):
@@ -237,7 +261,11 @@ def truth(world):
 
 
 def deviations(world):
-    """Return {parameter: error in standard deviations} of a calibration of the world, and the calibration."""
+    """
+    Return {parameter: error in standard deviations}, and the calibration.
+
+    The errors are of a calibration of the world.
+    """
     from imu_calibration.calibration.table_calibration import calibrate
 
     calibration = calibrate([lambda: iter([world.block])], world.table).calibration
@@ -266,14 +294,17 @@ def main():
         every.append(list(errors.values()))
         worst = max(errors, key=lambda name: abs(errors[name]))
         print(
-            f'world {seed}: mean square {np.mean(np.square(every[-1])):.2f}, worst {errors[worst]:+.2f} sd, {worst}',
+            f'world {seed}: mean square {np.mean(np.square(every[-1])):.2f}, worst'
+            f' {errors[worst]:+.2f} sd, {worst}',
             flush=True,
         )
     every = np.abs(np.array(every))
     print(
-        f'{len(every)} worlds of {every.shape[1]} parameters: within 3 sd {100 * np.mean(every < 3):.1f} %, each parameter in at least '
-        f'{100 * np.mean(every < 3, axis=0).min():.1f} % of the worlds, all at once in {100 * np.mean(np.all(every < 3, axis=1)):.1f} %; '
-        f'within 1.96 sd {100 * np.mean(every < 1.96):.1f} %; mean square {np.mean(every**2):.2f}'
+        f'{len(every)} worlds of {every.shape[1]} parameters: within 3 sd'
+        f' {100 * np.mean(every < 3):.1f} %, each parameter in at least'
+        f' {100 * np.mean(every < 3, axis=0).min():.1f} % of the worlds, all at once in'
+        f' {100 * np.mean(np.all(every < 3, axis=1)):.1f} %; within 1.96 sd'
+        f' {100 * np.mean(every < 1.96):.1f} %; mean square {np.mean(every**2):.2f}'
     )
 
 

@@ -1,4 +1,9 @@
-"""Robots as URDF text: arms, a SCARA and a gantry of our own dimensions, with the tags around them that real descriptions have."""
+"""
+Robots as URDF text.
+
+Arms, a SCARA and a gantry of our own dimensions, with the tags around them that real descriptions
+have.
+"""
 
 from textwrap import indent
 
@@ -13,20 +18,29 @@ def joint(name, parent, child, xyz='0 0 0', rpy='0 0 0', axis='0 0 1', kind='rev
     }.get(kind, '')
     moving = '' if kind == 'fixed' else f'<axis xyz="{axis}"/>{limit}{extra}'
     return (
-        f'<link name="{child}"><visual><geometry><mesh filename="package://nowhere/{child}.dae"/></geometry></visual></link>\n'
-        f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent link="{parent}"/><child link="{child}"/>{moving}</joint>'
+        f'<link name="{child}"><visual><geometry><mesh'
+        f' filename="package://nowhere/{child}.dae"/></geometry></visual></link>\n<joint'
+        f' name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent'
+        f' link="{parent}"/><child link="{child}"/>{moving}</joint>'
     )
 
 
 def robot(*joints, root='base_link'):
-    """Return the description of a robot with these joints, a camera that nobody asks for, and what simulators add."""
+    """
+    Return the description of a robot with these joints and extras.
+
+    The extras are a camera that nobody requests, and additions of simulators.
+    """
     aside = (
         joint('camera_joint', root, 'camera_link', kind='fixed')
         + '\n'
         + joint('gripper_joint', root, 'gripper_link', axis='0 1 0')
     )
     text = '\n'.join([f'<link name="{root}"/>', *joints, aside])
-    return f'<?xml version="1.0" encoding="utf-8"?>\n<robot name="own">\n{indent(text, "  ")}\n  <gazebo><plugin name="x" filename="y"/></gazebo>\n</robot>\n'
+    return (
+        f'<?xml version="1.0" encoding="utf-8"?>\n<robot name="own">\n{indent(text, "  ")}\n '
+        ' <gazebo><plugin name="x" filename="y"/></gazebo>\n</robot>\n'
+    )
 
 
 SIX_AXES = robot(
@@ -101,7 +115,10 @@ FOLLOWING = robot(
     ),
     joint('end', 'e', 'imu_link', '0.05 0 0', axis='0 1 1'),
 )
-"""Joints that follow others: one before them, one that turns while they slide, one that is not on the way."""
+"""
+Joints that follow others: one before them, one that turns while they slide, one that is not on the
+way.
+"""
 
 ROBOTS = {
     'six_axes': SIX_AXES,

@@ -1,4 +1,8 @@
-"""Worlds whose cause no catalogue holds: is the rest flagged, on the right axis, at the right place, with a formula of the right family?"""
+"""
+Worlds whose cause no catalogue holds.
+
+Is the rest flagged, on the right axis, at the right place, with a formula of the right family?
+"""
 
 import time
 from dataclasses import replace
@@ -21,7 +25,11 @@ MEASURES = ('flagged', 'axis', 'family', 'lowered', 'place', 'no name')
 
 
 def hidden_row(seed, kind, noise, *, known, size=1.0):
-    """Return the row of the session of a seed with a cause of a kind; `known` are bias and matrix without it."""
+    """
+    Return the row of the session of a seed with a cause of a kind.
+
+    `known` are bias and matrix without it.
+    """
     row, values = row_of(seed, kind, noise, Beyond(kind, seed, size))
     moved = [(values[name][0] - value) / values[name][1] for name, (value, _) in known.items()]
     return row | {'known_bias': float(np.sqrt(np.mean(np.square(moved))))}
@@ -52,7 +60,11 @@ def row_of(seed, kind, noise, cause=None):
 
 
 def _known(found, recording):
-    """Return {parameter: (value, sd)} beside what was found, with the formulas that were proposed in the model, as a user gets them."""
+    """
+    Return {parameter: (value, sd)} beside what was found.
+
+    With the formulas that were proposed in the model, as a user gets them.
+    """
     effects = [
         effect
         for rest in found.unexplained.values()
@@ -143,8 +155,10 @@ def figures(rows):
         (
             'what the cause moves biases and matrices by, rms',
             '0.5 sd',
-            f'{np.sqrt(np.mean(np.square(bias))) if bias else np.nan:.3f} sd; median world '
-            f'{np.median(bias) if bias else np.nan:.2f} sd',
+            (
+                f'{np.sqrt(np.mean(np.square(bias))) if bias else np.nan:.3f} sd; median world '
+                f'{np.median(bias) if bias else np.nan:.2f} sd'
+            ),
         ),
         (
             'processor time, median and 95 %',
@@ -169,7 +183,10 @@ def missed(rows):
             if bad
         ]
         if wrong or (row['kind'] == NOTHING and row['formulas']):
-            yield f'  {row["kind"]} seed {row["seed"]}: {", ".join(wrong)} {row["formulas"]} {row.get("where", "")}'
+            yield (
+                f'  {row["kind"]} seed {row["seed"]}: {", ".join(wrong)} {row["formulas"]}'
+                f' {row.get("where", "")}'
+            )
 
 
 def draw(rows, path):

@@ -1,4 +1,8 @@
-"""Random calibrations for the tests of compensation: every effect that can be inverted, at sizes that still converge."""
+"""
+Random calibrations for the tests of compensation.
+
+Every effect that can be inverted, at sizes that still converge.
+"""
 
 import numpy as np
 
@@ -52,7 +56,11 @@ def random_calibration(
     matrix_spread=0.02,
     **fields,
 ):
-    """Return a calibration with these further effects, random values, a full covariance and known noise."""
+    """
+    Return a calibration with these further effects and random values.
+
+    It has a full covariance and known noise.
+    """
     rng = np.random.default_rng([seed, 17])
     model = SensorModel(('bias', 'matrix', *accelerometer), ('bias', 'matrix', *gyroscope))
     values = np.concatenate([_values(effect, matrix_spread, rng) for effect in model.effects])

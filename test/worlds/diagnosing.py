@@ -8,7 +8,11 @@ from imu_calibration.selection.residual_analysis import inquire
 
 
 def diagnose(windows, table, model, *, bias_processes=None):
-    """Return the Diagnosis of the errors of a model on the windows of one recording, in order; unused ones serve dead reckoning."""
+    """
+    Return the Diagnosis of the errors of a model on the windows of one recording, in order.
+
+    Unused ones serve dead reckoning.
+    """
     found = build_diagnosis(table, inquire(windows, table, model, bias_processes=bias_processes))
     return replace(
         found, traces=residual_traces(windows, table, found.baseline, after=found.solution)

@@ -1,4 +1,9 @@
-"""A robot that drives and stops: specific force and rate of its IMU, with a gyroscope whose bias moves by warming up and by wandering."""
+"""
+A robot that drives and stops.
+
+Specific force and rate of its IMU, with a gyroscope whose bias moves by warming up and by
+wandering.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -94,7 +99,11 @@ def drive(
 
 
 def plain_calibration(offset=0.0):
-    """A calibration that changes nothing but the gyroscope's bias about z by `offset`, its bias known to SD."""
+    """
+    A calibration that changes nothing but the gyroscope's bias about z by `offset`.
+
+    The bias is known to SD.
+    """
     calibration = random_calibration(1, accelerometer=())
     values, sd = np.zeros(24), np.full(24, 1e-5)
     values[3:12] = values[15:24] = np.eye(3).ravel()

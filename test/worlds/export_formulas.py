@@ -1,8 +1,10 @@
 """
-What other programs make of an exported file: their formulas and their file formats, written from their sources, one function for each.
+What other programs make of an exported file.
 
-Nothing of `imu_calibration.document.exports` is used here. Each function takes the text of a file and one sample and returns what stands in its
-docstring. Sources are named by project and file.
+Their formulas and their file formats, written from their sources, one function for each.
+
+Nothing of `imu_calibration.document.exports` is used here. Each function takes the text of a file
+and one sample and returns what stands in its docstring. Sources are named by project and file.
 """
 
 import json
@@ -41,8 +43,9 @@ def openvins(text, am, wm):
     """
     Return corrected (force, rate) in the IMU frame, without biases.
 
-    rpng/open_vins: the file is read by VioManagerOptions.h (print_and_load_state), which inverts Tw and Ta and keeps the lower (model
-    kalibr) or upper (rpng) triangle of the inverse column by column; State.h (Dm, Tg) builds the matrices; Propagator.cpp applies them.
+    rpng/open_vins: the file is read by VioManagerOptions.h (print_and_load_state), which inverts Tw
+    and Ta and keeps the lower (model kalibr) or upper (rpng) triangle of the inverse column by
+    column; State.h (Dm, Tg) builds the matrices; Propagator.cpp applies them.
     """
     chain = safe_load(text.split('\n', 1)[1])['imu0']
     get = {
@@ -62,7 +65,11 @@ def openvins(text, am, wm):
 
 
 def basalt(text, accel, gyro):
-    """Return calibrated readings; VladyslavUsenko/basalt-headers, calib_bias.hpp, CalibAccelBias and CalibGyroBias::getCalibrated."""
+    """
+    Return calibrated readings.
+
+    VladyslavUsenko/basalt-headers, calib_bias.hpp, CalibAccelBias and CalibGyroBias::getCalibrated.
+    """
     value = json.loads(text)['value0']
     full = value['calib_accel_bias']
     scale = np.zeros((3, 3))
@@ -74,7 +81,9 @@ def basalt(text, accel, gyro):
 
 
 def parameters(text):
-    """Return {name: value} of a list of parameters: the last two words that are a NAME and its value."""
+    """
+    Return {name: value} of a list of parameters: the last two words that are a NAME and its value.
+    """
     found = {}
     for line in text.splitlines():
         words = line.replace(',', ' ').split()
@@ -88,7 +97,8 @@ def px4(text, accel, gyro, temperature_c):
     """
     Return corrected (accel, gyro), all in the sensor's forward-right-down axes.
 
-    PX4/PX4-Autopilot, Accelerometer.hpp and Gyroscope.hpp (Correct), temperature_compensation.cpp (calc_thermal_offsets_3D).
+    PX4/PX4-Autopilot, Accelerometer.hpp and Gyroscope.hpp (Correct), temperature_compensation.cpp
+    (calc_thermal_offsets_3D).
     """
     p = parameters(text)
 
@@ -115,10 +125,12 @@ def px4(text, accel, gyro, temperature_c):
 
 def ardupilot(text, accel, gyro, temperature_c):
     """
-    Return corrected (accel, gyro), all in the autopilot's forward-right-down axes before the board's orientation.
+    Return corrected (accel, gyro), all in the autopilot's forward-right-down axes.
 
-    ArduPilot/ardupilot, AP_InertialSensor_Backend.cpp (_rotate_and_correct_accel, _rotate_and_correct_gyro), AP_InertialSensor_tempcal.cpp
-    (polynomial_eval, correct_sensor).
+    These are the axes before the board's orientation.
+
+    ArduPilot/ardupilot, AP_InertialSensor_Backend.cpp (_rotate_and_correct_accel,
+    _rotate_and_correct_gyro), AP_InertialSensor_tempcal.cpp (polynomial_eval, correct_sensor).
     """
     p = parameters(text)
 
@@ -145,7 +157,9 @@ def ardupilot(text, accel, gyro, temperature_c):
 
 def autoware(text, accel, gyro):
     """
-    Return (accel, gyro) before the turn to base_link, with the scale that the comment of the file tells to publish.
+    Return (accel, gyro) before the turn to base_link.
+
+    With the scale that the comment of the file tells to publish.
 
     autowarefoundation/autoware_universe, imu_corrector_core.cpp (callback_imu).
     """
@@ -161,14 +175,22 @@ def autoware(text, accel, gyro):
 
 
 def imu_calib(text, accel, gyro):
-    """Return corrected accel, and gyro as it is; dpkoch/imu_calib, accel_calib.cpp (loadCalib, applyCalib)."""
+    """
+    Return corrected accel, and gyro as it is.
+
+    Dpkoch/imu_calib, accel_calib.cpp (loadCalib, applyCalib).
+    """
     node = safe_load(text)
     matrix = np.array([[node['SM'][3 * i + j] for j in range(3)] for i in range(3)])
     return matrix @ accel - node['bias'], gyro
 
 
 def imu_tk(text, raw):
-    """Return calibrated readings of one sensor; imu_tk, calibration.h (CalibratedTriad_::load, unbiasNormalize)."""
+    """
+    Return calibrated readings of one sensor.
+
+    Imu_tk, calibration.h (CalibratedTriad_::load, unbiasNormalize).
+    """
     values = [float(word) for word in text.split()]
     mis, scale, bias = (
         np.reshape(values[:9], (3, 3)),
@@ -180,10 +202,13 @@ def imu_tk(text, raw):
 
 def spread_in_a_second(name, text, dt):
     """
-    Return the variances that an estimator expects after one second, {(sensor, 'white' or 'walk'): value}.
+    Return the variances that an estimator expects after one second.
 
-    'white': of the integral of a sensor's readings, were they nothing but noise; 'walk': of its bias. For each: the variance of one step
-    in the program's own code, with the names in its file, times the number of steps.
+    They are {(sensor, 'white' or 'walk'): value}.
+
+    'white': of the integral of a sensor's readings, were they nothing but noise; 'walk': of its
+    bias. For each: the variance of one step in the program's own code, with the names in its file,
+    times the number of steps.
     """
     steps = 1.0 / dt
     head = text.split('\n', 1)[1] if text.startswith('%YAML') else text

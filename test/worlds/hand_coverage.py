@@ -1,4 +1,9 @@
-"""Do standard deviations by hand hold where the hand and the sensor do what no model holds? ``python -m worlds.hand_coverage`` in test/."""
+"""
+Check whether standard deviations by hand hold where no model holds.
+
+The hand and the sensor then do things that no model holds; run ``python -m worlds.hand_coverage``
+in test/.
+"""
 
 from argparse import ArgumentParser
 
@@ -20,7 +25,10 @@ WORLDS = {
     'poses that do not repeat': {'pose_sd': 0.02, 'drift_sd': 2e-3},
     'flexing grip': {'settling': 0.009},
 }
-"""What `hold_and_turn` is told: 0.15 deg/s of creep, 2 mg and 0.11 deg/s from pose to pose, half a degree of giving way."""
+"""
+What `hold_and_turn` is told: 0.15 deg/s of creep, 2 mg and 0.11 deg/s from pose to pose, half a
+degree of giving way.
+"""
 GROUPS = {
     'accelerometer.bias': slice(0, 3),
     'accelerometer.matrix': slice(3, 9),
@@ -30,7 +38,11 @@ GROUPS = {
 
 
 def session(world, seed, n_poses=24):
-    """Return (data, truth, change of the biases from the start to the mean over the recording) of one session of a world, found as a user's would be."""
+    """
+    Return (data, truth, change of the biases) of one session of a world.
+
+    The change is from the start to the mean over the recording, found as a user's would be.
+    """
     imu, _, truth = hold_and_turn(seed, n_poses=n_poses, rate_hz=50.0, **WORLDS[world])
     moved = {sensor: np.zeros(3) for sensor in SENSORS}
     if world == 'warm-up':
@@ -49,7 +61,11 @@ def session(world, seed, n_poses=24):
 
 
 def errors(world, seed, **options):
-    """Return group -> (errors, reported sds, factor of the sds on those that noise and scatter alone give)."""
+    """
+    Return group -> (errors, reported sds, factor of the sds).
+
+    The factor is the ratio to the sds that only noise and scatter give.
+    """
     data, truth, moved = session(world, seed, **options)
     hand, truth = solve_by_evidence(data, HandOptions(GRAVITY)).hand, truth.copy()
     for sensor, part in zip(SENSORS, (slice(0, 3), slice(9, 12)), strict=True):
@@ -76,9 +92,11 @@ def main():
             off, sd, grown = (np.concatenate([run[group][k] for run in runs]) for k in range(3))
             alone = off / (sd / grown)
             print(
-                f'{world:26s} {group:22s} noise alone {np.sqrt(np.mean(alone**2)):5.2f} {100 * np.mean(np.abs(alone) < 1.96):4.0f} %   '
-                f'reported {np.sqrt(np.mean((off / sd) ** 2)):5.2f} {100 * np.mean(np.abs(off / sd) < 1.96):4.0f} %   '
-                f'wider by {np.median(grown):.2f} (95 %: {np.quantile(grown, 0.95):.2f})',
+                f'{world:26s} {group:22s} noise alone {np.sqrt(np.mean(alone**2)):5.2f}'
+                f' {100 * np.mean(np.abs(alone) < 1.96):4.0f} %   reported'
+                f' {np.sqrt(np.mean((off / sd) ** 2)):5.2f}'
+                f' {100 * np.mean(np.abs(off / sd) < 1.96):4.0f} %   wider by'
+                f' {np.median(grown):.2f} (95 %: {np.quantile(grown, 0.95):.2f})',
                 flush=True,
             )
 

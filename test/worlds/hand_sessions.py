@@ -1,4 +1,8 @@
-"""Recordings by hand, simulated: held still in poses, turned between them by smooth motions whose rates are exact."""
+"""
+Recordings by hand, simulated.
+
+Held still in poses, turned between them by smooth motions whose rates are exact.
+"""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,7 +18,10 @@ PARAM_NAMES = (
     *(f'gyroscope.matrix.{k}' for k in SQUARE),
     *(f'gyroscope.gyro_g_sensitivity.{k}' for k in SQUARE),
 )
-"""Truths are laid out like this: the accelerometer's matrix without the elements above its diagonal, which are zero."""
+"""
+Truths are laid out like this: the accelerometer's matrix without the elements above its diagonal,
+which are zero.
+"""
 NOMINAL, SENSITIVITY = (
     np.array(
         [float(name.endswith(('matrix.xx', 'matrix.yy', 'matrix.zz'))) for name in PARAM_NAMES]
@@ -42,7 +49,11 @@ def random_truth(rng, sensitivity=0.0):
 
 
 def turn_samples(start, rotvec, wobble, period, duration):
-    """Attitudes and exact body rates of a turn that starts and ends at rest; the axis wobbles on the way."""
+    """
+    Attitudes and exact body rates of a turn that starts and ends at rest.
+
+    The axis wobbles on the way.
+    """
     s = np.arange(period, duration - 0.5 * period, period) / duration
     share, speed = s**3 * (10 - 15 * s + 6 * s**2), 30 * s**2 * (1 - s) ** 2 / duration
     bump, bump_speed = 4 * share * (1 - share), 4 * speed * (1 - 2 * share)
@@ -70,8 +81,8 @@ def simulate(
     """
     A recording held still in poses with turns between; returns (imu, ranges, true parameters).
 
-    `spoil(force, rate, time, pose)` returns what a hidden cause adds to both outputs, for the true motion and the number of the pose that
-    each sample is in or leaves.
+    `spoil(force, rate, time, pose)` returns what a hidden cause adds to both outputs, for the true
+    motion and the number of the pose that each sample is in or leaves.
     """
     rng = np.random.default_rng(seed)
     truth = random_truth(rng, sensitivity) if truth is None else truth

@@ -1,4 +1,8 @@
-"""Sessions by hand with one disturbance each, by its physics: 43 rests, turns and full turns at 100 Hz; nothing here knows the estimator."""
+"""
+Sessions by hand with one disturbance each, by its physics.
+
+43 rests, turns and full turns at 100 Hz; nothing here knows the estimator.
+"""
 
 from dataclasses import replace
 
@@ -10,19 +14,27 @@ from imu_calibration.core.samples import ImuSamples
 from worlds.hand_sessions import FACES, GRAVITY, random_truth, turn_samples, unpack
 
 RATE_HZ, RESTS, FIRST, STILL = 100.0, 43, 10.0, (2.5, 4.0)
-"""The first rest, from which peers take noise and bias, and the shortest and longest of the others, s."""
+"""
+The first rest, from which peers take noise and bias, and the shortest and longest of the others, s.
+"""
 FULL_TURN_EVERY = 4
 FADE = 0.1
 """A disturbance of a rest grows and fades within this time, s."""
 VIBRATION = ((17.0, 0.3), (31.0, 0.2))
 """Hz, amplitude in m/s^2; the gyroscope shows 0.02 rad/s at each."""
 TREMOR, TREMOR_RATE, SWAY = 0.002 * GRAVITY, np.radians(0.3), np.radians(0.02)
-"""Rms specific force (m/s^2) and rate (rad/s) at 7 to 11 Hz, and rms angle of the slow sway (rad)."""
+"""
+Rms specific force (m/s^2) and rate (rad/s) at 7 to 11 Hz, and rms angle of the slow sway (rad).
+"""
 KELVIN, WARM_UP = 10.0, 80.0
 
 
 def clean(seed, rests=RESTS):
-    """Return (ImuSamples, ranges of the rests, parameters at the end, which are those of the whole session)."""
+    """
+    Return (ImuSamples, ranges of the rests, parameters at the end).
+
+    The parameters at the end are the ones of the entire session.
+    """
     return _session(seed, rests)
 
 
@@ -52,7 +64,11 @@ def jitter(seed, rests=RESTS, sd=3e-3):
 
 
 def ramp(seed, rests=RESTS):
-    """A board that warms up by 10 K after power-on; no temperature is recorded. The parameters are those of the warm sensor, at the end."""
+    """
+    A board that warms up by 10 K after power-on; no temperature is recorded.
+
+    The parameters are those of the warm sensor, at the end.
+    """
     imu, ranges, truth = _session(seed, rests)
     rng, time = np.random.default_rng([seed, 4]), 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
     warm = -KELVIN * np.expm1(-time / WARM_UP)
@@ -132,7 +148,11 @@ def _session(seed, rests, disturb=None, force_sd=0.02, rate_sd=0.002):
 
 
 def _to_face(attitude, face, rng):
-    """Return a rotation vector in the sensor's axes after which `face` points up, with a turn about it."""
+    """
+    Return a rotation vector in the sensor's axes after which `face` points up.
+
+    With a turn about it.
+    """
     up = attitude.inv().apply([0, 0, 1.0])
     axis = np.cross(face, up)
     turn = Rotation.from_rotvec(

@@ -1,4 +1,8 @@
-"""The record of a run of hide and seek: kept in the repository, compressed, so that another run can be compared with it row by row."""
+"""
+The record of a run of hide and seek.
+
+Kept in the repository, compressed, so that another run can be compared with it row by row.
+"""
 
 import gzip
 import json
@@ -22,7 +26,11 @@ def read(path=KEPT):
 
 
 def keep(rows, path=KEPT):
-    """Write a record, in an order and with digits that do not depend on the machine's speed: rows of the same sessions replace those kept."""
+    """
+    Write a record, in an order and with digits that do not depend on the machine's speed.
+
+    Rows of the same sessions replace those kept.
+    """
     every = {_key(row): row for row in [*read(path), *rows] if row['part'] != 'failed'}
     text = ''.join(json.dumps(_rounded(every[key])) + '\n' for key in sorted(every))
     beside = path.with_suffix('.new')

@@ -56,7 +56,10 @@ SIZES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 BUNDLE = 13
 """Effects that one task hides: each task needs a session that hides nothing, for the sizes."""
 PAIR_SESSIONS, BEYOND_ROUNDS = 40, 10
-"""Sessions to which all pairs are dealt, and times that each kind of cause beyond the catalogue is hidden."""
+"""
+Sessions to which all pairs are dealt, and times that each kind of cause beyond the catalogue is
+hidden.
+"""
 FINE = ('tactical', 'navigation')
 """Grades at which the Earth's rate, whose size nobody chooses, is well above detectability."""
 
@@ -117,7 +120,11 @@ def failed(what, problem):
 
 
 def oracle(recording, effect):
-    """Return the held-out rms of what was found over that of a searcher who was told the effect, or None where nothing compares."""
+    """
+    Return the held-out rms of what was found over that of a searcher who was told the effect.
+
+    Or None where nothing compares.
+    """
     found = investigate(recording.windows, recording.table, recording.model)
     asked = [q for q in found.problem.questions if q.name == effect]
     if not asked or found.limits:
@@ -133,7 +140,11 @@ def oracle(recording, effect):
 
 
 def effects_of_seed(seed, noise, effects, profile='random', table='three_axis', part='effects'):
-    """Hide nothing, which gives the sizes, and each effect at five times the smallest detectable size in the same session."""
+    """
+    Hide nothing, which gives the sizes, and then each effect.
+
+    Each effect is at five times the smallest detectable size in the same session.
+    """
     options = {'profile': profile, 'table': table}
 
     def row(effect):
@@ -172,7 +183,11 @@ def nothing_of(sizes, seed, noise):
 
 
 def separating_of_seed(seed, noise, effects):
-    """Hide each effect in a session made to separate relatives: many angles, three speeds both ways, on an arm."""
+    """
+    Hide each effect in a session made to separate relatives.
+
+    Many angles, three speeds both ways, on an arm.
+    """
     return effects_of_seed(
         seed, noise, effects, profile='separating', table='centrifuge', part='separating'
     )
@@ -235,7 +250,9 @@ def traps_of_seed(seed, names):
 
 
 def sizes_of_seed(seed, noise, effects, factors, part='sizes'):
-    """Hide effects at several times the smallest detectable size; those of part 'power' are around it."""
+    """
+    Hide effects at several times the smallest detectable size; those of part 'power' are around it.
+    """
 
     def row(case):
         effect, factor = case
@@ -258,10 +275,12 @@ def sizes_of_seed(seed, noise, effects, factors, part='sizes'):
 
 def tasks_of(options):
     """
-    Return (function, arguments) of everything that is to run; parts take turns, so that a run cut short has some of each.
+    Return (function, arguments) of everything that is to run.
 
-    Each round of the part `effects` hides every effect once in white noise and once in a kind of realistic noise that is dealt to it, at each
-    grade; each task has a session of its own.
+    Parts take turns, so that a run cut short has some of each.
+
+    Each round of the part `effects` hides every effect once in white noise and once in a kind of
+    realistic noise that is dealt to it, at each grade; each task has a session of its own.
     """
     names = tuple(options.effects.split(',')) if options.effects else all_effects()
     rounds, first = range(options.seeds), options.first_seed
@@ -346,7 +365,11 @@ def beyond_of_seed(seed, noise, kinds):
 
 
 def _singles(names, number, grade, asked):
-    """Return (noise, effects) of a round at a grade: all in white noise and dealt to the kinds of realistic noise, or all in each that is asked for."""
+    """
+    Return (noise, effects) of a round at a grade.
+
+    All in white noise and dealt to the kinds of realistic noise, or all in each that is asked for.
+    """
     every = [
         (f'{noise}@{grade}', hand)
         for noise in asked or ('white',)

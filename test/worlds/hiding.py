@@ -1,4 +1,8 @@
-"""Sessions with something hidden in them, as large as a search could just detect, or any multiple of it; recorded through a bag."""
+"""
+Sessions with something hidden in them.
+
+As large as a search could just detect, or any multiple of it; recorded through a bag.
+"""
 
 import tempfile
 import time
@@ -41,7 +45,11 @@ class Recording:
 
 
 def record(seed, hidden=None, noise='white', through_bag=True, **options):
-    """Return the Recording of a session made by physics (`physics.make_session`), written to a bag and read again."""
+    """
+    Return the Recording of a session made by physics (`physics.make_session`).
+
+    The session is written to a bag and read again.
+    """
     kind, _, grade = noise.partition('@')
     session = physics.make_session(
         seed, hidden, kind, **({'grade': grade} if grade else {}) | options
@@ -80,7 +88,11 @@ def _empty(seed, noise, options):
 
 
 def sizes_for(seed, noise, effects, options):
-    """Return the Sizes in the session of a seed that hides nothing, of the kind that shows the effects."""
+    """
+    Return the Sizes in the session of a seed that hides nothing.
+
+    It is of the kind that shows the effects.
+    """
     return _empty(seed, noise, tuple(sorted({**options, **options_of(*effects)}.items())))
 
 
@@ -95,7 +107,11 @@ def pattern(effect, seed, n_joints=3):
 
 @lru_cache(maxsize=None)
 def threshold_noncentrality(n_parameters, n_questions):
-    """Return the noncentrality at which an effect passes the rules of the search half of the time: its threshold, its penalties, its held-out windows."""
+    """
+    Return the noncentrality at which an effect passes the rules of the search half of the time.
+
+    Its threshold, its penalties, its held-out windows.
+    """
     return brentq(
         lambda value: passing(value, n_parameters, n_questions).mean() - 0.5, 1.0, 1000.0, xtol=0.1
     )
@@ -103,10 +119,13 @@ def threshold_noncentrality(n_parameters, n_questions):
 
 def passing(noncentrality, n_parameters, n_questions, draws=4000):
     """
-    Return which draws of an effect pass the rules of the search, shape (draws,), where the noise is Gaussian and each fold knows as much as the others.
+    Return which draws of an effect pass the rules of the search, shape (draws,).
 
-    The chi-square test over all questions, the gain of held-out log likelihood with its least value and its penalty for each parameter, and the fall of the residual from
-    window to window in the unit of the sensor, for sure (95 %). Shares of a rest and halves are no part of it.
+    Where the noise is Gaussian and each fold knows as much as the others.
+
+    The chi-square test over all questions, the gain of held-out log likelihood with its least value
+    and its penalty for each parameter, and the fall of the residual from window to window in the
+    unit of the sensor, for sure (95 %). Shares of a rest and halves are no part of it.
     """
     noise = np.random.default_rng(1).normal(size=(draws, EVIDENCE_FOLDS, n_parameters)) * np.sqrt(
         EVIDENCE_FOLDS
@@ -124,7 +143,11 @@ def passing(noncentrality, n_parameters, n_questions, draws=4000):
 
 
 class Sizes:
-    """Smallest detectable sizes: the search finds half of them, the baseline projected out, from the session that hides nothing."""
+    """
+    Smallest detectable sizes.
+
+    The search finds half of them, the baseline projected out, from the session that hides nothing.
+    """
 
     def __init__(self, recording):
         self.recording, start = recording, time.process_time()
@@ -138,7 +161,11 @@ class Sizes:
         )
 
     def hidden(self, effect, seed, factor):
-        """Return what to hide: of random shape, `factor` times as large as detectable; None where nature gives the size."""
+        """
+        Return what to hide: of random shape, `factor` times as large as detectable.
+
+        None where nature gives the size.
+        """
         if effect in NOT_SIZED:
             return None
         if effect.endswith('_saturation'):
@@ -162,7 +189,12 @@ class Sizes:
         )
 
     def beside(self, hidden):
-        """Return how many times the smallest detectable size is left of each of two hidden effects where the other one may take any value; no limit for limits."""
+        """
+        Return how many times the smallest detectable size is left of each hidden effect.
+
+        It is left where the other one of the two hidden effects may have any value, and there is no
+        limit for limits.
+        """
         sized = {
             name: self._direction(name, np.ravel(value))
             for name, value in hidden.items()

@@ -1,4 +1,8 @@
-"""A call in a process of its own with limited memory and processor time, so that hostile input cannot take down the tests."""
+"""
+A call in a process of its own with limited memory and processor time.
+
+So that hostile input cannot take down the tests.
+"""
 
 import contextlib
 import io
@@ -41,7 +45,9 @@ class Ended(NamedTuple):
 
 
 def limited(function, *arguments) -> Ended:
-    """Return what became of ``function(*arguments)`` under the limits; `function` must be importable."""
+    """
+    Return what became of ``function(*arguments)`` under the limits; `function` must be importable.
+    """
     context = multiprocessing.get_context('forkserver')
     context.set_forkserver_preload(PRELOAD)
     ours, theirs = context.Pipe(duplex=False)
@@ -57,7 +63,9 @@ def limited(function, *arguments) -> Ended:
 
 
 def refused(*arguments) -> Ended:
-    """Run the command line under the limits and assert that it refused in one line, within 500 MB."""
+    """
+    Run the command line under the limits and assert that it refused in one line, within 500 MB.
+    """
     return _refused_or_warned(arguments, (1,))
 
 
@@ -75,7 +83,8 @@ def _refused_or_warned(arguments, codes):
     assert ended.code != 1 or (ended.err.count('\n') == 1 and len(ended.err) < 3000), said
     assert all(character.isprintable() or character in '\n\r' for character in ended.err), said
     print(
-        f'{arguments[0]}: {ended.seconds:.2f} s, {ended.megabytes:.0f} MB, exit code {ended.code}: {ended.err.strip()}'
+        f'{arguments[0]}: {ended.seconds:.2f} s, {ended.megabytes:.0f} MB, exit code {ended.code}:'
+        f' {ended.err.strip()}'
     )
     return ended
 

@@ -1,4 +1,8 @@
-"""Short sessions for the tests of the nodes: enough motion for an answer in a few seconds of processing."""
+"""
+Short sessions for the tests of the nodes.
+
+Enough motion for an answer in a few seconds of processing.
+"""
 
 import numpy as np
 
@@ -52,7 +56,9 @@ def assert_same(live, expected, share=1e-6):
 
 
 def errors_in_sd(calibration, model, values):
-    """Return the errors of the IMU's own parameters in standard deviations (true values of `model`)."""
+    """
+    Return the errors of the IMU's own parameters in standard deviations (true values of `model`).
+    """
     found = []
     for effect in model.effects:
         if (effect.sensor, effect.name) in calibration.model.slices:

@@ -1,8 +1,12 @@
 """
-Do intervals of a calibration hold where something goes on that no catalogue holds? ``python -m worlds.misfit_coverage [--seeds N]`` in test/.
+Check whether intervals of a calibration hold where unknown things happen.
 
-Prints for each world and group of parameters the root mean square of the errors in standard deviations, with those that noise alone gives
-and as reported, how often the 95 % interval holds, and how much wider than by noise alone the standard deviations are.
+Something happens then that no catalogue holds; run ``python -m worlds.misfit_coverage [--seeds N]``
+in test/.
+
+Prints for each world and group of parameters the root mean square of the errors in standard
+deviations, with those that noise alone gives and as reported, how often the 95 % interval holds,
+and how much wider than by noise alone the standard deviations are.
 """
 
 import argparse
@@ -65,7 +69,11 @@ def base_sd(solution):
 
 
 def errors_in_sd(found):
-    """Return ('noise alone' or 'reported', group) -> errors of its parameters in standard deviations, those held left out."""
+    """
+    Return ('noise alone' or 'reported', group) -> errors in standard deviations.
+
+    The errors are of the group's parameters, with the held parameters left out.
+    """
     errors, solution = {}, found.solution
     for group in GROUPS:
         sensor, name = group.split('.')
@@ -86,7 +94,8 @@ def main():
     parser.add_argument('--first', type=int, default=FIRST_SEED)
     arguments = parser.parse_args()
     print(
-        f'| world | parameters | rms error in sd, noise alone | as reported | 95 % interval holds | wider, median (95 %) |\n|{" --- |" * 6}'
+        '| world | parameters | rms error in sd, noise alone | as reported | 95 % interval holds |'
+        f' wider, median (95 %) |\n|{" --- |" * 6}'
     )
     for cause in (None, *CAUSES):
         results = [
@@ -104,8 +113,10 @@ def main():
                 [(found.solution.sd / base_sd(found.solution))[part] for found in results]
             )
             print(
-                f'| {cause or "clean"} | {group} | {np.sqrt(np.mean(alone**2)):.1f} | {np.sqrt(np.mean(reported**2)):.1f} | '
-                f'{100 * np.mean(np.abs(reported) < 1.96):.0f} % | {np.median(wider):.1f} ({np.quantile(wider, 0.95):.1f}) |',
+                f'| {cause or "clean"} | {group} | {np.sqrt(np.mean(alone**2)):.1f} |'
+                f' {np.sqrt(np.mean(reported**2)):.1f} |'
+                f' {100 * np.mean(np.abs(reported) < 1.96):.0f} % | {np.median(wider):.1f}'
+                f' ({np.quantile(wider, 0.95):.1f}) |',
                 flush=True,
             )
 

@@ -1,9 +1,10 @@
 """
 Pairs of sessions of one IMU in worlds where something goes on that no catalogue of effects holds.
 
-`make_pair` returns a first session to calibrate on and a second one to compensate: the same unit, table and cause, another motion and
-other noise. Each cause is made by its physics at the place where it acts: the motor moves the table, the encoder is read, the fixture
-gives way, the filter runs, the driver stamps.
+`make_pair` returns a first session to calibrate on and a second one to compensate: the same unit,
+table and cause, another motion and other noise. Each cause is made by its physics at the place
+where it acts: the motor moves the table, the encoder is read, the fixture gives way, the filter
+runs, the driver stamps.
 """
 
 from dataclasses import dataclass
@@ -68,7 +69,11 @@ class Disturbed:
 
 
 class MotorRipple(Cause):
-    """The torque of a motor varies with its angle at several orders, poles and steps: the joint runs ahead and behind."""
+    """
+    The torque of a motor varies with its angle at several orders, poles and steps.
+
+    The joint runs ahead and behind.
+    """
 
     ORDERS, AMPLITUDES = (6, 24, 50), (2e-3, 4e-4, 1.5e-4)
 
@@ -90,7 +95,11 @@ class MotorRipple(Cause):
 
 
 class Cogging(Cause):
-    """Magnets pull the joint into detents: at low speed it sticks and jumps, at high speed inertia carries it over."""
+    """
+    Magnets pull the joint into detents.
+
+    At low speed it sticks and jumps, at high speed inertia carries it over.
+    """
 
     DETENTS, DEPTH, SMOOTH_FROM = 48, 5e-3, 30.0 * DEG
 
@@ -105,7 +114,11 @@ class Cogging(Cause):
 
 
 class Backlash(Cause):
-    """The encoder sits on the motor's side of a gear with play: after each reversal the motor crosses the play while friction holds the load."""
+    """
+    The encoder sits on the motor's side of a gear with play.
+
+    After each reversal the motor crosses the play while friction holds the load.
+    """
 
     PLAY, CROSSING = 0.25 * DEG, 0.04
 
@@ -136,7 +149,11 @@ def _last_sign(rate):
 
 
 class EncoderEccentricity(Cause):
-    """The encoder's disc runs out of true and is not round: its reading errs with the first and the second harmonic of the angle."""
+    """
+    The encoder's disc runs out of true and is not round.
+
+    Its reading errs with the first and the second harmonic of the angle.
+    """
 
     ORDERS, AMPLITUDES = (1, 2), (8.0 * ARCMIN, 4.0 * ARCMIN)
 
@@ -161,7 +178,11 @@ class GearEccentricity(EncoderEccentricity):
 
 
 class FlexibleMount(Cause):
-    """The bracket is a spring that the IMU's inertia winds up and gravity bends: it turns against the plate, and rings."""
+    """
+    The bracket is a spring that the IMU's inertia winds up and gravity bends.
+
+    It turns against the plate, and rings.
+    """
 
     FREQUENCY, DAMPING, SAG = 9.0, 0.15, 0.3 * DEG
     oversampling = 8
@@ -170,7 +191,8 @@ class FlexibleMount(Cause):
         """
         Turn force and rate by the bracket's deflection theta, to first order.
 
-        ``theta'' + 2 d w theta' + w^2 theta = size (w^2 sag (e x f) / g - alpha)``, e a lever to the centre of mass.
+        ``theta'' + 2 d w theta' + w^2 theta = size (w^2 sag (e x f) / g - alpha)``, e a lever to
+        the centre of mass.
         """
         omega, step = 2.0 * np.pi * self.FREQUENCY, time[1] - time[0]
         drive = self.size * (omega**2 * self.SAG * np.cross(_lever(), force_s) / 9.80665 - alpha_s)
@@ -196,7 +218,11 @@ def _lever():
 
 
 class RateDependentLag(Cause):
-    """The device's firmware works longer when it turns faster: what it hands on is old, by more at high rates."""
+    """
+    The device's firmware works longer when it turns faster.
+
+    What it hands on is old, by more at high rates.
+    """
 
     AT_REST, PER_RATE = 4e-3, 4e-3
     oversampling = 4
@@ -215,7 +241,11 @@ class DriverLag(RateDependentLag):
 
 
 class LagJitter(Cause):
-    """The transport takes a time that differs from message to message and wanders, seldom much: stamps of arrival."""
+    """
+    The transport takes a time that differs from message to message and wanders, seldom much.
+
+    Stamps of arrival.
+    """
 
     SMALLEST, MEAN, WANDER = 2e-3, 3e-3, 2e-3
 
@@ -230,7 +260,11 @@ class LagJitter(Cause):
 
 
 class StampBursts(Cause):
-    """The driver's thread is held up now and then; what queued is delivered at once and stamped on arrival."""
+    """
+    The driver's thread is held up now and then.
+
+    What queued is delivered at once and stamped on arrival.
+    """
 
     EVERY, HELD_UP = 4.0, 0.08
 
@@ -301,7 +335,8 @@ def make_pair(
     size : float
         Of the cause; 1: clearly visible, 0: none.
     table, profile : str or dict, str
-        As for `worlds.physics.make_session`; table 'shaft' with profile 'sweeps': one joint swept to and fro, a quarter faster in the second session.
+        As for `worlds.physics.make_session`; table 'shaft' with profile 'sweeps': one joint swept
+        to and fro, a quarter faster in the second session.
     noise, grade, options
         As for `worlds.physics.make_session`.
 
@@ -326,7 +361,11 @@ def make_pair(
 
 
 def sweeps(pace=1.0, seconds=100.0):
-    """Return what a motor that advances in jerks does: 190 deg/s to and fro at pace 1 with 6 Hz on top, between rests."""
+    """
+    Return what a motor that advances in jerks does.
+
+    190 deg/s to and fro at pace 1 with 6 Hz on top, between rests.
+    """
     builder = MotionBuilder(1)
     builder.rest(5.0)
     for _ in range(round(seconds / 25.0)):

@@ -1,4 +1,8 @@
-"""Worlds in which something changes at one moment, or the clock of the sensor runs away: each by its physics."""
+"""
+Worlds in which something changes at one moment, or the clock of the sensor runs away.
+
+Each by its physics.
+"""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +23,12 @@ class Clock(Cause):
 
 
 class Moment(Cause):
-    """After a share of the session the axes x and y are exchanged ('axes'), the sensor is turned by `turn` ('mount', 'creep': gradually), or a joint slips ('belt')."""
+    """
+    After a share of the session the sensor or the table changes.
+
+    Then the axes x and y are exchanged ('axes'), the sensor is turned by `turn` ('mount', 'creep':
+    gradually), or a joint slips ('belt').
+    """
 
     def __init__(self, kind, share=0.55, turn=(0.01, -0.006, 0.008), joint=1, slip=0.03):
         super().__init__()

@@ -1,4 +1,8 @@
-"""Noise of known coefficients, by its physics: steps of a converter, white noise, flicker, a walk, a process that forgets, and grades made of them."""
+"""
+Noise of known coefficients, by its physics.
+
+Steps of a converter, white noise, flicker, a walk, a process that forgets, and grades made of them.
+"""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -20,7 +24,11 @@ def white(n, period, density, rng):
 
 
 def random_walk(n, period, density, rng):
-    """Means over the periods of a random walk whose steps over t seconds scatter by density times the root of t."""
+    """
+    Means over the periods of a random walk.
+
+    Its steps over t seconds scatter by density times the root of t.
+    """
     ends = np.cumsum(rng.standard_normal(n + 1))
     bridges = rng.standard_normal(n) / np.sqrt(12.0)
     return density * np.sqrt(period) * (0.5 * (ends[1:] + ends[:-1]) + bridges)
@@ -35,7 +43,11 @@ def gauss_markov(n, period, sd, time, rng):
 
 
 def flicker(n, period, instability, rng):
-    """Means over the periods of noise with the two-sided density instability^2 / (2 pi f), down to an eighth of what the record holds."""
+    """
+    Means over the periods of noise with the density instability^2 / (2 pi f).
+
+    The density is two-sided, down to an eighth of the extent of the record.
+    """
     length = next_fast_len(8 * n)
     size = _folded_flicker(length, period)
     drive = (rng.standard_normal(len(size)) + 1j * rng.standard_normal(len(size))) * size
@@ -44,7 +56,11 @@ def flicker(n, period, instability, rng):
 
 @lru_cache(maxsize=2)
 def _folded_flicker(length, period):
-    """Return the root of half the density of such means for unit instability, with what folds back from higher frequencies; none at zero."""
+    """
+    Return the root of half the density of such means for unit instability.
+
+    With what folds back from higher frequencies; none at zero.
+    """
     frequency = np.arange(length // 2 + 1) / (length * period)
     frequency[0] = frequency[1]
     folded = np.zeros(len(frequency))
@@ -62,7 +78,11 @@ def quantisation(n, period, coefficient, rng):
 
 @dataclass(frozen=True)
 class AxisTruth:
-    """Figures of one axis: name of the process -> figure; 'gauss_markov' and 'correlation_time' together."""
+    """
+    Figures of one axis: name of the process -> figure.
+
+    'gauss_markov' and 'correlation_time' together.
+    """
 
     figures: dict = field(default_factory=dict)
 
@@ -107,7 +127,11 @@ FORMS = (
 
 
 def draw_truth(grade, sensor, form, rng):
-    """Return the figures of an axis: the grade's densities and instability within a factor of two, in one of `FORMS`."""
+    """
+    Return the figures of an axis.
+
+    The grade's densities and instability within a factor of two, in one of `FORMS`.
+    """
     noise = GRADES[grade].noise
     density, instability = (
         (noise.accel_density, noise.accel_instability)

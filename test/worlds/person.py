@@ -1,4 +1,8 @@
-"""Somebody who has only the picture: turns the IMU where the arrow points, ten degrees off, holds it with a trembling hand, looks again."""
+"""
+Somebody who has only the picture.
+
+Turns the IMU where the arrow points, ten degrees off, holds it with a trembling hand, looks again.
+"""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -49,7 +53,11 @@ class Person:
         )
 
     def go(self, axis, angle):
-        """Return the samples of a turn about an axis of the sensor, and of the pose in which it ends, some degrees off."""
+        """
+        Return the samples of a turn about an axis of the sensor, and of the end pose.
+
+        The end pose is the pose in which the turn ends, some degrees off.
+        """
         aim = (
             Rotation.from_rotvec(np.asarray(axis) * angle)
             * Rotation.from_rotvec(self.rng.normal(0, OFF / np.sqrt(3), 3))

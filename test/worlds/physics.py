@@ -1,9 +1,9 @@
 """
 A turntable session made by physics, to hide effects in and to find them again.
 
-Nothing here knows the catalogue of effects or the estimator: the table stands crooked, the clock is late, the filter runs on a
-grid finer than the samples. `make_session` returns what a bag would hold, the table description that the searcher gets, and
-the truth.
+Nothing here knows the catalogue of effects or the estimator: the table stands crooked, the clock is
+late, the filter runs on a grid finer than the samples. `make_session` returns what a bag would
+hold, the table description that the searcher gets, and the truth.
 """
 
 import copy
@@ -75,8 +75,10 @@ class Session:
     covariance: dict | None
     """Variances that the messages claim ('force', 'rate'), or None for unknown."""
     truth: dict
-    """'accelerometer' and 'gyroscope' (Triads), 'values' (effect name -> value), 'earth_n', 'gravity', 'temperature_c' (at the IMU
-    samples), 'profile', 'noise', 'start_ns', and times of events."""
+    """
+    'accelerometer' and 'gyroscope' (Triads), 'values' (effect name -> value), 'earth_n', 'gravity',
+    'temperature_c' (at the IMU samples), 'profile', 'noise', 'start_ns', and times of events.
+    """
 
     @property
     def block(self):
@@ -117,12 +119,12 @@ def make_session(
     seed : int
         Draws the IMU, the motion (of 'random'), the effects' values and the noise.
     hidden : dict, optional
-        Effect (or outside cause) -> size. A number is the magnitude of a drawn value, None a clearly visible one, an array the
-        value itself. Saturation: the fraction of samples that are clipped, or the array (level,). Drift: the amplitude, or the
-        array (x, y, z, time constant).
+        Effect (or outside cause) -> size. A number is the magnitude of a drawn value, None a
+        clearly visible one, an array the value itself. Saturation: the fraction of samples that are
+        clipped, or the array (level,). Drift: the amplitude, or the array (x, y, z, time constant).
     noise : str or SimulatedNoise
-        'none', 'white', or 'realistic': bias wander, encoder resolution and stamp jitter too; a name in `worlds.wanders.WANDERS`:
-        realistic, but the bias wanders in that way.
+        'none', 'white', or 'realistic': bias wander, encoder resolution and stamp jitter too; a
+        name in `worlds.wanders.WANDERS`: realistic, but the bias wanders in that way.
     grade : str
         IMU grade in `imu_calibration.simulation.sensor_noise.GRADES`.
     duration : float, optional
@@ -134,7 +136,8 @@ def make_session(
     arms : bool
         Give every accelerometer an arm of its own although none is hidden.
     temperature : str or None
-        'warm_up' (8 K), 'cycle' (a heater too), or None: the same temperature, but nobody publishes it.
+        'warm_up' (8 K), 'cycle' (a heater too), or None: the same temperature, but nobody publishes
+        it.
     velocity : str
         'good', 'none' (NaN), 'zero' or 'differences'.
     encoder_resolution : float, optional
@@ -169,7 +172,8 @@ def make_session(
     )
     moves = cause.moved(told)
     n_joints = len(mapping['joints'])
-    # Every thing is drawn from its own generator: hiding an effect leaves unit, motion and noise as they were.
+    # Every thing is drawn from its own generator: hiding an effect leaves unit, motion and noise as
+    # they were.
     values = {
         name: draw_value(name, size, n_joints, generator(seed, name))
         for name, size in hidden.items()
@@ -370,14 +374,22 @@ def _sense(world, triads, temperature_c, values, events, cause):
 
 
 def bent(time, force_s, rate_s, compliance):
-    """Return force and rate in a sensor whose mount turns by the rotation vector ``compliance @ force``, exactly."""
+    """
+    Return force and rate in a sensor with a compliant mount, exactly.
+
+    The mount turns by the rotation vector ``compliance @ force``.
+    """
     turn = force_s @ np.asarray(compliance).T
     back = Rotation.from_rotvec(turn).inv()
     return back.apply(force_s), back.apply(rate_s) + np.gradient(turn, time, axis=0)
 
 
 def _set_limits(triads, outputs, values):
-    """Give the triads their range; a fraction becomes the level that this share of samples would pass on some axis."""
+    """
+    Give the triads their range.
+
+    A fraction becomes the level that this share of samples would pass on some axis.
+    """
     for name, triad, out in zip(('accel_saturation', 'gyro_saturation'), triads, outputs):
         if name in values:
             wanted = values[name]
@@ -429,7 +441,11 @@ def encoder_reading(angle, harmonics):
 
 
 def _told(mapping, hidden):
-    """Return the description that the searcher gets: nominal, and without its azimuth when the Earth's rate is hidden."""
+    """
+    Return the description that the searcher gets.
+
+    Nominal, and without its azimuth when the Earth's rate is hidden.
+    """
     told = copy.deepcopy(mapping)
     if 'earth_rate' in hidden:
         told.update(azimuth_deg=None)

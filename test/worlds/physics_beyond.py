@@ -1,4 +1,8 @@
-"""Causes that no catalogue holds, each by its physics: what comes onto a sensor's output, whatever columns the search may try."""
+"""
+Causes that no catalogue holds, each by its physics.
+
+What comes onto a sensor's output, whatever columns the search may try.
+"""
 
 from dataclasses import dataclass
 
@@ -18,7 +22,10 @@ class Kind:
     sensor: str
     """Whose output it enters."""
     family: frozenset | None
-    """Quantities that a right formula speaks of; None where no formula is right, since it is a matter of place."""
+    """
+    Quantities that a right formula speaks of; None where no formula is right, since it is a matter
+    of place.
+    """
     signal: object
     """``signal(scene, rng) -> (n,)``: how it goes, up to its size."""
     place: str = ''
@@ -42,13 +49,19 @@ def _axis(rng):
 
 
 def _arc(angle, rng):
-    """Return a smooth bump over an arc of 60 degrees of a joint, about an angle at which the session is often."""
+    """
+    Return a smooth bump over an arc of 60 degrees of a joint.
+
+    It is about an angle at which the session is often.
+    """
     middle = rng.choice(angle[:: max(1, len(angle) // 200)])
     return np.exp(-0.5 * (np.angle(np.exp(1j * (angle - middle))) / (10 * DEG)) ** 2)
 
 
 def _approach(scene, rng):
-    """Return +-1: on which flank of its gears a joint came to lie, which shifts the load of the mount."""
+    """
+    Return +-1: on which flank of its gears a joint came to lie, which shifts the load of the mount.
+    """
     turn = scene.turn[:, int(rng.integers(scene.turn.shape[1]))]
     side, moving = np.sign(turn), np.abs(turn) > 0.5 * DEG
     place = np.maximum.accumulate(np.where(moving, np.arange(len(turn)), 0))
@@ -192,7 +205,11 @@ class Beyond(Cause):
 
 
 class Machine(Cause):
-    """A mains hum in accelerometer z, and teeth of the outer joint's gear that gyroscope x feels; `size` 1: 1 mg and 0.2 deg/s."""
+    """
+    A mains hum in accelerometer z, and teeth of the outer joint's gear that gyroscope x feels.
+
+    `size` 1: 1 mg and 0.2 deg/s.
+    """
 
     hum_hz, teeth = 23.7, 12.4
 

@@ -1,10 +1,18 @@
-"""Where a world can do something beside the motion that was asked for: in `worlds.misfit_worlds` it does."""
+"""
+Where a world can do something beside the motion that was asked for.
+
+In `worlds.misfit_worlds` it does.
+"""
 
 import numpy as np
 
 
 class Cause:
-    """What a world does beside the motion that was asked for; each method is one place where it can act. `size` 1 is clearly visible."""
+    """
+    What a world does beside the motion that was asked for.
+
+    Each method is one place where it can act. `size` 1 is clearly visible.
+    """
 
     oversampling = 1
     """Steps of the physics per sample."""
@@ -13,7 +21,9 @@ class Cause:
         self.size, self.rng = size, rng
 
     def moved(self, moves):
-        """Return what the joints truly do (`at`, `duration`, `find`), given what they were told to do."""
+        """
+        Return what the joints truly do (`at`, `duration`, `find`), given what they were told to do.
+        """
         return moves
 
     def encoder_error(self, time, motion):
@@ -21,15 +31,25 @@ class Cause:
         return np.zeros_like(motion.position), np.zeros_like(motion.position)
 
     def carried(self, time, force_s, rate_s, alpha_s):
-        """Return force and rate of the sensor's body, given those of the table's plate, in s, each (n, 3)."""
+        """
+        Return force and rate of the sensor's body, in s, each (n, 3).
+
+        Force and rate of the table's plate are given.
+        """
         return force_s, rate_s
 
     def added(self, world, temperature_c, force_s, rate_s, alpha_s):
-        """Return what comes onto the outputs of accelerometer and gyroscope, each (n, 3) or 0, given the world and what the body feels."""
+        """
+        Return the additions to the outputs of accelerometer and gyroscope.
+
+        Each is (n, 3) or 0, given the world and the motion that the body feels.
+        """
         return 0.0, 0.0
 
     def delivered(self, time, outputs, rate_s):
-        """Return the two outputs (n, 3) as the driver hands them on, given the true rate of the body."""
+        """
+        Return the two outputs (n, 3) as the driver hands them on, given the true rate of the body.
+        """
         return outputs
 
     def stamped(self, time, rng):

@@ -1,4 +1,8 @@
-"""What differs from session to session: the unit, the sizes of what is hidden, the weather, and when things happen."""
+"""
+What differs from session to session.
+
+The unit, the sizes of what is hidden, the weather, and when things happen.
+"""
 
 from zlib import crc32
 
@@ -114,7 +118,9 @@ def _pattern(shape, rng):
 
 
 def draw_imu(grade, values, arms, rng):
-    """Return the accelerometer and the gyroscope of one random unit, with the hidden effects built in."""
+    """
+    Return the accelerometer and the gyroscope of one random unit, with the hidden effects built in.
+    """
     accel, gyro = (
         Triad(rng.normal(0.0, bias, 3), _matrix(grade, rng))
         for bias in (grade.accel_bias, grade.gyro_bias)
@@ -164,7 +170,11 @@ def _matrix(grade, rng):
 
 
 def draw_events(moves, rng):
-    """Return the times and directions of things that may happen, drawn always so that the rest of the session does not depend on them."""
+    """
+    Return the times and directions of things that may happen.
+
+    They are always drawn so that the rest of the session does not depend on them.
+    """
     length = moves.duration
     stops = moves.find('rest')[:, 0]
     return {

@@ -1,4 +1,6 @@
-"""What electronics, drivers and hands do to a recording by hand; nothing here knows the estimator."""
+"""
+What electronics, drivers and hands do to a recording by hand; nothing here knows the estimator.
+"""
 
 from dataclasses import replace
 
@@ -37,11 +39,13 @@ def hold_and_turn(
     Parameters
     ----------
     pose_sd, drift_sd : float
-        Scatter of the accelerometer's (m/s^2) and of the gyroscope's (rad/s) bias from pose to pose.
+        Scatter of the accelerometer's (m/s^2) and of the gyroscope's (rad/s) bias from pose to
+        pose.
     creep : float
         Rms rate per axis at which the attitude creeps while it is held, rad/s.
     settling : float
-        Rms angle per axis by which a grip that flexes gives way after each turn, rad, with a time constant of half a second.
+        Rms angle per axis by which a grip that flexes gives way after each turn, rad, with a time
+        constant of half a second.
     tremor : float
         Rms specific force of the hand's tremor at some 8 Hz, m/s^2.
     attitudes : sequence of Rotation, optional
@@ -106,7 +110,11 @@ def hold_and_turn(
 
 
 def with_spikes(imu, share, seed, force=30.0, rate=5.0):
-    """A glitch on the bus: a share of the samples carries an error of up to these sizes on one axis of each sensor."""
+    """
+    A glitch on the bus.
+
+    A share of the samples carries an error of up to these sizes on one axis of each sensor.
+    """
     rng = np.random.default_rng(seed)
     forces, rates = imu.force_s.copy(), imu.rate_s.copy()
     for values, size in ((forces, force), (rates, rate)):
@@ -133,7 +141,9 @@ def with_wrong_full_scale(imu, factor):
 
 
 def with_stamp_jitter(imu, sd, seed):
-    """The sensor samples evenly, the computer stamps on arrival: late by varying times, in order."""
+    """
+    The sensor samples evenly, the computer stamps on arrival: late by varying times, in order.
+    """
     late = np.abs(np.random.default_rng(seed).normal(0, sd, len(imu)))
     return replace(
         imu,
@@ -144,9 +154,12 @@ def with_stamp_jitter(imu, sd, seed):
 
 def warmed_up(imu, seed, *, force=0.0, rate=0.0, kelvin=8.0, time_constant=120.0):
     """
-    Return (imu, temperature in degrees Celsius): the board warms up exponentially and takes the biases along.
+    Return (imu, temperature in degrees Celsius).
 
-    `force` and `rate` are the sizes of the changes of the biases over the whole warm-up, m/s^2 and rad/s, in a random direction.
+    The board warms up exponentially and takes the biases along.
+
+    `force` and `rate` are the sizes of the changes of the biases over the whole warm-up, m/s^2 and
+    rad/s, in a random direction.
     """
     rng = np.random.default_rng(seed)
     time = 1e-9 * (imu.stamp_ns - imu.stamp_ns[0])
@@ -163,7 +176,9 @@ def warmed_up(imu, seed, *, force=0.0, rate=0.0, kelvin=8.0, time_constant=120.0
 
 
 def drifting(imu, force=0.0, rate=0.0):
-    """The biases of the x axes move steadily by these amounts over the recording, m/s^2 and rad/s."""
+    """
+    The biases of the x axes move steadily by these amounts over the recording, m/s^2 and rad/s.
+    """
     share = (imu.stamp_ns - imu.stamp_ns[0]) / (imu.stamp_ns[-1] - imu.stamp_ns[0])
     return replace(
         imu,
@@ -173,7 +188,11 @@ def drifting(imu, force=0.0, rate=0.0):
 
 
 def with_slow_turn(seed, rate=0.03, seconds=4.0, **session):
-    """Return (imu, truth, samples of the turn): a session, then a slow, steady turn about the vertical, which gravity does not show, and a rest."""
+    """
+    Return (imu, truth, samples of the turn).
+
+    A session, then a slow, steady turn about the vertical, which gravity does not show, and a rest.
+    """
     imu, ranges, truth = hold_and_turn(seed, **session)
     rng, last = np.random.default_rng(seed + 1), ranges[-1]
     period = int(np.median(np.diff(imu.stamp_ns)))

@@ -1,4 +1,8 @@
-"""Sensing elements: each has a place, an input direction and a physical response; written without the catalogue of effects."""
+"""
+Sensing elements: each has a place, an input direction and a physical response.
+
+Written without the catalogue of effects.
+"""
 
 from dataclasses import dataclass, field
 
@@ -11,7 +15,11 @@ TEMPERATURE_REF_C = 25.0
 
 @dataclass(eq=False)
 class Triad:
-    """Three sensing elements of one kind. Coefficients are those of the output, per unit of the input along the element's own axis."""
+    """
+    Three sensing elements of one kind.
+
+    Coefficients are those of the output, per unit of the input along the element's own axis.
+    """
 
     bias: np.ndarray
     """Output at zero input, shape (3,)."""
@@ -28,15 +36,24 @@ class Triad:
     to_force: np.ndarray | None = None
     """Response of gyroscope i to specific force, shape (3, 3)."""
     to_force_squared: np.ndarray | None = None
-    """Response of gyroscope i to xx, yy, zz, xy, yz, xz of specific force, shape (3, 6): its elements yield unlike."""
+    """
+    Response of gyroscope i to xx, yy, zz, xy, yz, xz of specific force, shape (3, 6): its elements
+    yield unlike.
+    """
     thermal_bias: np.ndarray | float = 0.0
     thermal_bend: np.ndarray | float = 0.0
     """Bias by the square of the temperature."""
     thermal_scale: np.ndarray | float = 0.0
     hysteresis: np.ndarray | float = 0.0
-    """Half of what the bias differs between the branches of warming up and cooling: strain that grains of unlike friction let go one after the other."""
+    """
+    Half of what the bias differs between the branches of warming up and cooling: strain that grains
+    of unlike friction let go one after the other.
+    """
     rectifies: np.ndarray | float = 0.0
-    """Bias by the mean square of vibration: of an accelerometer along its own axis, shape (3,), of a gyroscope along each, shape (3, 3)."""
+    """
+    Bias by the mean square of vibration: of an accelerometer along its own axis, shape (3,), of a
+    gyroscope along each, shape (3, 3).
+    """
     drift: np.ndarray | float = 0.0
     drift_constant: float = 1.0
     """Bias warm-up: drift (1 - exp(-t / constant))."""
@@ -51,7 +68,10 @@ class Triad:
     late: float = 0.0
     """By how much the output is old when it is stamped, s."""
     crosstalk: np.ndarray | None = None
-    """What of each other element's change in time comes onto element i, through the capacitance between their wires, s, shape (3, 2)."""
+    """
+    What of each other element's change in time comes onto element i, through the capacitance
+    between their wires, s, shape (3, 2).
+    """
     limit: float = np.inf
     """The output cannot leave [-limit, limit]."""
 
@@ -112,9 +132,12 @@ FRICTION = np.linspace(0.3, 1.5, 9)
 
 def _friction(temperature_c, time):
     """
-    Return the strain of grains that hold until they slip, over its largest, shape (n,): Jenkin's elements, spring and slider, side by side.
+    Return the strain of grains that hold until they slip, over its largest, shape (n,).
 
-    Each spring is stretched by the change of the temperature and cannot hold more than its friction; it starts without load.
+    Jenkin's elements, spring and slider, side by side.
+
+    Each spring is stretched by the change of the temperature and cannot hold more than its
+    friction; it starts without load.
     """
     steps = np.arange(time[0], time[-1] + 0.1, 0.1)
     load, total = np.zeros(len(FRICTION)), []
@@ -143,7 +166,11 @@ def filtered(values, step, triad):
 
 
 def butterworth(values, step, delay):
-    """Return the output of the maximally flat filter ``1 / (1 + d s + d^2 s^2 / 2)`` that was in balance at the start: bilinear, on a fine grid."""
+    """
+    Return the output of the maximally flat filter ``1 / (1 + d s + d^2 s^2 / 2)``.
+
+    It was in balance at the start, and it is bilinear, on a fine grid.
+    """
     system = cont2discrete(([1.0], [0.5 * delay**2, delay, 1.0]), step, 'bilinear')
     above, below = system[0].ravel(), system[1]
     return lfilter(above, below, values, axis=0, zi=lfilter_zi(above, below)[:, None] * values[:1])[
@@ -156,7 +183,8 @@ def low_pass(values, step, time_constant, order=1):
     Return the output of `order` equal first-order stages that were in balance at the start.
 
     Exact for an input that is linear between the grid points:
-    ``y[k+1] = e y[k] + c0 u[k] + c1 u[k+1]``, e = exp(-h / tau), c1 = 1 - tau / h (1 - e), c0 = tau / h (1 - e) - e.
+    ``y[k+1] = e y[k] + c0 u[k] + c1 u[k+1]``, e = exp(-h / tau), c1 = 1 - tau / h (1 - e), c0 = tau
+    / h (1 - e) - e.
     """
     if time_constant == 0.0:
         return values

@@ -1,7 +1,8 @@
 """
 Rigid-body motion of a turntable, written apart from the package so that the two check each other.
 
-Everything is done in the level frame n, link by link: rate, angular acceleration and the acceleration of the mount's point.
+Everything is done in the level frame n, link by link: rate, angular acceleration and the
+acceleration of the mount's point.
 """
 
 from dataclasses import dataclass
@@ -69,17 +70,21 @@ def move_table(
     gravity : float
         m/s^2.
     tilt : (2,)
-        The true vertical is the nominal one turned by the rotation vector (x, y, 0), rad; the Earth's axis turns with it.
+        The true vertical is the nominal one turned by the rotation vector (x, y, 0), rad; the
+        Earth's axis turns with it.
     axis_errors : (n_joints - 1,)
         How much each axis but the first is turned away from the one before it, rad.
     slip : array (n, 3), optional
         Turn of the sensor in its fixture against the nominal mount, rotation vector in s.
     sag : (n_joints - 1,)
-        By how much the end of each axis but the first would hang down if it lay level, rad: a shaft that bends with its load.
+        By how much the end of each axis but the first would hang down if it lay level, rad: a shaft
+        that bends with its load.
     wobble : (n_joints, 2, 2)
-        Two circles on which the tip of each axis moves, rad: (cosine, sine) of one against the turn, and of one at twice the turn.
+        Two circles on which the tip of each axis moves, rad: (cosine, sine) of one against the
+        turn, and of one at twice the turn.
     beside : (n_joints - 1, 2)
-        By how much each axis but the first passes beside the point where it should meet the others, m, in the two directions across it.
+        By how much each axis but the first passes beside the point where it should meet the others,
+        m, in the two directions across it.
 
     """
     axes = _true_axes(mapping, axis_errors)
@@ -135,13 +140,21 @@ def move_table(
 
 
 def _across(axis):
-    """Return two directions across an axis along x, y or z, and right-handed with it, shape (2, 3): the first of x, y, z comes first."""
+    """
+    Return two directions across an axis along x, y or z, and right-handed with it, shape (2, 3).
+
+    The first of x, y, z comes first.
+    """
     first = np.eye(3)[0 if abs(axis[0]) < 0.5 else 1]
     return np.array([first, np.cross(axis, first)])
 
 
 def _circles(amplitudes, angle):
-    """Return where the tip of an axis is across it, shape (n, 2), that runs on two circles: backwards, and forwards at twice the turn."""
+    """
+    Return where the tip of an axis is across it, shape (n, 2), that runs on two circles.
+
+    Backwards, and forwards at twice the turn.
+    """
     (c1, s1), (c2, s2) = amplitudes
     one, two = angle, 2 * angle
     return np.stack(
@@ -154,7 +167,11 @@ def _circles(amplitudes, angle):
 
 
 def earth_vector(mapping):
-    """Return the Earth's rate in the level frame (zero when latitude or azimuth is not given): north cos(lat) + up sin(lat)."""
+    """
+    Return the Earth's rate in the level frame (zero when latitude or azimuth is not given).
+
+    North cos(lat) + up sin(lat).
+    """
     if mapping.get('latitude') is None or mapping.get('azimuth_deg') is None:
         return np.zeros(3)
     latitude, azimuth = np.radians(mapping['latitude']), np.radians(mapping['azimuth_deg'])
@@ -165,7 +182,11 @@ def earth_vector(mapping):
 
 
 def local_gravity(latitude_deg, height):
-    """Return gravity by the 1980 formula (Moritz 2000) with the free-air reduction; within 2e-6 m/s^2 of WGS 84."""
+    """
+    Return gravity by the 1980 formula (Moritz 2000) with the free-air reduction.
+
+    Within 2e-6 m/s^2 of WGS 84.
+    """
     square = np.sin(np.radians(latitude_deg)) ** 2
     double = np.sin(2 * np.radians(latitude_deg)) ** 2
     surface = 9.780327 * (1 + 0.0053024 * square - 0.0000058 * double)

@@ -1,9 +1,17 @@
-"""A machine on the bench: it runs at several speeds' loudness, shakes the sensor far above the output's band, and what is even in an element rectifies it."""
+"""
+A machine on the bench.
+
+It runs at several speeds' loudness, shakes the sensor far above the output's band, and what is even
+in an element rectifies it.
+"""
 
 import numpy as np
 
 LOUDEST = 0.3
-"""What the machine leaves in the band of the output where it is loudest, root mean square of all axes, m/s^2."""
+"""
+What the machine leaves in the band of the output where it is loudest, root mean square of all axes,
+m/s^2.
+"""
 LEVELS = (0.0, 0.35, 0.7, 1.0)
 """How loud it is, in terms of the loudest: off, and three gears."""
 HOLDS = 8.0, 20.0
@@ -11,15 +19,25 @@ HOLDS = 8.0, 20.0
 RAMP = 0.3
 """Time constant with which it goes from one to the next, s."""
 ABOVE = 2.25, 2.42
-"""Frequencies of its lines in terms of the sample rate: what passes is aliased to between a quarter and two fifths of it."""
+"""
+Frequencies of its lines in terms of the sample rate: what passes is aliased to between a quarter
+and two fifths of it.
+"""
 CORNER = 0.25
-"""The readout passes half of the power at this share of the sample rate, a tenth of the amplitude at the lines."""
+"""
+The readout passes half of the power at this share of the sample rate, a tenth of the amplitude at
+the lines.
+"""
 ROCKS = 0.01
-"""The bench rocks by so much angular rate for each m/s^2, a quarter of a turn behind, (rad/s)/(m/s^2)."""
+"""
+The bench rocks by so much angular rate for each m/s^2, a quarter of a turn behind, (rad/s)/(m/s^2).
+"""
 
 
 class Machine:
-    """Lines of a machine whose speed wanders a little, along directions that are fixed in the room."""
+    """
+    Lines of a machine whose speed wanders a little, along directions that are fixed in the room.
+    """
 
     def __init__(self, duration, rate, rng, lines=3):
         self.frequency = rate * rng.uniform(*ABOVE, lines)
@@ -46,8 +64,8 @@ class Machine:
         """
         Return what comes onto the outputs of the two triads, each (n, 3).
 
-        What passes the readout comes as it is, aliased; an element that answers to the square of what it feels gives its envelope, beats
-        included: the readout passes no twice as fast lines.
+        What passes the readout comes as it is, aliased; an element that answers to the square of
+        what it feels gives its envelope, beats included: the readout passes no twice as fast lines.
         """
         level = self.level(time)
         felt = [
@@ -74,7 +92,11 @@ class Machine:
         )
 
     def _rectified(self, whole, triad):
-        """Return the mean of what the elements answer to the square of the acceleration; `triad.rectifies` is in terms of what is left in the band."""
+        """
+        Return the mean of what the elements answer to the square of the acceleration.
+
+        `triad.rectifies` is in terms of what is left in the band.
+        """
         if not np.any(triad.rectifies):
             return 0.0
         share = 0.5 * np.mean(self.passed**2)

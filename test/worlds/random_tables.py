@@ -8,7 +8,9 @@ from imu_calibration.kinematics.table import Table
 
 
 def random_axes(rng, count):
-    """Return axes of which no two neighbours are closer than 60 degrees to parallel, shape (count, 3)."""
+    """
+    Return axes of which no two neighbours are closer than 60 degrees to parallel, shape (count, 3).
+    """
     axes = [rng.normal(size=3)]
     while len(axes) < count:
         axis = rng.normal(size=3)
@@ -18,7 +20,11 @@ def random_axes(rng, count):
 
 
 def random_table(rng, count=3, ends=0.0, speeds_deg=(60, 300)):
-    """Return a table with so many joints, each with ends with the chance `ends`, with speeds between these."""
+    """
+    Return a table with so many joints, each with ends with the chance `ends`.
+
+    With speeds between these.
+    """
     joints = []
     for number, axis in enumerate(random_axes(rng, count)):
         lower, upper = (

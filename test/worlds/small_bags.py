@@ -22,7 +22,11 @@ def write_small_bag(path, n=200, frame_id='imu_link', **options):
 
 
 def hostile_calibration():
-    """Return a calibration of twenty effects whose columns nest powers: each level multiplies the text of the compensation by nine."""
+    """
+    Return a calibration of twenty effects whose columns nest powers.
+
+    Each level multiplies the text of the compensation by nine.
+    """
     column = 'f_x'
     for _ in range(9):
         column = f'abs({column})**9'

@@ -1,4 +1,8 @@
-"""The six stands of the planner's targets: two tables, a table with ends, a gantry, arms with six and seven joints."""
+"""
+The six stands of the planner's targets.
+
+Two tables, a table with ends, a gantry, arms with six and seven joints.
+"""
 
 import numpy as np
 

@@ -1,11 +1,17 @@
-"""Biases that move otherwise than the simulator's: fast or slow, as flicker, as a walk, in steps; in units of the data sheet's instability."""
+"""
+Biases that move otherwise than the simulator's: fast or slow, as flicker, as a walk, in steps.
+
+In units of the data sheet's instability.
+"""
 
 import numpy as np
 
 from worlds.noise_worlds import flicker, gauss_markov, random_walk
 
 SIZE = 3.0
-"""Standard deviation of a wander over a session, in data sheet instabilities; 2 for that of 100 s."""
+"""
+Standard deviation of a wander over a session, in data sheet instabilities; 2 for that of 100 s.
+"""
 STEPS_EVERY = 60.0
 """Mean time between the steps of a bias, s."""
 
@@ -41,11 +47,18 @@ WANDERS = {
     ),
     'steps': _steps,
 }
-"""Name -> ``draw(n, period, instability, rng)`` of one axis; all but the name of the wander is realistic noise."""
+"""
+Name -> ``draw(n, period, instability, rng)`` of one axis; all but the name of the wander is
+realistic noise.
+"""
 
 
 def add_wander(outputs, kind, model, period, rng):
-    """Return the outputs of accelerometer and gyroscope with biases that move in this way, of the noise model's instabilities."""
+    """
+    Return the outputs of accelerometer and gyroscope with biases that move this way.
+
+    The biases have the noise model's instabilities.
+    """
     return tuple(
         out
         + np.stack([WANDERS[kind](len(out), period, instability, rng) for _ in range(3)], axis=1)

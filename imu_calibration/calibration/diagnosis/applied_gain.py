@@ -40,9 +40,10 @@ def gain_of_findings(
     """
     Return the Gain of the findings `after` over the findings `before` on the locked windows.
 
-    The residual is the error of the readings that compensation returns, relative to the reference that each side estimates; both sides
-    are estimated from the other windows. If no additional finding can be compensated, the residual is that of the model
-    (`gain.heldout_gain`). Sensor and measure are chosen on the other windows.
+    The residual is the error of the readings that compensation returns, relative to the reference
+    that each side estimates; both sides are estimated from the other windows. If no additional
+    finding can be compensated, the residual is that of the model (`gain.heldout_gain`). Sensor and
+    measure are chosen on the other windows.
 
     Parameters
     ----------
@@ -71,7 +72,11 @@ def gain_of_findings(
 
 
 def _compensated(found, before, after):
-    """Return the findings of two choices that belong into the model, or None if compensation corrects no additional one."""
+    """
+    Return the findings of two choices that belong into the model.
+
+    Or None if compensation corrects no additional one.
+    """
     sides = [
         [question for question in some if question in found.adopted] for some in (before, after)
     ]
@@ -82,7 +87,11 @@ def _compensated(found, before, after):
 
 
 def _applied_parameters(found, chosen):
-    """Return (model, values, values as compensation applies them) of a choice of effects, estimated without the locked windows."""
+    """
+    Return (model, values, values to apply) of a choice of effects.
+
+    The last values are as compensation applies them. All are estimated without the locked windows.
+    """
     problem, wide = found.problem, found.problem.recording.model
     model = replace(problem.baseline, temperature_ref_c=wide.temperature_ref_c)
     for question in chosen:
@@ -103,10 +112,13 @@ def gain_by_hand(
     found: HandInvestigation, before: Sequence[Question], *, after: Sequence[Question], sensor: str
 ) -> Gain:
     """
-    Return the Gain of the findings `after` over the findings `before` on the held-out poses and turns.
+    Return the Gain of the findings `after` over the findings `before`.
 
-    The errors are those of `hand_proof.prove_by_hand` and, at rest, the corrected rate less that of the Earth about the vertical. Choice
-    and estimate of each side exclude the poses; if no additional finding can be compensated, the residual is that of the model.
+    The gain is that on the held-out poses and turns.
+
+    The errors are those of `hand_proof.prove_by_hand` and, at rest, the corrected rate less that of
+    the Earth about the vertical. Choice and estimate of each side exclude the poses; if no
+    additional finding can be compensated, the residual is that of the model.
     """
     applied = _compensated(found, before, after)
     if applied is None:
@@ -137,7 +149,11 @@ def gain_by_hand(
 
 
 def _pose_errors(found, block, rows, model, values, earth):
-    """Return the errors of some rows of a block after correction: of poses m/s^2 or rad/s, of turns the angle over the duration, rad/s."""
+    """
+    Return the errors of some rows of a block after correction.
+
+    Of poses m/s^2 or rad/s, of turns the angle over the duration, rad/s.
+    """
     poses = found.baseline.poses
     if block.duration is not None:
         missed = turn_errors(
@@ -157,7 +173,9 @@ def _pose_errors(found, block, rows, model, values, earth):
 
 
 def _errors(windows, table, model, values, applied):
-    """Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3)."""
+    """
+    Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3).
+    """
     motion, temperature, rows = all_samples(windows)
     ideal = with_reference(model, nominal_values(model), values)
     at_ideal = model.at(ideal)

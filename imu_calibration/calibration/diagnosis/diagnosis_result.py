@@ -27,13 +27,18 @@ class Finding:
     parameters: dict
     """Parameter name -> (value, sd, unit), SI, from all windows."""
     p_value: float
-    """Probability of such a decrease of the misfit from noise, times the number of effects under test."""
+    """
+    Probability of such a decrease of the misfit from noise, times the number of effects under test.
+    """
     heldout_gain: float
     """Gain of log likelihood on held-out windows, nats."""
     share: float
     """Share of the unexplained residual that it removes from held-out windows."""
     gain: Gain
-    """`gain.Gain` on windows held out from the choice, of this finding in addition to the earlier ones."""
+    """
+    `gain.Gain` on windows held out from the choice, of this finding in addition to the earlier
+    ones.
+    """
     indistinguishable_from: tuple
     """Effects that are collinear with it in this recording, at most two."""
     separating_motion: str
@@ -42,7 +47,8 @@ class Finding:
     """Variables of its residual plot, as in ``Effect.against``."""
     sizes_of_mates: dict = field(default_factory=dict)
     """
-    Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: its estimate in the place of the finding.
+    Each of `indistinguishable_from` -> parameter name -> (value, unit), SI: its estimate in the
+    place of the finding.
     """
     implausible: bool = False
     """Whether its size exceeds the known range of such sensors; it is then in no model."""
@@ -70,7 +76,10 @@ class Candidate:
     p_value_beside: float | None
     """Its p-value there."""
     verdict: str
-    """``found``, ``as good as NAME``, ``not needed beside the findings``, ``no evidence``, or the reason of a refusal."""
+    """
+    ``found``, ``as good as NAME``, ``not needed beside the findings``, ``no evidence``, or the
+    reason of a refusal.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +99,10 @@ class Diagnosis:
     solution: Any
     """Solution of the extended model on all windows; the baseline's without findings."""
     gain: Gain | None
-    """`gain.Gain` of all findings together on windows held out from the choice; None by hand without findings."""
+    """
+    `gain.Gain` of all findings together on windows held out from the choice; None by hand without
+    findings.
+    """
     windows: int
     """Windows used."""
     locked: int
@@ -98,7 +110,10 @@ class Diagnosis:
     traces: Any = None
     """`traces.Traces`: residuals before and after, for plots; None during a live session."""
     onset: Any = None
-    """Parameters that change at one moment (`selection.onset.Onset`), or None; the findings are those of the longer part."""
+    """
+    Parameters that change at one moment (`selection.onset.Onset`), or None; the findings are those
+    of the longer part.
+    """
     stamp_jitter: StampJitter = NO_JITTER
     """Errors of the stamps from the scatter in motion; by hand none are estimated."""
 
@@ -110,10 +125,13 @@ class Diagnosis:
 
 def formula_gain(rest: Unexplained, windows: int = 0) -> Gain:
     """
-    Return the gain of the formula that is proposed for an unexplained residual, in the unit of the sensor.
+    Return the gain of the formula proposed for an unexplained residual.
 
-    ``after = before sqrt(1 - share)`` with `before` the rms of the residual beyond noise and `share` the part of its power that the
-    formula removes from the held-out windows, `windows` in number; the interval is that of the share.
+    The gain is in the unit of the sensor.
+
+    ``after = before sqrt(1 - share)`` with `before` the rms of the residual beyond noise and
+    `share` the part of its power that the formula removes from the held-out windows, `windows` in
+    number; the interval is that of the share.
     """
     low, high = (
         float(1.0 - np.sqrt(np.clip(1.0 - share, 0.0, None))) for share in rest.proposal.ci95
@@ -141,7 +159,11 @@ DIAGNOSIS_FORMAT = 'imu_calibration/diagnosis/1'
 
 
 def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the content of diagnosis.json: plain dicts, lists, strings and numbers, None for NaN and infinity."""
+    """
+    Return the content of diagnosis.json.
+
+    Plain dicts, lists, strings and numbers, None for NaN and infinity.
+    """
     return json_types(
         {
             'format': DIAGNOSIS_FORMAT,
@@ -241,7 +263,9 @@ def _rest(sensor, rest, locked):
         'axes': rest.axes,
         'regimes': [regime.to_mapping() for regime in rest.regimes],
         'tones': [tone.to_mapping() for tone in rest.tones],
-        'proposals': []
-        if rest.proposal is None
-        else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}],
+        'proposals': (
+            []
+            if rest.proposal is None
+            else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]
+        ),
     }

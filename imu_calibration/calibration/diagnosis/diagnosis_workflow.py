@@ -44,9 +44,13 @@ MOST_SHOWN = 3
 MUCH = 100.0
 """Held-out gain of log likelihood from which a refused effect is reported, nats."""
 WHY_NOT = {
-    LEAVES_MOST: 'most of the unexplained residual remains with it, so that both may have another cause',
-    DISAGREED: 'the windows do not agree on it: the evidence comes from few windows, or some contradict it; '
-    'record more windows of the same motions',
+    LEAVES_MOST: (
+        'most of the unexplained residual remains with it, so that both may have another cause'
+    ),
+    DISAGREED: (
+        'the windows do not agree on it: the evidence comes from few windows, or some contradict'
+        ' it; record more windows of the same motions'
+    ),
 }
 """Verdict on an effect with a large gain -> reason why it is no finding."""
 
@@ -68,7 +72,9 @@ class DiagnosisResult:
     options: CalibrationOptions
     """The requested models and settings."""
     proposed: Calibration | None = None
-    """The calibration with the formulas proposed for the unexplained residual; None without a formula."""
+    """
+    The calibration with the formulas proposed for the unexplained residual; None without a formula.
+    """
 
     @property
     def document(self) -> dict[str, Any]:
@@ -91,7 +97,11 @@ class DiagnosisResult:
 
     @property
     def notes(self) -> list[str]:
-        """Residuals above the noise at rest, and biases that step or wander on every axis, of sensors without an unexplained residual."""
+        """
+        Residuals above the noise at rest, and biases that step or wander on every axis.
+
+        Both are for sensors without an unexplained residual.
+        """
         quiet = {
             sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant
         }
@@ -104,13 +114,21 @@ class DiagnosisResult:
 
     @property
     def lags(self) -> dict[str, tuple[float, float]]:
-        """Sensor -> (total lag of its output, standard deviation), s; independent of how collinear lag effects share it."""
+        """
+        Sensor -> (total lag of its output, standard deviation), s.
+
+        Independent of how collinear lag effects share it.
+        """
         found = self.calibration
         return total_lags(found.param_names, found.values, found.covariance)
 
 
 class StoredRecording:
-    """The map step of a calibration from one recording, which is read once: later linearisations reduce its stored windows."""
+    """
+    The map step of a calibration from one recording, which is read once.
+
+    Later linearisations reduce its stored windows.
+    """
 
     def __init__(self) -> None:
         self.windows = StoredWindows()
@@ -119,7 +137,11 @@ class StoredRecording:
     def __call__(
         self, step: GatherStep, numbered: Iterable[tuple[int, Callable]]
     ) -> list[SessionData]:
-        """Return the SessionData of the recording, given (its number, callable that yields its blocks)."""
+        """
+        Return the SessionData of the recording.
+
+        The recording is given as (its number, callable that yields its blocks).
+        """
         ((session, source),) = numbered
         if self._first is None:
             self._first = step.read(
@@ -186,7 +208,11 @@ def diagnose_recording(
 
 
 def _with_proposals(source, table, options, result, diagnosis, provenance, reader):
-    """Return the calibration of the extended model with the proposed formulas, or None without a formula."""
+    """
+    Return the calibration of the extended model with the proposed formulas.
+
+    Or None without a formula.
+    """
     effects = _proposed_effects(diagnosis)
     if not effects:
         return None
@@ -210,7 +236,8 @@ def _with_proposals(source, table, options, result, diagnosis, provenance, reade
         as_asked=True,
     )
     solution, gathered, gathered_model = solve_recordings([source], table, chosen, mapper=reader)
-    # A formula determines changes of the output, not its zero: biases of the affected axes keep the uncertainty.
+    # A formula determines changes of the output, not its zero: biases of the affected axes keep the
+    # uncertainty.
     unsure = ModelExtension(
         moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained))
     )
@@ -230,7 +257,10 @@ def diagnose_without_table(
     provenance: dict[str, Any] | None = None,
 ) -> DiagnosisResult:
     """
-    Calibrate a recording by hand, identify the errors of the model and their causes, and extend it (see `findings`).
+    Calibrate a recording by hand, and extend the model by identified errors.
+
+    The errors of the model and their causes are identified, and the model is extended (see
+    `findings`).
 
     Parameters
     ----------
@@ -265,14 +295,19 @@ def diagnose_without_table(
 
 
 def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return the findings, the unexplained residual of each sensor and the effects without a test, as lines."""
+    """
+    Return the findings, the unexplained residual of each sensor and the effects without a test.
+
+    As lines.
+    """
     lines = timing_lines(diagnosis)
     for number, finding in enumerate(diagnosis.findings, 1):
         lines.append(f'{number}. {finding.title}: {finding.explanation}')
         if finding.indistinguishable_from:
             lines.append(
-                f'   not separable in this recording from {", ".join(finding.indistinguishable_from)}; '
-                f'to separate them: {finding.separating_motion}'
+                '   not separable in this recording from'
+                f' {", ".join(finding.indistinguishable_from)}; to separate them:'
+                f' {finding.separating_motion}'
             )
     if not diagnosis.findings and not _proposed_effects(diagnosis):
         lines.append(nothing_named(diagnosis))
@@ -282,7 +317,8 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
                 f'; it correlates with {rest.correlates_with}' if rest.correlates_with else ''
             )
             lines.append(
-                f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the {sensor}{with_what}'
+                f'unexplained: {in_words(rest.rms, sensor, rest.unit)} rms in the'
+                f' {sensor}{with_what}'
             )
         lines += [
             f'   {line}' if rest.significant else line
@@ -296,7 +332,11 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
 
 
 def timing_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return the moment at which parameters change, with their values before and after, and errors of the stamps, as lines."""
+    """
+    Return the moment at which parameters change.
+
+    With their values before and after, and errors of the stamps, as lines.
+    """
     return [*_onset_lines(diagnosis.onset), *diagnosis.stamp_jitter.lines]
 
 
@@ -319,7 +359,10 @@ def _onset_lines(onset):
     axes = f' (axis {", ".join(onset.axes)})' if onset.axes else ''
     return [
         f'change at {onset.time:.1f} +- {onset.time_sd:.1g} s of {onset.what}{axes}: {values}',
-        f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the longer part; record again without the change',
+        (
+            f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the'
+            ' longer part; record again without the change'
+        ),
     ]
 
 
@@ -344,8 +387,10 @@ def _formula_lines(sensor, rest):
     )
     return [
         f'formula: {rest.proposal.sentence}',
-        f'gain of the formula: {gain.measure} of the {sensor} {before} before, {low} to {high} '
-        'after (95 %)',
+        (
+            f'gain of the formula: {gain.measure} of the {sensor} {before} before, {low} to {high} '
+            'after (95 %)'
+        ),
     ]
 
 
@@ -360,13 +405,17 @@ def _proposed_effects(diagnosis):
 
 
 def nothing_named(diagnosis: Diagnosis) -> str:
-    """Return the reason for a diagnosis without findings: no effect exceeds noise, or the best one is refused."""
+    """
+    Return the reason for a diagnosis without findings.
+
+    No effect exceeds noise, or the best one is refused.
+    """
     much = [row for row in diagnosis.candidates if row.verdict in WHY_NOT and row.gain_alone > MUCH]
     if not much:
         return 'nothing found: no effect of the catalogue explains more than noise'
     return (
-        f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out windows), '
-        f'but {WHY_NOT[much[0].verdict]}'
+        f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out'
+        f' windows), but {WHY_NOT[much[0].verdict]}'
     )
 
 

@@ -1,4 +1,8 @@
-"""From the result of a search, on a table or by hand, to findings as sentences, their gains, and motions that separate effects."""
+"""
+From the result of a search to findings, their gains, and motions.
+
+The search is on a table or by hand. The findings are sentences, and the motions separate effects.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -44,10 +48,13 @@ def separating_motion(
     solution: Solution, question: Question, mate: Question, *, gravity: float
 ) -> str:
     """
-    Return the standard motion after which the mate could no longer pass for the effect that was found.
+    Return the standard motion that separates the mate from the effect found.
 
-    For each motion: its added information about the extended model and the mate, and from that the part of the effect
-    that is not collinear with the mate and the model, in squared standard deviations.
+    After this motion the mate could no longer pass for the effect that was found.
+
+    For each motion: its added information about the extended model and the mate, and from that the
+    part of the effect that is not collinear with the mate and the model, in squared standard
+    deviations.
 
     Parameters
     ----------
@@ -130,12 +137,18 @@ def sentence(
         size = f'known here in combinations only, none of its values by itself: {size}'
     if n_clipped is not None:
         limit = _with_unit(f'{value * factor:.4g}', unit)
-        return f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and neighbouring samples were excluded.'
+        return (
+            f'{effect.explanation} The limit is {limit}; {n_clipped} samples at it and neighbouring'
+            ' samples were excluded.'
+        )
     which = '' if len(amplitudes) == 1 else f' (largest: {label})'
     when = f' at {values[-1][1]:.1f} s' if effect.located else ''
     text = f'{effect.explanation} Its size is {size}{which}{when}.'
     if gain is not None and gain.reduction > 0:
-        text += f' With it the {gain.of} ({gain.sensor}, held-out {gain.measure}) falls by {_percent(gain.reduction)}.'
+        text += (
+            f' With it the {gain.of} ({gain.sensor}, held-out {gain.measure}) falls by'
+            f' {_percent(gain.reduction)}.'
+        )
     return text
 
 
@@ -154,7 +167,9 @@ def candidates_of(
     agree: Callable[[Sequence[Question], Question], bool] | None = None,
 ) -> tuple[Candidate, ...]:
     """
-    Return every effect that a search tested in addition to the findings, the strongest first; of a warm-up its best time constant.
+    Return every effect that a search tested in addition to the findings, the strongest first.
+
+    Of a warm-up its best time constant.
 
     `agree(chosen, question)` is whether the windows agree on one of the chosen effects.
     """
@@ -184,7 +199,10 @@ def candidates_of(
 
 def _verdict_of(name, alone, beside, *, found, mates):
     """
-    Return 'found', 'as good as NAME', 'not needed in addition to the findings', 'no evidence', or why the effect was refused.
+    Return the verdict on an effect as text.
+
+    It is 'found', 'as good as NAME', 'not needed in addition to the findings', 'no evidence', or
+    why the effect was refused.
 
     Parameters
     ----------
@@ -241,7 +259,8 @@ def finding(
     motion_of : callable
         ``motion_of(question, mate)``: the motion that would separate two effects.
     shows : callable
-        ``shows(place, mate, gain)``: whether an effect in the place of this one shows in the sensor that shows this one.
+        ``shows(place, mate, gain)``: whether an effect in the place of this one shows in the sensor
+        that shows this one.
     rivals : sequence of Question
         Effects known to do nearly as well in its place.
 
@@ -304,9 +323,14 @@ def fitted(
 
 
 MATE = 0.5
-"""Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's reduction."""
+"""
+Least reduction of the sensor's residual by an alternative to a finding, as a share of the finding's
+reduction.
+"""
 HALF = 0.5
-"""Share of a finding that an unnamed effect would replace, from which it is reported with the finding."""
+"""
+Share of a finding that an unnamed effect would replace, from which it is reported with the finding.
+"""
 
 
 def build_diagnosis(
@@ -321,7 +345,8 @@ def build_diagnosis(
         The reference.
     found : Investigation
     calibrated : Solution, optional
-        Solution of a model with all findings, with the reported parameters; default: the solution of the investigation.
+        Solution of a model with all findings, with the reported parameters; default: the solution
+        of the investigation.
 
     """
     problem, named, limits = found.problem, found.named, found.limits
@@ -395,7 +420,11 @@ def build_diagnosis(
 
 
 def _rivals(found, question):
-    """Return alternatives to a finding that fit nearly as well, and doubtful effects that would replace half of it."""
+    """
+    Return alternatives to a finding, and doubtful effects that would replace it.
+
+    The alternatives fit nearly as well. The doubtful effects would replace half of the finding.
+    """
     near = [rival.other for rival in found.rivals if rival.question.name == question.name]
     values = dict(zip(found.problem.space.names, found.problem.values(found.named)))
     own = [found.problem.space.names[k] for k in question.parameters]
@@ -447,7 +476,11 @@ def _with_residuals(hand):
 
 
 def _traces_of(baseline, hand):
-    """Return the `Traces` of two calibrations: one point per pose, the accelerometer's residual along gravity."""
+    """
+    Return the `Traces` of two calibrations.
+
+    One point per pose, the accelerometer's residual along gravity.
+    """
     poses = hand.poses
     true = hand.gravity * hand.state.up
     errors = [
@@ -470,7 +503,9 @@ def _traces_of(baseline, hand):
 
 
 def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagnosis:
-    """Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings."""
+    """
+    Return the result of an investigation as a Diagnosis; `hand` is a calibration with all findings.
+    """
     problem, named = found.problem, list(found.named)
     before, after = _with_residuals(found.baseline), _with_residuals(hand)
 

@@ -69,7 +69,11 @@ class DiagnosisQuestion:
         return self.snapshot.gathered.accumulator.samples
 
     def answer(self) -> Answer:
-        """Diagnose and return the `Answer`; a listener of its progress (`core.progress`) may raise to end it."""
+        """
+        Diagnose and return the `Answer`.
+
+        A listener of its progress (`core.progress`) may raise to end it.
+        """
         try:
             evidence = self.snapshot.evidence()
             if evidence.found is None:
@@ -90,7 +94,11 @@ class DiagnosisQuestion:
 
 
 def question_about(live: LiveCalibration | None) -> DiagnosisQuestion | None:
-    """Return the DiagnosisQuestion about the last solution of a session, or None without a table or while there are too few windows."""
+    """
+    Return the DiagnosisQuestion about the last solution of a session.
+
+    Or None without a table or while there are too few windows.
+    """
     return (
         DiagnosisQuestion(live.last)
         if live is not None and live.last is not None and windows_to_ask(live.last.gathered)
@@ -99,7 +107,9 @@ def question_about(live: LiveCalibration | None) -> DiagnosisQuestion | None:
 
 
 def describe(diagnosis: Diagnosis) -> LiveState:
-    """Return the LiveState of a Diagnosis: the first finding, or none, or the unexplained residual."""
+    """
+    Return the LiveState of a Diagnosis: the first finding, or none, or the unexplained residual.
+    """
     values: dict[str, Any] = {
         'windows': diagnosis.windows,
         'windows held out for the gain': diagnosis.locked,
@@ -118,7 +128,10 @@ def describe(diagnosis: Diagnosis) -> LiveState:
     message = f'{first.title}: {first.explanation}'
     if first.indistinguishable_from:
         others = ', '.join(first.indistinguishable_from)
-        message += f' This motion does not separate it from {others}; a motion that does: {first.separating_motion}'
+        message += (
+            f' This motion does not separate it from {others}; a motion that does:'
+            f' {first.separating_motion}'
+        )
     low, high = first.gain.ci95
     values = {
         'effect': first.effect,

@@ -1,4 +1,8 @@
-"""Measurement against the simulation of two models: residuals over short blocks, segments, residual power and dead reckoning."""
+"""
+Measurement against the simulation of two models.
+
+Residuals over short blocks, segments, residual power and dead reckoning.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,9 +38,13 @@ class Distance:
     edges: np.ndarray
     """Edges of the frequency bands, Hz, shape (m + 1,)."""
     power: np.ndarray
-    """Mean square of the residual within windows by model (before, after) and band, shape (2, m, 3)."""
+    """
+    Mean square of the residual within windows by model (before, after) and band, shape (2, m, 3).
+    """
     noise: np.ndarray
-    """Mean square of the noise in each band, from the spectrum of the windows at rest, shape (m, 3)."""
+    """
+    Mean square of the noise in each band, from the spectrum of the windows at rest, shape (m, 3).
+    """
     means: np.ndarray
     """Mean square of the window means of the residual before and after, shape (2, 3)."""
     means_noise: np.ndarray
@@ -46,7 +54,10 @@ class Distance:
 
     def bands(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """
-        Return (band, rms beyond noise (2, 3), rms of the noise (3,)) of the window means and of each decade, m/s^2 or rad/s.
+        Return (band, rms beyond noise, rms of the noise) of window means and decades.
+
+        The rms beyond noise has shape (2, 3) and that of the noise (3,), in m/s^2 or rad/s. There
+        is a result for the window means and for each decade.
 
         ``sqrt(max(mean square of measured - simulated - that of the noise, 0))``.
         """
@@ -69,7 +80,9 @@ class Distance:
 
     def density(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        Return (frequency (k,), amplitude density of the residual (2, k, 3), of the noise (k, 3)), per sqrt(Hz).
+        Return (frequency, amplitude density of the residual, that of the noise).
+
+        The shapes are (k,), (2, k, 3) and (k, 3). The densities are per sqrt(Hz).
 
         Bands without data and the last one are left out.
         """
@@ -83,7 +96,11 @@ class Distance:
         )
 
     def to_mapping(self) -> dict:
-        """Return plain data: rms beyond noise before and after, and of the noise, by band, in SI units."""
+        """
+        Return plain data.
+
+        Rms beyond noise before and after, and of the noise, by band, in SI units.
+        """
         return {
             'bands': [
                 {
@@ -120,7 +137,11 @@ class DistanceSums:
         residuals: Sequence[Mapping[str, np.ndarray]],
         noise: Mapping[str, NoiseModel],
     ) -> None:
-        """Add a window with its residuals (before, after: sensor -> (n, 3)) and the noise of each sensor."""
+        """
+        Add a window with its residuals and the noise of each sensor.
+
+        The residuals are (before, after: sensor -> (n, 3)).
+        """
         n, rest = len(window), window.kind == 'static'
         if n < 4 or not window.period:
             return
@@ -205,7 +226,10 @@ class OverlaySegment:
     time: np.ndarray
     """Seconds since the first sample, shape (n,)."""
     signals: dict[str, np.ndarray]
-    """'measured', 'simulated before', 'simulated after': m/s^2 or rad/s, shape (n,); samples, or means of equal numbers of them."""
+    """
+    'measured', 'simulated before', 'simulated after': m/s^2 or rad/s, shape (n,); samples, or means
+    of equal numbers of them.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +255,10 @@ class Traces:
     samples: np.ndarray
     """Samples in each block, shape (n,)."""
     dead_reckoning: dict | None
-    """{'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after', 'stretches'}: medians, m and m/s, or None when
-    no stretch of the recording is long enough."""
+    """
+    {'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after',
+    'stretches'}: medians, m and m/s, or None when no stretch of the recording is long enough.
+    """
     segments: dict[str, list[OverlaySegment]] = field(default_factory=dict)
     """Sensor -> for each axis the segment with the largest residual before."""
     distances: dict[str, Distance] = field(default_factory=dict)
@@ -324,7 +350,9 @@ def residual_traces(
 
 
 def _used(windows, spans):
-    """Yield the windows that are not unused, and append (first, last) time of every window to `spans`."""
+    """
+    Yield the windows that are not unused, and append (first, last) time of every window to `spans`.
+    """
     for window in windows:
         spans.append((window.time[0], window.time[-1]))
         if window.kind != 'unused':
@@ -332,7 +360,11 @@ def _used(windows, spans):
 
 
 def _largest(time, residual):
-    """Return start and end of the segment of `SEGMENT` seconds with the largest sum of squares of a residual."""
+    """
+    Return start and end of the segment with the largest residual.
+
+    The segment has `SEGMENT` seconds and the largest sum of squares of a residual.
+    """
     sums = np.concatenate([[0.0], np.cumsum(residual**2)])
     stop = np.searchsorted(time, time + SEGMENT)
     first = int(np.argmax(sums[stop] - sums[:-1]))
@@ -362,7 +394,11 @@ def _segment(windows, spans, table, models, sensor, axis, start, stop):
 
 
 def _variables(windows, table, model):
-    """Return position, specific force, rate and temperature (or None) of the reference at the samples, at the values of a model."""
+    """
+    Return the state of the reference at the samples, at the values of a model.
+
+    The state is position, specific force, rate and temperature (or None).
+    """
     motion, temperature, rows = all_samples(windows)
     reference = _references(model, table, motion, temperature)
     return (
@@ -380,7 +416,9 @@ def _references(model, table, motion, temperature):
 
 
 def _starts(windows):
-    """Return the first sample of each block of the windows in one piece; blocks end with their window."""
+    """
+    Return the first sample of each block of the windows in one piece; blocks end with their window.
+    """
     places = [
         ((window.time - window.time[0]) / PLOT_BLOCK_SECONDS).astype(int) for window in windows
     ]
@@ -416,7 +454,11 @@ def _dead_reckoning(windows, spans, table, models):
 
 
 def _drifts(windows, table, models):
-    """Return the errors of velocity and position, m/s and m, of each model `DEAD_RECKONING` seconds after the start of some windows."""
+    """
+    Return the dead-reckoning errors of velocity and position of each model.
+
+    The errors, in m/s and m, are the ones `DEAD_RECKONING` seconds after the start of some windows.
+    """
     motion, temperature, rows = all_samples(windows)
     time, found = np.concatenate([window.time for window in windows]), []
     for model in models:

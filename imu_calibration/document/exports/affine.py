@@ -1,4 +1,8 @@
-"""The largest IMU model of other programs: temperature-dependent offsets, matrices, response to specific force, lever arms."""
+"""
+The largest IMU model of other programs.
+
+Temperature-dependent offsets, matrices, response to specific force, lever arms.
+"""
 
 import re
 import shlex
@@ -83,9 +87,13 @@ def _zeros(*shape):
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AffineImu:
     """
-    ``readings_i = bias_i + thermal_i (T - T0) + matrix_i @ (input + lever_matrix @ arm_i) + cross_i @ force``.
+    Sensor equation with bias, matrix, lever arms and cross terms.
 
-    The input is true specific force or rate at an origin, in some frame; the readings may have different axes.
+    It is ``readings_i = bias_i + thermal_i (T - T0) + matrix_i @ (input + lever_matrix @ arm_i) +
+    cross_i @ force``.
+
+    The input is true specific force or rate at an origin, in some frame; the readings may have
+    different axes.
     """
 
     bias: dict[str, np.ndarray] = _zeros(3)
@@ -120,13 +128,21 @@ class AffineImu:
 def held_values(
     calibration: Calibration, effect: Effect, capability: Capability | None
 ) -> np.ndarray:
-    """Return the values of an effect as the target represents them: its prior where it is not represented, shape (size,)."""
+    """
+    Return the values of an effect as the target represents them.
+
+    Its prior where it is not represented, shape (size,).
+    """
     values = calibration.values[calibration.model.slices[effect.key]]
     return effect.prior_values() if capability is None else capability.held(values)
 
 
 def undone(corrections: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> AffineImu:
-    """Return the IMU whose readings ``matrix @ readings - offset`` corrects, from sensor -> (matrix, offset); other sensors are perfect."""
+    """
+    Return the IMU whose readings ``matrix @ readings - offset`` corrects.
+
+    From sensor -> (matrix, offset); other sensors are perfect.
+    """
     matrix = {sensor: np.linalg.inv(turn) for sensor, (turn, _) in corrections.items()}
     bias = {sensor: matrix[sensor] @ offset for sensor, (_, offset) in corrections.items()}
     perfect = AffineImu()
@@ -174,7 +190,9 @@ class Placement:
     def truth(
         self, force: np.ndarray, rate: np.ndarray, alpha: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return true specific force and rate at the program's origin in its frame, each shape (n, 3)."""
+        """
+        Return true specific force and rate at the program's origin in its frame, each shape (n, 3).
+        """
         return (
             force + lever_matrix(rate, alpha) @ self.origin_s
         ) @ self.mat_ts.T, rate @ self.mat_ts.T
@@ -184,8 +202,8 @@ def moved(imu: AffineImu, to: Placement) -> AffineImu:
     """
     Return the same IMU in the frame, origin and axes of another program.
 
-    With ``f = mat_ts' f_t - lever_matrix @ origin_s``; the effect of the change of origin on the gyroscope's response to specific force
-    (a product of two small terms) is omitted.
+    With ``f = mat_ts' f_t - lever_matrix @ origin_s``; the effect of the change of origin on the
+    gyroscope's response to specific force (a product of two small terms) is omitted.
     """
     turned = {sensor: to.mat_readings @ imu.matrix[sensor] @ to.mat_ts.T for sensor in SENSORS}
     arms = (
@@ -230,7 +248,11 @@ def pose_line(placement: Placement, parent: str, child: str) -> str:
 
 
 def find_pose(content: bytes) -> tuple[Placement, str] | None:
-    """Return (placement, our frame) of the first such line in a file, None where there is none: in files of other programs."""
+    """
+    Return (placement, our frame) of the first such line in a file, None where there is none.
+
+    In files of other programs.
+    """
     line = re.search(rf'{PUBLISHER} (.*)', content.decode(errors='replace'))
     try:
         words = shlex.split(line.group(1).partition('"')[0]) if line else []
@@ -245,9 +267,9 @@ def find_pose(content: bytes) -> tuple[Placement, str] | None:
         return None
     if not np.all(np.isfinite(values)) or not 0.99 < np.linalg.norm(values[3:]) < 1.01:
         return None
-    return Placement(
-        mat_ts=Rotation.from_quat(values[3:]).as_matrix().T, origin_s=values[:3]
-    ), '' if parent == UNNAMED else parent
+    return Placement(mat_ts=Rotation.from_quat(values[3:]).as_matrix().T, origin_s=values[:3]), (
+        '' if parent == UNNAMED else parent
+    )
 
 
 FRD = np.diag([1.0, -1.0, -1.0])
@@ -266,8 +288,8 @@ def lower_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     if np.linalg.det(matrix) <= 0:
         raise InputError(
-            'the axes of a sensor must be right-handed, the matrix of this calibration turns them into their mirror image; '
-            'check for an exchanged axis',
+            'the axes of a sensor must be right-handed, the matrix of this calibration turns them'
+            ' into their mirror image; check for an exchanged axis',
             code='left_handed',
         )
     q, r = np.linalg.qr(matrix.T)

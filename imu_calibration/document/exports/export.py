@@ -72,15 +72,16 @@ def export(
     """
     Return the file of a target.
 
-    A sensor that compensation does not correct has the nominal numbers; its loss is the whole error by the calibration. For a target that
-    contains the complete document, with its decisions.
+    A sensor that compensation does not correct has the nominal numbers; its loss is the whole error
+    by the calibration. For a target that contains the complete document, with its decisions.
 
     Parameters
     ----------
     calibration : Calibration
     target : Target
     noise : NoiseFigures, optional
-        From a noise document; without one the white noise of the calibration's recording is used, without random walks.
+        From a noise document; without one the white noise of the calibration's recording is used,
+        without random walks.
     rate : float, optional
         Rate at which the target gets the readings, Hz; default that of the noise document.
     motion : TrialMotion, optional
@@ -91,7 +92,8 @@ def export(
     Raises
     ------
     InputError
-        When the target needs noise that is not there, or the calibration cannot be brought into its axes.
+        When the target needs noise that is not there, or the calibration cannot be brought into its
+        axes.
     DocumentError
         When no sensor should be corrected with the calibration.
 
@@ -161,7 +163,8 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
         )
         if target.only_noise:
             raise InputError(
-                f'for {target.title} there must be {lacks} and there is none; give a noise document',
+                f'for {target.title} there must be {lacks} and there is none; give a noise'
+                ' document',
                 key='noise',
                 code='noise_missing',
             )
@@ -186,8 +189,8 @@ def _noise_of(calibration, figures, rate) -> Noise | None:
         ]
         if unbounded:
             raise InputError(
-                f'the noise document must bound the random walk of both sensors, that of the {" and ".join(unbounded)} has no '
-                'bound; record a longer rest',
+                'the noise document must bound the random walk of both sensors, that of the'
+                f' {" and ".join(unbounded)} has no bound; record a longer rest',
                 key='noise',
                 code='walk_unbounded',
             )
@@ -216,7 +219,10 @@ def _placement_lines(calibration, target, placement) -> list[str]:
         return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
     child = f'{name}_{target.name}'
     return [
-        f"frame: {child}, turned and moved against {name} as the target's conventions demand; extrinsics change with it:",
+        (
+            f"frame: {child}, turned and moved against {name} as the target's conventions demand;"
+            ' extrinsics change with it:'
+        ),
         f'  {pose_line(placement, name, child)}',
     ]
 
@@ -231,7 +237,8 @@ def _worked_sample(target, numbers, placement, calibration) -> list[str]:
     made = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
     shown = [', '.join(f'{value:.9g}' for value in values[0]) for values in (force, rate, *made)]
     return [
-        f'worked sample: readings [{shown[0]}] m/s^2, [{shown[1]}] rad/s become [{shown[2]}], [{shown[3]}]'
+        f'worked sample: readings [{shown[0]}] m/s^2, [{shown[1]}] rad/s become [{shown[2]}],'
+        f' [{shown[3]}]'
     ]
 
 
@@ -243,8 +250,14 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
         )
         beside = ' in addition to a constant bias' if target.estimates else ''
         return [
-            'accepts no calibration: use compensated readings (compensator_node, or the verb compensate)',
-            f'fed with raw readings it is left with an error of rms {left}{beside}, on {loss.motion}',
+            (
+                'accepts no calibration: use compensated readings (compensator_node, or the verb'
+                ' compensate)'
+            ),
+            (
+                f'fed with raw readings it is left with an error of rms {left}{beside}, on'
+                f' {loss.motion}'
+            ),
         ]
     lines = []
     if loss.estimated:
@@ -257,7 +270,8 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
     for lost in loss.effects:
         what = 'held in part' if lost.in_part else 'lost'
         lines.append(
-            f'{what}: {lost.effect.sensor} {lost.effect.name}, {error_text(lost.rms, UNITS[lost.effect.sensor])} rms'
+            f'{what}: {lost.effect.sensor} {lost.effect.name},'
+            f' {error_text(lost.rms, UNITS[lost.effect.sensor])} rms'
         )
     for sensor in SENSORS:
         left, raw = (error_text(error[sensor], UNITS[sensor]) for error in (loss.left, loss.raw))
@@ -326,7 +340,8 @@ def find_target(name: str, *, read: bool = False) -> Target:
     }
     if name not in fitting:
         raise InputError(
-            f"the name of a program whose files can be {'read' if read else 'written'} is required, got '{name}'"
+            f'the name of a program whose files can be {"read" if read else "written"} is required,'
+            f" got '{name}'"
             f'{did_you_mean(name, fitting)}; choose from {", ".join(fitting)}'
         )
     return fitting[name]

@@ -37,7 +37,10 @@ class TrialMotion:
     """True motion on which a loss is measured."""
 
     reference: Reference
-    """Specific force, rate and angular acceleration at our origin in our sensor frame, and the temperature."""
+    """
+    Specific force, rate and angular acceleration at our origin in our sensor frame, and the
+    temperature.
+    """
     text: str
     """Description."""
 
@@ -55,10 +58,13 @@ def motion_of(
 
 def standard_motion(calibration: Calibration) -> TrialMotion:
     """
-    Return the declared motion of a calibration: a minute with gravity in all directions and rates as large as in its recording.
+    Return the declared motion of a calibration.
 
-    Gravity runs along a spiral from nadir to zenith; each rate swings with the calibration's largest rate, or 1 rad/s, at 0.3 to 0.5 Hz;
-    the temperature runs through the calibration's range. The three are drawn independently of one another.
+    A minute with gravity in all directions and rates as large as in its recording.
+
+    Gravity runs along a spiral from nadir to zenith; each rate swings with the calibration's
+    largest rate, or 1 rad/s, at 0.3 to 0.5 Hz; the temperature runs through the calibration's
+    range. The three are drawn independently of one another.
     """
     conditions = calibration.conditions
     largest = conditions.get('largest_rate') or USUAL_RATE
@@ -73,7 +79,10 @@ def standard_motion(calibration: Calibration) -> TrialMotion:
     low, high = conditions.get('temperature_range_c') or [calibration.model.temperature_ref_c] * 2
     temperature = np.linspace(low, high, len(time))
     warmth = f'{low:g} C' if low == high else f'{low:g} to {high:g} C'
-    text = f'a standard motion (gravity in all directions, {largest:.3g} rad/s at 0.3 to 0.5 Hz about each axis, {warmth})'
+    text = (
+        f'a standard motion (gravity in all directions, {largest:.3g} rad/s at 0.3 to 0.5 Hz about'
+        f' each axis, {warmth})'
+    )
     return motion_of(force, rate, alpha, temperature_c=temperature, text=text)
 
 
@@ -99,7 +108,8 @@ def recorded_motion(
     )
     if not kept.any():
         raise InputError(
-            f'{name} must have readings that can be compensated, it has none; give another recording'
+            f'{name} must have readings that can be compensated, it has none; give another'
+            ' recording'
         )
     stamps = imu.stamp_ns[kept]
     slope = StampedDerivative(derivative_for(calibration, typical_period(stamps[:10_000]) or 0.01))
@@ -116,7 +126,11 @@ def recorded_motion(
 def temperature_at(
     calibration: Calibration, temperature: TemperatureSamples | None, stamp_ns: np.ndarray
 ) -> np.ndarray:
-    """Return the temperature at stamps, shape (n,): the calibration's reference where none was measured."""
+    """
+    Return the temperature at stamps, shape (n,).
+
+    The calibration's reference where none was measured.
+    """
     if temperature is None or not len(temperature):
         return np.full(len(stamp_ns), calibration.model.temperature_ref_c)
     first = temperature.stamp_ns[0]
@@ -150,7 +164,10 @@ class Loss:
     estimated: tuple[Effect, ...]
     """Effects that the program finds by itself; they count as known here."""
     left: dict[str, float]
-    """Sensor -> rms difference per component between the program's readings and the full compensation, SI."""
+    """
+    Sensor -> rms difference per component between the program's readings and the full compensation,
+    SI.
+    """
     raw: dict[str, float]
     """Sensor -> rms difference per component between raw readings and the full compensation, SI."""
     motion: str
@@ -173,8 +190,9 @@ def loss_of(
     """
     Return the loss of a target on a motion.
 
-    Readings are simulated without noise by the model that compensation inverts. The effects that the target estimates are removed from
-    them; the target's formula is applied; the result is compared with the true motion in its frame, at its origin.
+    Readings are simulated without noise by the model that compensation inverts. The effects that
+    the target estimates are removed from them; the target's formula is applied; the result is
+    compared with the true motion in its frame, at its origin.
 
     Parameters
     ----------
@@ -222,7 +240,11 @@ def loss_of(
 
 
 def _lost(calibration, effect, holds, motion):
-    """Return the part of the readings due to the part of an effect that is not represented, None where the whole effect is."""
+    """
+    Return the part of the readings due to the part of an effect that is not represented.
+
+    None where the whole effect is.
+    """
     capability = affine.capability_of(effect, holds)
     held = affine.held_values(calibration, effect, capability)
     if np.array_equal(held, calibration.values[calibration.model.slices[effect.key]]):
@@ -243,9 +265,10 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     """
     Return the calibration in a file of another program.
 
-    Values are those of the file; where it states its rotation to the sensor frame, as exported files do, they are rotated back.
-    Standard deviations are those of the priors, since the file has none: a value in the file is
-    weak, a value that the format lacks is fixed at its prior. Without a proof each sensor is unproven.
+    Values are those of the file; where it states its rotation to the sensor frame, as exported
+    files do, they are rotated back. Standard deviations are those of the priors, since the file has
+    none: a value in the file is weak, a value that the format lacks is fixed at its prior. Without
+    a proof each sensor is unproven.
 
     Parameters
     ----------
@@ -303,7 +326,10 @@ def _document(
             known = np.eye(3).ravel() > 0 if capability.own_axis else np.full(effect.size, True)
             status[part] = np.where(known, WEAK, HELD)
     name = getattr(path, 'name', str(path))
-    reason = f'imported from {target.title} ({name}) without uncertainties, its error was not measured on a recording'
+    reason = (
+        f'imported from {target.title} ({name}) without uncertainties, its error was not measured'
+        ' on a recording'
+    )
     statistics = {sensor: {'noise_sd': [value] * 3} for sensor, value in found.sample_sd.items()}
     conditions = (
         {'temperature_range_c': list(imu.temperature_range_c)} if imu.temperature_range_c else {}

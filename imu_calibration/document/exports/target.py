@@ -1,4 +1,6 @@
-"""Target of an export: representable effects, frames, formula, file; text that it writes and reads."""
+"""
+Target of an export: representable effects, frames, formula, file; text that it writes and reads.
+"""
 
 import json
 import re
@@ -79,13 +81,13 @@ def numbers_at(mapping: dict, name: str, shape: tuple[int, ...], *, what: str) -
         array = np.asarray(mapping[name], float)
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(
-            f"the {what} must have '{name}', numbers of shape {shape}, got {shortened(repr(mapping.get(name)))}; "
-            'correct it'
+            f"the {what} must have '{name}', numbers of shape {shape}, got"
+            f' {shortened(repr(mapping.get(name)))}; correct it'
         ) from error
     if array.size != np.prod(shape, dtype=int) or not np.all(np.isfinite(array)):
         raise InputError(
-            f"'{name}' of the {what} must be finite numbers of shape {shape}, got {shortened(repr(mapping[name]))}; "
-            'correct it'
+            f"'{name}' of the {what} must be finite numbers of shape {shape}, got"
+            f' {shortened(repr(mapping[name]))}; correct it'
         )
     return array.reshape(shape)
 
@@ -95,7 +97,8 @@ def section(mapping: dict, name: str, what: str) -> dict:
     found = mapping.get(name)
     if not isinstance(found, dict):
         raise InputError(
-            f"the {what} must have a section '{name}', got {shortened(repr(found))}; give another file"
+            f"the {what} must have a section '{name}', got {shortened(repr(found))}; give another"
+            ' file'
         )
     return found
 
@@ -104,8 +107,8 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     """
     Return {name: value} from a list of parameters, one a line, comments after ``#``.
 
-    The last field of a line is the value in ArduPilot's lists (``NAME,VALUE``), the fourth in QGroundControl's
-    (``vehicle component NAME VALUE type``).
+    The last field of a line is the value in ArduPilot's lists (``NAME,VALUE``), the fourth in
+    QGroundControl's (``vehicle component NAME VALUE type``).
     """
     found = {}
     for line in text_of(content, what).splitlines():
@@ -119,17 +122,21 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
             found[words[name]] = float(words[name + 1])
         except ValueError as error:
             raise InputError(
-                f"the {what} must give '{words[name]}' a number, got {shortened(words[name + 1])}; correct it"
+                f"the {what} must give '{words[name]}' a number, got {shortened(words[name + 1])};"
+                ' correct it'
             ) from error
     if not found:
         raise InputError(
-            f'the {what} must hold parameters, one NAME and value a line, it holds none; give another file'
+            f'the {what} must hold parameters, one NAME and value a line, it holds none; give'
+            ' another file'
         )
     return found
 
 
 def vector_of(found: dict[str, float], name: str, missing: float = 0.0) -> np.ndarray:
-    """Return the parameters of the three axes, whose letter replaces ``*`` in the name, shape (3,)."""
+    """
+    Return the parameters of the three axes, whose letter replaces ``*`` in the name, shape (3,).
+    """
     return np.array([found.get(name.replace('*', axis), missing) for axis in AXIS_LETTERS])
 
 
@@ -146,8 +153,8 @@ def refuse_curved(found: dict[str, float], beginnings: list[str]) -> None:
     curved = [name for name, value in found.items() if name.startswith(tuple(beginnings)) and value]
     if curved:
         raise InputError(
-            f'thermal offsets must be linear in the temperature to be read, got {curved[0]} = {found[curved[0]]:g}; '
-            'set it to 0, or calibrate with a temperature topic',
+            f'thermal offsets must be linear in the temperature to be read, got {curved[0]} ='
+            f' {found[curved[0]]:g}; set it to 0, or calibrate with a temperature topic',
             code='not_linear',
         )
 
@@ -164,7 +171,10 @@ class Readings(NamedTuple):
     rate: np.ndarray
     """Measured rate, rad/s, shape (n, 3)."""
     alpha: np.ndarray
-    """True angular acceleration in the program's frame, rad/s^2, shape (n, 3): estimators have it from their trajectory."""
+    """
+    True angular acceleration in the program's frame, rad/s^2, shape (n, 3): estimators have it from
+    their trajectory.
+    """
     temperature_c: np.ndarray
     """Degrees Celsius, shape (n,)."""
 
@@ -180,15 +190,24 @@ class Noise:
     rate: float
     """Sampling rate, Hz."""
     walk_known: bool = True
-    """Whether the random walks are known: a noise document has them, a calibration has the white noise only."""
+    """
+    Whether the random walks are known: a noise document has them, a calibration has the white noise
+    only.
+    """
 
 
 EXPORT_INVERSION_STEPS = 30
-"""Fixed-point steps of the inversion: arms and g-sensitivity couple both sensors by small numbers."""
+"""
+Fixed-point steps of the inversion: arms and g-sensitivity couple both sensors by small numbers.
+"""
 
 
 def inverted(imu: AffineImu, readings: Readings) -> tuple[np.ndarray, np.ndarray]:
-    """Return true (force, rate), the inverse of `AffineImu`; beyond its range of temperature the thermal part is that of the end."""
+    """
+    Return true (force, rate), the inverse of `AffineImu`.
+
+    Beyond its range of temperature the thermal part is that of the end.
+    """
     low, high = imu.temperature_range_c or (-np.inf, np.inf)
     warmth = np.clip(readings.temperature_c, low, high) - imu.temperature_ref_c
     force, turning = (

@@ -24,7 +24,10 @@ class BiasMovement:
     course: np.ndarray
     """Departure from its mean in each pose, shape (k, 3), m/s^2 or rad/s."""
     growth: np.ndarray
-    """Factor by which the sds of the sensor's bias and matrix grow when the drift is estimated too, shape (n,)."""
+    """
+    Factor by which the sds of the sensor's bias and matrix grow when the drift is estimated too,
+    shape (n,).
+    """
 
     @property
     def size(self) -> np.ndarray:
@@ -33,7 +36,11 @@ class BiasMovement:
 
 
 def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[str, BiasMovement]:
-    """Return sensor -> `BiasMovement` of the biases that move beyond the scatter from pose to pose (F test of a parabola in time)."""
+    """
+    Return sensor -> `BiasMovement` of the biases that move.
+
+    They move beyond the scatter from pose to pose (F test of a parabola in time).
+    """
     if not np.ptp(poses.time) > 0:
         return {}
     time = (poses.time - poses.time.mean()) / np.ptp(poses.time)
@@ -55,7 +62,9 @@ def _powers(time, count):
 
 
 def _of_norms(time, residual, base):
-    """The drift of the accelerometer's bias: only its component along gravity is observable in a pose."""
+    """
+    The drift of the accelerometer's bias: only its component along gravity is observable in a pose.
+    """
     back = base[:, 0:3]
     powers = _powers(time, len(time) - base.shape[1] - 3)
     added = np.hstack([power[:, None] * back for power in powers.T])
@@ -93,7 +102,11 @@ def _of_rates(time, rates):
 
 
 def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
-    """Return an orthonormal basis of columns of unit length, maybe dependent: singular values above `least` of the largest count."""
+    """
+    Return an orthonormal basis of columns of unit length, maybe dependent.
+
+    Singular values above `least` of the largest count.
+    """
     size = np.linalg.norm(columns, axis=0)
     columns = columns[:, size > 0] / size[size > 0]
     if not columns.shape[1]:
@@ -108,7 +121,11 @@ def _shown(before, after, added, spare):
 
 
 def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Poses:
-    """Return the poses with the accelerometer's bias at its mean; the gyroscope's may differ between poses anyway."""
+    """
+    Return the poses with the accelerometer's bias at its mean.
+
+    The gyroscope's may differ between poses anyway.
+    """
     moved = movements.get('accelerometer')
     return poses if moved is None else replace(poses, force=poses.force - moved.course)
 
@@ -116,7 +133,11 @@ def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Pos
 def with_movement(
     covariance: np.ndarray, model: HandModel, movements: Mapping[str, BiasMovement]
 ) -> np.ndarray:
-    """Return the covariance with the drift: the bias at any time of the recording is within one sd of the reported mean."""
+    """
+    Return the covariance with the drift.
+
+    The bias at any time of the recording is within one sd of the reported mean.
+    """
     grown = covariance.copy()
     for sensor, movement in movements.items():
         index = model.base_index(sensor)

@@ -1,4 +1,8 @@
-"""The equations of a calibration by hand: poses at rest, turns between them, and full turns of known angle."""
+"""
+The equations of a calibration by hand.
+
+Poses at rest, turns between them, and full turns of known angle.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,17 +17,26 @@ from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
 COMPONENTS = ('pose', 'drift', 'turn')
-"""Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns."""
+"""
+Scatter beyond the noise: of the accelerometer between poses, of the gyroscope's bias, of the turns.
+"""
 SCATTER_SD = (0.002, 1e-4, 2e-3)
-"""Their standard deviations when there are too few poses or turns to estimate them, m/s^2, rad/s, rad."""
+"""
+Their standard deviations when there are too few poses or turns to estimate them, m/s^2, rad/s, rad.
+"""
 
 
 OF_DIRECTION, OF_DRIFT = slice(0, 2), slice(2, 5)
-"""Nuisances of a pose: components of its direction, departure of the gyroscope's bias; pose after pose, so that the rows form a band."""
+"""
+Nuisances of a pose: components of its direction, departure of the gyroscope's bias; pose after
+pose, so that the rows form a band.
+"""
 MAX_FIRST_ORDER_ANGLE = 1e-3
 """rad; its square, times a turn's few radians, is the error of the first-order correction."""
 CALM = 0.05
-"""Least scatter of the drifts in units of the noise of the means, so that no row has infinite weight."""
+"""
+Least scatter of the drifts in units of the noise of the means, so that no row has infinite weight.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +64,10 @@ class Poses:
     period: float = 0.0
     """Time from sample to sample, s."""
     half_turn: np.ndarray | None = None
-    """Angle by which the attitude creeps across gravity from the middle of each interval to its end, rad, shape (k, 3); not in `rate`."""
+    """
+    Angle by which the attitude creeps across gravity from the middle of each interval to its end,
+    rad, shape (k, 3); not in `rate`.
+    """
 
     @property
     def conditions(self) -> dict[str, Any]:
@@ -76,7 +92,9 @@ class TurnData:
     noise_variance: float = 0.0
     """Variance of the integrated rate noise per axis, rad^2."""
     rotation: np.ndarray | None = None
-    """Known rotation vector about a body axis, rad, shape (3,); None when gravity is the reference."""
+    """
+    Known rotation vector about a body axis, rad, shape (3,); None when gravity is the reference.
+    """
     rotation_cov: np.ndarray | None = None
     """Covariance of `rotation`, shape (3, 3)."""
     temperature_c: np.ndarray | None = None
@@ -113,14 +131,21 @@ class GravityRows:
     turns: Sequence[TurnData]
     """Turns between them."""
     memory: dict = field(default_factory=dict)
-    """Turns integrated before; for similar parameters they are corrected to first order instead of being integrated again."""
+    """
+    Turns integrated before; for similar parameters they are corrected to first order instead of
+    being integrated again.
+    """
 
     nominal = property(lambda self: self.model.nominal)
     priors = property(lambda self: self.model.priors)
     fixed = property(lambda self: self.model.fixed)
 
     def moved(self, state: State, step: np.ndarray) -> State:
-        """Return the state after a step: pose after pose 2 components of its direction and 3 of its drift, then the parameters."""
+        """
+        Return the state after a step.
+
+        Pose after pose 2 components of its direction and 3 of its drift, then the parameters.
+        """
         own = step[: 5 * len(state.up)].reshape(-1, 5)
         up = state.up + np.einsum('kij,kj->ki', tangent(state.up), own[:, :2])
         return State(state.values + step[own.size :], unit_rows(up), state.drift + own[:, 2:])
@@ -143,7 +168,11 @@ class GravityRows:
 
 
 def _pose_rows(model, state, poses, across):
-    """``force = bias + matrix @ (gravity * up) + further effects``: three rows per pose, two of them used for its direction."""
+    """
+    ``force = bias + matrix @ (gravity * up) + further effects``.
+
+    Three rows per pose, two of them used for its direction.
+    """
     bias, matrix, *_ = model.linear(state.values)
     count = len(state.up)
     true = model.gravity * state.up
@@ -184,7 +213,9 @@ def _calm_rows(model, state, poses):
 
 
 def _integrated(model, state, data, bias, key, memory):
-    """Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly changed since."""
+    """
+    Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly changed since.
+    """
     matrix, further = model.linear(state.values)[3], state.values[model.extra_index('gyroscope')]
     if key in memory:
         (old_bias, old_matrix, old_further), turn = memory[key]
@@ -207,7 +238,11 @@ def _integrated(model, state, data, bias, key, memory):
 
 
 def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndarray:
-    """Return the matrix of a turn, (3, 3), from the middle of the pose before it to that of the one after."""
+    """
+    Return the matrix of a turn, (3, 3).
+
+    From the middle of the pose before it to that of the one after.
+    """
     if poses.half_turn is None:
         return mat_ji
     return (
@@ -218,7 +253,11 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
 
 
 def _gravity_turn_rows(model, state, data, key, memory, across, poses):
-    """The direction before the turn, rotated by the gyroscope, against the direction after it: two rows, from middle to middle."""
+    """
+    The direction before the turn, rotated by the gyroscope, against the direction after it.
+
+    Two rows, from middle to middle.
+    """
     i, j = data.first, data.last
     mat_ji, turn = _integrated(
         model,
@@ -250,7 +289,11 @@ def _gravity_turn_rows(model, state, data, key, memory, across, poses):
 
 
 def _known_turn_rows(model, state, data):
-    """``matrix^-1 integral(measured - bias - further effects) = rotation`` for a turn about a fixed body axis, whitened: three rows."""
+    """
+    Equation of the rotation for a turn about a fixed body axis, three rows.
+
+    It is ``matrix^-1 integral(measured - bias - further effects) = rotation``, whitened.
+    """
     _, _, bias, matrix = model.linear(state.values)
     further = _further_of_turn(model, state, data, bias)
     turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=further)
@@ -274,7 +317,11 @@ def _known_turn_rows(model, state, data):
 
 
 def _further_of_turn(model, state, data, bias):
-    """Return output and columns of the gyroscope's further effects along a turn, at the forces and rates without them."""
+    """
+    Return output and columns of the gyroscope's further effects along a turn.
+
+    They are at the forces and rates without the further effects.
+    """
     bias_f, matrix_f, _, matrix = model.linear(state.values)
     force, rate = (
         np.linalg.solve(matrix_f, (data.force - bias_f).T).T,
@@ -291,7 +338,9 @@ def _further_of_turn(model, state, data, bias):
 
 
 def _flat(residual, place, blocks, main, noise, component):
-    """Return three rows per pose; `blocks`: their columns of the pose's own nuisances at `place`."""
+    """
+    Return three rows per pose; `blocks`: their columns of the pose's own nuisances at `place`.
+    """
     own, nuisance = np.arange(len(residual)), np.zeros((*residual.shape, len(residual), 5))
     nuisance[own, :, own, place] = blocks
     return (

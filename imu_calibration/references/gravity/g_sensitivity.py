@@ -1,4 +1,8 @@
-"""Test of the gyroscope's g-sensitivity at rest, given a drift in time: the order of the attitudes may correlate with a warm-up."""
+"""
+Test of the gyroscope's g-sensitivity at rest, given a drift in time.
+
+The order of the attitudes may correlate with a warm-up.
+"""
 
 from itertools import product
 
@@ -16,30 +20,39 @@ CHOSEN = 2
 SHARES = (0.0, 0.5, 0.8, 0.95, 0.99)
 """Candidate shares of the bias process in the scatter between poses."""
 RELATIVE_TIMES = (0.1, 0.3, 1.0, 3.0)
-"""Candidate correlation times of the bias process, in units of the time from the first pose to the last."""
+"""
+Candidate correlation times of the bias process, in units of the time from the first pose to the
+last.
+"""
 NO_EVIDENCE = {'g_sensitivity_p_value': 1.0, 'g_sensitivity_heldout_ratio': 1.0}
 G_SENSITIVITY_P_VALUE = 1e-3
 """The g-sensitivity enters the model below this p-value."""
 EARTH_UPWARDS_SD = EARTH_RATE / np.sqrt(3)
 """
-The Earth's rate about the vertical is its rate times the sine of the latitude, equivalent to an equal response of every axis to
-gravity. For an unknown latitude it is anything up to the full rate, rad/s.
+The Earth's rate about the vertical is its rate times the sine of the latitude, equivalent to an
+equal response of every axis to gravity. For an unknown latitude it is anything up to the full rate,
+rad/s.
 """
 
 
 def g_sensitivity_evidence(poses: Poses) -> dict:
     """
-    Test whether the gyroscope's readings at rest correlate with the direction of gravity, given drift in time and with temperature.
+    Test whether the gyroscope's readings at rest correlate with gravity.
 
-    ``rate = bias(time, temperature) + sensitivity @ force + earth * up + error``: the Earth's rate about the vertical is subtracted first,
-    as estimated from the readings within its physical limits; the bias is a parabola in time, with a term in temperature if it
-    was recorded, and the error contains a bias process whose share and correlation time are estimated by restricted likelihood.
+    The test is on the direction of gravity, given drift in time and with temperature.
+
+    ``rate = bias(time, temperature) + sensitivity @ force + earth * up + error``: the Earth's rate
+    about the vertical is subtracted first, as estimated from the readings within its physical
+    limits; the bias is a parabola in time, with a term in temperature if it was recorded, and the
+    error contains a bias process whose share and correlation time are estimated by restricted
+    likelihood.
 
     Returns
     -------
     dict
-        `g_sensitivity_p_value` of the F test against the bias model, and `g_sensitivity_heldout_ratio`, the rms with over that without it
-        for poses held out one at a time.
+        `g_sensitivity_p_value` of the F test against the bias model, and
+        `g_sensitivity_heldout_ratio`, the rms with over that without it for poses held out one at a
+        time.
 
     """
     count = len(poses.force)
@@ -78,7 +91,9 @@ def g_sensitivity_evidence(poses: Poses) -> dict:
 
 
 def shown(evidence: dict) -> bool:
-    """Return whether the g-sensitivity is significant enough to enter the model without a request."""
+    """
+    Return whether the g-sensitivity is significant enough to enter the model without a request.
+    """
     return (
         evidence['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE
         and evidence['g_sensitivity_heldout_ratio'] < 1
@@ -97,11 +112,16 @@ def _loss(covariance, design, values):
 
 
 def _left(covariance, design, values):
-    """Return the weighted residual sum of squares of a fit, shape (3,), and the leave-one-out prediction errors, shape (k, 3)."""
+    """
+    Return the weighted residual sum of squares of a fit.
+
+    Shape (3,), and the leave-one-out prediction errors, shape (k, 3).
+    """
     inverse = np.linalg.inv(covariance)
     weighted = inverse @ design
     projector = inverse - weighted @ np.linalg.solve(design.T @ weighted, weighted.T)
     left = projector @ values
-    return np.einsum('ki,ki->i', values, left), left / np.maximum(np.diag(projector), 1e-300)[
-        :, None
-    ]
+    return (
+        np.einsum('ki,ki->i', values, left),
+        left / np.maximum(np.diag(projector), 1e-300)[:, None],
+    )

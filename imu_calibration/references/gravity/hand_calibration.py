@@ -1,4 +1,8 @@
-"""Calibration without a table: gravity is the reference, poses held still and the turns between them are the data."""
+"""
+Calibration without a table.
+
+Gravity is the reference, poses held still and the turns between them are the data.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -57,18 +61,31 @@ GAUGE = {'origin': 'not_needed', 'axes': 'accelerometer_lower_triangular'}
 MIN_ATTITUDES = 4
 """With fewer attitudes even the accelerometer's biases are determined by the prior."""
 CROSS_TERM_RATIO = 1.96**2
-"""Likelihood ratio above which the data contradict a cross term of zero: 95 % of chi-square with one degree of freedom."""
+"""
+Likelihood ratio above which the data contradict a cross term of zero: 95 % of chi-square with one
+degree of freedom.
+"""
 MAX_HAND_PASSES = 4
-"""Largest number of solutions, when the columns of a warm-up are recomputed or poses and turns are excluded."""
+"""
+Largest number of solutions, when the columns of a warm-up are recomputed or poses and turns are
+excluded.
+"""
 MAX_SETTLED_CHANGE = 0.03
 """Relative change of a time constant below which its columns are not recomputed."""
 POSES_FULL = 12
-"""The nine accelerometer parameters need one equation per attitude; further ones determine the scatter of the poses."""
+"""
+The nine accelerometer parameters need one equation per attitude; further ones determine the scatter
+of the poses.
+"""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HandCalibration(Solution):
-    """Solution of ``measured = bias + matrix @ true (+ further effects)`` of both sensors with gravity as the reference."""
+    """
+    Solution of both sensors' equations with gravity as the reference.
+
+    The equation is ``measured = bias + matrix @ true (+ further effects)``.
+    """
 
     judged_without = (GRAVITY,)
 
@@ -100,7 +117,9 @@ class HandCalibration(Solution):
     @property
     def replacement_limit(self) -> np.ndarray:
         """
-        Likelihood ratio for cross terms of the accelerometer, otherwise the smallest expected error.
+        Likelihood ratio for cross terms, otherwise the smallest expected error.
+
+        The cross terms are terms of the accelerometer.
 
         Near the six faces the poses determine cross terms only through small tilts.
         """
@@ -108,7 +127,11 @@ class HandCalibration(Solution):
 
     @property
     def statuses(self) -> tuple[Status, ...]:
-        """Status of each parameter relative to gravity as used, without its uncertainty (`common_scale`)."""
+        """
+        Status of each parameter relative to gravity as used.
+
+        Without its uncertainty (`common_scale`).
+        """
         return statuses(self.judged_sd, self.held, self.tolerances)
 
     @property
@@ -118,7 +141,9 @@ class HandCalibration(Solution):
 
     @property
     def gyroscope(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity."""
+        """
+        (bias, matrix, g-sensitivity) of the gyroscope; zeros where the model has no g-sensitivity.
+        """
         effect = self.model.find('gyroscope', Role.CROSS)
         response = (
             np.zeros((3, 3))
@@ -135,7 +160,11 @@ class HandCalibration(Solution):
         *,
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return true specific force and rate for readings of shape (n, 3), at `time` s and `temperature_c` for effects that need them."""
+        """
+        Return true specific force and rate for readings of shape (n, 3).
+
+        The readings are at `time` s and `temperature_c` for effects that need them.
+        """
         return self.hand_model.compensate(
             self.values, force, rate, time=time, temperature_c=temperature_c
         )
@@ -146,7 +175,9 @@ class HandCalibration(Solution):
         return self.hand_model.norm_rows(self.values, poses.force, **poses.conditions)[0]
 
     def rate_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residual rates of the poses, shape (k, 3), and their columns, shape (k, 3, n)."""
+        """
+        Return the residual rates of the poses, shape (k, 3), and their columns, shape (k, 3, n).
+        """
         return self.hand_model.rate_rows(
             self.values, self.gravity * self.state.up, self.poses.rate, **self.poses.conditions
         )
@@ -163,9 +194,10 @@ def calibrate_by_hand(
     """
     Calibrate accelerometer and gyroscope from poses held still and the turns between them.
 
-    One weighted least-squares system: ``force_k = bias + matrix @ gravity u_k`` in pose k, ``C u_i = u_j`` for the turn from
-    pose i to j with C integrated from the rates, ``rate_k = bias + drift_k`` at rest. Scatter beyond the noise of poses,
-    drifts and turns is estimated as well. A wrong gravity is equivalent to a common scale of the accelerometer.
+    One weighted least-squares system: ``force_k = bias + matrix @ gravity u_k`` in pose k, ``C u_i
+    = u_j`` for the turn from pose i to j with C integrated from the rates, ``rate_k = bias +
+    drift_k`` at rest. Scatter beyond the noise of poses, drifts and turns is estimated as well. A
+    wrong gravity is equivalent to a common scale of the accelerometer.
 
     Parameters
     ----------
@@ -219,9 +251,10 @@ def gather_by_hand(
     attitudes = distinct_attitudes(poses.force)
     if attitudes < MIN_ATTITUDES:
         raise NotObservableError(
-            f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still ({POSES_FULL} or more for all parameters), '
-            f'got {attitudes} in {len(poses.start)} intervals at rest; hold the IMU still in more attitudes, '
-            'or describe the table or arm that moved it',
+            f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still'
+            f' ({POSES_FULL} or more for all parameters), got {attitudes} in {len(poses.start)}'
+            ' intervals at rest; hold the IMU still in more attitudes, or describe the table or'
+            ' arm that moved it',
             key='table',
             code='too_few_attitudes',
         )
@@ -260,7 +293,8 @@ def solve_by_hand(
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
         raise InputError(
-            f'{", ".join(thermal)} needs temperatures, the recording has none; record imu/temperature or omit it'
+            f'{", ".join(thermal)} needs temperatures, the recording has none; record'
+            ' imu/temperature or omit it'
         )
     state = first_state(model, poses)
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
@@ -363,7 +397,9 @@ def _settled(model, found):
 
 
 def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
-    """Return (the gyroscope's effects without a request, the evidence of the poses for g-sensitivity)."""
+    """
+    Return (the gyroscope's effects without a request, the evidence of the poses for g-sensitivity).
+    """
     evidence = g_sensitivity_evidence(poses)
     return G_SENSITIVE if shown(evidence) else BASE, evidence
 

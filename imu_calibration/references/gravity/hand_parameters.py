@@ -1,4 +1,8 @@
-"""Options and parameters of a calibration by hand: bias and matrix of both sensors, and further effects of the catalogue."""
+"""
+Options and parameters of a calibration by hand.
+
+Bias and matrix of both sensors, and further effects of the catalogue.
+"""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,11 +27,18 @@ CONVENTION_SD = 1e-12
 UNKNOWN_BY_HAND = {'angular acceleration', 'attitude', 'joint angle', 'joint rate'}
 """Quantities that cannot be determined from gravity in poses and the rates between them."""
 REPEATS = 4
-"""Fixed-point steps that invert an effect: each reduces the error by its size relative to the input, a thousand or more."""
+"""
+Fixed-point steps that invert an effect: each reduces the error by its size relative to the input, a
+thousand or more.
+"""
 
 
 def possible_by_hand(effect: Effect) -> bool:
-    """Return whether an effect is observable from gravity in poses and the turns between them: it has columns, and none needs a table."""
+    """
+    Return whether an effect is observable from gravity in poses and the turns between them.
+
+    It has columns, and none needs a table.
+    """
     return (
         bool(effect.groups)
         and effect.warp is None
@@ -52,7 +63,10 @@ class HandModel:
     gravity: float
     """Reference, m/s^2."""
     gyro_factor: float = 1.0
-    """Nominal reading of the gyroscope over the true rate: 2 where the driver converts for half the actual full-scale range."""
+    """
+    Nominal reading of the gyroscope over the true rate: 2 where the driver converts for half the
+    actual full-scale range.
+    """
 
     def __post_init__(self):
         """Refuse effects that are not observable by hand."""
@@ -117,7 +131,11 @@ class HandModel:
         return np.array([k for part in parts for k in range(part.start, part.stop)], int)
 
     def linear(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix) of a parameter vector."""
+        """
+        Return the biases and matrices of a parameter vector.
+
+        The order is (accelerometer bias, accelerometer matrix, gyroscope bias, gyroscope matrix).
+        """
         found = (
             values[self.model.part(sensor, role)]
             for sensor in SENSORS
@@ -141,7 +159,9 @@ class HandModel:
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return the contribution of the further effects to the output of a sensor, and its derivative by their parameters.
+        Return the contribution of the further effects to a sensor's output.
+
+        The derivative of the contribution by their parameters is returned as well.
 
         Parameters
         ----------
@@ -220,7 +240,9 @@ class HandModel:
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return ``|true force| - gravity`` of mean readings at rest, shape (k,), and minus its derivative by all parameters, shape (k, n).
+        Return ``|true force| - gravity`` of mean readings at rest.
+
+        Shape (k,), and minus its derivative by all parameters, shape (k, n).
 
         Parameters
         ----------
@@ -256,7 +278,12 @@ class HandModel:
         time: np.ndarray | None = None,
         temperature_c: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``rate - bias - further effects`` of mean rates at rest, (k, 3), and its columns, (k, 3, n), at true specific forces."""
+        """
+        Return ``rate - bias - further effects`` of mean rates at rest, and its columns.
+
+        The shapes are (k, 3) for the rates and (k, 3, n) for the columns. The columns are at true
+        specific forces.
+        """
         more, slopes = self.further(
             'gyroscope', values, force, time=time, temperature_c=temperature_c
         )
@@ -267,7 +294,10 @@ class HandModel:
 
 
 GRAVITY_LEAST, GRAVITY_MOST = 9.7, 9.9
-"""Smallest and largest gravity on the surface of the Earth with a margin, m/s^2: 9.764 on a mountain in Peru, 9.834 in the Arctic."""
+"""
+Smallest and largest gravity on the surface of the Earth with a margin, m/s^2: 9.764 on a mountain
+in Peru, 9.834 in the Arctic.
+"""
 
 
 @dataclass(frozen=True)
@@ -304,7 +334,9 @@ class HandOptions:
 
 def hand_options(options: CalibrationOptions) -> HandOptions:
     """
-    Return the requested options by hand: the standard gravity with its uncertainty if the local one is unknown.
+    Return the requested options by hand.
+
+    The standard gravity with its uncertainty if the local one is unknown.
 
     Raises
     ------
@@ -325,8 +357,8 @@ def hand_options(options: CalibrationOptions) -> HandOptions:
     )
     if options.gravity is not None and not GRAVITY_LEAST <= options.gravity <= GRAVITY_MOST:
         raise InputError(
-            f'gravity must be {GRAVITY_LEAST} to {GRAVITY_MOST} m/s^2, which covers the surface of the Earth, '
-            f'got {options.gravity:g}; give the local gravity in m/s^2, or none',
+            f'gravity must be {GRAVITY_LEAST} to {GRAVITY_MOST} m/s^2, which covers the surface of'
+            f' the Earth, got {options.gravity:g}; give the local gravity in m/s^2, or none',
             key='gravity',
         )
     gravity, spread = (

@@ -1,4 +1,8 @@
-"""Test of every effect on a recording by hand: the search of a diagnosis, on poses and turns instead of windows on a table."""
+"""
+Test of every effect on a recording by hand.
+
+The search of a diagnosis, on poses and turns instead of windows on a table.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -102,7 +106,9 @@ class HandProblem:
 
     def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
         """
-        Return whether the estimates of an effect from the poses before and after the middle agree (`evidence.agree`).
+        Return whether the estimates of an effect from both halves of the poses agree.
+
+        The halves are the poses before and after the middle (`evidence.agree`).
 
         Effects that are smooth in time differ by nature.
         """
@@ -125,7 +131,11 @@ class HandProblem:
         *,
         sensor: str,
     ) -> Gain:
-        """Return the Gain of one choice over another on the poses of `HandInvestigation.held_out`, held out from both fit and choice."""
+        """
+        Return the Gain of one choice over another on held-out poses.
+
+        The poses are `HandInvestigation.held_out`, held out from both fit and choice.
+        """
         block = self.clearest(before, after, sensor)
         pair = [np.full(block.known.shape, np.nan) for _ in range(2)]
         for out, named, smaller in held_out:
@@ -139,7 +149,11 @@ class HandProblem:
         return gain_of_poses(block, pair)
 
     def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Block:
-        """Return the rows of a sensor in which one choice improves most over another by cross-validation of the fit."""
+        """
+        Return the rows of a sensor in which one choice improves most over another.
+
+        The improvement is by cross-validation of the fit.
+        """
         squares = [
             [
                 np.sum(rest**2)
@@ -162,7 +176,9 @@ class HandInvestigation(SelectedEffects):
     named: Sequence[Question]
     """Questions that became findings, in the order found."""
     held_out: Sequence
-    """(poses, findings without them, the inquiry without them), ...: the complete search, repeated."""
+    """
+    (poses, findings without them, the inquiry without them), ...: the complete search, repeated.
+    """
     not_testable: list[dict]
     """Effects that could not be tested."""
     constants: np.ndarray
@@ -193,7 +209,11 @@ class HandInvestigation(SelectedEffects):
         }
 
     def point(self, problem: HandProblem, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
-        """Return effect -> initial values for its columns, of the warm-ups among the chosen effects, from the rows of `problem`."""
+        """
+        Return effect -> initial values for its columns, of the warm-ups among the chosen effects.
+
+        From the rows of `problem`.
+        """
         fit, warm = (
             problem.search.values(chosen),
             [question for question in chosen if '@' in question.label],
@@ -207,7 +227,9 @@ class HandInvestigation(SelectedEffects):
         self, problem: HandProblem, chosen: Sequence[Question]
     ) -> tuple[HandModel, np.ndarray, float]:
         """
-        Return the baseline extended by some effects: (model, parameters, the Earth's rate about the vertical, rad/s).
+        Return the baseline extended by some effects.
+
+        (model, parameters, the Earth's rate about the vertical, rad/s).
 
         `problem` has the rows for the estimate, those of this investigation or fewer.
         """
@@ -231,9 +253,10 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     """
     Test every effect that is observable by hand on held-out poses.
 
-    Every pose is held out in turn. The accelerometer is tested with the norm of gravity, the gyroscope with the rates at rest and the
-    directions of gravity before and after each turn. Poses are few, so variances are estimated too (F tests, losses
-    ``n log(mean square)``), with a bias process in addition to the scatter between poses.
+    Every pose is held out in turn. The accelerometer is tested with the norm of gravity, the
+    gyroscope with the rates at rest and the directions of gravity before and after each turn. Poses
+    are few, so variances are estimated too (F tests, losses ``n log(mean square)``), with a bias
+    process in addition to the scatter between poses.
 
     Parameters
     ----------
@@ -293,8 +316,8 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
 def too_few_poses(count: int) -> NotObservableError:
     """Return the error of a recording with so few poses that none can be held out."""
     return NotObservableError(
-        f'a diagnosis by hand needs at least {MIN_FOLD_POSES} poses held still, so that some can be held out, '
-        f'{count} were found; hold the IMU still in more attitudes',
+        f'a diagnosis by hand needs at least {MIN_FOLD_POSES} poses held still, so that some can be'
+        f' held out, {count} were found; hold the IMU still in more attitudes',
         code='too_few_poses',
     )
 
@@ -348,7 +371,11 @@ def _why_not(effect, poses, turns, follows_gravity):
 
 
 def _questions(effects, blocks, space, base, not_testable):
-    """Return the questions; an effect that is collinear with the baseline in these poses is moved to `not_testable`."""
+    """
+    Return the questions.
+
+    An effect that is collinear with the baseline in these poses is moved to `not_testable`.
+    """
     by_name, asked = {e.name: e for e in effects}, []
     probe = HandEvidence(blocks, space, (), baseline=base)
     for label, part in space.parts.items():
@@ -370,7 +397,11 @@ def _questions(effects, blocks, space, base, not_testable):
 
 
 def _held_out(problem):
-    """Return fold -> (poses, findings without them, evidence without them): the complete search, repeated."""
+    """
+    Return fold -> (poses, findings without them, evidence without them).
+
+    The complete search, repeated.
+    """
     poses = np.unique(np.concatenate([block.pose for block in problem.blocks]))
     found, times = [], min(OUTER, len(poses))
     for number in reported('repeating the search', range(times), times):
@@ -381,7 +412,11 @@ def _held_out(problem):
 
 
 def gain_of_poses(block: Block, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
-    """Return the Gain from residuals of each row of a block before and after, shape (m, n), resampled by pose."""
+    """
+    Return the Gain from residuals of each row of a block before and after.
+
+    Shape (m, n), resampled by pose.
+    """
     place = np.unique(block.pose, return_inverse=True)[1]
     numbers = np.bincount(place) * block.known.shape[1]
     return gain_of(

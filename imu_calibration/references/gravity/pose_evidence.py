@@ -1,5 +1,7 @@
 """
-Evidence from a recording without a table: norms of gravity in poses, rates at rest, directions after turns, and their residual.
+Evidence from a recording without a table.
+
+Norms of gravity in poses, rates at rest, directions after turns, and their residual.
 
 Poses are few, so that variances are estimated too and every pose is held out in turn.
 """
@@ -45,14 +47,19 @@ from imu_calibration.selection.unexplained import (
 
 @dataclass(frozen=True, eq=False)
 class Block(AlignedArrays):
-    """Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor."""
+    """
+    Rows of one kind, ``residual = columns @ parameters + error``, in the unit of their sensor.
+    """
 
     name: str
     """'poses' or 'turns'."""
     sensor: str
     """'accelerometer' or 'gyroscope'."""
     rows: np.ndarray
-    """``[columns | residual]`` at the baseline, shape (m, n_axes, q + 1); different axes have independent errors."""
+    """
+    ``[columns | residual]`` at the baseline, shape (m, n_axes, q + 1); different axes have
+    independent errors.
+    """
     known: np.ndarray
     """Variance by the noise of the samples, shape (m, n_axes)."""
     floor: np.ndarray
@@ -67,10 +74,17 @@ class Block(AlignedArrays):
 
 @dataclass(frozen=True, eq=False)
 class HandSpace:
-    """Parameters of a diagnosis by hand: baseline, Earth's rate about the vertical, then one run per column set."""
+    """
+    Parameters of a diagnosis by hand.
+
+    Baseline, Earth's rate about the vertical, then one run per column set.
+    """
 
     parts: dict
-    """Label of each run of columns (effect name, for a warm-up with the number of its time constant) -> slice."""
+    """
+    Label of each run of columns (effect name, for a warm-up with the number of its time constant)
+    -> slice.
+    """
     prior_sd: np.ndarray
     """Shape (q,); wide for the baseline, which is linearised at its own solution."""
     size: int
@@ -147,7 +161,11 @@ def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
 
 
 def _columns(hand, effect, tau, force, rate, time, temperature_c):
-    """Return the contribution of the effect's parameters to its sensor's output, shape (m, 3, p), at the baseline's solution."""
+    """
+    Return the contribution of the effect's parameters to its sensor's output.
+
+    Shape (m, 3, p), at the baseline's solution.
+    """
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
     names = {
         sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS
@@ -205,11 +223,15 @@ def _rest_block(hand, space, at_rest):
 
 def _turn_block(hand, turns, space, at_rest, moving):
     """
-    Two rows per turn: the direction after it against the direction before it rotated by the rates, over the turn's duration.
+    Two rows per turn.
 
-    The bias in a turn is the mean of the rates at rest before and after it, which removes its drift; the contributions of
-    further effects at rest are removed with it. The variance of a row is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the
-    integrated rates, rad^2, the duration T and the standard errors s of the two means.
+    The direction after it against the direction before it rotated by the rates, over the turn's
+    duration.
+
+    The bias in a turn is the mean of the rates at rest before and after it, which removes its
+    drift; the contributions of further effects at rest are removed with it. The variance of a row
+    is ``N / T^2 + (s_i^2 + s_j^2) / 4`` with the noise N of the integrated rates, rad^2, the
+    duration T and the standard errors s of the two means.
     """
     bias_f, matrix_f = hand.accelerometer
     matrix = hand.gyroscope[1]
@@ -267,7 +289,9 @@ BIASES = (0.0, 0.5, 1.0, 2.0, 4.0)
 BIAS_TIMES = (100.0, 300.0)
 """Its correlation times, s."""
 DEPENDENT = 1e-9
-"""Singular value of scaled columns, over the largest, up to which one of them depends on the others."""
+"""
+Singular value of scaled columns, over the largest, up to which one of them depends on the others.
+"""
 MIN_COLUMN_DIFFERENCE = 0.1
 """Columns that differ by less than this count as collinear."""
 MIN_COLUMN_SINE = 0.2
@@ -278,7 +302,8 @@ class HandEvidence(Evidence):
     """
     Losses of choices of parameters on all poses and on held-out poses.
 
-    Losses are ``n log(mean square)`` per block: the variance is not known but estimated from the same few rows.
+    Losses are ``n log(mean square)`` per block: the variance is not known but estimated from the
+    same few rows.
 
     Parameters
     ----------
@@ -317,7 +342,11 @@ class HandEvidence(Evidence):
         )
 
     def _whitened(self, number=None):
-        """Return the rows of each block, without fold `number`, as independent rows of unit variance, a list of (m, q + 1)."""
+        """
+        Return the rows of each block, without fold `number`.
+
+        As independent rows of unit variance, a list of (m, q + 1).
+        """
         white = []
         for block, (variance, processes), fold in zip(self.blocks, self._noise, self.folds):
             kept = fold != number
@@ -335,7 +364,11 @@ class HandEvidence(Evidence):
         ]
 
     def heldout_residuals(self, used: Sequence[int]) -> list[np.ndarray]:
-        """Return the residual of every row under the fit without its pose, shape (m, n_axes) per block."""
+        """
+        Return the residual of every row under the fit without its pose.
+
+        Shape (m, n_axes) per block.
+        """
         left = self.left_by_others(used)
         return [
             np.einsum('mac,mc->ma', block.rows, left[fold])
@@ -343,7 +376,11 @@ class HandEvidence(Evidence):
         ]
 
     def against_noise(self, used: Sequence[int]) -> dict[str, np.ndarray]:
-        """Return sensor -> squares of the same in units of noise and usual bias drift, of each block, shape (n_blocks, 1)."""
+        """
+        Return sensor -> squares of the same in units of noise and usual bias drift, of each block.
+
+        Shape (n_blocks, 1).
+        """
         left = self.heldout_residuals(used)
         return {
             sensor: np.array(
@@ -380,7 +417,11 @@ class HandEvidence(Evidence):
         return white[:, -1] - white[:, list(used)] @ self.fit(used)[0]
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
-        """Return the p-value of `larger` against `smaller`: F test on the blocks that contain the new columns."""
+        """
+        Return the p-value of `larger` against `smaller`.
+
+        F test on the blocks that contain the new columns.
+        """
         added = [k for k in larger if k not in set(smaller)]
         concerned = [white for white in self._white if np.any(white[:, added])]
         squares = [
@@ -399,7 +440,9 @@ class HandEvidence(Evidence):
         )
 
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
-        """Return how many combinations of the added columns are not collinear with the smaller choice."""
+        """
+        Return how many combinations of the added columns are not collinear with the smaller choice.
+        """
         white = np.concatenate(self._white)
         known, new = (
             orthonormal_basis(white[:, list(smaller)], DEPENDENT),
@@ -412,7 +455,11 @@ class HandEvidence(Evidence):
 
 
 def _noise(block, used):
-    """Return (independent variance of each row (m, n_axes), bias processes): scatter between rows, for poses a bias process too."""
+    """
+    Return (independent variance of each row (m, n_axes), bias processes).
+
+    Scatter between rows, for poses a bias process too.
+    """
     count, axes, width = block.rows.shape
     basis = orthonormal_basis(block.rows.reshape(-1, width)[:, used], DEPENDENT)
     rows = np.concatenate([basis.reshape(count, axes, -1), block.rows[:, :, -1:]], axis=2)
@@ -447,7 +494,9 @@ def unexplained_by_hand(
     sensor: str,
 ) -> Unexplained:
     """
-    Return the unexplained residual of one sensor: its rows at rest and its turns against the expectation from noise.
+    Return the unexplained residual of one sensor.
+
+    Its rows at rest and its turns against the expectation from noise.
 
     Parameters
     ----------
@@ -568,7 +617,11 @@ def regimes_by_hand(
 
 
 def _variables(hand: HandCalibration, block: Block) -> list[Variable]:
-    """Return the variables of regimes of poses: the attitude, the previous attitude, the time and the temperature."""
+    """
+    Return the variables of regimes of poses.
+
+    The attitude, the previous attitude, the time and the temperature.
+    """
     force = hand.gravity * hand.state.up
     before = np.concatenate([force[:1], force[:-1]])
     of = partial(ranged, starts=np.arange(len(block.time)))

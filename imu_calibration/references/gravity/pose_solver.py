@@ -1,4 +1,8 @@
-"""The joint estimate of a calibration by hand: first guess, and the covariance due to gravity, the Earth's rate and the model error."""
+"""
+The joint estimate of a calibration by hand.
+
+First guess, and the covariance due to gravity, the Earth's rate and the model error.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -83,7 +87,9 @@ def _model_error(reference, found):
 
 
 def first_state(model: HandModel, poses: Poses) -> State:
-    """Return a `State` from the norms in poses, which determine directions too, and the rates at rest."""
+    """
+    Return a `State` from the norms in poses, which determine directions too, and the rates at rest.
+    """
     values, nominal, priors, gravity = (
         model.nominal.copy(),
         model.nominal,
@@ -108,14 +114,22 @@ def first_state(model: HandModel, poses: Poses) -> State:
 
 
 def _of_gravity(model, values, relative_sd):
-    """Return the contribution of a wrong gravity to the covariance: poses at rest determine only matrix / gravity."""
+    """
+    Return the contribution of a wrong gravity to the covariance.
+
+    Poses at rest determine only matrix / gravity.
+    """
     common, part = np.zeros(len(values)), model.model.part('accelerometer', Role.LINEAR)
     common[part] = values[part]
     return relative_sd**2 * np.outer(common, common)
 
 
 def _of_earth(model, state, poses, free):
-    """Return the contribution of the Earth's rate about the vertical to the covariance, through biases and responses to gravity."""
+    """
+    Return the contribution of the Earth's rate to the covariance.
+
+    It is the rate about the vertical, which contributes through biases and responses to gravity.
+    """
     columns = model.rate_rows(
         state.values, model.gravity * state.up, poses.rate, **poses.conditions
     )[1].reshape(-1, model.size)
@@ -128,15 +142,22 @@ def _of_earth(model, state, poses, free):
 
 
 MAX_POSE_OUTLIERS = 0.1
-"""Largest share of each kind that is excluded (one of few); a more frequent deviation is a property of the recording."""
+"""
+Largest share of each kind that is excluded (one of few); a more frequent deviation is a property of
+the recording.
+"""
 MIN_POSE_FREEDOM = 3.0
 """Degrees of freedom of the remaining data that the test requires."""
 CONTRADICTED = 0.35
 """
-rad; a larger angle between rotated and observed gravity after a turn is no error of the rates: scale errors of a tenth cause less.
+rad; a larger angle between rotated and observed gravity after a turn is no error of the rates:
+scale errors of a tenth cause less.
 """
 LEAST_ERROR_SHARE = 0.05
-"""A combination of a unit's rows that keeps less than this share of its error after the fit is not tested."""
+"""
+A combination of a unit's rows that keeps less than this share of its error after the fit is not
+tested.
+"""
 OUTLIER_SD_FACTOR = 1e3
 """Sd factor that excludes an outlying pose; its direction is still estimated from the turns."""
 
@@ -144,7 +165,11 @@ OUTLIER_SD_FACTOR = 1e3
 def possible_turns(
     model: HandModel, state: State, poses: Poses, *, turns: Sequence[TurnData]
 ) -> tuple[list[TurnData], int]:
-    """Return (turns whose rates match gravity approximately, number of excluded turns): in a pause of the recorder, rates miss a turn."""
+    """
+    Return (turns whose rates match gravity approximately, number of excluded turns).
+
+    In a pause of the recorder, rates miss a turn.
+    """
     kept = [
         turn
         for turn in turns
@@ -163,9 +188,12 @@ def without_outliers(
     integrated: dict | None = None,
 ) -> tuple[Poses, list[TurnData], dict]:
     """
-    Return (poses, turns, {kind: number}) without outliers: leave-one-out F tests per kind, with Bonferroni correction.
+    Return (poses, turns, {kind: number}) without outliers.
 
-    Excluded poses keep their place, with negligible weight. `integrated`: the turns at the estimate, from `solve_joint`.
+    Leave-one-out F tests per kind, with Bonferroni correction.
+
+    Excluded poses keep their place, with negligible weight. `integrated`: the turns at the
+    estimate, from `solve_joint`.
     """
     rows = GravityRows(model, poses, turns, integrated or {}).linearise(found.state)
     rest, leverage = _whitened(rows, found)
@@ -207,7 +235,12 @@ def _whitened(rows, found):
 
 
 def _distance(rest, basis, least):
-    """Return (squared Mahalanobis distance of some residuals, with the covariance of residuals after the fit, and its rank)."""
+    """
+    Return (squared Mahalanobis distance of some residuals, rank of the covariance).
+
+    The distance is with the covariance of residuals after the fit, and the rank is that of this
+    covariance.
+    """
     values, vectors = np.linalg.eigh(np.eye(len(rest)) - basis @ basis.T)
     seen = values > least
     return float(np.sum((vectors[:, seen].T @ rest) ** 2 / values[seen])), int(

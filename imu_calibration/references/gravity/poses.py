@@ -1,4 +1,8 @@
-"""Poses and turns from samples: means over the intervals held still, with standard errors, and the readings between them."""
+"""
+Poses and turns from samples.
+
+Means over the intervals held still, with standard errors, and the readings between them.
+"""
 
 from collections.abc import Sequence
 
@@ -20,12 +24,18 @@ from imu_calibration.references.gravity.equations import Poses, State, TurnData
 from imu_calibration.references.gravity.hand_parameters import KnownTurn
 
 CREEPS = 3.0
-"""Mean square of the slopes of forces across gravity, relative to its expectation from noise, above which poses creep."""
+"""
+Mean square of the slopes of forces across gravity, relative to its expectation from noise, above
+which poses creep.
+"""
 
 ATTITUDES_APART = 0.2
 """Attitudes closer than this count as one pose, rad."""
 DITHER = 3.0
-"""Variance of readings over that of rounding below which rounding is not averaged: half a step; 1 % of a step remains above."""
+"""
+Variance of readings over that of rounding below which rounding is not averaged: half a step; 1 % of
+a step remains above.
+"""
 
 
 def average_poses(
@@ -36,7 +46,8 @@ def average_poses(
 
     `temperature_c` is that of the samples, shape (n,), when it was recorded.
 
-    The noise need not be white: the scatter of means of pieces of half a second or more determines the factor over white noise.
+    The noise need not be white: the scatter of means of pieces of half a second or more determines
+    the factor over white noise.
     """
     parts = {
         'accelerometer': [imu.force_s[a:b] for a, b in ranges],
@@ -80,16 +91,23 @@ def average_poses(
 
 
 def _with_rounding(variance, parts, rounding):
-    """Return the variance of the means, at least that of rounding where readings scatter by less than half a step and do not average it."""
+    """
+    Return the variance of the means, at least that of rounding where it matters.
+
+    Rounding matters where readings scatter by less than half a step and do not average it.
+    """
     within = np.array([part.var(axis=0) for part in parts])
     return np.where(within < DITHER * rounding, np.maximum(variance, rounding), variance)
 
 
 def _creep(forces, length, noise):
     """
-    Return the rates at which the attitude creeps in each pose, as observable from gravity, rad/s, shape (k, 3).
+    Return the rates at which the attitude creeps in each pose, as observable from gravity, rad/s.
 
-    ``d force / dt = -rate x force``: the part across gravity. Zero where the slopes of all poses together are no more than noise.
+    Shape (k, 3).
+
+    ``d force / dt = -rate x force``: the part across gravity. Zero where the slopes of all poses
+    together are no more than noise.
     """
     rates, excess = np.zeros((len(forces), 3)), 0.0
     for pose, (force, seconds) in enumerate(zip(forces, length)):
@@ -114,7 +132,11 @@ def noise_statistics(poses: Poses) -> dict:
 
 
 def _pooled_noise(parts, rounding, pieces=8):
-    """Return the NoiseModel of samples, from the median of the intervals and how much means of pieces scatter more than white noise."""
+    """
+    Return the NoiseModel of samples.
+
+    From the median of the intervals and how much means of pieces scatter more than white noise.
+    """
     floor = 1e-9 * max(1e-3, max(np.max(np.abs(p)) for p in parts))
     within = (
         np.sqrt(np.maximum(np.median([p.var(0, ddof=1) for p in parts], axis=0), rounding)) + floor
@@ -133,7 +155,11 @@ def _pooled_noise(parts, rounding, pieces=8):
 
 
 def distinct_attitudes(force: np.ndarray) -> int:
-    """Return how many of the mean readings (k, 3) point in directions more than `ATTITUDES_APART` from each other."""
+    """
+    Return how many of the mean readings (k, 3) point in separate directions.
+
+    The directions are more than `ATTITUDES_APART` from each other.
+    """
     kept = []
     for direction in unit_rows(force):
         if all(np.arccos(np.clip(direction @ other, -1, 1)) > ATTITUDES_APART for other in kept):
@@ -146,13 +172,22 @@ MAX_RANGE_READINGS = 4000
 TOP = 20
 """Readings below the largest whose density is estimated."""
 CROWDED = 20.0
-"""The extreme is the end of the range when it has this many times the readings expected by chance."""
+"""
+The extreme is the end of the range when it has this many times the readings expected by chance.
+"""
 CERTAIN = 1e-3
-"""If fewer readings than this are expected, two equal ones are the end of the range, also neighbours."""
+"""
+If fewer readings than this are expected, two equal ones are the end of the range, also neighbours.
+"""
 LINE = 20.0
-"""Duration over which a clock is straight, s: long against the jitter of its stamps, short against the drift of its rate."""
+"""
+Duration over which a clock is straight, s: long against the jitter of its stamps, short against the
+drift of its rate.
+"""
 UNDECIDED = 1.02
-"""Factor by which interpolation errors at even times may exceed those at the stamps, due to noise."""
+"""
+Factor by which interpolation errors at even times may exceed those at the stamps, due to noise.
+"""
 TURN_LONGEST = 30.0
 """Longer stretches between two poses are not used, s: drift and clipping enter."""
 MAX_TURN_GAP = 0.1
@@ -168,7 +203,11 @@ SUMMIT = 3
 def collect_turns(
     time: np.ndarray, imu: ImuSamples, *, poses: Poses, temperature_c: np.ndarray | None = None
 ) -> tuple[list[TurnData], dict[str, int]]:
-    """Return (turns between consecutive poses, {reason: count of excluded ones}); `temperature_c` is that of the samples or None."""
+    """
+    Return (turns between consecutive poses, {reason: count of excluded ones}).
+
+    `temperature_c` is that of the samples or None.
+    """
     turns, dropped, rate = [], {}, imu.rate_s
     limit = max(MAX_TURN_GAP, 5 * poses.period)
     ended = at_range_end(rate)
@@ -205,8 +244,9 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
     """
     Return which samples are at the end of the gyroscope's range, shape (n,).
 
-    At the end of the range, different motions end at the same reading, on either side and on all axes; without it two readings are
-    hardly ever both the largest, if the converter's step is finer than the distance between the largest readings.
+    At the end of the range, different motions end at the same reading, on either side and on all
+    axes; without it two readings are hardly ever both the largest, if the converter's step is finer
+    than the distance between the largest readings.
 
     Parameters
     ----------
@@ -226,7 +266,11 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
 
 
 def _at_end(signed, axes, fresh):
-    """Return the samples at the largest value of ``signed(axes)``, shape (m, n), when that is the end of a range."""
+    """
+    Return the samples at the largest value of ``signed(axes)``.
+
+    Shape (m, n), when that is the end of a range.
+    """
     some = np.sort(np.concatenate([_largest(signed, axis, fresh) for axis in axes]))[
         -MAX_RANGE_READINGS:
     ]
@@ -267,7 +311,9 @@ def known_turn_data(
     poses: Poses,
     temperature_c: np.ndarray | None = None,
 ) -> TurnData:
-    """Return the data of a `KnownTurn`; `KNOWN_TURN_SD` applies along and, for the axis, across it."""
+    """
+    Return the data of a `KnownTurn`; `KNOWN_TURN_SD` applies along and, for the axis, across it.
+    """
     axis = np.asarray(turn.axis, float) / np.linalg.norm(turn.axis)
     along = np.outer(axis, axis)
     cov = KNOWN_TURN_SD**2 * along + (turn.angle * KNOWN_TURN_SD) ** 2 * (np.eye(3) - along)
@@ -287,10 +333,13 @@ def known_turn_data(
 
 def sample_times(imu: ImuSamples) -> np.ndarray:
     """
-    Return the times of samples since the first one, s, shape (n,): of the clock fitted to the stamps, or the stamps.
+    Return the times of samples since the first one, s, shape (n,).
 
-    An even clock is a straight line through the stamps over the count of the samples, in pieces of `LINE` seconds. It is used unless the
-    readings interpolate better from their neighbours at the stamps, as with a driver that polls the sensor at uneven times.
+    Of the clock fitted to the stamps, or the stamps.
+
+    An even clock is a straight line through the stamps over the count of the samples, in pieces of
+    `LINE` seconds. It is used unless the readings interpolate better from their neighbours at the
+    stamps, as with a driver that polls the sensor at uneven times.
     """
     stamps = rising(1e-9 * (imu.stamp_ns - imu.stamp_ns[0]))
     even, step = stamps.copy(), np.diff(stamps)
@@ -309,7 +358,9 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
 
 
 def _clock_times(stamps, period):
-    """Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed."""
+    """
+    Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed.
+    """
     step, numbers = np.diff(stamps) / period, [np.arange(float(len(stamps)))]
     lost = (step > MAX_REGULAR_STEP) & (np.abs(step - np.rint(step)) <= WHOLE_STEP_SHARE)
     if lost.any():  # long steps of a rebuilt clock need not be lost samples
@@ -338,7 +389,11 @@ def _clock_line(number, time, pieces):
 
 
 def _roughness(time, rate):
-    """Return the sum of squared errors of linear interpolation between the two neighbours of each reading."""
+    """
+    Return the sum of squared errors of linear interpolation.
+
+    The interpolation is between the two neighbours of each reading.
+    """
     total = 0.0
     for start in range(0, len(time) - 2, BLOCK):
         some, own = time[start : start + BLOCK + 2], rate[start : start + BLOCK + 2].T
@@ -359,9 +414,12 @@ def rising(time: np.ndarray) -> np.ndarray:
 
 def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> float:
     """
-    Return the factor between measured and true rates, 1 if the rotated gravity matches its observed direction (`preprocessing.full_scale`).
+    Return the factor between measured and true rates (`preprocessing.full_scale`).
 
-    Only turns with gravity as reference count; the bias of each is the mean of the rates at rest before and after it.
+    It is 1 if the rotated gravity matches its observed direction.
+
+    Only turns with gravity as reference count; the bias of each is the mean of the rates at rest
+    before and after it.
 
     Parameters
     ----------
@@ -386,7 +444,11 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
 
 
 def missed_angle(state: State, poses: Poses, turn: TurnData, *, matrix: np.ndarray) -> float:
-    """Return the angle between rotated and observed gravity after a turn when the gyroscope reads `matrix` times the rate, rad."""
+    """
+    Return the angle between rotated and observed gravity after a turn, rad.
+
+    The gyroscope reads `matrix` times the rate.
+    """
     bias = 0.5 * (poses.rate[turn.first] + poses.rate[turn.last])
     mat_ji = total_rotation(turn.time, (turn.rate - bias) @ np.linalg.inv(matrix).T)
     return float(np.arccos(np.clip(mat_ji @ state.up[turn.first] @ state.up[turn.last], -1.0, 1.0)))

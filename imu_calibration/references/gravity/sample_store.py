@@ -1,4 +1,8 @@
-"""The sample store of a live calibration by hand: all samples up to a limit, then the least informative are discarded first."""
+"""
+The sample store of a live calibration by hand.
+
+All samples up to a limit, then the least informative are discarded first.
+"""
 
 import io
 from collections.abc import Iterable, Sequence
@@ -45,7 +49,11 @@ class HandStore:
         return twin
 
     def add(self, accepted: Iterable[tuple[int, ImuSamples]]) -> None:
-        """Add the output of a StreamCheck: (epoch, ImuSamples), ...; stamps continue to increase at a clock reset."""
+        """
+        Add the output of a StreamCheck: (epoch, ImuSamples), ...
+
+        Stamps continue to increase at a clock reset.
+        """
         for epoch, samples in accepted:
             if not len(samples):
                 continue
@@ -76,7 +84,10 @@ class HandStore:
 
     def forget(self, rests: Sequence[slice], most_rests: int) -> bool:
         """
-        Discard samples above the limit: the inside of the longest rest if that suffices, otherwise the oldest; return whether any were.
+        Discard samples above the limit.
+
+        The inside of the longest rest if that suffices, otherwise the oldest; return whether any
+        were.
 
         Parameters
         ----------
@@ -145,8 +156,8 @@ class HandStore:
             with load_arrays(data) as arrays:
                 if str(arrays['format']) != SAMPLES_FORMAT:
                     raise DocumentError(
-                        f"samples must have the format '{SAMPLES_FORMAT}', got '{arrays['format']}'; remove the file, or "
-                        'start without resume'
+                        f"samples must have the format '{SAMPLES_FORMAT}', got"
+                        f" '{arrays['format']}'; remove the file, or start without resume"
                     )
                 imu = ImuSamples(
                     arrays['stamp_ns'], arrays['force_s'], arrays['rate_s'], str(arrays['frame_id'])
@@ -162,8 +173,9 @@ class HandStore:
             raise
         except Exception as error:  # damaged archives and arrays raise many kinds
             raise DocumentError(
-                f'saved samples must be a whole file of {SAMPLES_FORMAT}, this is not '
-                f'({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start without resume',
+                f'saved samples must be a whole file of {SAMPLES_FORMAT}, this is not'
+                f' ({shortened(f"{type(error).__name__}: {error}", 200)}); remove it, or start'
+                ' without resume',
                 code='samples_damaged',
             ) from error
         if len(imu):
@@ -171,7 +183,12 @@ class HandStore:
 
 
 def _across_holes(stamp_ns, rests):
-    """Return the ranges at rest, joined where only discarded samples and the time excluded after a hole lie between them."""
+    """
+    Return the ranges at rest, joined across short interruptions.
+
+    They are joined where only discarded samples and the time excluded after a hole lie between
+    them.
+    """
     joined, hole = [], 5 * np.median(np.diff(stamp_ns)) * 1e-9
     for rest in rests:
         between = (

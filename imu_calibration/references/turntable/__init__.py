@@ -1,1 +1,5 @@
-"""Reference by a turntable or an arm: gathered windows, held-out windows, the model extended by selected effects."""
+"""
+Reference by a turntable or an arm.
+
+Gathered windows, held-out windows, the model extended by selected effects.
+"""

@@ -33,7 +33,8 @@ class WindowStore:
     """
     All windows of a session as long as they fit, none of them afterwards.
 
-    A static window is stored as its reduced form with one row of motion; of other windows every sample is kept.
+    A static window is stored as its reduced form with one row of motion; of other windows every
+    sample is kept.
 
     Parameters
     ----------
@@ -55,7 +56,11 @@ class WindowStore:
         return twin
 
     def add(self, window: Window, reduced: WindowStatistics) -> None:
-        """Add a copy of one window (`owned_window`), and its statistics; when it does not fit, discard all windows."""
+        """
+        Add a copy of one window (`owned_window`), and its statistics.
+
+        When it does not fit, discard all windows.
+        """
         if not self.complete:
             return
         if window.kind == 'static':
@@ -71,7 +76,11 @@ class WindowStore:
             self.complete, self._entries = False, []
 
     def reduced(self, model: SensorModel, table: Table, session: int) -> Iterator[WindowStatistics]:
-        """Yield all windows in order with the columns of `model`, as `calibration.collector` reduces them."""
+        """
+        Yield all windows in order with the columns of `model`.
+
+        As `calibration.collector` reduces them.
+        """
         for entry in self._entries:
             if isinstance(entry, Window):
                 yield reduce_window(entry, model, table, session=session)
@@ -99,7 +108,9 @@ def _again(entry, model, table):
 
 
 def owned_window(window: Window) -> Window:
-    """Return a copy of the window in separate memory: slices would keep the complete chunk in memory."""
+    """
+    Return a copy of the window in separate memory: slices would keep the complete chunk in memory.
+    """
     motion = JointMotion.concatenate([window.motion])
     temperature = None if window.temperature_c is None else np.array(window.temperature_c)
     return Window(
@@ -186,8 +197,8 @@ class HeldOut:
     """
     Blocks of windows.
 
-    Undivided windows of each kind are assigned to blocks in turn, so that every block has windows of each kind, and memory does not grow
-    with the session.
+    Undivided windows of each kind are assigned to blocks in turn, so that every block has windows
+    of each kind, and memory does not grow with the session.
     """
 
     blocks: list[HeldOutBlock] = field(
@@ -228,9 +239,12 @@ class HeldOut:
 
     def values_without(self, solution: Solution) -> list[np.ndarray]:
         """
-        Return the parameters without each fold: one Gauss-Newton step from the solution, on the rows of the remaining folds.
+        Return the parameters without each fold.
 
-        Noise and held parameters are those of the solution; a parameter that only the fold determines is set to its prior.
+        One Gauss-Newton step from the solution, on the rows of the remaining folds.
+
+        Noise and held parameters are those of the solution; a parameter that only the fold
+        determines is set to its prior.
         """
         model, prior, values = solution.model, make_prior(solution.model), solution.values
         free = ~fixed_parameters(model) & ~solution.held
@@ -249,7 +263,11 @@ class HeldOut:
 
 
 def _linearised(blocks, solution, prior):
-    """Return the triangular factor of ``[derivative of the residuals | residuals]`` of all windows of some blocks, weighed by noise."""
+    """
+    Return the triangular factor of ``[derivative of the residuals | residuals]``.
+
+    It covers all windows of some blocks, weighed by noise.
+    """
     n_params, rows = len(solution.values), []
     for block in blocks:
         if block.accumulator.rows:
@@ -263,14 +281,17 @@ def _linearised(blocks, solution, prior):
 MAX_KEPT_SAMPLES = 100_000
 """Most samples kept of a recording."""
 MAX_LIVE_SAMPLES = 30_000
-"""Most samples kept of a live session; a diagnosis needs about 1.5 kB of memory for each of them."""
+"""
+Most samples kept of a live session; a diagnosis needs about 1.5 kB of memory for each of them.
+"""
 
 
 class DecimatedWindows:
     """
     Every so many-th window of each kind, so that memory and the time of a search are bounded.
 
-    The selection depends only on the recording. Above `most` samples every second window of each kind is removed.
+    The selection depends only on the recording. Above `most` samples every second window of each
+    kind is removed.
     """
 
     def __init__(self, most: int = MAX_KEPT_SAMPLES) -> None:
@@ -321,7 +342,10 @@ class SessionData:
     kept: list = field(default_factory=list)
     """Windows with all samples, up to KEPT_SAMPLES."""
     spreads: list[DecimatedWindows] = field(default_factory=lambda: [DecimatedWindows()])
-    """Windows for the search of effects, of each of the recordings with most samples, the largest first; empty without a search."""
+    """
+    Windows for the search of effects, of each of the recordings with most samples, the largest
+    first; empty without a search.
+    """
     poses: list = field(default_factory=list)
     """(time, session, joint positions) of each static window."""
     counts: dict = field(default_factory=dict)
@@ -360,7 +384,9 @@ class SessionData:
 
     @property
     def moving(self) -> list:
-        """Moving windows with all their kept samples; live, the windows of the search of effects."""
+        """
+        Moving windows with all their kept samples; live, the windows of the search of effects.
+        """
         return self.kept or [
             window
             for spread in self.spreads
@@ -419,7 +445,11 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
 
 
 def naming(names: Sequence[str], session: int) -> Callable:
-    """Return a function that calls another one and, with several recordings, puts the recording's name before its error."""
+    """
+    Return a function that calls another one and.
+
+    With several recordings, puts the recording's name before its error.
+    """
 
     def call(function, *arguments, **options):
         try:
@@ -450,7 +480,8 @@ def join(
     Raises
     ------
     InputError
-        When a recording has no window, another frame than the first, or does not pass the check, with its name.
+        When a recording has no window, another frame than the first, or does not pass the check,
+        with its name.
 
     """
     for session, part in enumerate(parts):
@@ -464,7 +495,8 @@ def join(
 def _require_like_the_first(first, part, first_name, name):
     if not part.accumulator.rows:
         raise InputError(
-            f'{name}: every recording must contain a static window, spin or dynamic segment, this one has none; omit it'
+            f'{name}: every recording must contain a static window, spin or dynamic segment, this'
+            ' one has none; omit it'
         )
     if part.frame_id != first.frame_id:
         raise InputError(

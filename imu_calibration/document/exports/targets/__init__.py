@@ -1,1 +1,5 @@
-"""One module for each program or family of programs; `export.all_targets` imports every module of this folder."""
+"""
+One module for each program or family of programs.
+
+`export.all_targets` imports every module of this folder.
+"""

@@ -1,4 +1,8 @@
-"""ArduPilot and PX4: parameter files with offsets, scale factors and linear temperature calibration of the first IMU."""
+"""
+ArduPilot and PX4.
+
+Parameter files with offsets, scale factors and linear temperature calibration of the first IMU.
+"""
 
 from pathlib import Path
 
@@ -61,7 +65,11 @@ LARGEST_OFFSET, SCALES_ALLOWED = 3.5, (0.8, 1.2)
 
 
 def numbers_ardupilot(imu: AffineImu) -> dict:
-    """Return parameters; offsets count at the temperature CALTEMP, polynomials without constant are about 35 C."""
+    """
+    Return parameters.
+
+    Offsets count at the temperature CALTEMP, polynomials without constant are about 35 C.
+    """
     found = _linear(imu, OFFSET, SCALE)
     if any(np.any(imu.thermal[sensor]) for sensor in SENSORS):
         low, high = imu.temperature_range_c or ARDUPILOT_RANGE_C
@@ -69,9 +77,9 @@ def numbers_ardupilot(imu: AffineImu) -> dict:
         for sensor in SENSORS:
             found[CALTEMP[sensor]] = imu.temperature_ref_c
             found |= {
-                f'{TCAL}_{TCAL_SENSORS[sensor]}{power}_{a}': float(value) / PER_PARAMETER
-                if power == 1
-                else 0.0
+                f'{TCAL}_{TCAL_SENSORS[sensor]}{power}_{a}': (
+                    float(value) / PER_PARAMETER if power == 1 else 0.0
+                )
                 for power in (1, 2, 3)
                 for a, value in zip(AXIS_LETTERS, imu.thermal[sensor])
             }
@@ -124,8 +132,8 @@ def read_ardupilot(content: bytes, _path: str | Path) -> Read:
     found = read_parameters(content, 'ArduPilot parameter file')
     if not any(_has(found, pattern) for pattern in (*OFFSET.values(), SCALE)):
         raise InputError(
-            'the ArduPilot parameter file must hold INS_ACCOFFS, INS_ACCSCAL or INS_GYROFFS, it holds none of them; '
-            'give another file'
+            'the ArduPilot parameter file must hold INS_ACCOFFS, INS_ACCSCAL or INS_GYROFFS, it'
+            ' holds none of them; give another file'
         )
     if found.get(f'{TCAL}_ENABLE') == 1:
         refuse_curved(
@@ -141,12 +149,14 @@ def ignored_ardupilot(found: dict) -> list[str]:
     offset, scale = vector_of(found, OFFSET['accelerometer']), vector_of(found, SCALE, 1.0)
     if np.any(np.abs(offset) > LARGEST_OFFSET):
         lines.append(
-            f'ArduPilot accepts INS_ACCOFFS to {LARGEST_OFFSET:g} m/s^2, here {np.abs(offset).max():.3g}: arming will be refused'
+            f'ArduPilot accepts INS_ACCOFFS to {LARGEST_OFFSET:g} m/s^2, here'
+            f' {np.abs(offset).max():.3g}: arming will be refused'
         )
     if np.any((scale < SCALES_ALLOWED[0]) | (scale > SCALES_ALLOWED[1])):
         low, high = SCALES_ALLOWED
         lines.append(
-            f'ArduPilot accepts INS_ACCSCAL from {low:g} to {high:g}, here {scale.min():.3g} to {scale.max():.3g}'
+            f'ArduPilot accepts INS_ACCSCAL from {low:g} to {high:g}, here {scale.min():.3g} to'
+            f' {scale.max():.3g}'
         )
     return [
         *lines,
@@ -159,9 +169,15 @@ ARDUPILOT = (
         name='ardupilot',
         title='ArduPilot parameters',
         suffix='.param',
-        formula='(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL in forward-right-down axes before the turn of the board; gyroscopes: no SCAL\n'
-        'poly(T) = 1e-6 (c1 dT + c2 dT^2 + c3 dT^3), dT = T - 35 C, T within TMIN..TMAX',
-        source='ArduPilot/ardupilot, libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp, AP_InertialSensor_tempcal.cpp',
+        formula=(
+            '(raw - poly(T) + poly(CALTEMP) - OFFS) * SCAL in forward-right-down axes before the'
+            ' turn of the board; gyroscopes: no SCAL\npoly(T) = 1e-6 (c1 dT + c2 dT^2 + c3 dT^3),'
+            ' dT = T - 35 C, T within TMIN..TMAX'
+        ),
+        source=(
+            'ArduPilot/ardupilot, libraries/AP_InertialSensor/AP_InertialSensor_Backend.cpp,'
+            ' AP_InertialSensor_tempcal.cpp'
+        ),
         holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS,
         placement=forward_right_down,
         numbers=numbers_ardupilot,
@@ -181,7 +197,10 @@ TC = {'accelerometer': 'TC_A', 'gyroscope': 'TC_G'}
 PX4_RANGE_C = (0.0, 100.0)
 """Degrees Celsius; PX4's own range of thermal compensation."""
 UNNOTICED = 0.01
-"""Norm up to which PX4 ignores a change of an offset (m/s^2, rad/s) or a scale; 0.001 in older versions."""
+"""
+Norm up to which PX4 ignores a change of an offset (m/s^2, rad/s) or a scale; 0.001 in older
+versions.
+"""
 INTEGER, REAL = 6, 9
 """Types of MAVLink."""
 
@@ -208,7 +227,11 @@ def numbers_px4(imu: AffineImu) -> dict:
 
 
 def imu_px4(found: dict) -> AffineImu:
-    """Return the IMU of such parameters; thermal offsets beyond the first power are refused by `read_px4`."""
+    """
+    Return the IMU of such parameters.
+
+    Thermal offsets beyond the first power are refused by `read_px4`.
+    """
     bias, thermal, ref, limits = {}, {}, 25.0, None
     for sensor in SENSORS:
         short = f'{TC[sensor]}0'
@@ -251,7 +274,8 @@ def read_px4(content: bytes, _path: str | Path) -> Read:
     present['accelerometer'] |= _has(found, CAL_SCALE)
     if not any(present.values()):
         raise InputError(
-            'the PX4 parameter file must hold CAL_ACC0 or CAL_GYRO0, it holds none of them; give another file'
+            'the PX4 parameter file must hold CAL_ACC0 or CAL_GYRO0, it holds none of them; give'
+            ' another file'
         )
     refuse_curved(found, [f'{short}0_X{power}' for short in TC.values() for power in (2, 3)])
     return Read(
@@ -276,8 +300,9 @@ def ignored_px4(found: dict) -> list[str]:
         change = float(np.linalg.norm(vector_of(found, pattern, nominal) - nominal))
         if 0 < change <= UNNOTICED:
             lines.append(
-                f'PX4 ignores a change of {pattern} if the three together change by {UNNOTICED:g} or less (older '
-                f'versions 0.001), here they change by {change:.2g} from {nominal:g}: check that your version accepts them'
+                f'PX4 ignores a change of {pattern} if the three together change by {UNNOTICED:g}'
+                f' or less (older versions 0.001), here they change by {change:.2g} from'
+                f' {nominal:g}: check that your version accepts them'
             )
     return lines
 
@@ -287,9 +312,14 @@ PX4 = (
         name='px4',
         title='PX4 parameters',
         suffix='.params',
-        formula='(raw - thermal - OFF) * SCALE in forward-right-down axes; gyroscopes: no SCALE\n'
-        'thermal = X0 + X1 (T - TREF) + ..., T within TMIN..TMAX',
-        source='PX4/PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.{hpp,cpp}, Gyroscope.hpp, temperature_compensation',
+        formula=(
+            '(raw - thermal - OFF) * SCALE in forward-right-down axes; gyroscopes: no SCALE\n'
+            'thermal = X0 + X1 (T - TREF) + ..., T within TMIN..TMAX'
+        ),
+        source=(
+            'PX4/PX4-Autopilot, src/lib/sensor_calibration/Accelerometer.{hpp,cpp}, Gyroscope.hpp,'
+            ' temperature_compensation'
+        ),
         holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS,
         placement=forward_right_down,
         numbers=numbers_px4,
@@ -298,8 +328,10 @@ PX4 = (
         imu=imu_px4,
         back=forward_right_down,
         ignored=ignored_px4,
-        hint='set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these sensors, or PX4 ignores them;'
-        ' the readings must be uncalibrated',
+        hint=(
+            'set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these'
+            ' sensors, or PX4 ignores them; the readings must be uncalibrated'
+        ),
     ),
 )
 

@@ -1,4 +1,6 @@
-"""Visual, lidar and wheel estimators with noise parameters only; their input is compensated readings."""
+"""
+Visual, lidar and wheel estimators with noise parameters only; their input is compensated readings.
+"""
 
 from functools import partial
 
@@ -13,7 +15,11 @@ def _gravity(page: Page) -> float:
 
 
 def vins(found: Noise) -> dict:
-    """Return the noise for the midpoint rule, which weights each of two samples with half a step and multiplies walks by a full one."""
+    """
+    Return the noise for the midpoint rule.
+
+    The rule weights each of two samples with half a step and multiplies walks by a full one.
+    """
     accel, gyro = found.accelerometer, found.gyroscope
     return {
         'acc_n': accel.white * (2 * found.rate) ** 0.5,
@@ -102,7 +108,8 @@ TARGETS = (
     _target(
         'lio-sam',
         'LIO-SAM noise',
-        "gtsam's preintegration: variance of a step = imuGyrNoise^2 dt, of the bias imuGyrBiasN^2 dt",
+        "gtsam's preintegration: variance of a step = imuGyrNoise^2 dt, of the bias"
+        ' imuGyrBiasN^2 dt',
         'TixiaoShan/LIO-SAM, src/imuPreintegration.cpp, config/params.yaml',
         lio_sam,
         'continuous: N, K',
@@ -138,6 +145,9 @@ TARGETS = (
         write,
         needs_walk=False,
         estimates=(),
-        hint='compensator_node fills them in by itself; these numbers are for drivers with such parameters',
+        hint=(
+            'compensator_node fills them in by itself; these numbers are for drivers with such'
+            ' parameters'
+        ),
     ),
 )

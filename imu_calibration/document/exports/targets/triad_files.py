@@ -1,4 +1,8 @@
-"""imu_calib (ROS 1, and its ports to ROS 2), imu_tk (read only) and Autoware: matrices, offsets or scale factors of triads."""
+"""
+imu_calib (ROS 1, and its ports to ROS 2), imu_tk (read only) and Autoware.
+
+Matrices, offsets or scale factors of triads.
+"""
 
 import re
 from pathlib import Path
@@ -53,7 +57,10 @@ IMU_CALIB = (
     Target(
         name='imu-calib',
         title='imu_calib YAML (ROS 1 and ROS 2)',
-        formula='corrected = SM raw - bias of the accelerometer, SM by rows; the gyroscopes lose the mean of their first readings',
+        formula=(
+            'corrected = SM raw - bias of the accelerometer, SM by rows; the gyroscopes lose the'
+            ' mean of their first readings'
+        ),
         source='dpkoch/imu_calib, src/accel_calib.cpp',
         holds=of('accelerometer', OFFSETS + MATRICES),
         estimates=of('gyroscope', OFFSETS),
@@ -114,8 +121,8 @@ def _numbers(content):
         )
     ):
         raise InputError(
-            f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be inverted and a bias, got '
-            f'{len(words)} entries; give a different file'
+            f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be'
+            f' inverted and a bias, got {len(words)} entries; give a different file'
         )
     return values
 
@@ -138,7 +145,9 @@ SCALE_KEY = 'gyro_scale_input'
 
 
 def numbers_autoware(imu: AffineImu) -> dict:
-    """Return offsets and scale factors of the gyroscopes: the same model as ours on the diagonal."""
+    """
+    Return offsets and scale factors of the gyroscopes: the same model as ours on the diagonal.
+    """
     offsets = {
         f'angular_velocity_offset_{a}': value for a, value in zip(AXES, imu.bias['gyroscope'])
     }
@@ -155,7 +164,9 @@ def imu_autoware(found: dict) -> AffineImu:
 
 
 def noise_autoware(found: Noise) -> dict:
-    """Return standard deviations of samples, the square roots of the covariances in its messages."""
+    """
+    Return standard deviations of samples, the square roots of the covariances in its messages.
+    """
     rate = found.gyroscope.sample_sd(found.rate)
     return {
         **{f'angular_velocity_stddev_{a}{a}': rate for a in AXES},
@@ -167,8 +178,14 @@ def write_autoware(page: Page) -> str:
     """Return a parameter file."""
     x, y, z = (float(value) for value in page.numbers[SCALE_KEY])
     scale = [
-        f'the file has no scale factors; the node reads them from the topic {SCALE_KEY}, published repeatedly:',
-        f'  ros2 topic pub -r 1 {SCALE_KEY} geometry_msgs/msg/Vector3Stamped "{{vector: {{x: {x!r}, y: {y!r}, z: {z!r}}}}}"',
+        (
+            f'the file has no scale factors; the node reads them from the topic {SCALE_KEY},'
+            ' published repeatedly:'
+        ),
+        (
+            f'  ros2 topic pub -r 1 {SCALE_KEY} geometry_msgs/msg/Vector3Stamped "{{vector: {{x:'
+            f' {x!r}, y: {y!r}, z: {z!r}}}}}"'
+        ),
     ]
     parameters = {name: value for name, value in page.numbers.items() if name != SCALE_KEY} | (
         page.noise or {}
@@ -199,8 +216,8 @@ def read_autoware(content: bytes, _path: str | Path) -> Read:
         values = [float(part) for part in scale.groups()] if scale else [1.0] * 3
     except ValueError as error:
         raise InputError(
-            f'the {what} must repeat three numbers in its comment on {SCALE_KEY}: {shortened(str(error))}; '
-            'correct it'
+            f'the {what} must repeat three numbers in its comment on {SCALE_KEY}:'
+            f' {shortened(str(error))}; correct it'
         ) from error
     return Read({**offsets, SCALE_KEY: values}, () if scale else of('gyroscope', SCALES))
 
@@ -209,9 +226,15 @@ AUTOWARE = (
     Target(
         name='autoware',
         title='Autoware imu_corrector parameters',
-        formula='rate = (raw - angular_velocity_offset) / gyro_scale_input; specific force unchanged\n'
-        'covariances = stddev^2; after the rotation to base_link the largest of the three is used for all',
-        source='autowarefoundation/autoware_universe, sensing/autoware_imu_corrector/src/imu_corrector_core.cpp',
+        formula=(
+            'rate = (raw - angular_velocity_offset) / gyro_scale_input; specific force'
+            ' unchanged\ncovariances = stddev^2; after the rotation to base_link the largest of the'
+            ' three is used for all'
+        ),
+        source=(
+            'autowarefoundation/autoware_universe,'
+            ' sensing/autoware_imu_corrector/src/imu_corrector_core.cpp'
+        ),
         holds=of('gyroscope', OFFSETS + SCALES),
         numbers=numbers_autoware,
         noise=noise_autoware,
@@ -220,7 +243,9 @@ AUTOWARE = (
         write=write_autoware,
         read=read_autoware,
         imu=imu_autoware,
-        hint='older versions name the switches on_off_correction.correct_for_bias and have no scale',
+        hint=(
+            'older versions name the switches on_off_correction.correct_for_bias and have no scale'
+        ),
     ),
 )
 

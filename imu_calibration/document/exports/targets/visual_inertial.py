@@ -1,4 +1,8 @@
-"""Kalibr, OpenVINS and basalt: files of visual-inertial estimators with the intrinsics of their models and noise densities."""
+"""
+Kalibr, OpenVINS and basalt.
+
+Files of visual-inertial estimators with the intrinsics of their models and noise densities.
+"""
 
 import json
 from functools import partial
@@ -39,9 +43,12 @@ LEVERS = ('rx_i', 'ry_i', 'rz_i')
 
 def numbers_kalibr(imu: AffineImu) -> dict:
     """
-    Return M, C_gyro_i, A and lever arms of an IMU in the axes of its accelerometer, at its x accelerometer.
+    Return M, C_gyro_i, A and lever arms of an IMU in its accelerometer's axes.
 
-    ``matrix_g = M C`` and ``A C = cross``: Kalibr's A acts on specific force in the gyroscope's axes.
+    The origin is at the x accelerometer of the IMU.
+
+    ``matrix_g = M C`` and ``A C = cross``: Kalibr's A acts on specific force in the gyroscope's
+    axes.
     """
     gyro, turn = lower_times_rotation(imu.matrix['gyroscope'])
     arms = (
@@ -118,7 +125,8 @@ def read_kalibr(content: bytes, _path: str | Path) -> Read:
     if 'accelerometers' not in mapping:
         model = shortened(str(mapping.get('model', 'calibrated')))
         raise InputError(
-            f"the {what} must come of a model with intrinsics, its model is '{model}'; run Kalibr with scale-misalignment"
+            f"the {what} must come of a model with intrinsics, its model is '{model}'; run Kalibr"
+            ' with scale-misalignment'
         )
     a, g = section(mapping, 'accelerometers', what), section(mapping, 'gyroscopes', what)
     arms = {name: numbers_at(a, name, (3,), what=what) for name in LEVERS if name in a}
@@ -133,7 +141,12 @@ def read_kalibr(content: bytes, _path: str | Path) -> Read:
 
 
 def accelerometer_lower_at_x(imu: AffineImu) -> Placement:
-    """Return the placement with a lower triangular accelerometer matrix and the origin in the sensitive point of the x accelerometer."""
+    """
+    Return the placement in the axes and at the origin of the accelerometer.
+
+    The accelerometer matrix is lower triangular, and the origin is in the sensitive point of the x
+    accelerometer.
+    """
     return Placement(
         mat_ts=lower_times_rotation(imu.matrix['accelerometer'])[1], origin_s=imu.arms[0]
     )
@@ -148,21 +161,32 @@ KALIBR = (
     Target(
         name='kalibr',
         title='Kalibr imu.yaml',
-        formula='a_m = M (f + [W r]) + b with (W r)_i of the arm r_i of axis i, W = [alpha x] + [w x]^2\n'
-        'w_m = M C_gyro_i w + A C_gyro_i f + b; M lower triangular; rx_i = 0: the origin is the x accelerometer',
-        source='ethz-asl/kalibr, kalibr_imu_camera_calibration/IccSensors.py and kalibr_common/ConfigReader.py',
+        formula=(
+            'a_m = M (f + [W r]) + b with (W r)_i of the arm r_i of axis i, W = [alpha x] + [w'
+            ' x]^2\nw_m = M C_gyro_i w + A C_gyro_i f + b; M lower triangular; rx_i = 0: the origin'
+            ' is the x accelerometer'
+        ),
+        source=(
+            'ethz-asl/kalibr, kalibr_imu_camera_calibration/IccSensors.py and'
+            ' kalibr_common/ConfigReader.py'
+        ),
         holds=MATRICES + G_SENSITIVITY + ARMS,
         estimates=SLOW_OFFSETS,
         placement=accelerometer_lower_at_x,
         numbers=numbers_kalibr,
         noise=noise_kalibr,
-        noise_is='continuous: N in m/s^2/sqrt(Hz), rad/s/sqrt(Hz), K in m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz)',
+        noise_is=(
+            'continuous: N in m/s^2/sqrt(Hz), rad/s/sqrt(Hz), K in m/s^3/sqrt(Hz), rad/s^2/sqrt(Hz)'
+        ),
         write=write_kalibr,
         read=read_kalibr,
         imu=imu_kalibr,
         back=at_the_mean,
         axes='accelerometer_lower_triangular',
-        hint='Kalibr reads the topic, the rate and the noise, and estimates all other values; its intrinsics have the format of its output',
+        hint=(
+            'Kalibr reads the topic, the rate and the noise, and estimates all other values; its'
+            ' intrinsics have the format of its output'
+        ),
     ),
 )
 
@@ -171,7 +195,9 @@ _TURNED_ROUND = np.eye(3)[::-1]
 
 
 def upper_times_rotation(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (U, Q) with ``matrix = U @ Q``: U upper triangular with positive diagonal, Q a rotation."""
+    """
+    Return (U, Q) with ``matrix = U @ Q``: U upper triangular with positive diagonal, Q a rotation.
+    """
     lower, rotation = lower_times_rotation(_TURNED_ROUND @ matrix @ _TURNED_ROUND)
     return _TURNED_ROUND @ lower @ _TURNED_ROUND, _TURNED_ROUND @ rotation @ _TURNED_ROUND
 
@@ -181,7 +207,11 @@ MATRIX_KEYS = ('Tw', 'R_IMUtoGYRO', 'Ta', 'R_IMUtoACC', 'Tg')
 
 
 def numbers_openvins(imu: AffineImu, shape: str) -> dict:
-    """Return triangular matrices and the rotations to them; the IMU's axes are unchanged, so that no extrinsic changes."""
+    """
+    Return triangular matrices and the rotations to them.
+
+    The IMU's axes are unchanged, so that no extrinsic changes.
+    """
     (ta, to_acc), (tw, to_gyro) = (
         SHAPES[shape](imu.matrix[sensor]) for sensor in ('accelerometer', 'gyroscope')
     )
@@ -189,7 +219,9 @@ def numbers_openvins(imu: AffineImu, shape: str) -> dict:
 
 
 def imu_openvins(found: dict) -> AffineImu:
-    """Return the IMU of such numbers: ``a_m = Ta R_IMUtoACC f``, ``w_m = Tw R_IMUtoGYRO w + Tg f``."""
+    """
+    Return the IMU of such numbers: ``a_m = Ta R_IMUtoACC f``, ``w_m = Tw R_IMUtoGYRO w + Tg f``.
+    """
     tw, to_gyro, ta, to_acc, tg = (np.asarray(found[name]) for name in MATRIX_KEYS)
     return AffineImu(matrix={'accelerometer': ta @ to_acc, 'gyroscope': tw @ to_gyro}, cross=tg)
 
@@ -218,9 +250,14 @@ def _target(name: str, model: str, shape: str) -> Target:
     return Target(
         name=name,
         title=f'OpenVINS kalibr_imu_chain.yaml, model {model}',
-        formula="f = R_IMUtoACC' Ta^-1 (a_m - b); w = R_IMUtoGYRO' Tw^-1 (w_m - b - Tg f)\n"
-        f'Ta and Tw {shape} triangular: the other half is not read by the model {model}',
-        source='rpng/open_vins, ov_msckf/src/core/VioManagerOptions.h, state/Propagator.cpp, state/State.h',
+        formula=(
+            "f = R_IMUtoACC' Ta^-1 (a_m - b); w = R_IMUtoGYRO' Tw^-1 (w_m - b - Tg f)\n"
+            f'Ta and Tw {shape} triangular: the other half is not read by the model {model}'
+        ),
+        source=(
+            'rpng/open_vins, ov_msckf/src/core/VioManagerOptions.h, state/Propagator.cpp,'
+            ' state/State.h'
+        ),
         holds=MATRICES + G_SENSITIVITY,
         estimates=SLOW_OFFSETS,
         numbers=partial(numbers_openvins, shape=shape),
@@ -229,7 +266,10 @@ def _target(name: str, model: str, shape: str) -> Target:
         write=partial(write_openvins, model=model),
         read=read_openvins,
         imu=imu_openvins,
-        hint='the file named by relative_config_imu; set calib_imu_intrinsics and calib_imu_g_sensitivity to false to keep these numbers',
+        hint=(
+            'the file named by relative_config_imu; set calib_imu_intrinsics and'
+            ' calib_imu_g_sensitivity to false to keep these numbers'
+        ),
     )
 
 
@@ -240,7 +280,11 @@ LOWER_BY_COLUMNS = ((0, 0), (1, 0), (2, 0), (1, 1), (2, 1), (2, 2))
 
 
 def numbers_basalt(imu: AffineImu) -> dict:
-    """Return biases (after the matrix) and matrices minus identity, by columns: a lower triangle; the full matrix for the gyroscope."""
+    """
+    Return biases (after the matrix) and matrices minus identity, by columns: a lower triangle.
+
+    The full matrix for the gyroscope.
+    """
     inverse = {sensor: np.linalg.inv(matrix) for sensor, matrix in imu.matrix.items()}
     bias = {sensor: inverse[sensor] @ imu.bias[sensor] for sensor in inverse}
     extra = {sensor: matrix - np.eye(3) for sensor, matrix in inverse.items()}
@@ -316,8 +360,10 @@ BASALT = (
     Target(
         name='basalt',
         title='basalt calibration JSON',
-        formula='calibrated = (I + S) raw - b, the bias after the matrix\n'
-        'accelerometer: b and the lower triangle of S, gyroscope: b and the full S, by columns',
+        formula=(
+            'calibrated = (I + S) raw - b, the bias after the matrix\n'
+            'accelerometer: b and the lower triangle of S, gyroscope: b and the full S, by columns'
+        ),
         source='VladyslavUsenko/basalt-headers, calibration/calib_bias.hpp and calibration.hpp',
         holds=OFFSETS + MATRICES,
         estimates=THERMAL_OFFSETS,
@@ -330,7 +376,10 @@ BASALT = (
         read=read_basalt,
         imu=imu_basalt,
         axes='accelerometer_lower_triangular',
-        hint="put these entries into the 'value0' of your calibration.json; the camera entries there must refer to the frame named above",
+        hint=(
+            "put these entries into the 'value0' of your calibration.json; the camera entries there"
+            ' must refer to the frame named above'
+        ),
     ),
 )
 

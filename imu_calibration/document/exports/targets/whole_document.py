@@ -13,7 +13,10 @@ from imu_calibration.document.exports.target import Page, Read, Target, read_jso
 from imu_calibration.effects.base import SENSORS
 
 MAT_HEADER = b'MATLAB 5.0 MAT-file'
-"""Beginning of a .mat file; the rest of its text, which holds the time, is made blank: the same input gives the same bytes."""
+"""
+Beginning of a .mat file; the rest of its text, which holds the time, is made blank: the same input
+gives the same bytes.
+"""
 MAT_TEXT_BYTES = 116
 DOCUMENT = 'document_json'
 
@@ -29,7 +32,9 @@ def read_json_document(content: bytes, _path: str | Path) -> Read:
 
 
 def write_mat(page: Page) -> bytes:
-    """Return a struct for each sensor, values with names and covariance, and the document as text."""
+    """
+    Return a struct for each sensor, values with names and covariance, and the document as text.
+    """
     from scipy.io import savemat
 
     calibration = page.calibration
@@ -81,7 +86,8 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
         zlib.error,
     ) as error:
         raise InputError(
-            f"the {what} must be a .mat file with '{DOCUMENT}', as an export writes it; give another file"
+            f"the {what} must be a .mat file with '{DOCUMENT}', as an export writes it; give"
+            ' another file'
         ) from error
     return Read(read_json(text.encode(), what))
 
@@ -90,7 +96,9 @@ def _target(name, title, writer, reader, suffix):
     return Target(
         name=name,
         title=title,
-        formula='measured = bias + matrix @ (true + lever-arm terms) + further effects; values in SI',
+        formula=(
+            'measured = bias + matrix @ (true + lever-arm terms) + further effects; values in SI'
+        ),
         source='imu_calibration, calibration.yaml',
         whole=True,
         write=writer,
