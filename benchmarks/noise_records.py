@@ -33,7 +33,7 @@ from imu_calibration.allan.terms import (
     TIME_KEY,
     fit_form,
     identify_axis,
-)  # noqa: E402  # noqa: E402
+)  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
 

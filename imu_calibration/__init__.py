@@ -6,27 +6,32 @@ This page fixes the conventions. If code and this page disagree, one of them is 
 Frames
 ------
 ``s`` sensor (the frame_id of the message), ``b`` body, ``n`` local level with z up, ``i`` inertial.
-A vector ends in its frame (``force_s``); a matrix reads target-source (``force_s = mat_sn @ force_n``).
-All frames are right-handed. The table's base frame, turned so that ``up`` becomes z, is ``n``.
+A vector ends in its frame (``force_s``); a matrix reads target-source (``force_s = mat_sn @
+force_n``). All frames are right-handed. The table's base frame, turned so that ``up`` becomes z, is
+``n``.
 
 Signs
 -----
-``rate_s`` is the turn of ``s`` against ``i``, expressed in ``s``; rotation vectors turn counter-clockwise
-seen from the tip. ``force_s`` is the specific force: at rest, z up, the accelerometer reads +g.
+``rate_s`` is the turn of ``s`` against ``i``, expressed in ``s``; rotation vectors turn
+counter-clockwise seen from the tip. ``force_s`` is the specific force: at rest, z up, the
+accelerometer reads +g.
 
 Measurement equation
 --------------------
-``measured = bias + matrix @ (true + lever-arm terms) + further effects``, for both sensors. The lever arm points
-from the reference point to the sensitive point: ``f_point = f_ref + alpha x r + omega x (omega x r)``.
+``measured = bias + matrix @ (true + lever-arm terms) + further effects``, for both sensors. The
+lever arm points from the reference point to the sensitive point: ``f_point = f_ref + alpha x r +
+omega x (omega x r)``.
 
 Units and time
 --------------
-SI and radians inside; different units only with the unit in the name (``temperature_c``, ``bias_deg_h``). ``stamp_ns`` is an
-integer header stamp; ``time`` is float seconds since the session's first sample. Ranges are half open.
+SI and radians inside; different units only with the unit in the name (``temperature_c``,
+``bias_deg_h``). ``stamp_ns`` is an integer header stamp; ``time`` is float seconds since the
+session's first sample. Ranges are half open.
 
 Shapes
 ------
-Time first: ``(n, 3)``, stacks ``(n, 3, 3)``. A parameter vector or covariance travels with its ``param_names``.
+Time first: ``(n, 3)``, stacks ``(n, 3, 3)``. A parameter vector or covariance travels with its
+``param_names``.
 
 In a notebook
 -------------
@@ -40,27 +45,34 @@ draw and saves itself.
 
 Contents
 --------
-From the lowest layer; each package imports only packages above it in this list. docs/glossary.md explains the terms.
+From the lowest layer; each package imports only packages above it in this list. docs/glossary.md
+explains the terms.
 
-================
-======================================================================================================
-`core`            samples, units, settings, errors, documents, probabilities `kinematics`      table
-and joints become attitude, rate, angular acceleration, specific force; strapdown integration
-`effects`         the catalogue of physical effects, and the sensor model made of it `preprocessing`
-a stream becomes windows: static poses, spins, dynamic stretches; checks of a recording `estimation`
-windows become a solution: noise, likelihood, least squares, observability `simulation`      the
-model run: profiles of motion, noise, sessions `compensation`    the model inverted: corrected
-samples with their covariance `selection`       choice of the effects that the data support, tested
-on held-out windows; analysis of the residual `allan`           the noise of an IMU at rest: Allan
-curves, their fit with intervals, noise.yaml `document`        the calibration file, its verdict,
-comparison, and conversion to formats of other programs `references`      turntable and gravity:
-gathered data and the equations of calibration by hand `calibration`     from recordings to a judged
-document; live sessions, fleets, diagnosis `between_imus`    the arm between two IMUs `planning`
-choice of motions, a lower bound on the time of all plans, execution with stops and their reason
-`report`          HTML reports `use_cases`       from files to files: functions of the command line
-and of notebooks `cli`, `nodes`    the command line and the ROS 2 nodes; the package `msg_adapters`
-handles messages and bags ================
-======================================================================================================
+================  ==================================================================================
+`core`            samples, units, settings, errors, documents, probabilities
+`kinematics`      table and joints become attitude, rate, angular acceleration, specific force;
+                  strapdown integration
+`effects`         the catalogue of physical effects, and the sensor model made of it
+`preprocessing`   a stream becomes windows: static poses, spins, dynamic stretches; checks of a
+                  recording
+`estimation`      windows become a solution: noise, likelihood, least squares, observability
+`simulation`      the model run: profiles of motion, noise, sessions
+`compensation`    the model inverted: corrected samples with their covariance
+`selection`       choice of the effects that the data support, tested on held-out windows; analysis
+                  of the residual
+`allan`           the noise of an IMU at rest: Allan curves, their fit with intervals, noise.yaml
+`document`        the calibration file, its verdict, comparison, and conversion to formats of other
+                  programs
+`references`      turntable and gravity: gathered data and the equations of calibration by hand
+`calibration`     from recordings to a judged document; live sessions, fleets, diagnosis
+`between_imus`    the arm between two IMUs
+`planning`        choice of motions, a lower bound on the time of all plans, execution with stops
+                  and their reason
+`report`          HTML reports
+`use_cases`       from files to files: functions of the command line and of notebooks
+`cli`, `nodes`    the command line and the ROS 2 nodes; the package `msg_adapters` handles messages
+                  and bags
+================  ==================================================================================
 """
 
 # The name that type checkers take for true; `typing` would take most of the time of this import

@@ -214,6 +214,7 @@ def test_every_package_says_what_comes_in_what_goes_out_and_what_to_read_first()
     for folder in (ROOT / 'imu_calibration').iterdir():
         if folder.is_dir() and any(folder.glob('*.py')):
             text = ast.get_docstring(ast.parse((folder / '__init__.py').read_text())) or ''
+            text = ' '.join(text.split())
             assert 'In: ' in text and 'Out: ' in text and 'Read `' in text, folder.name
 
 
