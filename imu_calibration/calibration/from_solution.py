@@ -297,6 +297,7 @@ def statistics(solution: Solution, gathered: SessionData) -> dict:
             'residual_rms_moving': finite(solution.residual_rms[sensor][0]),
             'residual_rms_window_means': solution.residual_rms[sensor][1],
             'chi2_per_dof': solution.chi2_per_dof[sensor],
+            'slow_over_fast': solution.slow_over_fast.get(sensor, {}),
         }
         if sensor in solution.session_biases:
             result[sensor] |= {

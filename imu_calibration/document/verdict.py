@@ -41,6 +41,13 @@ the model.
 """
 NOTED_MISFIT = 2.0
 """From this factor on the misfit is worth a note."""
+MIN_STRUCTURE = 1.25
+"""
+Ratio of the slow over the fast residual variance from which the residual of moving windows has
+structure in time (`BandMisfit.slow_over_fast`).
+"""
+LOUDER_ONLY = 'without structure in time: noise or vibration that is larger in motion'
+"""Description of residuals that are larger in motion, but not correlated."""
 LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
 
@@ -197,6 +204,16 @@ def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
     }
 
 
+def has_structure(calibration: Calibration, sensor: str, kind: str) -> bool:
+    """
+    Return whether the residual of a kind of moving window is correlated in time.
+
+    True for documents that do not contain the comparison.
+    """
+    ratios = calibration.statistics.get(sensor, {}).get('slow_over_fast') or {}
+    return ratios.get(kind, np.inf) > MIN_STRUCTURE
+
+
 def rested(calibration: Calibration) -> bool:
     """Return whether a recording on a table has rests, from which the noise is known."""
     windows = calibration.statistics.get('windows')
@@ -217,7 +234,8 @@ def misfits(calibration: Calibration) -> list[Reason]:
     """
     Return the residuals in motion above the noise at rest.
 
-    Notes, or warnings where they are far above; diagnoses use the same test.
+    Notes, or warnings where residuals with structure in time are far above; diagnoses use the same
+    test. Residuals without structure are noise or vibration, which no effect of a model explains.
 
     Without a rest they are compared with their slow part; lags are visible in the fast part.
     """
@@ -232,18 +250,27 @@ def misfits(calibration: Calibration) -> list[Reason]:
             if at_rest and helps_everywhere(calibration.proof.get(sensor))
             else ''
         )
-        reasons += [
-            Reason(
-                WARNING if ratio > MAX_MISFIT_RATIO else NOTE,
-                f'the {sensor} residuals of {kind} windows are '
-                f'{np.sqrt(ratio):.1f} times {reference}: the model is incomplete{more}',
-                'find the cause',
-                key='diagnose',
-                sensors=(sensor,),
+        for kind, ratio in misfit_ratios(calibration, sensor).items():
+            if ratio <= NOTED_MISFIT:
+                continue
+            size = (
+                f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times'
+                f' {reference}'
             )
-            for kind, ratio in misfit_ratios(calibration, sensor).items()
-            if ratio > NOTED_MISFIT
-        ]
+            if at_rest and not has_structure(calibration, sensor, kind):
+                reasons.append(
+                    Reason(NOTE, f'{size}, {LOUDER_ONLY}', 'reduce vibration', sensors=(sensor,))
+                )
+                continue
+            reasons.append(
+                Reason(
+                    WARNING if ratio > MAX_MISFIT_RATIO else NOTE,
+                    f'{size}: the model is incomplete{more}',
+                    'find the cause',
+                    key='diagnose',
+                    sensors=(sensor,),
+                )
+            )
     return reasons
 
 

@@ -26,6 +26,8 @@ CAUTIOUS_SDS = 2.0
 The residual variance of the slow part is raised by this many of its standard deviations, in
 comparison and use.
 """
+SURE_SDS = 4.0
+"""Standard deviations by which a slow part must exceed that of white noise to show structure."""
 DESIGN_EIGENVALUE_SHARE = 1e-6
 """
 Directions of a scaled design with less than this share of the largest eigenvalue do not count.
@@ -55,6 +57,28 @@ class BandMisfit:
     """Of the other rows, shape (3,)."""
     apart: np.ndarray
     """Whether slow and fast part have separate weights, shape (3,)."""
+    dof_slow: float = 0.0
+    """Degrees of freedom of the slow part."""
+
+    def slow_over_fast(self, inflation: np.ndarray) -> float:
+        """
+        Return the least plausible ratio of slow over fast residual, 1 at most for white noise.
+
+        It is the ratio of the variances, of the axis with the largest one. A residual with
+        structure is correlated in time, so that its slow part exceeds that of white noise; louder
+        white noise raises both parts alike.
+
+        Parameters
+        ----------
+        inflation : ndarray, shape (3,)
+            Variance of the noise at low frequency over that of white noise (`NoiseModel`).
+
+        """
+        if self.dof_slow < 1:
+            return 0.0
+        largest_chance = 1 + SURE_SDS * np.sqrt(2 / self.dof_slow)
+        noise = np.maximum(self.fast, np.finfo(float).tiny) * np.maximum(inflation, 1.0)
+        return float(np.max(self.slow / (noise * largest_chance)))
 
     def factors(self, noise: NoiseModel) -> MovingFactors:
         """
@@ -107,7 +131,7 @@ def band_misfit(
     of_fast = np.maximum(total - slow, 0.0) / max(dof_total - dof_slow, 1)
     cautious = of_slow * (1 + CAUTIOUS_SDS * np.sqrt(2 / dof_slow))
     apart = of_fast > MIN_VARIANCE_RATIO * cautious
-    return BandMisfit(overall, np.where(apart, cautious, of_slow), of_fast, apart)
+    return BandMisfit(overall, np.where(apart, cautious, of_slow), of_fast, apart, dof_slow)
 
 
 def own_misfit(rows: np.ndarray) -> np.ndarray:
@@ -300,7 +324,7 @@ def _at_rest(system, sensor, values):
         )
     variance = np.full(3, 1e-30)
     for kind in system.within[sensor]:
-        variance = np.maximum(variance, _misfit_of(system, sensor, kind, values).noise)
+        variance = np.maximum(variance, moving_misfit(system, sensor, kind, values=values).noise)
     return NoiseModel(variance, np.ones(3), reference=reference)
 
 
@@ -310,7 +334,7 @@ def _with_bands(system, sensor, noise):
 
     The slow parts, fitted separately, have a smaller residual variance there.
     """
-    misfits = {kind: _misfit_of(system, sensor, kind) for kind in system.within[sensor]}
+    misfits = {kind: moving_misfit(system, sensor, kind) for kind in system.within[sensor]}
     return replace(
         noise,
         moving={
@@ -360,7 +384,7 @@ def _judged(system, sensor, kind, values) -> BandMisfit:
 
     Of the fast part at least the misfit along the parameters.
     """
-    misfit = _misfit_of(system, sensor, kind, values)
+    misfit = moving_misfit(system, sensor, kind, values=values)
     if not misfit.apart.any():
         return misfit
     dc = coefficient_jacobian(system.model, sensor, values)[:, :, ~fixed_parameters(system.model)]
@@ -377,7 +401,9 @@ def _judged(system, sensor, kind, values) -> BandMisfit:
     return replace(misfit, fast=np.where(misfit.apart, np.maximum(misfit.fast, along), misfit.fast))
 
 
-def _misfit_of(system, sensor, kind, values=None) -> BandMisfit:
+def moving_misfit(
+    system: WeightedSystem, sensor: str, kind: str, *, values: np.ndarray | None = None
+) -> BandMisfit:
     """
     Return the misfit of the centred rows of a kind at `values`.
 

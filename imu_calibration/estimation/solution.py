@@ -248,6 +248,12 @@ class Solution:
     misfit can cause.
     """
 
+    slow_over_fast: dict = field(default_factory=dict)
+    """
+    Sensor -> kind of moving window -> `BandMisfit.slow_over_fast`: above 1 the residual has
+    structure in time.
+    """
+
     replaced: tuple[str, ...] = ()
     """
     Held parameters that the recording determines weakly, replaced by their prior (`replace_weak`).

@@ -18,7 +18,11 @@ from imu_calibration.estimation.scaled_solve import (
     inverse_normal,
     scaled_lstsq,
 )
-from imu_calibration.estimation.session_noise import first_noise, updated_noise
+from imu_calibration.estimation.session_noise import (
+    first_noise,
+    moving_misfit,
+    updated_noise,
+)
 from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE, Solution
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
 from imu_calibration.estimation.whitening import predict_session_offsets
@@ -317,7 +321,7 @@ def solve(
         HELD_PRIORS: of_held,
         **model_error(system, values, noises, free=free & ~held).terms(own + of_held),
     }
-    chi2, rms = _fit_quality(system, values, noises)
+    chi2, rms, slow_over_fast = _fit_quality(system, values, noises)
     return Solution(
         model,
         values,
@@ -329,6 +333,7 @@ def solve(
         rms,
         _session_biases(system, values, noises),
         not_believed,
+        slow_over_fast=slow_over_fast,
     )
 
 
@@ -454,11 +459,11 @@ def _undetermined(system, values, factors, free):
 
 def _fit_quality(system, values, noises):
     """
-    Return chi-square per degree of freedom by part, and rms residuals.
+    Return chi-square per degree of freedom by part, rms residuals, and slow over fast residuals.
 
     The residuals are for moving samples and for window means.
     """
-    chi2, rms = {}, {}
+    chi2, rms, slow_over_fast = {}, {}, {}
     for sensor in SENSORS:
         noise, quality, moving, count = noises[sensor], {}, 0.0, 0
         misfit = system.misfit(sensor, system.means[sensor], values)
@@ -471,10 +476,14 @@ def _fit_quality(system, values, noises):
             )
             moving, count = moving + squares.sum(), count + 3 * system.dof_within[kind]
         chi2[sensor] = quality
+        slow_over_fast[sensor] = {
+            kind: moving_misfit(system, sensor, kind, values=values).slow_over_fast(noise.inflation)
+            for kind in system.within[sensor]
+        }
         rms[sensor] = np.array(
             [np.sqrt(moving / count) if count else np.nan, np.sqrt((misfit**2).mean())]
         )
-    return chi2, rms
+    return chi2, rms, slow_over_fast
 
 
 def _session_biases(system, values, noises):

@@ -30,8 +30,13 @@ onset, can be searched.
 """
 SUDDEN = 0.5
 """
-Largest share of the excess of a linear change in time that an onset may have: above it the change
-may be gradual.
+Largest share of the excess of a gradual change that an onset may have: above it the change may be
+gradual.
+"""
+GRADUAL = 5
+"""
+Degree of the polynomial in time of a gradual change. A step keeps a tenth of its variance beside
+such a polynomial, a clock that bends with the temperature hardly anything.
 """
 LIKELY = 16.0
 """
@@ -103,9 +108,9 @@ def find_onset(
 
     For each group of parameters and each moment between two windows, the model ``columns @ values +
     after * columns[:, group] @ change`` is fitted with the noise at rest. The onset must remove
-    `MIN_EXPLAINED_SHARE` of the excess, and its excess must be at most half that of a linear change
-    of the same parameters with time. The moment is then refined to the sample at which the
-    residuals of both states are least.
+    `MIN_EXPLAINED_SHARE` of the excess, and its excess must be at most half that of a gradual
+    change of the same parameters (a polynomial in time of degree `GRADUAL`). The moment is then
+    refined to the sample at which the residuals of both states are least.
     """
     used, space, groups = (
         problem.search.indices(chosen),
@@ -113,7 +118,7 @@ def find_onset(
         _groups(problem.recording.model),
     )
     every = np.array(list(dict.fromkeys([*used, *(k for group in groups.values() for k in group)])))
-    small, time = space.restricted(every), space.recording.time - space.recording.time.mean()
+    small, time = space.restricted(every), space.recording.time
     each = matrix_of_each(small, explained.floor.noise)
     total, count = each.sum(axis=0), explained.n_means + explained.n_within
     base, noise = np.arange(len(used)), SIGNIFICANT_REST * np.sqrt(2 * count)
@@ -125,17 +130,21 @@ def find_onset(
     if single < noise or not len(allowed):
         return None
     after = total - np.cumsum(each, axis=0)[allowed]
-    slope, curve = (np.tensordot(time**power, each, 1) for power in (1, 2))
+    curves = _curves(time)
+    along = np.tensordot(curves, each, (0, 0))
+    between = np.tensordot(curves[:, :, None] * curves[:, None, :], each, (0, 0))
     found = []
     for name, group in groups.items():
         at = np.flatnonzero(np.isin(every, group))
         own = np.union1d(base, at)
-        fits = [_fit(total, own, small, (matrix, matrix, at)) for matrix in after]
+        fits = [
+            _fit(total, own, small, _Change(at, part[None], part[None, None])) for part in after
+        ]
         losses = np.array([loss for loss, *_ in fits])
         best, likely = int(np.argmin(losses)), allowed[losses < losses.min() + LIKELY]
         excess, gradual = (
             fits[best][0] - count,
-            _fit(total, own, small, (slope, curve, at))[0] - count,
+            _fit(total, own, small, _Change(at, along, between))[0] - count,
         )
         if excess < (1 - MIN_EXPLAINED_SHARE) * single and excess < SUDDEN * gradual:
             found.append(
@@ -202,23 +211,41 @@ def _of_reference(model):
     return {effect.name: model.slices[effect.key] for effect in model.effects if effect.sudden}
 
 
-def _fit(total, own, small, changed=None):
+def _curves(time):
+    """Return the Legendre polynomials of degree 1 to `GRADUAL` over the times, shape (k, m)."""
+    middle, half = 0.5 * (time[0] + time[-1]), max(0.5 * (time[-1] - time[0]), 1e-9)
+    return np.polynomial.legendre.legvander((time - middle) / half, GRADUAL)[:, 1:]
+
+
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """Changes of some parameters along m functions of time, of q parameters with the residual."""
+
+    places: np.ndarray
+    """Parameters that change, shape (n,)."""
+    along: np.ndarray
+    """Normal matrices of the windows weighted with each function, shape (m, q + 1, q + 1)."""
+    between: np.ndarray
+    """The same for the product of two functions, shape (m, m, q + 1, q + 1)."""
+
+
+def _fit(total, own, small, change=None):
     """
     Return (loss, values, changes, sds of the changes) of the parameters `own`.
 
-    `changed`: (cross products, products, places).
+    The changes are in the order of the functions of `change`, all its parameters for each.
     """
     known = 1 / small.prior_sd[own] ** 2
     normal, right = (
         total[np.ix_(own, own)] + np.diag(known),
         total[own, -1] + small.prior_mean[own] * known,
     )
-    if changed is not None:
-        cross, squares, at = changed
-        normal = np.block(
-            [[normal, cross[np.ix_(own, at)]], [cross[np.ix_(at, own)], squares[np.ix_(at, at)]]]
-        )
-        right = np.append(right, cross[at, -1])
+    if change is not None:
+        at = change.places
+        cross = np.concatenate([part[np.ix_(own, at)] for part in change.along], axis=1)
+        squares = np.block([[part[np.ix_(at, at)] for part in row] for row in change.between])
+        normal = np.block([[normal, cross], [cross.T, squares]])
+        right = np.concatenate([right, *(part[at, -1] for part in change.along)])
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(
         normal / np.outer(scale, scale), rcond=1e-12, hermitian=True

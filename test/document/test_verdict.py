@@ -7,7 +7,7 @@ import pytest
 
 from imu_calibration.document.calibration import Calibration, parameter_rows
 from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS, UNPROVEN, WARNING
-from imu_calibration.document.verdict import judge, judged
+from imu_calibration.document.verdict import judge, judged, misfits
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK, tolerances_of
 
@@ -128,6 +128,25 @@ def test_residuals_in_motion_against_the_noise_at_rest(factor, kinds):
         r.word for r in found.reasons if f'{np.sqrt(factor):.1f} times the noise at rest' in r.what
     ] == kinds
     assert found.word is UNPROVEN  # without a proof, whatever the residuals are
+
+
+@pytest.mark.parametrize(
+    ('slow_over_fast', 'windows', 'kinds', 'keys'),
+    [
+        (0.9, {'static': 9, 'spin': 3}, [NOTE], [None]),  # louder, and white
+        (1.5, {'static': 9, 'spin': 3}, [WARNING], ['diagnose']),
+        (0.9, {'spin': 3}, [WARNING], ['diagnose']),  # without rests the slow part is the reference
+    ],
+)
+def test_only_residuals_with_structure_show_an_incomplete_model(
+    slow_over_fast, windows, kinds, keys
+):
+    statistics = with_statistics(
+        'gyroscope', chi2_per_dof={'spin': 20.0}, slow_over_fast={'spin': slow_over_fast}
+    ).statistics
+    found = misfits(calibration(statistics=statistics | {'windows': windows}))
+    assert [reason.word for reason in found] == kinds
+    assert [reason.key for reason in found] == keys
 
 
 def test_a_regime_in_which_the_error_grows_is_a_warning_and_leaves_the_decision():

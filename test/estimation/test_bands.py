@@ -149,3 +149,20 @@ def test_the_slow_misfit_of_few_pieces_is_taken_larger():
     )
     assert not few.apart.any() and many.apart.all()
     np.testing.assert_allclose(many.slow, 1 + 2 * np.sqrt(2 / 800))
+
+
+@pytest.mark.parametrize(
+    ('slow', 'fast', 'inflation', 'structure'),
+    [
+        (1.2, 1.0, 1.0, False),  # within the scatter of 200 pieces
+        (30.0, 30.0, 1.0, False),  # louder, and as white as at rest
+        (3.0, 30.0, 1.0, False),  # vibration above the band of the pieces
+        (60.0, 30.0, 1.0, True),
+        (60.0, 30.0, 2.0, False),  # the sensor itself has this noise at low frequency
+    ],
+)
+def test_only_a_slow_part_above_that_of_white_noise_is_structure(slow, fast, inflation, structure):
+    misfit = band_misfit(
+        np.full(3, 200 * slow + 1800 * fast), 2000, np.full(3, 200 * slow), dof_slow=200
+    )
+    assert (misfit.slow_over_fast(np.full(3, inflation)) > 1.0) == structure

@@ -88,9 +88,11 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
 
 
-@pytest.mark.parametrize('cause', [None, Moment('creep')])
+@pytest.mark.parametrize('cause', [None, Moment('creep'), Clock(share=0.35, bend=4e-3)])
 def test_no_change_and_a_gradual_change_are_no_onset(cause):
-    assert investigated(cause)[1].onset is None
+    found = investigated(cause)[1]
+    assert found.onset is None
+    assert 'clock_step' not in {question.name for question in found.named}
 
 
 def test_a_clock_of_another_rate_is_named():

@@ -11,15 +11,35 @@ from worlds.physics_cause import Cause
 
 
 class Clock(Cause):
-    """Stamps by a clock of another rate, with a step after a share of the session."""
+    """
+    Stamps by a clock of another rate, with a step after a share of the session.
 
-    def __init__(self, rate=0.0, step=0.0, share=0.6):
+    Or with a bend: its lag approaches another value within a sixth of the session.
+    """
+
+    def __init__(self, rate=0.0, step=0.0, share=0.6, bend=0.0):
         super().__init__()
-        self.rate, self.step, self.share = rate, step, share
+        self.rate, self.step, self.share, self.bend = rate, step, share, bend
 
     def stamped(self, time, rng):
         """Return the lag of each stamp."""
-        return self.rate * time + self.step * (time > self.share * time[-1])
+        course = time / time[-1]
+        step = self.step * (course > self.share)
+        return self.rate * time + step + self.bend * np.tanh(8.0 * (course - self.share))
+
+
+class LouderInMotion(Cause):
+    """White noise of the gyroscope that has a larger standard deviation in motion, rad/s."""
+
+    def __init__(self, sd):
+        super().__init__()
+        self.sd = sd
+
+    def delivered(self, time, outputs, rate_s):
+        """Add the noise of the motion."""
+        moving = np.linalg.norm(rate_s, axis=1, keepdims=True) > 0.02
+        noise = np.random.default_rng(11).normal(0.0, self.sd, outputs[1].shape)
+        return [outputs[0], outputs[1] + moving * noise]
 
 
 class Moment(Cause):

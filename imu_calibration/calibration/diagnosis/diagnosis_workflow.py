@@ -100,17 +100,23 @@ class DiagnosisResult:
         """
         Residuals above the noise at rest, and biases that step or wander on every axis.
 
-        Both are for sensors without an unexplained residual.
+        Both are for sensors without an unexplained residual. An onset explains them all.
         """
+        if self.diagnosis.onset is not None:
+            return []
         quiet = {
             sensor for sensor, rest in self.diagnosis.unexplained.items() if not rest.significant
         }
-        reasons = [*misfits(self.calibration), *unsteady(self.calibration, self.tolerances)]
-        return [
-            f'{reason.what}; no effect of the catalogue explains it'
-            for reason in reasons
-            if quiet.issuperset(reason.sensors)
-        ]
+        wandering = unsteady(self.calibration, self.tolerances)
+        notes = []
+        for reason in (*misfits(self.calibration), *wandering):
+            if not quiet.issuperset(reason.sensors):
+                continue
+            # Noise that is larger in motion has no effect that could explain it.
+            needs_cause = reason in wandering or reason.key == 'diagnose'
+            unexplained = '; no effect of the catalogue explains it' if needs_cause else ''
+            notes.append(reason.what + unexplained)
+        return notes
 
     @property
     def lags(self) -> dict[str, tuple[float, float]]:
