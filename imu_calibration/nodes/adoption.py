@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
+from imu_calibration.compensation.plausible_change import implausible_change
 from imu_calibration.compensation.stream import requested_transfer
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
@@ -58,8 +59,9 @@ class CompensatorSettings:
     anyway: bool = setting(
         False,
         '',
-        'also correct a sensor whose decision is unproven; one whose decision is harms is never'
-        ' corrected',
+        'also correct a sensor whose decision is unproven, and adopt a calibration from the topic'
+        ' that changes the readings by more than such sensors need; one whose decision is harms is'
+        ' never corrected',
         symptom='the correction may increase the error of the readings',
         live=True,
     )
@@ -200,6 +202,11 @@ class Adopted:
     """Changes whenever the document does."""
     source: str
     """Source of the document, readable."""
+    anchor: Calibration
+    """
+    The last calibration from a file or with consent, or else the first from the topic: documents
+    from the topic are compared with it too, so that many small changes do not add up.
+    """
 
     @property
     def caveats(self) -> list[str]:
@@ -238,9 +245,13 @@ def adopt(
     *,
     frames: StaticFrames,
     before: Adopted | None = None,
+    from_topic: bool = False,
 ) -> Adopted:
     """
     Return the calibration in a document, ready to take the place of `before`.
+
+    A document from the topic is not trusted: without the user's consent (`anyway`) it may change
+    the readings only by as much as sensors of the kind need.
 
     Raises
     ------
@@ -255,12 +266,16 @@ def adopt(
         calibration = calibration_from_text(text)
         used = trust.usable(calibration, anyway=settings.anyway, live=True)
         _require_same_frame(calibration, before)
+        anchor = used.calibration
+        if from_topic:
+            anchor = _anchor_from_topic(used.calibration, settings, before)
         return Adopted(
             calibration,
             used,
             _prepared(used.calibration, settings, frames, before),
             version_of(text),
             source,
+            anchor,
         )
     except ImuCalibrationError:
         raise
@@ -349,6 +364,32 @@ def _watch(
         if was is transfer or (transfer is not None and transfer.is_close(was)):
             return watch
     return StopWatch(CalibrationHealth(calibration, transfer, options))
+
+
+def _anchor_from_topic(
+    calibration: Calibration, settings: CompensatorSettings, before: Adopted | None
+) -> Calibration:
+    """
+    Return the anchor after a calibration from the topic.
+
+    Refuses a change that no IMU of the kind needs: a copied decision proves nothing.
+    """
+    if settings.anyway:
+        return calibration
+    references: list[Calibration | None] = [None]
+    if before is not None:
+        references = [before.used.calibration, before.anchor]
+    for reference in references:
+        why = implausible_change(calibration, reference)
+        if why:
+            near = 'uncorrected readings' if reference is None else 'the one in use'
+            raise DocumentError(
+                f'a calibration from the topic must be near {near}: {why}; if it is right, set'
+                ' anyway:=true',
+                key='anyway',
+                code='implausible_change',
+            )
+    return calibration if before is None else before.anchor
 
 
 def _require_same_frame(calibration: Calibration, before: Adopted | None) -> None:

@@ -36,6 +36,7 @@ from imu_calibration.nodes.diagnostics import LOG_ERROR, Complaints
 from imu_calibration.nodes.inputs import (
     MatchedInput,
     latched_qos,
+    node_of,
     output_qos,
     sent_ns,
     watch_inputs,
@@ -221,13 +222,22 @@ class CompensatorNode(Node):
                 f" '{self.settings.calibration_file}'"
             )
 
-    def _adopt(self, text: str, source: str, settings: CompensatorSettings) -> None:
+    def _adopt(
+        self, text: str, source: str, settings: CompensatorSettings, *, from_topic: bool = False
+    ) -> None:
         """
         Put the calibration in a document in force.
 
         Raises an ImuCalibrationError and keeps the one there is.
         """
-        adopted = adopt(text, source, settings, frames=self._frames, before=self.adopted)
+        adopted = adopt(
+            text,
+            source,
+            settings,
+            frames=self._frames,
+            before=self.adopted,
+            from_topic=from_topic,
+        )
         self._put_in_force(adopted)
         if adopted.says_more_than(self._reported):
             self._reported = adopted
@@ -284,7 +294,7 @@ class CompensatorNode(Node):
                 f'calibration {self._harmful} increased the error at rest; calibrate again',
                 code='increased_error',
             )
-        self._adopt(self._heard, self._topic, settings)
+        self._adopt(self._heard, self._topic, settings, from_topic=True)
 
     def _load_file(self, settings: CompensatorSettings) -> None:
         path = files.user_path(settings.calibration_file)
@@ -375,14 +385,22 @@ class CompensatorNode(Node):
             self.compensation.refresh()
 
     def look_for_correction(self) -> None:
-        """Notice when another compensator publishes the input, and when it no longer does."""
+        """
+        Notice when another compensator publishes the input, and when it no longer does.
+
+        A compensator publishes both the topic and its mark; the mark of another node is ignored,
+        because any participant could stop the output with it.
+        """
         topic = self.imu.topic_name
-        self.corrected_already = (
-            f'{topic} is corrected already ({topic + MARK} has a publisher): no messages are'
-            ' published; remap imu/data_raw to the raw topic'
-            if self.count_publishers(topic + MARK)
-            else ''
-        )
+        marked = {node_of(each) for each in self.get_publishers_info_by_topic(topic + MARK)}
+        senders = {node_of(each) for each in self.get_publishers_info_by_topic(topic)}
+        compensators = sorted(marked & senders)
+        self.corrected_already = ''
+        if compensators:
+            self.corrected_already = (
+                f'{topic} is corrected already ({compensators[0]} publishes it and'
+                f' {topic + MARK}): no messages are published; remap imu/data_raw to the raw topic'
+            )
 
 
 def main(arguments: list[str] | None = None) -> int:

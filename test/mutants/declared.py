@@ -1217,6 +1217,13 @@ BY_SENSOR = _of(
         'test_verdict_by_sensor.py::test_other_programs_get_nominal_numbers_for_the_sensor_that_is_refused',
     ),
     ('who corrects takes the refused sensor too', 'adopt', '_1.anyway', 'True', 'test_adoption.py'),
+    (
+        'many small changes from the topic add up',
+        '_anchor_from_topic',
+        '[_1.used.calibration, _1.anchor]',
+        '[_1.used.calibration]',
+        'test_adoption.py::test_many_small_changes_from_the_topic_do_not_add_up',
+    ),
 )
 MUTANTS = (
     *NOISE,

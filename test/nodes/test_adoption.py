@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.compensation.plausible_change import implausible_change
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.nodes import adoption
@@ -167,3 +168,80 @@ def test_only_what_changed_by_more_than_its_sd_is_worth_a_line():
         for share in (0.1, 3.0)
     )
     assert not little.says_more_than(before) and much.says_more_than(before)
+
+
+def near(**bias):
+    """A document with copied decisions: these biases, and identity matrices."""
+    values = np.zeros(len(GOOD.values))
+    for sensor in PROVEN:
+        values[GOOD.model.slices[sensor, 'matrix']] = np.eye(3).ravel()
+        values[GOOD.model.slices[sensor, 'bias']] = bias.get(sensor, 0.0)
+    return replace(GOOD, values=values, proof=PROVEN)
+
+
+def scaled(size):
+    document = near()
+    values = document.values.copy()
+    values[GOOD.model.slices['accelerometer', 'matrix']] = size * np.eye(3).ravel()
+    return replace(document, values=values)
+
+
+FAR = {
+    'scale 0.5': scaled(0.5),
+    'bias 0.6 m/s^2': near(accelerometer=0.6),
+    'gyroscope 0.15 rad/s': near(gyroscope=0.15),
+}
+
+
+@pytest.mark.parametrize('document', FAR.values(), ids=FAR)
+@pytest.mark.parametrize('in_use', (None, near(accelerometer=0.01)), ids=('first', 'second'))
+def test_a_far_document_from_the_topic_needs_consent_and_a_file_none(document, in_use):
+    """Scale 0.5 or a bias of 0.6 m/s^2 with a copied decision was adopted at once."""
+    before = in_use and adopt(calibration_to_text(in_use), 'a file', SETTINGS, frames=None)
+    text = calibration_to_text(document)
+    with refused(DocumentError, 'implausible_change') as refusal:
+        adopt(text, 'the topic', SETTINGS, frames=None, before=before, from_topic=True)
+    assert refusal.value.key == 'anyway'
+    insisting = replace(SETTINGS, anyway=True)
+    for settings, from_topic in ((insisting, True), (SETTINGS, False)):
+        adopted = adopt(text, 'x', settings, frames=None, before=before, from_topic=from_topic)
+        assert adopted.anchor is adopted.used.calibration
+
+
+def test_many_small_changes_from_the_topic_do_not_add_up():
+    adopted = None
+    for bias in (0.2, 0.4, 0.6):
+        adopted = adopt(
+            calibration_to_text(near(accelerometer=bias)),
+            'the topic',
+            SETTINGS,
+            frames=None,
+            before=adopted,
+            from_topic=True,
+        )
+    with refused(DocumentError, 'implausible_change'):
+        adopt(
+            calibration_to_text(near(accelerometer=0.8)),
+            'the topic',
+            SETTINGS,
+            frames=None,
+            before=adopted,
+            from_topic=True,
+        )
+
+
+@pytest.mark.parametrize('effect', ('accel_quadratic', 'accel_thermal_bias', 'gyro_g_sensitivity'))
+def test_the_change_by_any_effect_is_limited(effect):
+    """The limits hold for readings: a large coefficient of another effect is found too."""
+    further = random_calibration(
+        1,
+        accelerometer=('accel_quadratic', 'accel_thermal_bias'),
+        gyroscope=('gyro_g_sensitivity',),
+        frame_id='imu_link',
+    )
+    sensor = 'gyroscope' if effect.startswith('gyro') else 'accelerometer'
+    part = further.model.slices[sensor, effect]
+    assert not implausible_change(further, None)
+    values = further.values.copy()
+    values[part] = 0.05
+    assert implausible_change(replace(further, values=values), None)

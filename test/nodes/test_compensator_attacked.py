@@ -413,3 +413,20 @@ def test_a_calibration_that_harms_at_rest_gives_way_to_the_previous_one(bench, p
         'the refusal',
     )
     assert node.adopted.version == version_of(GOOD_TEXT)
+
+
+def test_a_mark_without_its_topic_does_not_stop_the_output(bench, place):
+    """A silent publisher of another node on `imu/data_raw/correction` ended the publication."""
+    node = bench.start(CompensatorNode, {'calibration_file': str(place)})
+    mark = node.imu.topic_name + compensator_node.MARK
+    stranger = bench.start(Sender)
+    stranger.create_publisher(String, mark, latched_qos())
+    bench.until(lambda: node.count_publishers(mark), 'the mark')
+    node.look_for_correction()
+    assert not node.corrected_already
+    assert node.convert(MESSAGES[0], {'source_timestamp': 1}) is not None
+    stranger.create_publisher(Imu, node.imu.topic_name, 10)
+    bench.until(lambda: node.count_publishers(node.imu.topic_name), 'the topic')
+    node.look_for_correction()
+    assert '/sender' in node.corrected_already
+    assert node.convert(MESSAGES[0], {'source_timestamp': 1}) is None
