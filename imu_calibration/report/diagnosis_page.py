@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding, formula_gain
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, Finding
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
     DiagnosisResult,
     beyond_lines,
@@ -69,7 +69,6 @@ def diagnosis_report(result: DiagnosisResult) -> str:
         rests=rests,
         draw_finding=draw_finding,
         draw_formula=draw_formula,
-        formula_gain=formula_gain,
         unexplained_text=unexplained_text,
         overlay=overlay_section(
             diagnosis.traces, diagnosis.baseline.model.joint_names, _causes(diagnosis)

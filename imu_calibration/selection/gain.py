@@ -14,8 +14,8 @@ from imu_calibration.selection.questions import Question
 
 WINDOW_RESAMPLES = 1000
 """Number of resamples of windows for an interval."""
-REST_MEASURE = 'means of windows at rest'
-MEASURES = ('samples', 'window means', 'samples about the mean of their window', REST_MEASURE)
+SAMPLES, REST_MEASURE = 'samples', 'means of windows at rest'
+MEASURES = (SAMPLES, 'window means', 'samples about the mean of their window', REST_MEASURE)
 """Residuals of which a gain is reported."""
 APPLIED, OF_MODEL = 'error of corrected readings', 'residual of the model'
 """
@@ -47,6 +47,17 @@ class Gain:
     """Windows that were held out."""
     of: str = OF_MODEL
     """`APPLIED` or `OF_MODEL`."""
+    noise_rms: float = float('nan')
+    """Rms noise at rest that both contain, m/s^2 or rad/s; nan where it is not known."""
+
+    @property
+    def beyond_noise(self) -> tuple[float, float]:
+        """Rms before and after without the noise at rest, ``sqrt(max(rms^2 - noise^2, 0))``."""
+        before, after = (
+            float(np.sqrt(max(rms**2 - self.noise_rms**2, 0.0)))
+            for rms in (self.heldout_rms_before, self.heldout_rms_after)
+        )
+        return before, after
 
     @property
     def least(self) -> float:

@@ -31,6 +31,7 @@ from imu_calibration.report.diagnosis_page import (
     variables,
 )
 from imu_calibration.report.page import chance
+from imu_calibration.selection.gain import APPLIED, Gain
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
@@ -216,7 +217,14 @@ def of_formula(result):
     return replace(
         result,
         diagnosis=replace(
-            diagnosis, findings=(), unexplained={**diagnosis.unexplained, 'gyroscope': rest}
+            diagnosis,
+            findings=(),
+            unexplained={**diagnosis.unexplained, 'gyroscope': rest},
+            formula_gains={
+                'gyroscope': Gain(
+                    'gyroscope', 'samples', 5e-3, 3e-3, (0.35, 0.45), 12, APPLIED, noise_rms=3e-3
+                )
+            },
         ),
     )
 
@@ -231,22 +239,18 @@ def test_the_headline_of_a_formula_states_its_share(of_formula):
     assert not any('nothing found' in line for line in of_formula.lines)
 
 
-def test_the_gain_of_a_formula_is_in_the_unit_of_the_sensor(of_formula):
-    """
-    ``after = before sqrt(1 - share)``, and the interval of the reduction from that of the share.
-    """
+def test_the_gain_of_a_formula_is_printed_with_and_without_the_noise(of_formula):
+    """Of 5 mrad/s and 3 mrad/s, noise 3 mrad/s: 4 mrad/s and nothing beyond the noise."""
     gain = of_formula.document['unexplained']['gyroscope']['proposals'][0]['gain']
-    assert gain['heldout_rms_before'] == 5e-4 and gain['heldout_rms_after'] == pytest.approx(
-        5e-4 * 0.2, rel=1e-12
-    )
-    assert (
-        gain['ci95'] == pytest.approx([0.7, 0.9], rel=1e-12)
-        and gain['windows'] == of_formula.diagnosis.locked
-    )
+    assert (gain['heldout_rms_before'], gain['heldout_rms_after']) == (5e-3, 3e-3)
+    assert gain['beyond_noise_before'] == pytest.approx(4e-3, rel=1e-12)
+    assert gain['beyond_noise_after'] == 0.0
     assert any(
-        all(size in line for size in ('0.0286 deg/s', '0.00286 deg/s', '0.00859 deg/s'))
+        all(size in line for size in ('0.286 deg/s', '0.172 deg/s', '0.229 deg/s', '35 to 45 %'))
         for line in of_formula.lines
     )
+    page = diagnosis_report(of_formula)
+    assert '0.286' in page and '0.172' in page
 
 
 def test_the_distance_agrees_with_the_held_out_gain(result):

@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.diagnosis.applied_gain import gains_of_formulas
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.cli.main import main
@@ -18,6 +19,7 @@ from imu_calibration.document import files
 from imu_calibration.effects.expressions import ColumnGroup
 from imu_calibration.selection import proposals
 from imu_calibration.selection.formulas import grammar
+from imu_calibration.selection.gain import APPLIED, SAMPLES
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.selection.proposals import find_formulas, propose
 from imu_calibration.selection.regime_variables import variables_of
@@ -257,6 +259,27 @@ def test_the_place_is_found(kind, size):
     row, known = row_of(6, kind, 'white', Beyond(kind, 6, size))
     assert row['flagged'] and row['f1'] > 0.7 and row['axis'] and not row['found'], row
     assert len(known) == 24 and all(sd > 0 for _, sd in known.values())
+
+
+def test_the_gain_of_a_formula_is_that_of_corrected_readings():
+    """
+    Beyond the noise at rest the error before is the hidden signal, all samples of locked windows.
+
+    It is a root mean square over the axes; the bias that the fit absorbs is within 10 %.
+    """
+    (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
+    proposal = found.proposals['gyroscope']
+    gain = gains_of_formulas(found, recording.table, [proposal])['gyroscope']
+    time = np.concatenate(
+        [window.time for window, locked in zip(found.used, found.problem.locked) if locked]
+    )
+    signal = [np.interp(time, cause.time, column) for column in cause.signal.T]
+    hidden = float(np.sqrt(np.mean(np.square(signal))))
+    before, after = gain.beyond_noise
+    assert (gain.of, gain.measure) == (APPLIED, SAMPLES)
+    assert before == pytest.approx(hidden, rel=0.1)
+    assert after < 0.3 * before  # a noise variance known to 4 % is a fifth of the noise here
+    assert gain.ci95[0] > 0.0
 
 
 def test_the_formula_is_printed():

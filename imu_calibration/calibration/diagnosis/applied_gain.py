@@ -19,13 +19,25 @@ from imu_calibration.effects.forward_equations import (
     not_applied,
     sensor_output,
 )
+from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import HELD
+from imu_calibration.estimation.solver import solve
+from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import all_samples, chunks
 from imu_calibration.references.gravity.model_selection import HandInvestigation, gain_of_poses
-from imu_calibration.selection.gain import APPLIED, Gain, gain_in_turn, heldout_gain
+from imu_calibration.selection.gain import (
+    APPLIED,
+    OF_MODEL,
+    SAMPLES,
+    Gain,
+    gain_in_turn,
+    heldout_gain,
+)
 from imu_calibration.selection.investigation import Investigation
+from imu_calibration.selection.proposals import Proposal
 from imu_calibration.selection.questions import Question
+from imu_calibration.selection.residual_blocks import residuals
 from imu_calibration.selection.saturation import measured
 
 
@@ -58,17 +70,80 @@ def gain_of_findings(
     if applied is None:
         return heldout_gain(problem, before, after, sensors=sensors)
     chosen = gain_in_turn(problem, *applied, sensors=sensors)
-    sides, sums = [_applied_parameters(found, some) for some in applied], DistanceSums()
+    sums = _locked_errors(found, table, [_applied_parameters(found, some) for some in applied])
+    return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
+
+
+def gains_of_formulas(
+    found: Investigation, table: Table, proposals: Sequence[Proposal]
+) -> dict[str, Gain]:
+    """
+    Return sensor -> Gain of the proposed formulas over the findings on the locked windows.
+
+    The residual is the error of corrected readings, sample by sample, as for findings; that of the
+    model where compensation cannot undo the formula. Model and formulas are estimated together from
+    the other windows.
+
+    Parameters
+    ----------
+    found : Investigation
+    table : Table
+    proposals : sequence of Proposal
+        At most one for each sensor.
+
+    """
+    if not proposals:
+        return {}
+    problem = found.problem
+    before = model, values, applied = _applied_parameters(found, found.adopted)
+
+    # The model with the formulas, linearised at their amplitudes.
+    for proposal in proposals:
+        for effect, size in zip(proposal.effects, proposal.values):
+            known = replace(model, catalogue=model.catalogue.with_effects(effect))
+            model, values = known.with_sized_effect(values, effect.sensor, effect.name, size=size)
+    model, accumulator = model.at(values), Accumulator()
+    unlocked = [window for window, locked in zip(found.used, problem.locked) if not locked]
+    for group in chunks(unlocked):
+        for window in reduce_windows(group, model, table):
+            accumulator.add(window)
+    estimated = solve(accumulator, model, noise=problem.noise).values
+
+    # Compensation fixes the effects of the model that it does not undo as on the first side.
+    after = applied_values(model, estimated)
+    for effect in not_applied(before[0]):
+        after[model.slices[effect.key]] = applied[before[0].slices[effect.key]]
+    sides = [before, (model.at(estimated), estimated, after)]
+    sums, gains = {}, {}
+    for proposal in proposals:
+        undone = any(effect.compensation == 'exact' for effect in proposal.effects)
+        of = APPLIED if undone else OF_MODEL
+        if of not in sums:
+            sums[of] = _locked_errors(found, table, sides, of=of)
+        gain = sums[of].gains(proposal.sensor, of)[SAMPLES]
+        noise = problem.noise[proposal.sensor].white_variance
+        gains[proposal.sensor] = replace(gain, noise_rms=float(np.sqrt(np.mean(noise))))
+    return gains
+
+
+def _locked_errors(found, table, sides, *, of=APPLIED):
+    """
+    Return the sums over the locked windows of the errors of corrected readings, or of the model.
+
+    Each side is (model, values, values to apply).
+    """
+    problem, sums = found.problem, DistanceSums()
     start = max(judged_from_of(model, problem.duration) for model, *_ in sides)
     held_out = [
         window
         for window, locked in zip(found.used, problem.locked)
         if locked and window.time[0] >= start
     ]
+    errors_of = _errors if of == APPLIED else _model_errors
     for group in chunks(held_out):
-        for window, *residuals in zip(group, *(_errors(group, table, *side) for side in sides)):
-            sums.add(window, residuals, problem.noise)
-    return sums.gains(chosen.sensor, APPLIED)[chosen.measure]
+        for window, *errors in zip(group, *(errors_of(group, table, *side) for side in sides)):
+            sums.add(window, errors, problem.noise)
+    return sums
 
 
 def _compensated(found, before, after):
@@ -198,3 +273,12 @@ def _errors(windows, table, model, values, applied):
     ]
     for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
         yield {sensor: error[start:stop] for sensor, error in zip(SENSORS, errors)}
+
+
+def _model_errors(windows, table, model, values, applied):
+    """
+    Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3).
+    """
+    left = residuals(windows, table, model, values=values)
+    for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
+        yield {sensor: rest[start:stop] for sensor, rest in left.items()}

@@ -116,28 +116,13 @@ class Diagnosis:
     """
     stamp_jitter: StampJitter = NO_JITTER
     """Errors of the stamps from the scatter in motion; by hand none are estimated."""
+    formula_gains: dict[str, Gain] = field(default_factory=dict)
+    """Sensor with a proposed formula -> the held-out gain of corrected readings by it."""
 
     @property
     def model(self) -> SensorModel:
         """The extended SensorModel, linearised at the solution."""
         return self.solution.model.at(self.solution.values)
-
-
-def formula_gain(rest: Unexplained, windows: int = 0) -> Gain:
-    """
-    Return the gain of the formula proposed for an unexplained residual.
-
-    The gain is in the unit of the sensor.
-
-    ``after = before sqrt(1 - share)`` with `before` the rms of the residual beyond noise and
-    `share` the part of its power that the formula removes from the held-out windows, `windows` in
-    number; the interval is that of the share.
-    """
-    low, high = (
-        float(1.0 - np.sqrt(np.clip(1.0 - share, 0.0, None))) for share in rest.proposal.ci95
-    )
-    after = rest.rms * (1.0 - rest.proposal.reduction)
-    return Gain(rest.proposal.sensor, 'rms beyond noise', rest.rms, after, (low, high), windows)
 
 
 def parameters_of(
@@ -177,7 +162,9 @@ def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
                 sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()
             },
             'unexplained': {
-                sensor: _rest(sensor, diagnosis.unexplained[sensor], diagnosis.locked)
+                sensor: _rest(
+                    sensor, diagnosis.unexplained[sensor], diagnosis.formula_gains.get(sensor)
+                )
                 for sensor in SENSORS
             },
             'not_testable': diagnosis.not_testable,
@@ -250,7 +237,7 @@ def _gain(gain):
     return {name: getattr(gain, name) for name in names}
 
 
-def _rest(sensor, rest, locked):
+def _rest(sensor, rest, formula_gain):
     unit = rest.unit or UNITS[sensor]
     return {
         'significant': rest.significant,
@@ -266,6 +253,11 @@ def _rest(sensor, rest, locked):
         'proposals': (
             []
             if rest.proposal is None
-            else [rest.proposal.to_mapping() | {'gain': _gain(formula_gain(rest, locked))}]
+            else [rest.proposal.to_mapping() | {'gain': _formula_gain(formula_gain)}]
         ),
     }
+
+
+def _formula_gain(gain):
+    before, after = gain.beyond_noise
+    return _gain(gain) | {'beyond_noise_before': before, 'beyond_noise_after': after}

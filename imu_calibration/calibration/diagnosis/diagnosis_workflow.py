@@ -8,11 +8,7 @@ import numpy as np
 
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.diagnosis.diagnosis_result import (
-    Diagnosis,
-    formula_gain,
-    to_mapping,
-)
+from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, to_mapping
 from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
     LEAVES_MOST,
@@ -328,7 +324,10 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
             )
         lines += [
             f'   {line}' if rest.significant else line
-            for line in (*beyond_lines(sensor, rest), *_formula_lines(sensor, rest))
+            for line in (
+                *beyond_lines(sensor, rest),
+                *_formula_lines(sensor, rest, diagnosis.formula_gains.get(sensor)),
+            )
         ]
     if diagnosis.not_testable:
         lines.append(
@@ -382,20 +381,22 @@ def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
     return [*lines, *(f'spectrum: {tone.text}' for tone in rest.tones)]
 
 
-def _formula_lines(sensor, rest):
+def _formula_lines(sensor, rest, gain):
     """Return the formula that an unexplained residual follows and its gain, as lines."""
     if rest.proposal is None:
         return []
-    gain = formula_gain(rest)
-    before, low, high = (
-        in_words(gain.heldout_rms_before * factor, sensor)
-        for factor in (1.0, 1.0 - gain.ci95[1], 1.0 - gain.ci95[0])
+    # The interval of the reduction is that of the rms with noise, as for effects of the catalogue.
+    share = ' to '.join(f'{100 * end:.2g}' for end in gain.ci95)
+    before, after, only_before, only_after = (
+        in_words(rms, sensor)
+        for rms in (gain.heldout_rms_before, gain.heldout_rms_after, *gain.beyond_noise)
     )
     return [
         f'formula: {rest.proposal.sentence}',
         (
-            f'gain of the formula: {gain.measure} of the {sensor} {before} before, {low} to {high} '
-            'after (95 %)'
+            f'gain of the formula: {gain.of} ({sensor}, held-out {gain.measure}, rms) {before}'
+            f' before, {after} after, a reduction of {share} % (95 %); beyond the noise at rest'
+            f' {only_before} before, {only_after} after'
         ),
     ]
 

@@ -10,7 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import extended_solution
-from imu_calibration.calibration.diagnosis.applied_gain import gain_by_hand, gain_of_findings
+from imu_calibration.calibration.diagnosis.applied_gain import (
+    gain_by_hand,
+    gain_of_findings,
+    gains_of_formulas,
+)
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
     Diagnosis,
@@ -416,6 +420,11 @@ def build_diagnosis(
         int(np.sum(problem.locked)),
         onset=found.onset,
         stamp_jitter=analysis.stamp_jitter,
+        formula_gains=gains_of_formulas(
+            found,
+            table,
+            [rest.proposal for rest in rests.values() if rest.proposal is not None],
+        ),
     )
 
 
