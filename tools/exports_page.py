@@ -8,13 +8,14 @@ from imu_calibration.document.exports.target import Target
 HEAD = """\
 # Into other programs, and back
 
-`imu_calibration export` writes these formats, `imu_calibration import` reads them; `make answers` writes this page
-([decision](decisions/exports.md)). N is the density of white noise, K that of the random walk, in continuous time as in noise.yaml;
-`rate` is the sampling rate of the program.
+`imu_calibration export` writes these formats, `imu_calibration import` reads them; `make answers`
+writes this page ([decision](decisions/exports.md)). N is the density of white noise, K that of the
+random walk, in continuous time as in noise.yaml; `rate` is the sampling rate of the program.
 
-Effects that a program cannot hold are lost: file and terminal state each with its size in the readings and the remaining error, measured
-with the formula below on the given recording or a standard motion. Tests apply the same formulas, written again from the sources, to
-random calibrations.
+Effects that a program cannot hold are lost: file and terminal state each with its size in the
+readings and the remaining error, measured with the formula below on the given recording or a
+standard motion. Tests apply the same formulas, written again from the sources, to random
+calibrations.
 
 | name | format | held parts of the calibration | estimated by the program | noise | import |
 | --- | --- | --- | --- | --- | --- |
@@ -46,7 +47,8 @@ def _row(target: Target) -> str:
 def _section(target: Target) -> str:
     hint = f'{target.hint[0].upper()}{target.hint[1:]}.\n' if target.hint else ''
     return (
-        f'## {target.name}\n\n```\n{target.formula}\n```\n\nSource: {target.source}. {hint}'.rstrip()
+        f'## {target.name}\n\n```\n{target.formula}\n```\n\n'
+        + f'Source: {target.source}. {hint}'.rstrip()
         + '\n'
     )
 

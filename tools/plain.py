@@ -32,10 +32,11 @@ MOST_WORDS = {
 """Largest number of words of a page."""
 MARKERS = set(
     """
-what whatever whoever whose nobody nothing everything everybody somebody hardly anew strange alone else others those
-say says said tell tells told ask asks asked speak speaks spoken answer answers answered know knows let lets
-beside behind apart far whole stay stays stayed come comes came go goes went gone stand stands stood leave leaves
-take takes took taken look looks looked word words people chance chances story say-so
+what whatever whoever whose nobody nothing everything everybody somebody hardly anew strange alone
+else others those say says said tell tells told ask asks asked speak speaks spoken answer answers
+answered know knows let lets beside behind apart far whole stay stays stayed come comes came go
+goes went gone stand stands stood leave leaves take takes took taken look looks looked word words
+people chance chances story say-so
 """.split()
 )
 SENTENCE = re.compile(r'(?<=[.!?;:])\s+')

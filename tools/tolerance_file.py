@@ -8,9 +8,10 @@ from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 
 HEAD = """\
-# Standard deviation up to which a parameter counts as determined; above it the parameter is called weak.
-# One number per effect, SI, for each of its components. Copy this file, change what your use needs, and pass it on:
-# the option tolerances of the command line, the parameter tolerances_file of calibration_node.
+# Standard deviation up to which a parameter counts as determined; above it the parameter is called
+# weak. One number per effect, SI, for each of its components. Copy this file, change what your use
+# needs, and pass it on: the option tolerances of the command line, the parameter tolerances_file of
+# calibration_node.
 # The reasons refer to navigation with a MEMS or tactical IMU on a robot.
 """
 COMMENT_AT = 35

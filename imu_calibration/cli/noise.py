@@ -76,9 +76,8 @@ def _show(found, rates, folder, names):
     ):
         print(head)
         for row in rows:
-            print(
-                f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'.rstrip()
-            )
+            line = f' {row.axis} {row.value:>8}  {row.interval:>17}  {row.status:<10}  {row.note}'
+            print(line.rstrip())
     print()
     for line in [
         *document.lines(found.figures),

@@ -172,11 +172,12 @@ def _look_through(events, what, aliases):
 
     From the events of the parser, which need neither.
     """
-    count, sizes, open_parts = (
-        0,
-        {},
-        [],
-    )  # parts with aliases expanded; those of each anchor; [anchor, count, keys or None, key is next]
+    # Number of parts with aliases expanded.
+    count = 0
+    # Anchor -> number of its parts.
+    sizes = {}
+    # Stack of [anchor, count, keys or None, key is next].
+    open_parts = []
     for event in events:
         kind = type(event).__name__
         if kind.endswith(

@@ -266,7 +266,8 @@ class Calibration:
             )
 
         body = ''.join(row(cells, 'td') for cells in parameter_rows(self))
-        return f'<table><caption>{escape(repr(self))}</caption>{row(PARAMETER_HEADINGS, "th")}{body}</table>'
+        head = row(PARAMETER_HEADINGS, 'th')
+        return f'<table><caption>{escape(repr(self))}</caption>{head}{body}</table>'
 
 
 PARAMETER_HEADINGS = ('parameter', 'value', 'sd', 'unit', 'status')

@@ -356,10 +356,11 @@ class Catalogue:
 
         """
         if not isinstance(definitions, dict) or len(definitions) > MOST_ADDED:
+            is_mapping = isinstance(definitions, dict)
+            received = len(definitions) if is_mapping else shortened(str(definitions))
             raise InputError(
                 f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit,'
-                ' tolerance, text}, got'
-                f' {len(definitions) if isinstance(definitions, dict) else shortened(str(definitions))};'
+                f' tolerance, text}}, got {received};'
                 ' correct it',
                 code='effects_count',
             )

@@ -89,9 +89,9 @@ def model_error(
         return ModelError(np.ones(len(values)), *np.zeros((2, len(values))))
     waves = _waves_of_blocks(*_block_scores(system, values, noises), system.prior.root, free)
     found, misfits = errors_of_waves(waves, system.model)
-    if (
-        'accelerometer' in misfits
-    ):  # an error that depends on the attitude has a mean as large as its scatter, absorbed by the bias
+    if 'accelerometer' in misfits:
+        # An error that depends on the attitude has a mean as large as its scatter, absorbed by the
+        # bias
         offset = system.model.part('accelerometer', Role.OFFSET)
         found.scatter_variance[offset] += COMMON_MEAN_FACTOR * _scatter_of_means(
             noises['accelerometer']

@@ -266,12 +266,15 @@ def _candidates(n_joints):
 
 
 def _joint_phrases(names, order, signs):
-    return tuple(
-        f'{names[k]} turns'
-        f' {"the other way round" if j == k else f"as {names[j]} should" + ", reversed" * (sign < 0)}'
-        for k, (j, sign) in enumerate(zip(order, signs))
-        if k != j or sign < 0
-    )
+    phrases = []
+    for k, (j, sign) in enumerate(zip(order, signs)):
+        if k != j and sign > 0:
+            phrases.append(f'{names[k]} turns as {names[j]} should')
+        elif k != j:
+            phrases.append(f'{names[k]} turns as {names[j]} should, reversed')
+        elif sign < 0:
+            phrases.append(f'{names[k]} turns the other way round')
+    return tuple(phrases)
 
 
 def _axis_phrases(axes, seen=np.eye(3)):

@@ -156,9 +156,9 @@ class MotionGatherer:
         while True:
             for name in STREAMS:
                 for epoch, part in self._queue[name]:
-                    if (
-                        epoch == self._epoch
-                    ):  # remaining samples of an earlier epoch arrived after its end: late temperatures
+                    if epoch == self._epoch:
+                        # Remaining samples of an earlier epoch arrived after its end: late
+                        # temperatures
                         self._chunks.add(**{name: part})
                 self._queue[name] = [
                     (epoch, part) for epoch, part in self._queue[name] if epoch > self._epoch

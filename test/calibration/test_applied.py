@@ -114,7 +114,7 @@ def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
         )
 
 
-def test_the_proof_from_statistics_of_windows_differs_from_that_of_readings_by_the_square_of_the_errors():
+def test_the_proof_from_window_statistics_differs_by_the_square_of_the_errors():
     """With the same values for all folds: held-out statistics against corrected readings."""
     from imu_calibration.calibration.proof import prove
     from imu_calibration.effects.forward_equations import applied_values

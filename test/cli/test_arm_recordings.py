@@ -34,7 +34,10 @@ XACRO = """<?xml version="1.0"?>
 <robot name="own" xmlns:xacro="http://www.ros.org/wiki/xacro">
   <xacro:property name="height" value="${0.25 * 2}"/>
   <link name="base_link"/><link name="imu_link"/>
-  <joint name="turn" type="continuous"><origin xyz="0 0 ${height}"/><parent link="base_link"/><child link="imu_link"/><axis xyz="0 0 1"/></joint>
+  <joint name="turn" type="continuous">
+    <origin xyz="0 0 ${height}"/><parent link="base_link"/><child link="imu_link"/>
+    <axis xyz="0 0 1"/>
+  </joint>
 </robot>"""
 
 

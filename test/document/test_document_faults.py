@@ -231,18 +231,24 @@ from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.core.errors import InputError
 laughs = "".join(f"a{k}: &a{k} [{', '.join(['*a' + str(k - 1)] * 10)}]\\n" for k in range(1, 12))
 texts = {
-    'brackets': '[' * 200_000, 'braces': '{a: ' * 100_000, 'dashes': '- ' * 100_000, 'questions': '? ' * 100_000,
-    'aliases': 'a0: &a0 [x, x]\\n' + laughs, 'recursion': 'a: &a [*a]', 'many': 'a: [' + '1,' * 900_000 + ']', 'large': 'a: "' + 'x' * 3_000_000 + '"',
-    'sixty': 'a: 1' + ':59' * 600_000, 'digits': 'a: ' + '9' * 100_000, 'some digits': 'a: ' + '9' * 4_500, 'date': 'a: 2026-99-99', 'float': 'a: !!float x',
-    'binary': 'a: !!binary xx', 'stamp': 'a: !!timestamp x', 'key': '? [a]\\n: b', 'object': 'a: !!python/object/apply:os.getcwd []', 'nul': '\\0', 'empty': '',
-    'half a character': 'a: \\ud800', 'merge': '<<: [1, 2]', 'list': '[]', 'number': '7', 'bell': '\\a',
+    'brackets': '[' * 200_000, 'braces': '{a: ' * 100_000, 'dashes': '- ' * 100_000,
+    'questions': '? ' * 100_000,
+    'aliases': 'a0: &a0 [x, x]\\n' + laughs, 'recursion': 'a: &a [*a]',
+    'many': 'a: [' + '1,' * 900_000 + ']', 'large': 'a: "' + 'x' * 3_000_000 + '"',
+    'sixty': 'a: 1' + ':59' * 600_000, 'digits': 'a: ' + '9' * 100_000,
+    'some digits': 'a: ' + '9' * 4_500, 'date': 'a: 2026-99-99', 'float': 'a: !!float x',
+    'binary': 'a: !!binary xx', 'stamp': 'a: !!timestamp x', 'key': '? [a]\\n: b',
+    'object': 'a: !!python/object/apply:os.getcwd []', 'nul': '\\0', 'empty': '',
+    'half a character': 'a: \\ud800', 'merge': '<<: [1, 2]', 'list': '[]', 'number': '7',
+    'bell': '\\a',
 }
 for name, text in texts.items():
     try:
         calibration_from_text(text)
         print(name, 'came through')
     except InputError as error:
-        print('' if '\\n' not in str(error) and len(str(error)) < 500 else f'{name}: {error}', end='')
+        short = '\\n' not in str(error) and len(str(error)) < 500
+        print('' if short else f'{name}: {error}', end='')
 print('done')
 """
 

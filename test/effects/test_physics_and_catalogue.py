@@ -112,9 +112,9 @@ def test_forward_equation_reproduces_the_physics(name):
     session = make_session(11, {name: None}, 'none', **OPTIONS, **options_of(name))
     without, with_effect = predicted(session), predicted(session, name)
     measured = session.imu.force_s, session.imu.rate_s
-    if (
-        'machine' in options_of(name)
-    ):  # what comes through as it is is no part of the equation: beside the same machine without the effect
+    if 'machine' in options_of(name):
+        # What comes through as it is is no part of the equation: beside the same machine without
+        # the effect
         bare = make_session(11, None, 'none', **OPTIONS, **options_of(name))
         measured = tuple(
             got - alone + guess

@@ -370,7 +370,8 @@ def test_the_node_reads_the_file(mine):
         ' {"effects_file": sys.argv[1], "table_file": config_file("table_simulated.yaml"),\n       '
         '  "gyroscope_model": "bias+matrix+gyro_warm_force"}\nrclpy.init(args=["--ros-args", *(part'
         ' for name, value in given.items() for part in ("-p", f"{name}:={value}"))])\nnode ='
-        ' CalibrationNode()\nprint(node._options.catalogue.definitions(["gyro_warm_force"]).keys())\nnode.close();'
+        ' CalibrationNode()\n'
+        'print(node._options.catalogue.definitions(["gyro_warm_force"]).keys())\nnode.close();'
         ' node.destroy_node(); rclpy.shutdown()'
     )
     done = subprocess.run(

@@ -633,7 +633,7 @@ HAND = _of(
         "_1['g_sensitivity_p_value'] < 0.9",
         (
             'test_hand_faults.py::test_a_warm_up_is_not_sold_as_g_sensitivity'
-            ' test_hand_faults.py::test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order'
+            ' test_hand_faults.py::test_a_drift_is_not_named_g_sensitivity_if_attitudes_are_sorted'
             ' test_by_hand.py'
         ),
     ),
@@ -644,7 +644,7 @@ HAND = _of(
         '[np.ones(_1)]',
         (
             'test_hand_faults.py::test_a_warm_up_is_not_sold_as_g_sensitivity'
-            ' test_hand_faults.py::test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order'
+            ' test_hand_faults.py::test_a_drift_is_not_named_g_sensitivity_if_attitudes_are_sorted'
         ),
     ),
     (
@@ -694,14 +694,14 @@ HAND = _of(
         'quiet_beside_joints',
         '_1 & _steady(_2, ratio=_3, resting=_4)',
         '_steady(_2, ratio=_3, resting=_4)',
-        'test_windows.py::test_a_table_that_vibrates_rests_where_its_joints_stand_and_one_that_is_moved_or_knocked_does_not',
+        'test_windows.py::test_a_vibrating_table_rests_while_its_joints_rest_and_a_moved_or_knocked_one_does_not',
     ),
     (
         'a knock passes for vibration',
         '_steady',
         '_1 ** 2 * _2',
         'np.inf',
-        'test_windows.py::test_a_table_that_vibrates_rests_where_its_joints_stand_and_one_that_is_moved_or_knocked_does_not',
+        'test_windows.py::test_a_vibrating_table_rests_while_its_joints_rest_and_a_moved_or_knocked_one_does_not',
     ),
     (
         'a vibration is the noise of all rests',

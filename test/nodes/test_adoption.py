@@ -127,7 +127,7 @@ def test_a_document_whose_sensors_both_have_values_of_no_instrument_is_refused()
     assert refusal.value.key is None
 
 
-def test_an_unproven_document_with_most_parameters_undetermined_is_not_adopted_with_consent_either():
+def test_an_unproven_document_with_most_parameters_undetermined_is_never_adopted():
     for share, adopted in ((0.4, True), (0.6, False)):
         status = tuple(
             'weak' if k % 10 < 10 * share else 'determined' for k in range(len(GOOD.status))

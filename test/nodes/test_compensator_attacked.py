@@ -352,7 +352,7 @@ def test_how_the_stamps_are_is_said_at_most_once_a_minute_for_each_state(bench, 
     assert bench.heard(states[0], level='info') == 3 and bench.heard(states[1], level='info') == 2
 
 
-def test_while_two_publishers_are_there_nothing_is_adopted_and_then_the_last_word_of_the_one_that_stays(
+def test_with_two_publishers_nothing_is_adopted_and_later_the_last_document_of_the_remaining_one(
     bench,
 ):
     node = bench.start(CompensatorNode, {'adopt': 'topic'})

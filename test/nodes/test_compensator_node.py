@@ -318,9 +318,8 @@ def test_a_stream_that_is_corrected_already_is_refused(bench):
         ),
         what='the refusal',
     )
-    bench.received[
-        corrected('twice')
-    ].clear()  # messages that came before the mark was discovered, which takes long on a busy machine
+    # Messages before the discovery of the mark, which takes long on a busy machine.
+    bench.received[corrected('twice')].clear()
     assert len(sent_through(bench, 'own', imu_messages(5, 4000))) == 5
     bench.spin(0.5)
     assert bench.received[corrected('twice')] == []

@@ -209,7 +209,8 @@ def spin(node):
 
 def broken():
     raise rclpy.handle.InvalidHandle('Failed to publish')
-sys.exit(run_node(CompensatorNode if sys.argv[1] == 'compensator' else PlannerNode, sys.argv[2:], spin=spin))
+kind = CompensatorNode if sys.argv[1] == 'compensator' else PlannerNode
+sys.exit(run_node(kind, sys.argv[2:], spin=spin))
 '''
 
 

@@ -474,7 +474,7 @@ def test_a_stop_in_mid_motion_and_joint_states_that_fall_silent_leave_nothing_mo
 
 @pytest.mark.live
 @pytest.mark.long
-def test_a_class_that_the_six_faces_leave_is_driven_apart_and_a_node_that_ends_leaves_nothing_moving(
+def test_a_class_of_effects_after_six_faces_is_separated_and_an_ending_node_stops_all_motion(
     tmp_path,
 ):
     from sensor_msgs.msg import JointState

@@ -28,9 +28,11 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu, MagneticField
 rclpy.init()
 node = rclpy.create_node('driver')
-good, bad = node.create_publisher(Imu, 'good/imu/data_raw', 10), node.create_publisher(Imu, 'bad/imu/data_raw', qos_profile_sensor_data)
+good = node.create_publisher(Imu, 'good/imu/data_raw', 10)
+bad = node.create_publisher(Imu, 'bad/imu/data_raw', qos_profile_sensor_data)
 other = node.create_publisher(MagneticField, 'strange/imu/data', 10)
-listener = node.create_subscription(Imu, 'bad/imu/data_raw', lambda message: None, QoSProfile(depth=5))
+depth = QoSProfile(depth=5)
+listener = node.create_subscription(Imu, 'bad/imu/data_raw', lambda message: None, depth)
 counter, STEP_NS = [0], 5_000_000
 start_ns = node.get_clock().now().nanoseconds
 def publish_due():   # a sensor's clock runs on while a busy machine lets its driver wait
@@ -43,9 +45,11 @@ def publish():
         message = Imu()
         message.header.stamp = Time(nanoseconds=start_ns + (counter[0] - 1) * STEP_NS).to_msg()
         message.header.frame_id = frame
-        message.linear_acceleration.x, message.linear_acceleration.y, message.linear_acceleration.z = wobble, -wobble, unit + wobble
-        message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z = wobble, -wobble, 2 * wobble
-        message.linear_acceleration_covariance[0] = message.linear_acceleration_covariance[4] = message.linear_acceleration_covariance[8] = 1e-4
+        force, rate = message.linear_acceleration, message.angular_velocity
+        force.x, force.y, force.z = wobble, -wobble, unit + wobble
+        rate.x, rate.y, rate.z = wobble, -wobble, 2 * wobble
+        for element in (0, 4, 8):
+            message.linear_acceleration_covariance[element] = 1e-4
         message.angular_velocity_covariance[0] = message.angular_velocity_covariance[4] = 1e-4
         message.angular_velocity_covariance[8] = variance
         message.orientation_covariance[0] = -1.0

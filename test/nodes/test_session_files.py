@@ -31,7 +31,9 @@ def live(n_windows, size):
 place = SessionFiles(sys.argv[1] + '/calibration.yaml')
 print(*place.save(live(3, 40_000), 'the first'), sep='; ')
 print(*place.save(live(4, 120_000), 'the second'), sep='; ')
-print(place.unsaved(live(5, 0)), place.calibration.read_text(), set(place.accumulator.read_text()), len(list(place.accumulator.parent.iterdir())))
+saved = set(place.accumulator.read_text())
+n_files = len(list(place.accumulator.parent.iterdir()))
+print(place.unsaved(live(5, 0)), place.calibration.read_text(), saved, n_files)
 """
 ON_A_SMALL_DISK = [
     'unshare',

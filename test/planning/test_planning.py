@@ -135,7 +135,7 @@ def test_next_motions_end_when_all_is_known_and_take_says_what_is(plan, table):
     assert planner.next_motion(position).motion is not None
 
 
-def test_spins_in_both_senses_fall_out_of_the_criterion_where_the_bias_wanders_and_no_joint_goes_far():
+def test_spins_in_both_senses_follow_from_the_criterion_where_the_bias_wanders():
     table = Table.from_mapping(
         {
             'joints': [

@@ -294,7 +294,7 @@ def test_knock_stays_out_of_static_windows():
     [(31.0, 0.0, True), (1.5, 0.0, False), (31.0, 8.0, False)],
     ids=['vibration', 'hand', 'knocks'],
 )
-def test_a_table_that_vibrates_rests_where_its_joints_stand_and_one_that_is_moved_or_knocked_does_not(
+def test_a_vibrating_table_rests_while_its_joints_rest_and_a_moved_or_knocked_one_does_not(
     hertz, swells, rests
 ):
     imu, joints = record(rest(20), imu_hz=200)

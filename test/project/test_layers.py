@@ -43,7 +43,8 @@ import importlib, sys
 class OnlyNumpyAndScipy:
     def find_spec(self, name, path=None, target=None):
         head = name.partition('.')[0]
-        if head not in {'numpy', 'scipy', 'imu_calibration', *sys.stdlib_module_names} and not head.startswith('_sysconfigdata'):
+        allowed = {'numpy', 'scipy', 'imu_calibration', *sys.stdlib_module_names}
+        if head not in allowed and not head.startswith('_sysconfigdata'):
             raise ModuleNotFoundError(f'{name} may not be imported here', name=name)
 
 sys.meta_path.insert(0, OnlyNumpyAndScipy())

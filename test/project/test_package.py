@@ -95,8 +95,10 @@ READ_SETUP = """
 import json, setuptools
 from distutils.core import run_setup
 found = run_setup('setup.py', stop_after='init')
-print(json.dumps({'name': found.get_name(), 'version': found.get_version(), 'packages': found.packages, 'requires': found.install_requires,
-                  'scripts': found.entry_points['console_scripts'], 'data': found.data_files, 'extras': found.extras_require, 'license': found.get_license()}))
+print(json.dumps({'name': found.get_name(), 'version': found.get_version(),
+                  'packages': found.packages, 'requires': found.install_requires,
+                  'scripts': found.entry_points['console_scripts'], 'data': found.data_files,
+                  'extras': found.extras_require, 'license': found.get_license()}))
 """
 
 

@@ -180,7 +180,7 @@ def test_a_warm_up_is_not_sold_as_g_sensitivity():
         assert not any('g_sensitivity' in name for name in found.param_names)
 
 
-def test_a_drift_is_not_sold_as_g_sensitivity_where_attitudes_follow_each_other_in_order():
+def test_a_drift_is_not_named_g_sensitivity_if_attitudes_are_sorted():
     """Tipped over step by step: gravity's direction and the bias both go with time."""
     imu, ranges, _ = hold_and_turn(8, n_poses=20, rate_hz=50.0, still=2.0)
     poses = average_poses(imu, [(r.start, r.stop) for r in ranges])
@@ -424,7 +424,7 @@ def test_a_gravity_of_no_place_on_the_earth_is_refused(gravity):
     assert refused.value.key == 'gravity'
 
 
-def test_the_error_budget_lists_an_unknown_gravity_under_gravity_and_the_given_standard_one_as_known():
+def test_the_error_budget_lists_an_unknown_gravity_and_not_a_given_one():
     imu, ranges, _ = hold_and_turn(3, n_poses=14)
     unknown, given = (
         evident_result(

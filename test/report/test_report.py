@@ -332,18 +332,27 @@ def chromium():
 
 
 WATCH = """<script>window.addEventListener('load', () => {
-const shown = [], own = node => [...node.childNodes].filter(child => child.nodeType === 3 && child.textContent.trim());
-for (const node of document.querySelectorAll('body *:not(script):not(svg *)')) for (const child of own(node)) {
+const shown = [], isText = child => child.nodeType === 3 && child.textContent.trim();
+const nodes = document.querySelectorAll('body *:not(script):not(svg *)');
+for (const node of nodes) for (const child of [...node.childNodes].filter(isText)) {
   const range = document.createRange(); range.selectNodeContents(child);
-  const frame = node.closest('.wide, pre, .pair > div'), limit = frame && getComputedStyle(frame).overflowX !== 'visible' ? frame.getBoundingClientRect().right : Infinity;
-  for (const r of range.getClientRects()) if (r.left < limit - 1) shown.push([r.left, Math.min(r.right, limit), r.top, r.bottom]); }
+  const frame = node.closest('.wide, pre, .pair > div');
+  const clips = frame && getComputedStyle(frame).overflowX !== 'visible';
+  const limit = clips ? frame.getBoundingClientRect().right : Infinity;
+  for (const r of range.getClientRects())
+    if (r.left < limit - 1) shown.push([r.left, Math.min(r.right, limit), r.top, r.bottom]); }
 let overlaps = 0;
 for (const [k, a] of shown.entries()) for (const b of shown.slice(k + 1))
-  if (Math.min(a[1], b[1]) - Math.max(a[0], b[0]) > 1 && Math.min(a[3], b[3]) - Math.max(a[2], b[2]) > 6) overlaps += 1;
-const cut = [...document.querySelectorAll('.wide, .scroll, pre, .pair > div')].filter(e => e.scrollWidth > e.clientWidth + 1).length;
-const wide = document.documentElement.scrollWidth - window.innerWidth, figures = [...document.querySelectorAll('svg')];
+  if (Math.min(a[1], b[1]) - Math.max(a[0], b[0]) > 1
+      && Math.min(a[3], b[3]) - Math.max(a[2], b[2]) > 6) overlaps += 1;
+const frames = [...document.querySelectorAll('.wide, .scroll, pre, .pair > div')];
+const cut = frames.filter(e => e.scrollWidth > e.clientWidth + 1).length;
+const wide = document.documentElement.scrollWidth - window.innerWidth;
+const figures = [...document.querySelectorAll('svg')];
 const flat = figures.filter(s => s.getBoundingClientRect().height < 50).length;
-document.title = `wide ${wide} flat ${flat} overlaps ${overlaps} cut ${cut} figures ${figures.length}`; });</script></body>"""
+document.title =
+  `wide ${wide} flat ${flat} overlaps ${overlaps} cut ${cut} figures ${figures.length}`;
+});</script></body>"""
 
 
 def opened(page, width, tmp_path):

@@ -29,7 +29,8 @@ LIBRARIES = (
 LOADED_FIRST = """from ctypes import CDLL
 from pathlib import Path
 
-for path in Path(__file__).parent.glob('lib*.so'):   # rosidl_typesupport_c asks for them by name, and finds what is loaded
+# rosidl_typesupport_c opens them by name and finds the loaded ones.
+for path in Path(__file__).parent.glob('lib*.so'):
     CDLL(str(path))
 """
 

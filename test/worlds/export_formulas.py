@@ -214,9 +214,9 @@ def spread_in_a_second(name, text, dt):
     head = text.split('\n', 1)[1] if text.startswith('%YAML') else text
     c = safe_load(head) if name != 'basalt' else json.loads(text)['value0']
     pairs = {'accelerometer': ('acc', 'Acc'), 'gyroscope': ('gyr', 'Gyr')}
-    if (
-        name == 'kalibr'
-    ):  # IccSensors.py: noise density * sqrt(rate) is the sd of a sample; the walk enters a continuous spline
+    if name == 'kalibr':
+        # IccSensors.py: noise density * sqrt(rate) is the sd of a sample; the walk enters a
+        # continuous spline
         found = {
             s: (
                 (c[f'{s}_noise_density'] * c['update_rate'] ** 0.5 * dt) ** 2 * steps,
@@ -232,16 +232,16 @@ def spread_in_a_second(name, text, dt):
             )
             for s in pairs
         }
-    elif (
-        name == 'vins'
-    ):  # integration_base.h, midPointIntegration: V has 0.5 dt for each of two samples, dt for the bias
+    elif name == 'vins':
+        # Integration_base.h, midPointIntegration: V has 0.5 dt for each of two samples, dt for the
+        # bias
         found = {
             s: (2 * (0.5 * dt * c[f'{a}_n']) ** 2 * steps, (dt * c[f'{a}_w']) ** 2 * steps)
             for s, (a, _) in pairs.items()
         }
-    elif (
-        name == 'lio-sam'
-    ):  # imuPreintegration.cpp: covariance = I imuGyrNoise^2 (gtsam: continuous), between factor sqrt(dt) * imuGyrBiasN
+    elif name == 'lio-sam':
+        # imuPreintegration.cpp: covariance = I imuGyrNoise^2 (gtsam: continuous), between factor
+        # sqrt(dt) * imuGyrBiasN
         found = {
             s: (
                 c['lio_sam'][f'imu{b}Noise'] ** 2 * dt * steps,
@@ -257,9 +257,9 @@ def spread_in_a_second(name, text, dt):
             )
             for s, (a, _) in pairs.items()
         }
-    elif (
-        name == 'orb-slam3'
-    ):  # Tracking.cc: Calib(Ng sqrt(f), Na sqrt(f), Ngw / sqrt(f), Naw / sqrt(f)); ImuTypes.cc adds the walk per step
+    elif name == 'orb-slam3':
+        # Tracking.cc: Calib(Ng sqrt(f), Na sqrt(f), Ngw / sqrt(f), Naw / sqrt(f)); ImuTypes.cc adds
+        # the walk per step
         f = c['IMU.Frequency']
         long = {'accelerometer': 'Acc', 'gyroscope': 'Gyro'}
         found = {
@@ -269,9 +269,9 @@ def spread_in_a_second(name, text, dt):
             )
             for s, n in long.items()
         }
-    elif (
-        name == 'basalt'
-    ):  # calibration.hpp: std * sqrt(rate) is the sd of a sample; sqrt_vio_estimator: bias weight 1 / (std sqrt(dt))
+    elif name == 'basalt':
+        # calibration.hpp: std * sqrt(rate) is the sd of a sample; sqrt_vio_estimator: bias weight 1
+        # / (std sqrt(dt))
         short = {'accelerometer': 'accel', 'gyroscope': 'gyro'}
         found = {
             s: (
