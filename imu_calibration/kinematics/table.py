@@ -219,11 +219,11 @@ class Table:
     @property
     def gravity_value(self) -> float:
         """Local gravity, m/s^2: as given, otherwise normal gravity."""
-        return (
-            self.gravity
-            if self.gravity is not None
-            else normal_gravity(self.latitude, self.height or 0.0)
-        )  # type: ignore[arg-type]
+        if self.gravity is not None:
+            return self.gravity
+        # Required by the constructor.
+        assert self.latitude is not None
+        return normal_gravity(self.latitude, self.height or 0.0)
 
     @property
     def gravity_sd_value(self) -> float:

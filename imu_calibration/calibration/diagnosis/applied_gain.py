@@ -275,7 +275,7 @@ def _errors(windows, table, model, values, applied):
         yield {sensor: error[start:stop] for sensor, error in zip(SENSORS, errors)}
 
 
-def _model_errors(windows, table, model, values, applied):
+def _model_errors(windows, table, model, values, _applied):
     """
     Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3).
     """

@@ -11,7 +11,6 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.stamp_jitter import NO_JITTER, StampJitter
-from imu_calibration.selection.unexplained import Unexplained
 
 
 @dataclass(frozen=True, eq=False)
