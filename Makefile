@@ -4,6 +4,8 @@
 # With a ROS 2 Jazzy sourced its rclpy is used, otherwise rclpy comes from PyPI; all versions are pinned in constraints/.
 
 PYTHON ?= python3
+# `set -o pipefail` of demo-check.
+SHELL = /bin/bash
 VENV ?= .venv
 PY = $(VENV)/bin/python
 OUTPUT ?= demo
@@ -37,7 +39,7 @@ PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 4
 
-.PHONY: help setup demo live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
+.PHONY: help setup demo demo-check live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
@@ -59,6 +61,11 @@ $(STAMP): $(filter-out $(addprefix constraints/,docs.txt validate.txt oracles.tx
 
 demo: $(STAMP)
 	@$(PY) examples/demo.py --output $(OUTPUT)
+
+# The demonstration in a temporary folder; its errors are compared with the README.
+demo-check: $(STAMP)
+	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && set -o pipefail && \
+	  $(PY) examples/demo.py --output "$$folder/demo" | tee "$$folder/log" && $(PY) tools/demo_figures.py "$$folder/log"
 
 live-demo: $(STAMP)
 	@$(PY) examples/live_demo.py --output $(OUTPUT)

@@ -32,6 +32,30 @@ def commands(page):
     return [line for line in lines if line.startswith('imu_calibration ')]
 
 
+NOT_RUN = {
+    'python3 -m venv venv && . venv/bin/activate': 'test_package installs into an environment',
+    'pip install .': 'test_package installs into an empty environment, by the same command',
+    "pip install '.[arm]'": 'the set-up of the tests installs the extra with its pins',
+    'make demo': 'a stage of .ci/run, before the tests',
+    'make test': 'this test is a part of it',
+    'rosdep install --from-paths src --ignore-src': 'its index is not available without ROS',
+    'colcon build': 'test/ros/workspace.py builds the package for the ros2 commands',
+}
+"""Commands of the README that no test of pages runs -> reason."""
+
+
+def test_each_command_of_the_readme_runs_or_has_a_reason():
+    """A command runs here, in the tests of ``ros2`` commands, or as Python, or is listed."""
+    text = (ROOT / 'README.md').read_text()
+    shell = re.findall(r'^ *```\n(.*?)^ *```', text, re.DOTALL | re.MULTILINE)
+    blocks = re.findall(r'^ *```(\w*)\n', text, re.MULTILINE)
+    assert len(shell) == len(blocks) - 1 and blocks.count('python') == 1
+    lines = [line.strip() for block in shell for line in block.splitlines()]
+    lines += re.findall(r'`((?:make|pip|rosdep|colcon) [^`]+)`', text)
+    run = {*commands('README.md'), *(line for line in lines if line.startswith('ros2 '))}
+    assert {line for line in lines if line not in run} == set(NOT_RUN)
+
+
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
     """
