@@ -47,9 +47,9 @@ NOT_RUN = {
 def test_each_command_of_the_readme_runs_or_has_a_reason():
     """A command runs here, in the tests of ``ros2`` commands, or as Python, or is listed."""
     text = (ROOT / 'README.md').read_text()
-    shell = re.findall(r'^ *```\n(.*?)^ *```', text, re.DOTALL | re.MULTILINE)
-    blocks = re.findall(r'^ *```(\w*)\n', text, re.MULTILINE)
-    assert len(shell) == len(blocks) - 1 and blocks.count('python') == 1
+    blocks = re.findall(r'^ *```(\w*)\n(.*?)^ *```$', text, re.DOTALL | re.MULTILINE)
+    shell = [block for language, block in blocks if not language]
+    assert [language for language, _ in blocks if language] == ['python']
     lines = [line.strip() for block in shell for line in block.splitlines()]
     lines += re.findall(r'`((?:make|pip|rosdep|colcon) [^`]+)`', text)
     run = {*commands('README.md'), *(line for line in lines if line.startswith('ros2 '))}
