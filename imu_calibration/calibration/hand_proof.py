@@ -97,6 +97,8 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     if not norms:
         return {}
     proof = {'accelerometer': entry_of(_joined(norms), 'm/s^2')}
+    if model.untested:  # held-out rests have the directions of the other rests
+        proof['accelerometer']['few_directions'] = True
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
         proof['gyroscope'] = entry_of(_joined(angles), TURN_ANGLE_UNIT)
     return proof

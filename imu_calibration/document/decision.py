@@ -20,6 +20,10 @@ DELAY_SHARE = 0.1
 OTHER_ATTITUDES = (
     '; unproven for other attitudes, because all held-out windows have the same attitude'
 )
+FEW_DIRECTIONS = (
+    '; unproven for other attitudes, because all held-out rests lie near the axes of the sensor,'
+    ' where cross terms have no effect'
+)
 NO_PROOF = 'its error on held-out data was not measured'
 
 
@@ -31,7 +35,7 @@ class SensorDecision(StrEnum):
     UNPROVEN = 'unproven'
     """
     The interval includes 1, there is none, or the held-out windows of the accelerometer have one
-    attitude.
+    attitude or lie near the axes of the sensor.
     """
     HARMS = 'harms'
     """The interval lies above 1."""
@@ -45,9 +49,16 @@ BY_DEFINITION: dict[str, Any] = {
 """Fields of the Calibration with which a session was simulated."""
 
 
+def same_directions(entry: Mapping) -> str:
+    """Return why other attitudes are unproven, from an entry of a proof; '' where they are not."""
+    if entry.get('one_attitude'):
+        return OTHER_ATTITUDES
+    return FEW_DIRECTIONS if entry.get('few_directions') else ''
+
+
 def decide(entry: Mapping | None) -> SensorDecision:
     """Return the decision on a sensor from its entry of a proof (`proof.prove`), or from None."""
-    if not entry or not entry['windows'] or entry.get('one_attitude'):
+    if not entry or not entry['windows'] or same_directions(entry):
         return UNPROVEN
     low, high = entry['ci95']
     return HELPS if high < 1.0 else HARMS if low > 1.0 else UNPROVEN
@@ -83,13 +94,9 @@ def reason_of(entry: Mapping | None) -> str:
         if earlier
         else ''
     )
-    cause = (
-        OTHER_ATTITUDES
-        if entry.get('one_attitude')
-        else ''
-        if decide(entry) is HELPS
-        else _cause(entry)
-    )
+    cause = same_directions(entry)
+    if not cause and decide(entry) is not HELPS:
+        cause = _cause(entry)
     return (
         f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, after /'
         f' before {ratio_text(entry)}){more}{cause}'

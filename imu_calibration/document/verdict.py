@@ -26,6 +26,7 @@ from imu_calibration.document.decision import (
     decide,
     lines_of,
     reason_of,
+    same_directions,
     worse_regimes,
 )
 from imu_calibration.document.trust import uncorrected_lines
@@ -415,7 +416,7 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
 
 def _decided(calibration, sensor, word):
     entry, step, key = calibration.proof.get(sensor), '', None
-    if word is not HELPS and entry and not entry.get('one_attitude'):
+    if word is not HELPS and entry and not same_directions(entry):
         step, key = 'find the cause', 'diagnose'
     elif word is not HELPS:
         step = 'record more windows, or hold it still in more attitudes'

@@ -94,7 +94,13 @@ class RowEstimate:
     """Number of Gauss-Newton steps."""
 
 
-def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) -> RowEstimate:
+def estimate_rows(
+    reference: RowReference,
+    state: Any,
+    *,
+    fallback: np.ndarray,
+    withheld: np.ndarray | None = None,
+) -> RowEstimate:
     """
     Estimate all parameters, the scatter of the components and the nuisances.
 
@@ -107,13 +113,16 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
         Where the first step begins.
     fallback : array, shape (n_components,)
         Variances of the components where the data are too few to estimate them.
+    withheld : array of bool, shape (n,), optional
+        Parameters to hold at their prior in any case.
 
     """
     asked, priors = ~reference.fixed, reference.priors
+    held = np.zeros(len(priors), bool) if withheld is None else withheld & asked
     state, scatter, steps = _iterate(
-        reference, state, asked, priors, variance=fallback, fallback=fallback
+        reference, state, asked & ~held, priors, variance=fallback, fallback=fallback
     )
-    held = _choose_held(_factor(reference.linearise(state), scatter), priors, asked)
+    held = _choose_held(_factor(reference.linearise(state), scatter), priors, asked, held=held)
     free = asked & ~held
     state = replace(state, values=np.where(held, reference.nominal, state.values))
     start = np.maximum(scatter.variance, 0.01 * fallback)
@@ -128,16 +137,16 @@ def estimate_rows(reference: RowReference, state: Any, *, fallback: np.ndarray) 
     return RowEstimate(state, terms, held, free, scatter, factor, steps + more)
 
 
-def _choose_held(factor, priors, asked):
+def _choose_held(factor, priors, asked, *, held):
     """
     Return which of the parameters `asked` (mask) have next to no information from the data.
 
     Shape (n,).
 
     One at a time, given the parameters fixed so far, the one with the largest sd in units of its
-    prior, while that exceeds one half.
+    prior, while that exceeds one half. `held` (mask): fixed before.
     """
-    held = np.zeros(len(priors), bool)
+    held = held.copy()
     while np.any(free := asked & ~held):
         ratio = np.zeros(len(priors))
         # the sds in units of the priors, nearly unlimited without information from the data

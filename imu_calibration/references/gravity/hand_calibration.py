@@ -25,6 +25,7 @@ from imu_calibration.estimation.solution import (
     total,
     with_term,
 )
+from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.references.gravity.bias_movement import (
     bias_movements,
@@ -51,8 +52,17 @@ from imu_calibration.references.gravity.poses import (
     distinct_attitudes,
     full_scale_factor,
     known_turn_data,
+    missed_angle,
     noise_statistics,
     sample_times,
+)
+from imu_calibration.references.gravity.tested_directions import (
+    TESTING_TURNS,
+    contradicted_by_turns,
+    demanded_by_placements,
+    directions,
+    off_axis_lacking,
+    turns_between,
 )
 from imu_calibration.selection.questions import at_time_constants
 
@@ -275,8 +285,34 @@ def solve_by_hand(
     Estimate from given poses and turns.
 
     See `calibrate_by_hand`. `point`: effect -> values at which its columns are first computed.
+    Cross terms of the accelerometer that no attitude tests are held at their prior
+    (`tested_directions`).
     """
     report('solving')
+    free = _solved(data, options, point)
+    model, poses = free.hand_model, free.used_poses
+    up = directions(model, poses)
+    names = off_axis_lacking(up)
+    if not names:
+        return free
+    testing = turns_between(up, free.used_turns)
+    if len(testing) < TESTING_TURNS:
+        demanded = demanded_by_placements(model, free.values, poses, up=up, names=names)
+        return free if demanded else _solved(data, options, point, untested=names)
+    held = _solved(data, options, point, untested=names)
+    errors = [np.array([_missed_by(hand, turn) for turn in testing]) for hand in (free, held)]
+    return held if contradicted_by_turns(*errors) else free
+
+
+def _missed_by(hand, turn):
+    """Return the angle between rotated and measured gravity after a turn, rad."""
+    force = hand.compensate(hand.poses.force, hand.poses.rate, **hand.poses.conditions)[0]
+    state = replace(hand.state, up=unit_rows(force))
+    return missed_angle(state, hand.poses, turn, matrix=hand.gyroscope[1])
+
+
+def _solved(data, options, point, *, untested=()):
+    """Return the calibration with the cross terms `untested` held at their prior."""
     poses, turns = data.poses, data.turns
     default, evidence = default_gyroscope(poses)
     reference_c = (
@@ -289,7 +325,7 @@ def solve_by_hand(
         point=point or {},
         catalogue=options.catalogue,
     )
-    model = HandModel(sensors, options.gravity)
+    model = HandModel(sensors, options.gravity, untested=untested)
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
         raise InputError(

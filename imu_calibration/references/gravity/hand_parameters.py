@@ -67,6 +67,8 @@ class HandModel:
     Nominal reading of the gyroscope over the true rate: 2 where the driver converts for half the
     actual full-scale range.
     """
+    untested: tuple[str, ...] = ()
+    """Cross terms that are held at their prior, because no attitude tests them."""
 
     def __post_init__(self):
         """Refuse effects that are not observable by hand."""
@@ -93,6 +95,11 @@ class HandModel:
     def fixed(self) -> np.ndarray:
         """Mask of the parameters that the choice of axes fixes, shape (n,)."""
         return np.isin(self.model.param_names, UPPER_TERMS)
+
+    @cached_property
+    def withheld(self) -> np.ndarray:
+        """Mask of the parameters in `untested`, shape (n,)."""
+        return np.isin(self.model.param_names, self.untested)
 
     @cached_property
     def nominal(self) -> np.ndarray:

@@ -52,7 +52,10 @@ def solve_joint(
 
     """
     found = estimate_rows(
-        GravityRows(model, poses, turns), first_state(model, poses), fallback=np.square(SCATTER_SD)
+        GravityRows(model, poses, turns),
+        first_state(model, poses),
+        fallback=np.square(SCATTER_SD),
+        withheld=model.withheld,
     )
     reference, values = GravityRows(model, poses, turns), found.state.values
     terms = {
@@ -97,6 +100,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
         model.gravity,
     )
     own = model.base_index('accelerometer')
+    own = own[~model.withheld[own]]
     for _ in range(MAX_NEWTON_STEPS):
         residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
         rows = np.vstack([columns[:, own] / (1e-3 * gravity), np.diag(1 / priors[own])])
