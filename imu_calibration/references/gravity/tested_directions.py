@@ -33,7 +33,7 @@ FEWEST_SPARE = 3
 """Degrees of freedom of the placements that a likelihood ratio needs."""
 DEMANDED = 0.05
 """p-value of the likelihood ratio below which the placements demand the cross terms."""
-CONTRADICTED = 3.84
+TURNS_CONTRADICT = 3.84
 """Increase of ``n log(mean square)`` of turns by which they contradict the cross terms."""
 
 
@@ -122,4 +122,4 @@ def contradicted_by_turns(free: np.ndarray, held: np.ndarray) -> bool:
         Angle errors of the turns with estimated cross terms, and with cross terms at their prior.
 
     """
-    return bool(len(free) * np.log(np.mean(free**2) / np.mean(held**2)) > CONTRADICTED)
+    return bool(len(free) * np.log(np.mean(free**2) / np.mean(held**2)) > TURNS_CONTRADICT)
