@@ -22,6 +22,7 @@ from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSa
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.full_scale import relate_turns
 from imu_calibration.preprocessing.scan import ChunkSeries
+from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.write import write_session
 
@@ -155,7 +156,9 @@ class CsvLog:
 @np.errstate(
     over='ignore', invalid='ignore'
 )  # readings that are not finite are counted where samples are used
-def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
+def read_csv(
+    path: str | PathLike[str], columns: Sequence[str] = (), where: Sequence[str] = ()
+) -> CsvLog:
     """
     Read a text log with a header line.
 
@@ -167,12 +170,15 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
         Assignments ``quantity=NAME[,NAME,NAME][:UNIT]`` that replace the guess; the quantity is
         time, force, rate, temperature or joint.JOINT. A name may be the number of a column (1 is
         the first).
+    where : sequence of str
+        Conditions ``COLUMN=VALUE``; only the rows that fulfil all are read, such as those of one
+        of several IMUs in a log.
 
     Raises
     ------
     InputError
         When a needed column or unit is neither given, nor in the header, nor determined by the
-        values.
+        values; when the rows are those of two IMUs.
 
     """
     path = Path(path)
@@ -191,7 +197,7 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
                 f' {shortened(", ".join(table.names), 300)}; {REMEDY}',
                 key='columns',
             )
-    table.load([name for each in found for name in each.names])
+    table.load([name for each in found for name in each.names], where)
     time = _with_unit(
         by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path
     )
@@ -200,6 +206,7 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
         by_quantity['force'], lambda: _force_unit(table.values(by_quantity['force'].names)), path
     )
     force_s = table.values(force.names) * COLUMN_UNITS['force'][force.unit]
+    _require_one_imu(stamp_ns, force_s, table.values(by_quantity['rate'].names))
     rate = _with_unit(
         by_quantity['rate'],
         lambda: _rate_unit(stamp_ns, force_s, table.values(by_quantity['rate'].names)),
@@ -228,6 +235,14 @@ def read_csv(path: str | PathLike[str], columns: Sequence[str] = ()) -> CsvLog:
         temperature,
         tuple(name for name in table.names if name not in taken),
     )
+
+
+def _require_one_imu(stamp_ns, force_s, rate):
+    """Raise where the rows are those of two IMUs; units of force and rate do not matter."""
+    sources = TwoSourceSearch()
+    good = np.isfinite(force_s).all(axis=1) & np.isfinite(rate).all(axis=1)
+    sources.push(ImuSamples(stamp_ns[good], force_s[good], rate[good]))
+    sources.require_one()
 
 
 def _with_unit(columns, guess, path):
@@ -351,13 +366,17 @@ class _Table:
             f' {shortened(", ".join(self.names), 300)}'
         )
 
-    def load(self, names):
-        """Read the columns; cells without a number become NaN."""
+    def load(self, names, where=()):
+        """
+        Read the columns; cells without a number become NaN.
+
+        Rows that do not fulfil the conditions `where` are left out.
+        """
         wanted = sorted({self.column(name) for name in names})
         numbers = [k for k in wanted if k not in self.dates]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
         with _opened(self.path) as file:
-            lines = file.read().splitlines()[self.first :]
+            lines = self._selected(file.read().splitlines()[self.first :], where)
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]
         with warnings.catch_warnings():
@@ -386,6 +405,36 @@ class _Table:
             raise InputError(
                 f'{self.path} must have at least two rows of numbers, got fewer; check the file'
             )
+
+    def _selected(self, lines, where):
+        """Return the lines that fulfil all conditions COLUMN=VALUE; values as text or numbers."""
+        for condition in where:
+            name, equals, value = condition.partition('=')
+            if not equals or not value.strip():
+                raise InputError(
+                    f'a condition must be COLUMN=VALUE, got {condition!r}; correct --where',
+                    code='where',
+                )
+            column, value, kept, seen = self.column(name.strip()), value.strip(), [], Counter()
+            for line in lines:
+                cells = self._cells(line)
+                if column >= len(cells):
+                    continue
+                cell = cells[column].strip()
+                seen[cell] += 1
+                if cell == value or (
+                    _numeric(cell) and _numeric(value) and float(cell) == float(value)
+                ):
+                    kept.append(line)
+            if not kept:
+                most = ', '.join(cell for cell, _ in seen.most_common(5))
+                raise InputError(
+                    f'rows of {self.path} must fulfil {condition}, got none; {name} is'
+                    f' {shortened(most, 100)}; correct --where',
+                    code='where',
+                )
+            lines = kept
+        return lines
 
     def values(self, names):
         """Return columns, shape (n, len(names))."""

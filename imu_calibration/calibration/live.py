@@ -413,10 +413,11 @@ class LiveCalibration:
         NotObservableError
             When no window is complete yet, or no parameter is determined.
         InputError
-            When the units are plainly wrong.
+            When the units are plainly wrong, or the stream holds the readings of two IMUs.
 
         """
         collector = self._begun()
+        collector.gatherer.cleaner.sources.require_one()
         gathered, store = collector.snapshot(pending)
         snapshot = LiveSnapshot(
             self._with_earlier(gathered),

@@ -428,7 +428,7 @@ class LiveByHand:
         NotObservableError
             With fewer than four different attitudes.
         InputError
-            When the units are plainly wrong.
+            When the units are plainly wrong, or the stream holds the readings of two IMUs.
 
         """
         store = self._store
@@ -442,6 +442,7 @@ class LiveByHand:
                 ' was received; check the topic',
                 code='no_samples',
             )
+        self._check.sources.require_one()
         self._search(store)
         recording = HandRecording(imu, None, self.counts)
         self.result = evident_result(recording, self.options, provenance, stills=self.found.rests)[

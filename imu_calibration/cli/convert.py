@@ -30,6 +30,13 @@ def add_arguments(parser: OneLineParser) -> None:
             ' sign; units: s ms us ns, m/s^2 g mg, rad/s deg/s mdeg/s, rad deg'
         ),
     )
+    parser.common(
+        '--where',
+        metavar='COLUMN=VALUE',
+        nargs='+',
+        default=[],
+        help='read only the rows with this value, such as one of several IMUs in a log',
+    )
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 
@@ -38,7 +45,7 @@ def run(options: Options) -> VerbResult:
     from msg_adapters.csv_log import read_csv
     from msg_adapters.write import write_session
 
-    log = read_csv(options.log, options.columns)
+    log = read_csv(options.log, options.columns, options.where)
     for columns in log.columns:
         print(columns)
     if log.unused:

@@ -13,7 +13,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.preprocessing import value_checks
+from imu_calibration.preprocessing import two_sources, value_checks
 from imu_calibration.preprocessing.recording_evidence import (
     GOOD,
     NOTE,
@@ -29,6 +29,13 @@ from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner
 
 MIN_MOVING_STEPS = 50.0
 """A constant axis is frozen if another axis moves by this many steps of the converter."""
+
+
+def one_source(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """The readings are those of one sensor."""
+    imu = evidence.streams.get('imu')
+    if imu is not None and imu.two_sources:
+        yield CheckFinding(two_sources.CHECK, REFUSE, imu.two_sources, key=two_sources.KEY)
 
 
 def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -282,6 +289,7 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 CHECKS = (
+    one_source,
     value_checks.force_unit,
     stamps,
     clocks,

@@ -17,6 +17,7 @@ from imu_calibration.core.samples import (
 )
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
+from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 
 _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
@@ -47,6 +48,8 @@ class StreamCheck:
 
     def __init__(self) -> None:
         self.counts = Counter()
+        self.sources = TwoSourceSearch()
+        """Whether an IMU stream holds the readings of two sensors."""
         self.epoch = 0
         self._steps = StepHistogram()
         self._n_accepted = 0
@@ -76,7 +79,10 @@ class StreamCheck:
         """
         if samples is None or not len(samples):
             return []
-        return self._without_spikes(self._accept(self._without_strays(self._finite(samples))))
+        samples = self._finite(samples)
+        if isinstance(samples, ImuSamples):
+            self.sources.push(samples)
+        return self._without_spikes(self._accept(self._without_strays(samples)))
 
     def finish(self) -> list[tuple[int, Any]]:
         """Return the buffered samples, as `push` does."""
@@ -102,6 +108,7 @@ class StreamCheck:
             *self._steps.summary(gap),
             *self._extent_ns,
             None if self._times is None else self._times.odd_line(self._n_accepted),
+            two_sources=self.sources.requirement if self.sources.found else '',
         )
 
     def _without_spikes(self, accepted, ended=False):
@@ -260,6 +267,8 @@ class StreamStatistics:
     """Regularity of the stamps of an IMU; None if they are regular, and for other streams."""
     unstamped: int = 0
     """Samples with stamp zero, for which the time of arrival was used."""
+    two_sources: str = ''
+    """Refusal of an IMU with the readings of two sensors (`TwoSourceSearch`); '' for one sensor."""
 
     @property
     def rate(self) -> float:
@@ -436,6 +445,11 @@ class BlockCleaner:
             )
             for name, check in self._checks.items()
         }
+
+    @property
+    def sources(self) -> TwoSourceSearch:
+        """Whether the IMU stream holds the readings of two sensors."""
+        return self._checks['imu'].sources
 
     @property
     def stamping(self) -> StampLine | None:

@@ -282,3 +282,35 @@ def test_times_beyond_64_bits_are_refused_without_a_warning(tmp_path, number):
     )
     with refused(InputError, 'csv_time', '4e+09', 1):
         read_csv(tmp_path / 'x.csv')
+
+
+def two_instances(path, imu):
+    """Write the readings of two IMUs in alternation, with a column of the instance."""
+    second = np.array([0.3, -0.2, 0.15]), np.array([0.02, -0.01, 0.015])
+    with path.open('w') as file:
+        file.write('time,unit,ax,ay,az,gx,gy,gz\n')
+        for stamp, force, rate in zip(seconds(imu), imu.force_s, imu.rate_s):
+            for unit, added in (('3', 0), ('7', 1)):
+                cells = [stamp, unit, *(force + added * second[0]), *(rate + added * second[1])]
+                file.write(','.join(str(cell) for cell in cells) + '\n')
+    return path
+
+
+def test_one_of_two_instances_is_selected(tmp_path, imu):
+    path = two_instances(tmp_path / 'two.csv', imu)
+    with refused(InputError, 'one_source', '50 %', '--where'):
+        read_csv(path)
+    assert_read(read_csv(path, where=['unit=3']), imu)
+    other = read_csv(path, where=['unit=7.0']).imu
+    np.testing.assert_allclose(
+        other.force_s - imu.force_s, np.tile([0.3, -0.2, 0.15], (len(imu), 1))
+    )
+    with refused(InputError, 'where', 'unit=5', '3, 7'):
+        read_csv(path, where=['unit=5'])
+    with refused(InputError, 'where', "'unit'"):
+        read_csv(path, where=['unit'])
+    arguments = ['convert', str(path), '--output', str(tmp_path / 'bag')]
+    assert main(arguments) == 1 and not (tmp_path / 'bag').exists()
+    assert main([*arguments, '--where', 'unit=7']) == 0
+    with open_recording(tmp_path / 'bag', want_joints=False) as recording:
+        assert recording.message_counts[recording.imu_topic] == len(imu)
