@@ -277,11 +277,12 @@ class TableResult(CalibrationResult):
 
         Directions that the gauge fixes by convention are left out.
         """
-        convention = make_prior(self.solution.model).root[len(self.tolerances) :]
+        prior = make_prior(self.solution.model)
+        convention = prior.root[len(self.tolerances) :]
         values = tolerance_scaled_singular_values(
             self.solution.information + convention.T @ convention, self.tolerances
         )
-        return values[len(convention) :]
+        return values[len(prior.gauge) :]
 
     def window_errors(self) -> WindowErrors:
         """

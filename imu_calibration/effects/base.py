@@ -191,6 +191,12 @@ class Effect:
     """Whether the values cannot be negative, e.g. lags."""
     smooth: bool = False
     """Whether it changes smoothly in time: any other smooth curve resembles it."""
+    bias_sums: tuple[tuple[int, ...], ...] = ()
+    """
+    Groups of parameters, each with a sum that acts as a bias where the specific force is as long as
+    gravity: ``f_x^2 + f_y^2 + f_z^2 = g^2``. By convention each sum is zero, to its tolerance,
+    unless other data determine it.
+    """
     against: tuple = ()
     """
     Abscissa of its residual plot: 'time', 'temperature', 'force', 'rate', 'angle'; empty: its own

@@ -42,7 +42,9 @@ def make_prior(model: SensorModel) -> Prior:
     Return the prior of a model.
 
     When an arm for each axis and a common one are estimated, the former sum to zero: the origin is
-    the mean of the sensitive points.
+    the mean of the sensitive points. Sums of parameters that act as a bias (`Effect.bias_sums`) are
+    zero to their tolerance: this row has information, so that data with another specific force than
+    that of rest determine the sum.
     """
     mean, sd = model.prior()
     mean = np.where(np.isfinite(mean), mean, 0.0)
@@ -55,6 +57,14 @@ def make_prior(model: SensorModel) -> Prior:
         rows.append(gauge)
         sd = sd.copy()
         sd[arms.ravel()] *= np.sqrt(2 / 3)
+    sums = []
+    for effect in model.effects:
+        for group in effect.bias_sums:
+            row = np.zeros(len(mean))
+            row[model.slices[effect.key].start + np.array(group)] = 1 / effect.tolerance
+            sums.append(row)
+    if sums:
+        rows.append(np.array(sums))
     return Prior(mean, np.concatenate(rows), sd, gauge)
 
 

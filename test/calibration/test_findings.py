@@ -11,7 +11,9 @@ import pytest
 
 from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
+    IMPOSSIBLE,
     LEAVES_MOST,
+    UNCERTAIN,
     candidates_of,
     finding,
     motions_of_one_joint,
@@ -143,9 +145,36 @@ def test_what_explains_much_but_leaves_most_is_said():
     )
     assert all(word in nothing_named(LagHypothesis) for word in ('gyro_delay', '163 nats'))
     LagHypothesis.candidates = (
-        Candidate('time_offset', 'reference', 12.0, 1e-4, 12.0, 1e-4, LEAVES_MOST),
+        Candidate('time_offset', 'reference', 3.0, 1e-4, 3.0, 1e-4, LEAVES_MOST),
     )
-    assert 'time_offset' not in nothing_named(LagHypothesis)
+    assert 'time_offset' not in nothing_named(LagHypothesis)  # not significant
+
+
+@pytest.mark.parametrize('verdict', [LEAVES_MOST, DISAGREED, IMPOSSIBLE, UNCERTAIN])
+def test_the_strongest_refused_effect_is_reported_for_each_reason(verdict):
+    """The gain in addition to the findings decides, not the gain alone."""
+    from imu_calibration.calibration.diagnosis.diagnosis_result import Candidate
+    from imu_calibration.calibration.diagnosis.diagnosis_workflow import strongest_refused
+
+    class WithFinding:
+        candidates = (
+            Candidate('lever_arm', 'accelerometer', 900.0, 0.0, None, None, 'found'),
+            Candidate('time_offset', 'reference', 800.0, 0.0, 5.0, 1e-6, verdict),
+            Candidate('gyro_delay', 'gyroscope', 163.0, 0.0, 40.0, 0.0, verdict),
+        )
+
+    assert strongest_refused(WithFinding).effect == 'gyro_delay'
+
+
+def test_an_effect_that_the_calibration_refused_has_that_reason():
+    rows = {
+        row.effect: row.verdict
+        for row in candidates_of(
+            Search(), [], agree=lambda chosen, question: True, withdrawn=[FIRST]
+        )
+    }
+    assert rows[FIRST.name] == UNCERTAIN
+    assert rows[SECOND.name] == LEAVES_MOST
 
 
 class LagsAndDelay(forward.Evidence):

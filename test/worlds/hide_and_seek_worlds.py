@@ -6,10 +6,14 @@ from itertools import combinations
 import numpy as np
 
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.kinematics.table import Table
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.investigation import investigate
+from imu_calibration.use_cases.diagnose import diagnose as diagnose_block
 
+from worlds import physics
 from worlds.beyond_catalogue import NOTHING, hidden_row, row_of
 from worlds.diagnosing import diagnose
 from worlds.hiding import NOT_SIZED, all_effects, options_of, record, sizes_for
@@ -17,7 +21,18 @@ from worlds.physics_beyond import KINDS
 from worlds.physics_draw import OUTSIDE, generator
 from worlds.wanders import WANDERS
 
-PARTS = ('effects', 'none', 'outside', 'pairs', 'sizes', 'traps', 'separating', 'power', 'beyond')
+PARTS = (
+    'effects',
+    'none',
+    'outside',
+    'pairs',
+    'sizes',
+    'traps',
+    'separating',
+    'power',
+    'beyond',
+    'components',
+)
 GRADES = ('consumer', 'industrial', 'tactical', 'navigation')
 REALISTIC = ('realistic', *WANDERS)
 """Kinds of realistic noise, dealt to effects and sessions in turn."""
@@ -60,6 +75,8 @@ PAIR_SESSIONS, BEYOND_ROUNDS = 40, 10
 Sessions to which all pairs are dealt, and times that each kind of cause beyond the catalogue is
 hidden.
 """
+COMPONENT_SESSIONS = 12
+"""Sessions to which all single components are dealt."""
 FINE = ('tactical', 'navigation')
 """Grades at which the Earth's rate, whose size nobody chooses, is well above detectability."""
 
@@ -91,7 +108,7 @@ def _row(diagnosis, truth, hidden, seconds, labels):
     }
     for finding in findings:
         if finding.effect in truth and finding.effect in (hidden or ()):
-            true = np.ravel(truth[finding.effect])
+            true = by_convention(finding.effect, np.ravel(truth[finding.effect]))
             if finding.effect.endswith('_saturation'):
                 value = next(iter(finding.parameters.values()))[0]
                 row['level_error'] = float(abs(value / true[0] - 1))
@@ -101,6 +118,19 @@ def _row(diagnosis, truth, hidden, seconds, labels):
                 for (value, sd, _), t in zip(finding.parameters.values(), true)
             ]
     return row
+
+
+def by_convention(name, values):
+    """Return parameters of an effect with the sums that act as a bias moved into the bias."""
+    values = np.array(values, float)
+    for group in _effect(name).bias_sums:
+        values[list(group)] -= values[list(group)].mean()
+    return values
+
+
+def _effect(name):
+    """Return the effect of a name on the table of the sessions."""
+    return next(effect for effect in CATALOGUE.effects().values() if effect.name == name)
 
 
 def _each(cases, row, what):
@@ -227,6 +257,47 @@ def pairs_of_seed(seed, noise, pairs):
     return _each(pairs, row, f'pairs {seed}')
 
 
+def components_of(effects):
+    """Return (effect, component) of all effects with several amplitudes of a free size."""
+    cases = []
+    for name in effects:
+        count = _effect(name).n_amplitudes
+        if name not in NOT_SIZED and count > 1 and not _effect(name).time_constant:
+            cases += [(name, component) for component in range(count)]
+    return cases
+
+
+def components_of_seed(seed, noise, cases):
+    """
+    Hide one component of an effect at a time, and diagnose as the command does.
+
+    An effect with collinear components may be found only where all are drawn at once, or be
+    withdrawn by the calibration that follows the search.
+    """
+
+    def row(case):
+        effect, component = case
+        sizes = sizes_for(seed, noise, [effect], {})
+        hidden = {effect: sizes.hidden(effect, seed, 5.0, component)}
+        start, kind = time.process_time(), noise.partition('@')
+        session = physics.make_session(
+            seed,
+            hidden,
+            kind[0],
+            **({'grade': kind[2]} if kind[2] else {}) | options_of(effect),
+        )
+        found = diagnose_block(session.block, Table.from_mapping(session.table)).result.diagnosis
+        return _row(
+            found,
+            session.truth['values'],
+            hidden,
+            time.process_time() - start,
+            {'part': 'components', 'component': component, 'seed': seed, 'noise': noise},
+        )
+
+    return _each(cases, row, f'components {seed} {noise}')
+
+
 def all_pairs(effects):
     """Return all pairs of the effects whose size can be chosen."""
     return list(combinations([name for name in effects if name not in NOT_SIZED], 2))
@@ -341,6 +412,10 @@ def tasks_of(options):
         'separating': [
             (separating_of_seed, (first + 5000 + k, 'white', SEPARATED)) for k in rounds
         ],
+        'components': [
+            (components_of_seed, (first + 7000 + k, noise, hand))
+            for k, noise, hand in _component_hands(names, rounds, shuffled)
+        ],
         'power': [
             (sizes_of_seed, (first + 6000 + k, 'white', POWER, POWER_SIZES, 'power'))
             for k in range(3 * options.seeds)
@@ -353,6 +428,20 @@ def tasks_of(options):
         for k, task in enumerate(some[part])
     ]
     return [task for _, task in sorted(placed, key=lambda pair: pair[0])]
+
+
+def _component_hands(names, rounds, shuffled):
+    """
+    Return (number, noise, cases) of the single components: all in white noise, then realistic.
+
+    Each task has a session of its own, because each needs one that hides nothing.
+    """
+    tasks = []
+    for _ in rounds:
+        for noise in ('white', 'realistic'):
+            for hand in _dealt(shuffled(components_of(names)), COMPONENT_SESSIONS):
+                tasks.append((len(tasks), noise, hand))
+    return tasks
 
 
 def beyond_of_seed(seed, noise, kinds):

@@ -160,17 +160,20 @@ class Sizes:
             normal[np.ix_(used, used)] + prior, normal[used]
         )
 
-    def hidden(self, effect, seed, factor):
+    def hidden(self, effect, seed, factor, component=None):
         """
         Return what to hide: of random shape, `factor` times as large as detectable.
 
-        None where nature gives the size.
+        None where nature gives the size. With a component all others are zero.
         """
         if effect in NOT_SIZED:
             return None
         if effect.endswith('_saturation'):
             return factor * LEAST_CLIPPED_SHARE
         value = pattern(effect, seed)
+        if component is not None:
+            number = np.arange(value.size).reshape(value.shape)
+            value = np.where(number == component, value, 0.0)
         direction, n_parameters = self._direction(effect, value)
         strength = direction @ self.information @ direction
         seen = np.sqrt(

@@ -8,10 +8,16 @@ import numpy as np
 
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.diagnosis.diagnosis_result import Diagnosis, to_mapping
+from imu_calibration.calibration.diagnosis.diagnosis_result import (
+    Candidate,
+    Diagnosis,
+    to_mapping,
+)
 from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
+    IMPOSSIBLE,
     LEAVES_MOST,
+    UNCERTAIN,
     build_diagnosis,
     diagnosis_by_hand,
 )
@@ -33,12 +39,11 @@ from imu_calibration.references.gravity.model_selection import too_few_poses
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.selection.investigation import too_few_windows
+from imu_calibration.selection.search import MIN_GAIN_NATS
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
 MOST_SHOWN = 3
 """Parameters of a change that are printed."""
-MUCH = 100.0
-"""Held-out gain of log likelihood from which a refused effect is reported, nats."""
 WHY_NOT = {
     LEAVES_MOST: (
         'most of the unexplained residual remains with it, so that both may have another cause'
@@ -47,8 +52,13 @@ WHY_NOT = {
         'the windows do not agree on it: the evidence comes from few windows, or some contradict'
         ' it; record more windows of the same motions'
     ),
+    UNCERTAIN: (
+        'none of its coefficients is significant in the calibration with all uncertainties; record'
+        ' motions that separate them'
+    ),
+    IMPOSSIBLE: 'its size is impossible for such a sensor, or within the steps of the encoders',
 }
-"""Verdict on an effect with a large gain -> reason why it is no finding."""
+"""Verdict on a significant effect -> reason why it is no finding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,8 +321,14 @@ def diagnosis_lines(diagnosis: Diagnosis) -> list[str]:
                 f' {", ".join(finding.indistinguishable_from)}; to separate them:'
                 f' {finding.separating_motion}'
             )
+    refused = strongest_refused(diagnosis)
     if not diagnosis.findings and not _proposed_effects(diagnosis):
         lines.append(nothing_named(diagnosis))
+    elif refused is not None:
+        lines.append(
+            f'refused: {refused.effect} ({_gain_of(refused):.0f} nats on held-out windows):'
+            f' {WHY_NOT[refused.verdict]}'
+        )
     for sensor, rest in diagnosis.unexplained.items():
         if rest.significant:
             with_what = (
@@ -417,13 +433,31 @@ def nothing_named(diagnosis: Diagnosis) -> str:
 
     No effect exceeds noise, or the best one is refused.
     """
-    much = [row for row in diagnosis.candidates if row.verdict in WHY_NOT and row.gain_alone > MUCH]
-    if not much:
+    row = strongest_refused(diagnosis)
+    if row is None:
         return 'nothing found: no effect of the catalogue explains more than noise'
     return (
-        f'nothing named: {much[0].effect} explains much ({much[0].gain_alone:.0f} nats on held-out'
-        f' windows), but {WHY_NOT[much[0].verdict]}'
+        f'nothing named: {row.effect} explains much ({_gain_of(row):.0f} nats on held-out windows),'
+        f' but {WHY_NOT[row.verdict]}'
     )
+
+
+def strongest_refused(diagnosis: Diagnosis) -> Candidate | None:
+    """
+    Return the refused effect with the largest gain in addition to the findings.
+
+    None where no refused effect is significant.
+    """
+    refused = [
+        row
+        for row in diagnosis.candidates
+        if row.verdict in WHY_NOT and _gain_of(row) > MIN_GAIN_NATS
+    ]
+    return max(refused, key=_gain_of, default=None)
+
+
+def _gain_of(row):
+    return row.gain_alone if row.gain_beside is None else row.gain_beside
 
 
 def in_words(value: float, sensor: str, unit: str | None = None) -> str:

@@ -108,6 +108,10 @@ LEAVES_MOST = 'rejected: most of the residual would remain'
 """Verdict on an effect that is significant, but removes too small a share."""
 DISAGREED = 'refused: the windows do not agree on it'
 """Verdict on an effect with evidence from few windows only, or with contradictory windows."""
+IMPOSSIBLE = 'refused: its size is impossible, or within the steps of the encoders'
+"""Verdict on an effect with an estimate that no instrument can have."""
+UNCERTAIN = 'refused: none of its coefficients is significant in the calibration'
+"""Verdict on an effect that a solution with all allowances does not determine."""
 
 
 def sentence(
@@ -169,14 +173,17 @@ def candidates_of(
     named: Sequence[Question],
     *,
     agree: Callable[[Sequence[Question], Question], bool] | None = None,
+    withdrawn: Sequence[Question] = (),
 ) -> tuple[Candidate, ...]:
     """
     Return every effect that a search tested in addition to the findings, the strongest first.
 
     Of a warm-up its best time constant.
 
-    `agree(chosen, question)` is whether the windows agree on one of the chosen effects.
+    `agree(chosen, question)` is whether the windows agree on one of the chosen effects; `withdrawn`
+    are effects that the search chose and the halves of the recording or the calibration refused.
     """
+    refused_later = {question.name for question in withdrawn}
     found, mates, rows = {question.name for question in named}, {}, {}
     for question in named:
         for mate, _ in search.confounded(named, question):
@@ -189,6 +196,8 @@ def candidates_of(
         verdict = _verdict_of(question.name, alone, beside, found=found, mates=mates)
         if verdict == LEAVES_MOST and agree is not None and not agree([*named, question], question):
             verdict = DISAGREED
+        elif verdict == LEAVES_MOST and question.name in refused_later:
+            verdict = UNCERTAIN
         rows[question.name] = Candidate(
             question.name,
             question.sensor,
@@ -225,7 +234,7 @@ def _verdict_of(name, alone, beside, *, found, mates):
     if name in mates:
         return f'as good as {mates[name]}'
     if not alone.allowed and alone.p_value < FAMILY_WISE and alone.gain > 0:
-        return 'refused: its size is impossible, or within the steps of the encoders'
+        return IMPOSSIBLE
     if beside is not None and beside.significant:
         return LEAVES_MOST
     if alone.significant:
@@ -411,7 +420,7 @@ def build_diagnosis(
     return Diagnosis(
         tuple(findings),
         rests,
-        candidates_of(problem.search, named, agree=problem.windows_agree),
+        candidates_of(problem.search, named, agree=_agreement(problem), withdrawn=found.unstable),
         tuple(found.not_testable),
         baseline,
         solution,
@@ -426,6 +435,17 @@ def build_diagnosis(
             [rest.proposal for rest in rests.values() if rest.proposal is not None],
         ),
     )
+
+
+def _agreement(problem):
+    """Return whether windows and both halves of the recording agree on a chosen effect."""
+
+    def agree(chosen, question):
+        return problem.windows_agree(chosen, question) and problem.agrees_in_halves(
+            chosen, question
+        )
+
+    return agree
 
 
 def _rivals(found, question):
