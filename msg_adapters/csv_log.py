@@ -80,18 +80,19 @@ COLUMN_PATTERNS = (
     (
         'time',
         r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|'
-        r'(.* )?stamp|.*elapsed|time since start.*',
+        r'(.* )?stamp|.*elapsed|time since start.*|millis|micros|nanos|rtc ?time|time of day|'
+        r'sample ?time ?fine',
     ),
     (
         'force',
-        r'(a|acc|accel|accelerometer|acceleration|f|specific force|a rs'
+        r'(a|ac|acc|acc smooth|accel|accelerometer|acceleration|f|specific force|a rs'
         r' s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
         r'(.* )?linear acceleration)',
     ),
     (
         'rate',
-        r'(g|w|gyr|gyro|gyroscope|omega|rate|w rs s|(angular|rotation|gyro|gyroscope|imu|raw)'
-        r' ?(rate|rotation|gyro\w*)|'
+        r'(g|w|gy|gyr|gyro|gyro adc|gyroscope|omega|rate|w rs s|'
+        r'(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
         r'(.* )?angular velocity)',
     ),
     ('temperature', r'temp|temperature|(imu|sensor|chip|die) temp(erature)?'),
@@ -105,6 +106,11 @@ PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns
 Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within
 the usual rates.
 """
+CLOCK = re.compile(r'\s*(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d+))?\s*')
+"""Time of day: hours, minutes, seconds, decimals."""
+DAY_NS = 86_400 * 10**9
+NO_TIME = np.iinfo(np.int64).min
+"""The value of NaT."""
 MAX_TIME_SECONDS = 4e9
 """s; stamps in ns and their differences fit into 64 bits."""
 GRAVITY_BAND = 1.15
@@ -151,6 +157,8 @@ class CsvLog:
     """Temperatures."""
     unused: tuple[str, ...]
     """Other columns."""
+    n_dropped: int = 0
+    """Lines that were left out, because they have too few columns."""
 
 
 @np.errstate(
@@ -233,7 +241,8 @@ def read_csv(
         imu,
         JointSamples.of_angles(stamp_ns, angles) if angles else None,
         temperature,
-        tuple(name for name in table.names if name not in taken),
+        tuple(name for name in table.names if name and name not in taken),
+        table.n_dropped,
     )
 
 
@@ -319,9 +328,11 @@ class _Table:
                 f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces,'
                 ' got none; check the file'
             )
-        self.first, self.decimal_comma = (
-            first,
-            any(re.fullmatch(r'\s*-?\d+,\d+\s*', cell) for cell in rows[first]),
+        self.first, self.first_row = first, rows[first]
+        self.decimal_comma = any(
+            re.fullmatch(r'\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*', cell)
+            for row in rows[first:]
+            for cell in row
         )
         width = len(rows[first])
         header = [row for row in rows[:first] if len(row) == width][-2:]
@@ -344,6 +355,8 @@ class _Table:
             for k, cell in enumerate(rows[first])
             if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell)
         }
+        self.clocks = {k for k, cell in enumerate(rows[first]) if CLOCK.fullmatch(cell)}
+        self.n_dropped = 0
         self._values = {}
 
     def _cells(self, line):
@@ -373,12 +386,13 @@ class _Table:
         Rows that do not fulfil the conditions `where` are left out.
         """
         wanted = sorted({self.column(name) for name in names})
-        numbers = [k for k in wanted if k not in self.dates]
+        numbers = [k for k in wanted if k not in self.dates | self.clocks]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
         with _opened(self.path) as file:
             lines = self._selected(file.read().splitlines()[self.first :], where)
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]
+        lines = self._complete(lines, wanted[-1] + 1)
         with warnings.catch_warnings():
             warnings.simplefilter(
                 'ignore', UserWarning
@@ -390,6 +404,8 @@ class _Table:
                     lines, usecols=numbers, invalid_raise=False, **options
                 ).reshape(-1, len(numbers))
         self._values = dict(zip(numbers, data.T, strict=True))
+        for k in set(wanted) & self.clocks:
+            self._values[k] = _times_of_day([self._cells(line)[k] for line in lines])
         for k in set(wanted) & self.dates:
             cells = [self._cells(line) for line in lines if line.strip()]
             dates = [
@@ -405,6 +421,22 @@ class _Table:
             raise InputError(
                 f'{self.path} must have at least two rows of numbers, got fewer; check the file'
             )
+
+    def _complete(self, lines, width):
+        """Return the lines with at least `width` cells; count those that are dropped."""
+        complete = []
+        for line in lines:
+            if not line.strip() or line.startswith('#'):
+                continue
+            if self.delimiter is not None and '"' not in line:
+                n_cells = line.count(self.delimiter) + 1
+            else:
+                n_cells = len(self._cells(line))
+            if n_cells >= width:
+                complete.append(line)
+            else:
+                self.n_dropped += 1
+        return complete
 
     def _selected(self, lines, where):
         """Return the lines that fulfil all conditions COLUMN=VALUE; values as text or numbers."""
@@ -454,16 +486,46 @@ class _Table:
         """Return stamps in ns of the Columns of time, int64, shape (n,)."""
         values = self.raw(time.names[0])
         if values.dtype.kind == 'M':
-            return values.astype(np.int64)
-        unit = COLUMN_UNITS['time'][time.unit]
-        bad = np.count_nonzero(~(np.abs(values * unit) < MAX_TIME_SECONDS))
+            bad = np.count_nonzero(np.isnat(values))
+        else:
+            unit = COLUMN_UNITS['time'][time.unit]
+            bad = np.count_nonzero(~(np.abs(values * unit) < MAX_TIME_SECONDS))
+        if bad == len(values):
+            cell = self.first_row[self.column(time.names[0])].strip()
+            raise InputError(
+                f'the time in {self.path} must be a number, a date with time or a time of day'
+                f' (HH:MM:SS.sss), the format of {shortened(cell, 60)!r} was not understood; name'
+                ' another column with time=NAME:UNIT',
+                key='columns',
+                code='csv_format',
+            )
         if bad:
             raise InputError(
                 f'the time of every row of {self.path} must be a number below {MAX_TIME_SECONDS:g}'
                 f' s, got {bad} without one; remove these rows',
                 code='csv_time',
             )
-        return stamps_of(values, unit)
+        return values.astype(np.int64) if values.dtype.kind == 'M' else stamps_of(values, unit)
+
+
+def _times_of_day(cells):
+    """
+    Return times of day as datetime64[ns] from the midnight before the first one, shape (n,).
+
+    A step back by more than half a day is a midnight. NaT where a cell is no time of day.
+    """
+    time_ns = np.full(len(cells), NO_TIME, np.int64)
+    for k, cell in enumerate(cells):
+        found = CLOCK.fullmatch(cell)
+        if found:
+            hours, minutes, seconds, fraction = found.groups(default='')
+            whole = 3600 * int(hours) + 60 * int(minutes) + int(seconds)
+            time_ns[k] = whole * 10**9 + int(fraction[:9].ljust(9, '0'))
+    good = time_ns != NO_TIME
+    known = time_ns[good]
+    midnights = np.cumsum(np.diff(known, prepend=known[:1]) < -DAY_NS // 2)
+    time_ns[good] = known + DAY_NS * midnights
+    return time_ns.view('datetime64[ns]')
 
 
 def _delimiter(lines):
@@ -498,7 +560,12 @@ def _guess(table):
                     axes[quantity].setdefault(re.sub(r'[^a-z]', '', axis.group(1)), {})[
                         axis.group(2)
                     ] = (name, _unit(quantity, unit_text))
-            elif re.fullmatch(pattern, words) and quantity not in {each.quantity for each in found}:
+            elif (
+                re.fullmatch(pattern, words)
+                # T (°C) is no time
+                and (not unit_text or _unit(quantity, unit_text) or quantity != 'time')
+                and quantity not in {each.quantity for each in found}
+            ):
                 found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
         if joint:
             found.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
@@ -526,17 +593,24 @@ def _guess(table):
 
 def _words(name):
     """Return (name in lower case with spaces, without unit; text of the unit)."""
+    # Elements of an array are axes: gyro[0] is x. A space before the bracket marks a repeated name.
+    element = re.fullmatch(r'(.*\S)\[([012])\]', name)
+    if element:
+        words, unit = _words(element.group(1))
+        return f'{words} {"xyz"[int(element.group(2))]}', unit
     bracket = re.search(r'[(\[](.*?)[)\]]\s*(?:\[\d+\])?$', name)
     unit = bracket.group(1) if bracket else ''
     text = name[: bracket.start()] if bracket else name
     if not unit:
         suffix = re.search(
-            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|ms|us|ns|deg|rad|c|s)$',
+            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|ms|us|ns|deg|rad|c|s)$',
             text,
             re.IGNORECASE,
         )
         if suffix:
             unit, text = suffix.group(1), text[: suffix.start()]
+    if not unit and text.lower() in ('millis', 'micros', 'nanos'):
+        unit = text
     text = re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', text)
     unit = unit.lower().replace('m_s2', 'm/s2').replace('m_s_2', 'm/s2').replace('_s', '/s')
     return re.sub(r'[\s_./-]+', ' ', text).strip().lower(), unit

@@ -50,6 +50,8 @@ def run(options: Options) -> VerbResult:
         print(columns)
     if log.unused:
         print_line(f'unused: {", ".join(log.unused)}')
+    if log.n_dropped:
+        print_line(f'dropped: {log.n_dropped} lines with too few columns')
     write_session(
         options.output, log.imu, log.joints, temperature=log.temperature, storage=options.storage
     )
@@ -61,5 +63,6 @@ def run(options: Options) -> VerbResult:
             'count': len(log.imu),
             'columns': list(map(asdict, log.columns)),
             'unused': log.unused,
+            'dropped': log.n_dropped,
         },
     )

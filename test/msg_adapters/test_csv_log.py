@@ -314,3 +314,92 @@ def test_one_of_two_instances_is_selected(tmp_path, imu):
     assert main([*arguments, '--where', 'unit=7']) == 0
     with open_recording(tmp_path / 'bag', want_joints=False) as recording:
         assert recording.message_counts[recording.imu_topic] == len(imu)
+
+
+def clock_text(time_s, start_s=86_390.0):
+    """Return times of day with three decimals; midnight is 10 s after the start."""
+    texts = []
+    for time in np.round(time_s + start_s, 3):
+        minutes, seconds = divmod(time % 86_400, 60)
+        texts.append(f'{int(minutes) // 60:02d}:{int(minutes) % 60:02d}:{seconds:06.3f}')
+    return texts
+
+
+def test_times_of_day_pass_midnight(tmp_path, imu):
+    lines = ['recorder started', 'tag:,left', 'rtcDate,rtcTime,aX,aY,aZ,gX,gY,gZ,']
+    for clock, force, rate in zip(clock_text(seconds(imu)), imu.force_s, imu.rate_s):
+        cells = ['02/28/2021', clock, *force.astype(str), *rate.astype(str)]
+        lines.append(','.join(cells) + ',')
+    path = tmp_path / 'clock.csv'
+    path.write_text('\n'.join(lines) + '\n')
+    log = read_csv(path)
+    assert log.imu.stamp_ns[0] == 86_390 * 10**9
+    np.testing.assert_allclose(np.diff(log.imu.stamp_ns), np.diff(imu.stamp_ns), atol=1.1e6)
+    np.testing.assert_allclose(log.imu.force_s, imu.force_s)
+    assert log.unused == ('rtcDate',)
+
+
+@pytest.mark.parametrize('delimiter', [';', '\t'])
+def test_decimal_commas(tmp_path, imu, delimiter):
+    rows = np.column_stack([seconds(imu), imu.force_s, imu.rate_s])
+    rows[0] = np.round(rows[0])  # the first row has no decimals
+    lines = [PLAIN.replace(',', delimiter)]
+    for row in rows:
+        lines.append(delimiter.join(f'{cell:.12g}' for cell in row).replace('.', ','))
+    path = tmp_path / 'comma.csv'
+    path.write_text('\n'.join(lines) + '\n')
+    np.testing.assert_allclose(read_csv(path).imu.force_s, rows[:, 1:4], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('header', 'units'),
+    [
+        ('millis,ax_g,ay_g,az_g,gx_dps,gy_dps,gz_dps', ('ms', 'g', 'deg/s')),
+        ('micros,AcX,AcY,AcZ,GyX,GyY,GyZ', ('us', 'mg', 'deg/s')),
+        (
+            'timestamp,accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2],'
+            'gyro_rad[0],gyro_rad[1],gyro_rad[2]',
+            ('us', 'm/s^2', 'rad/s'),
+        ),
+        (
+            'time (us),accSmooth[0],accSmooth[1],accSmooth[2],gyroADC[0],gyroADC[1],gyroADC[2]',
+            ('us', 'g', 'deg/s'),
+        ),
+        ('SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z', ('us', 'm/s^2', 'deg/s')),
+    ],
+)
+def test_names_of_common_loggers(tmp_path, imu, header, units):
+    sizes = [csv_log.COLUMN_UNITS[q][u] for q, u in zip(('time', 'force', 'rate'), units)]
+    path = write(
+        tmp_path / 'log.csv',
+        header,
+        seconds(imu) / sizes[0],
+        imu.force_s / sizes[1],
+        imu.rate_s / sizes[2],
+    )
+    log = read_csv(path)
+    assert tuple(columns.unit for columns in log.columns) == units
+    np.testing.assert_allclose(log.imu.force_s, imu.force_s, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(log.imu.rate_s, imu.rate_s, rtol=1e-9, atol=1e-9)
+
+
+def test_an_unknown_format_of_time_is_named(tmp_path, imu):
+    path = tmp_path / 'day.csv'
+    lines = [PLAIN]
+    for force, rate in zip(imu.force_s[:50], imu.rate_s[:50]):
+        lines.append(','.join(['noon+1', *force.astype(str), *rate.astype(str)]))
+    path.write_text('\n'.join(lines) + '\n')
+    with refused(InputError, 'csv_format', 'noon+1'):
+        read_csv(path, ['time=time:s'])
+
+
+def test_dropped_lines_are_counted(tmp_path, imu, capsys):
+    path = write(tmp_path / 'log.csv', PLAIN, seconds(imu), imu.force_s, imu.rate_s)
+    lines = path.read_text().splitlines()
+    lines[10] = lines[10][:12]
+    lines[20] = 'restarted'
+    path.write_text('\n'.join(lines) + '\n')
+    log = read_csv(path)
+    assert (log.n_dropped, len(log.imu)) == (2, len(imu) - 2)
+    assert main(['convert', str(path), '--output', str(tmp_path / 'bag')]) == 0
+    assert 'dropped: 2' in capsys.readouterr().out
