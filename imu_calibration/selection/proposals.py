@@ -366,7 +366,8 @@ def _text_of(effect):
 def _size(effect, values, sd):
     k = int(np.argmax(np.abs(values)))
     factor, unit = for_people(effect.unit_of(k), effect.sensor)
-    return f'{" ± ".join(with_sd(values[k] * factor, sd[k] * factor))} {unit} on {AXES[k]}'
+    size = ' ± '.join(with_sd(values[k] * factor, sd[k] * factor))
+    return f'{size} {unit} on {effect.sensor} {AXES[k]}'
 
 
 def _motion(effects):

@@ -223,6 +223,8 @@ class Tone:
     """All frequencies under test, shape (n,)."""
     power: np.ndarray
     """Mean power of the axis there, over that around it, shape (n,)."""
+    rested: bool = False
+    """Whether the recording contains rest, so that a fixed frequency is independent of motion."""
 
     @property
     def text(self) -> str:
@@ -230,10 +232,12 @@ class Tone:
         factor, unit = for_people('m/s^2' if self.sensor == SENSORS[0] else 'rad/s')
         where = f'on {self.sensor} {self.axis}, {significant(self.amplitude * factor, 2)} {unit}'
         if self.joint is None:
-            return (
-                f'a tone of {self.frequency:.1f} Hz {where}, independent of motion: electrical, or'
-                ' a resonance'
+            cause = (
+                'independent of motion: electrical, or a resonance'
+                if self.rested
+                else 'at a fixed frequency; whether motion causes it is open, because nothing rests'
             )
+            return f'a tone of {self.frequency:.1f} Hz {where}, {cause}'
         return (
             f'{self.frequency:.1f} times per turn of {self.joint} {where}, at every speed: its'
             ' bearing, gear, motor or encoder'
@@ -303,8 +307,12 @@ def find_tones(
             )
         )
         tones[sensor] |= _significant(turning, tests)
+    rested = any(window.kind == 'static' for window in found.used)
     return {
-        sensor: tuple(sorted(every.values(), key=lambda tone: tone.p_value))
+        sensor: tuple(
+            replace(tone, rested=rested)
+            for tone in sorted(every.values(), key=lambda tone: tone.p_value)
+        )
         for sensor, every in tones.items()
     }
 

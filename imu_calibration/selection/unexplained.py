@@ -77,6 +77,11 @@ class Unexplained:
     """Fixed frequencies and fixed multiples of a joint's speed in it (`Tone`), the surest first."""
 
     @property
+    def by_structure(self) -> bool:
+        """Whether it is significant by a formula, a place, a tone or scatter, not by its size."""
+        return self.significant and self.sigma < SIGNIFICANT_SDS
+
+    @property
     def entry(self) -> dict[str, Any]:
         """Entry of a calibration document."""
         return {'rms': self.rms, 'axes': list(self.axes)} | (

@@ -4,11 +4,12 @@ A chosen effect as a finding.
 The same words, mates and candidates whether the search ran on a table or by hand.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import beyond_lines
 from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
     IMPOSSIBLE,
@@ -27,6 +28,7 @@ from imu_calibration.selection import search as forward
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.search import Score
+from imu_calibration.selection.unexplained import Unexplained
 
 FIRST, SECOND, MATE, OTHER = (
     Question(CATALOGUE.find('accelerometer', name), (k,), 3, name)
@@ -164,6 +166,15 @@ def test_the_strongest_refused_effect_is_reported_for_each_reason(verdict):
         )
 
     assert strongest_refused(WithFinding).effect == 'gyro_delay'
+
+
+@pytest.mark.parametrize(('sigma', 'by_structure'), [(-2.2, True), (4.9, True), (5.1, False)])
+def test_a_residual_below_the_limit_is_significant_by_its_structure_only(sigma, by_structure):
+    nothing = np.zeros((1, 3))
+    rest = Unexplained(True, 1e-3, sigma, None, 0.0, nothing, nothing, axes=('y',))
+    assert rest.by_structure == by_structure
+    assert not replace(rest, significant=False).by_structure
+    assert all('gyroscope' in line for line in beyond_lines('gyroscope', rest))
 
 
 def test_an_effect_that_the_calibration_refused_has_that_reason():

@@ -57,7 +57,13 @@ def test_the_power_of_a_sine_is_in_its_band(distance):
     assert rms[0] == pytest.approx([0.01, 0.0, 0.0], abs=1.2e-3)
     assert rms[1] == pytest.approx([0.0, 0.0, 0.0], abs=1.2e-3)
     assert noise == pytest.approx(np.full(3, 0.01 * np.sqrt(9 / 50)), rel=0.05)
-    assert bands['10 to 100 Hz'][0] == pytest.approx(np.zeros((2, 3)), abs=1.5e-3)
+    assert bands['10 to 46.4 Hz'][0] == pytest.approx(np.zeros((2, 3)), abs=1.5e-3)
+
+
+def test_no_band_reaches_the_nyquist_frequency(distance):
+    """50 Hz here; a part of a band that the Nyquist frequency cuts would be a band too small."""
+    highest = [float(name.split()[-2]) for name, _, _ in distance.bands()[1:]]
+    assert max(highest) == pytest.approx(46.4, abs=0.05)
 
 
 def test_an_offset_is_in_the_window_means(distance):

@@ -1,5 +1,6 @@
 """Tones in the rest: what they are fixed to, and what is none."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -102,6 +103,10 @@ def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
         and teeth.to_mapping()['joint'] == 'outer'
     )
 
+    # A motion may have a fixed frequency too; only rests show that the tone does not need one.
+    assert hum.rested
+    assert replace(hum, rested=False).text != hum.text
+    assert 'independent' not in replace(hum, rested=False).text
     mesh = term(
         'mesh',
         sensor='gyroscope',

@@ -389,7 +389,7 @@ def _onset_lines(onset):
 
 def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
     """Return the axes, conditions and tones of an unexplained residual, as lines."""
-    lines = [f'axis {" and ".join(rest.axes)}'] * bool(rest.axes)
+    lines = [f'{sensor} axis {" and ".join(rest.axes)}'] if rest.axes else []
     lines += [
         f'where: {sensor} {regime.axis}, {regime.text} ({100 * regime.share:.0f} % of it)'
         for regime in rest.regimes

@@ -57,7 +57,8 @@ class Distance:
         Return (band, rms beyond noise, rms of the noise) of window means and decades.
 
         The rms beyond noise has shape (2, 3) and that of the noise (3,), in m/s^2 or rad/s. There
-        is a result for the window means and for each decade.
+        is a result for the window means and for each decade, up to the last edge below the Nyquist
+        frequency.
 
         ``sqrt(max(mean square of measured - simulated - that of the noise, 0))``.
         """
@@ -65,10 +66,12 @@ class Distance:
         decade = np.floor(np.log10(self.edges[:-1]) + 1e-9).astype(int)
         for each in np.unique(decade):
             rows = decade == each
+            rows[-1] = False  # the Nyquist frequency cuts it
             if self.power[0, rows].any():
+                highest = self.edges[1:][rows].max()
                 found.append(
                     (
-                        f'{10.0**each:g} to {10.0 ** (each + 1):g} Hz',
+                        f'{10.0**each:g} to {highest:.3g} Hz',
                         self.power[:, rows].sum(axis=1),
                         self.noise[rows].sum(axis=0),
                     )
