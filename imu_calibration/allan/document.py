@@ -21,6 +21,7 @@ from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.core.documents import finite, from_text, to_text
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import NOISE_QUANTITY, STANDARD_GRAVITY, for_people, significant
+from imu_calibration.document.outcome import dropped_text, exit_code_of
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 
@@ -498,9 +499,19 @@ def counts(figures: NoiseFigures) -> dict[str, int]:
 
 
 def exit_code(figures: NoiseFigures) -> int:
-    """Return 0 when every required figure is determined and no sample was lost, else 3."""
-    found = counts(figures)
-    return 3 if found[WEAK] or found[HELD] or figures.recording.get('dropped') else 0
+    """Return 0 when every required figure is determined and few samples were dropped, else 3."""
+    return exit_code_of(shortcomings(figures))
+
+
+def shortcomings(figures: NoiseFigures) -> list[str]:
+    """Return why the exit code is 3, a line each; empty for 0."""
+    found, lines = counts(figures), []
+    if lacking := found[WEAK] + found[HELD]:
+        lines.append(f'{lacking} of {sum(found.values())} noise figures are not determined')
+    kept = round(figures.recording.get('seconds_at_rest', 0.0) * figures.rate)
+    if dropped := dropped_text(figures.recording.get('dropped') or {}, kept):
+        lines.append(dropped)
+    return lines
 
 
 def lines(figures: NoiseFigures) -> list[str]:

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.result import CalibrationResult, exit_code
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import decisions_text
+from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
@@ -56,6 +57,8 @@ class UnitResult:
     """The missing input, a key of `errors.ERROR_KEYS`."""
     files: dict | None = None
     """File name -> text."""
+    reasons: tuple[str, ...] = ()
+    """Why the exit code is not 0, a line each."""
 
     @property
     def verdicts(self) -> dict[str, str]:
@@ -90,12 +93,11 @@ class FleetStep:
         try:
             return self._calibrated(unit)
         except ImuCalibrationError as error:
-            return UnitResult(unit.name, error=' '.join(str(error).split()), key=error.key)
+            text = ' '.join(str(error).split())
+            return UnitResult(unit.name, error=text, key=error.key, reasons=(text,))
         except Exception as error:  # a failed unit does not end the run of the fleet
-            return UnitResult(
-                unit.name,
-                error=f'stopped by {type(error).__name__}: {" ".join(str(error).split())}',
-            )
+            text = f'stopped by {type(error).__name__}: {" ".join(str(error).split())}'
+            return UnitResult(unit.name, error=text, reasons=(text,))
 
     def _calibrated(self, unit):
         provenance = unit.provenance() if unit.provenance is not None else None
@@ -111,6 +113,7 @@ class FleetStep:
             str(result.verdict.word),
             exit_code(result.calibration),
             files=texts,
+            reasons=tuple(shortcomings(result.calibration)),
         )
 
 

@@ -38,6 +38,7 @@ from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.outcome import parameter_count
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import COMMON_SCALE, LACKING, tolerances_of
 from imu_calibration.kinematics.rotations import unit_rows
@@ -174,7 +175,7 @@ def _needs(found, not_seen, calibration, *, step, hints):
         return Progress.WAITING, [
             f'{step}{more}; {MIN_ATTITUDES} attitudes at least, {POSES_FULL} for all parameters'
         ]
-    lacking = [name for name, status in calibration.status_by_name.items() if status in LACKING]
+    lacking = list(parameter_count(calibration).lacking)
     if not lacking:
         return Progress.DETERMINED, []
     if lacking == [COMMON_SCALE]:

@@ -1,7 +1,7 @@
 """
 A finished calibration with the data for a report, for any kind of reference.
 
-Its summary and its exit code.
+With its summary.
 """
 
 from abc import ABC, abstractmethod
@@ -11,9 +11,8 @@ from typing import ClassVar
 import numpy as np
 
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.decision import HELPS, Verdict, most_cautious
+from imu_calibration.document.decision import Verdict
 from imu_calibration.document.trust import usage
-from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
@@ -132,20 +131,3 @@ def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> l
     """
     hint = usage(result.calibration)
     return [*result.verdict.lines(hints), *[hint] * bool(hint)]
-
-
-def exit_code(calibration: Calibration) -> int:
-    """
-    Return 0 when the calibration of every sensor is complete, else 3.
-
-    It is 0 when each sensor helps, every requested parameter is determined and no data were lost.
-    """
-    harmful = most_cautious(calibration.decisions.values()) is not HELPS
-    lacking = harmful or any(status != DETERMINED for status in calibration.requested.values())
-    return (
-        3
-        if lacking
-        or calibration.statistics.get('dropped')
-        or calibration.statistics.get('unusable')
-        else 0
-    )

@@ -1,7 +1,7 @@
 """Calibration on a table, and the check of a calibration on another recording."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -30,7 +30,16 @@ from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import TemperatureSamples
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.decision import HELPS, decide, reason_of, worse_regimes
+from imu_calibration.document.decision import (
+    HELPS,
+    UNPROVEN,
+    SensorDecision,
+    decide,
+    most_cautious,
+    reason_of,
+    worse_regimes,
+)
+from imu_calibration.document.outcome import exit_code_of
 from imu_calibration.document.trust import end_of, judged_from_of, uncorrected_on_table
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
@@ -337,6 +346,8 @@ class CheckResult:
     """Why there is no proof, where there is none."""
     notes: tuple[str, ...] = ()
     """Notes on the result."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Sensor of which compensation refuses the values -> why."""
 
     @property
     def helps(self) -> bool:
@@ -346,12 +357,34 @@ class CheckResult:
     @property
     def exit_code(self) -> int:
         """0 where the decision on each sensor is `helps`, otherwise 3."""
-        return 0 if self.helps else 3
+        return exit_code_of(self.reasons)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        if not self.proof:
+            return self.lines
+        return [
+            self._line(sensor, entry)
+            for sensor, entry in self.proof.items()
+            if sensor not in self.helped
+        ]
+
+    def decision(self, sensor: str) -> SensorDecision:
+        """Return the decision on a sensor; at best UNPROVEN where compensation refuses it."""
+        found = decide(self.proof.get(sensor))
+        return most_cautious([found, UNPROVEN]) if sensor in self.refused else found
+
+    def _line(self, sensor, entry):
+        why = f'; not applied: {self.refused[sensor]}' if sensor in self.refused else ''
+        return f'{sensor} {self.decision(sensor)}: {reason_of(entry)}{why}'
 
     @property
     def helped(self) -> dict[str, Any]:
         """The entries of the proof of the sensors that it helps."""
-        return {sensor: entry for sensor, entry in self.proof.items() if decide(entry) is HELPS}
+        return {
+            sensor: entry for sensor, entry in self.proof.items() if self.decision(sensor) is HELPS
+        }
 
     @property
     def lines(self) -> list[str]:
@@ -359,10 +392,7 @@ class CheckResult:
         if not self.proof:
             return [f'unproven: {self.why}']
         return [
-            *(
-                f'{sensor} {decide(entry)}: {reason_of(entry)}'
-                for sensor, entry in self.proof.items()
-            ),
+            *(self._line(sensor, entry) for sensor, entry in self.proof.items()),
             *(
                 f'{sensor}: {line}'
                 for sensor, entry in self.proof.items()

@@ -38,4 +38,4 @@ def run(options: Options) -> VerbResult:
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report)
         show_calibration(found, folder, options.hints(), report=not options.no_report)
-        return VerbResult(found.exit_code, to_mapping(found.calibration))
+        return VerbResult(found.exit_code, to_mapping(found.calibration), found.reasons)

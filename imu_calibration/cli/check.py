@@ -48,4 +48,4 @@ def run(options: Options) -> VerbResult:
             )
     show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
     out.print(str(found))
-    return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps})
+    return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps}, found.reasons)

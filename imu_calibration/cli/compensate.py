@@ -81,4 +81,5 @@ def run(options: Options) -> VerbResult:
             'warnings': list(found.warnings),
             'lost': found.lost,
         },
+        found.reasons,
     )

@@ -52,4 +52,4 @@ def run(options: Options) -> VerbResult:
             f'written: diagnosis.json, calibration.yaml and report.html{also} in {folder}',
         ):
             print_line(line)
-        return VerbResult(found.exit_code, found.document)
+        return VerbResult(found.exit_code, found.document, found.reasons)

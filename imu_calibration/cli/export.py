@@ -62,7 +62,9 @@ def run(options: Options) -> VerbResult:
     )
     for line in (*found.lines, f'written: {options.output}'):
         print_line(line)
-    return VerbResult(found.exit_code, {'output': options.output, 'lines': found.lines})
+    return VerbResult(
+        found.exit_code, {'output': options.output, 'lines': found.lines}, found.reasons
+    )
 
 
 def _show_targets():

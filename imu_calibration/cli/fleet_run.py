@@ -158,6 +158,7 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     return VerbResult(
         3 if any(result.exit_code for result in results) else 0,
         {'units': rows['units.csv'], 'parameters': rows['summary.csv']},
+        [f'{result.name}: {line}' for result in results for line in result.reasons],
     )
 
 

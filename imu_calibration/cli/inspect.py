@@ -51,7 +51,7 @@ def run(options: Options) -> VerbResult:
     out = Terminal.of()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints)
-    codes = []
+    codes, reasons = [], []
     for look in looks:
         out.print()
         if len(looks) > 1:
@@ -62,7 +62,9 @@ def run(options: Options) -> VerbResult:
         show_findings(out, look.findings, hints)
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
-        codes.append(max(look.exit_code, _judge(out, look, hints)))
+        code, more = _judge(out, look, hints)
+        codes.append(max(look.exit_code, code))
+        reasons += [*look.reasons, *more]
         if look.by_hand is not None:
             _show_by_hand(out, look.by_hand, hints)
     if set(codes) == {1}:  # no topic is usable: also one line on standard error, as every refusal
@@ -73,6 +75,7 @@ def run(options: Options) -> VerbResult:
             'topics': [asdict(topic) for topic in looks[0].recording.topics],
             'imu': [_document(look) for look in looks],
         },
+        reasons if any(codes) else (),
     )
 
 
@@ -158,15 +161,16 @@ def _step(step_ns):
 
 
 def _judge(out, look, hints):
-    """Print which motions were found and which parameters they determine; return the exit code."""
-    from imu_calibration.calibration.result import exit_code
+    """Print the motions and parameters that were found; return (exit code, its reasons)."""
+    from imu_calibration.document.outcome import exit_code, shortcomings
 
     result = look.calibrated
     if result is None or look.refused:
-        return 0
+        return 0, []
     if isinstance(result, ImuCalibrationError):
-        out.print(f'not usable for calibration: {result.with_hint(hints)}')
-        return 3
+        why = f'not usable for calibration: {result.with_hint(hints)}'
+        out.print(why)
+        return 3, [why]
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
         out.print(
@@ -174,7 +178,7 @@ def _judge(out, look, hints):
             ' samples'
         )
     _show_parameters(out, result.calibration)
-    return exit_code(result.calibration)
+    return exit_code(result.calibration), shortcomings(result.calibration)
 
 
 def _show_by_hand(out, found, hints):

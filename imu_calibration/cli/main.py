@@ -135,7 +135,7 @@ def run(options: Namespace) -> int:
     from imu_calibration.core.errors import ImuCalibrationError, printable
     from imu_calibration.core.progress import listening
 
-    prog = f'imu_calibration {options.verb}'
+    prog, reasons = f'imu_calibration {options.verb}', ()
     try:
         with contextlib.ExitStack() as stack:
             if options.json or options.quiet:
@@ -144,7 +144,7 @@ def run(options: Namespace) -> int:
                 stack.enter_context(
                     listening(stack.enter_context(ProgressBars(verbose=options.verbose)))
                 )
-            code, document = options.run(options)
+            code, document, reasons = options.run(options)
     except BrokenPipeError:
         sys.stdout = None  # a later flush would fail again
         return 1
@@ -164,8 +164,11 @@ def run(options: Namespace) -> int:
         code, document = 1, {'error': text, 'key': key, 'code': name}
     except KeyboardInterrupt:
         return _interrupted(prog)
+    if options.quiet:
+        for reason in reasons:
+            complain(f'{prog}: exit code {code}: {printable(reason)}')
     if options.json:
-        print(json_text(options.verb, code, document))
+        print(json_text(options.verb, code, document, reasons))
     return code
 
 
@@ -177,16 +180,18 @@ def _interrupted(prog):
 CLI_FORMAT = 'imu_calibration/cli/1'
 
 
-def json_text(verb: str, exit_code: int, document: Mapping[str, Any]) -> str:
+def json_text(
+    verb: str, exit_code: int, document: Mapping[str, Any], reasons: Sequence[str] = ()
+) -> str:
     """
-    Return one JSON document: format, verb, exit code, and the result or the error.
+    Return one JSON document: format, verb, exit code, its reasons, and the result or the error.
 
     Numbers that are not finite become null.
     """
     from imu_calibration.core.documents import json_types
 
     part = 'error' if 'error' in document else 'result'
-    return json.dumps(
-        {'format': CLI_FORMAT, 'verb': verb, 'exit_code': exit_code, part: json_types(document)},
-        allow_nan=False,
-    )
+    content = {'format': CLI_FORMAT, 'verb': verb, 'exit_code': exit_code}
+    if reasons:
+        content['reasons'] = list(reasons)
+    return json.dumps({**content, part: json_types(document)}, allow_nan=False)

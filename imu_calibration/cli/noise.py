@@ -64,7 +64,7 @@ def run(options: Options) -> VerbResult:
             folder,
             'noise.yaml' + ('' if options.no_report else ' and report.html'),
         )
-        return VerbResult(found.exit_code, to_mapping(found.figures, found.horizon))
+        return VerbResult(found.exit_code, to_mapping(found.figures, found.horizon), found.reasons)
 
 
 def _show(found, rates, folder, names):

@@ -95,6 +95,8 @@ class VerbResult(NamedTuple):
     """See `EXIT_CODES`."""
     document: Mapping[str, Any] = {}
     """The result as data, printed by --json."""
+    reasons: Sequence[str] = ()
+    """Why the exit code is 3, a line each; printed with --quiet, and part of --json."""
 
 
 BAG = 'rosbag2 folder, .db3, .mcap, ROS 1 .bag, text (.csv)'

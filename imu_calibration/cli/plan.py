@@ -115,7 +115,7 @@ def run(options: Options) -> VerbResult:
             )
         made.save(folder, report=not options.no_report, storage=options.storage)
     _show(made, folder)
-    return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance))
+    return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance), made.reasons)
 
 
 def _pose(text):

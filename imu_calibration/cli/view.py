@@ -40,4 +40,5 @@ def run(options: Options) -> VerbResult:
     return VerbResult(
         found.exit_code,
         {'output': str(options.output), 'layout': str(layout), 'lacks': found.lacks},
+        found.reasons,
     )

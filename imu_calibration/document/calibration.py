@@ -4,7 +4,7 @@ The calibration: parameters with covariance, statuses, reasons, nominal values a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
@@ -15,6 +15,8 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, significant, with_sd
 from imu_calibration.document.decision import (
     BY_DEFINITION,
+    HARMS,
+    UNPROVEN,
     SensorDecision,
     Verdict,
     decide,
@@ -168,30 +170,32 @@ class Calibration:
         """
         Sensor -> decision: the more cautious of that in the file and that of the proof.
 
-        UNPROVEN without both.
+        UNPROVEN without both, and at best UNPROVEN where compensation refuses the values.
         """
         found = {}
         for sensor in SENSORS:
             known = [SensorDecision(self.decision[sensor])] if sensor in self.decision else []
-            found[sensor] = most_cautious(
-                [*known, decide(self.proof.get(sensor))]
-                if self.proof.get(sensor) or not known
-                else known
-            )
+            if self.proof.get(sensor) or not known:
+                known.append(decide(self.proof.get(sensor)))
+            if beyond_instruments(self, sensor):
+                known.append(UNPROVEN)
+            found[sensor] = most_cautious(known)
+        if needs_accelerometer(self, found):
+            found['gyroscope'] = most_cautious([found['gyroscope'], UNPROVEN])
         return found
 
     @property
     def requested(self) -> dict[str, str]:
         """
-        Status of the requested parameters and of the common scale, by name.
+        Status of the requested parameters of the sensors and of the common scale, by name.
 
-        Table, clock and the common arm are nuisances.
+        Table, clock and the common arm are nuisances: they belong to the reference.
         """
         nuisances = set(np.array(self.param_names)[~self.model.requested])
         return {
             name: status
             for name, status in self.status_by_name.items()
-            if name not in nuisances and status != FIXED
+            if name not in nuisances and status != FIXED and name.partition('.')[0] in SENSORS
         }
 
     def compensate(
@@ -229,7 +233,7 @@ class Calibration:
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
     def __repr__(self):
-        known = list(self.status_by_name.values())
+        known = list(self.requested.values())
         counts = ', '.join(
             f'{known.count(status)} {status}' for status in Status if status in known
         )
@@ -419,6 +423,28 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
             f'a bias must be within full scale ({significant(LARGEST_BIAS[sensor])} SI), it is'
             f' {significant(np.abs(bias).max())}'
         )
+    return ''
+
+
+def needs_accelerometer(calibration: Calibration, decisions: Mapping[str, SensorDecision]) -> bool:
+    """Return whether the gyroscope cannot be corrected: its axes by hand are not available."""
+    if calibration.gauge.get('axes') != HAND_AXES:
+        return False
+    return bool(
+        decisions['accelerometer'] is HARMS or beyond_instruments(calibration, 'accelerometer')
+    )
+
+
+AXES_MISSING = 'its axes depend on the accelerometer'
+"""Why compensation refuses the gyroscope of a calibration by hand."""
+
+
+def never_applied(calibration: Calibration, sensor: str) -> str:
+    """Return why compensation refuses the values of a sensor; '' where it does not."""
+    if why := beyond_instruments(calibration, sensor):
+        return why
+    if sensor == 'gyroscope' and needs_accelerometer(calibration, calibration.decisions):
+        return AXES_MISSING
     return ''
 
 

@@ -9,13 +9,14 @@ import numpy as np
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import (
+    AXES_MISSING,
     HAND_AXES,
     Calibration,
     beyond_instruments,
-    listed,
     with_nominal,
 )
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, reason_of
+from imu_calibration.document.outcome import missing
 from imu_calibration.effects.base import SENSORS, UNITS, Effect
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
@@ -303,7 +304,7 @@ def refused_sensors(
         ):
             refused[sensor] = why
     if 'accelerometer' in refused and calibration.gauge.get('axes') == HAND_AXES:
-        refused.setdefault('gyroscope', 'its axes depend on the accelerometer')
+        refused.setdefault('gyroscope', AXES_MISSING)
     return refused
 
 
@@ -344,18 +345,8 @@ def caveats(calibration: Calibration) -> list[str]:
     """
     Return the caveats for a user of the calibration in addition to the decisions, a line each.
     """
-    return uncorrected_lines(calibration.statistics) + (
-        [text] if (text := missing(calibration)) else []
-    )
-
-
-def missing(calibration: Calibration) -> str:
-    """Return which parameters are not determined, as text; '' when all are."""
-    known = calibration.status_by_name
-    names = [name for name, status in known.items() if status in LACKING]
-    return (
-        f'{len(names)} of {len(known)} parameters not determined ({listed(names)})' if names else ''
-    )
+    text = missing(calibration)
+    return uncorrected_lines(calibration.statistics) + ([text] if text else [])
 
 
 def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Calibration:

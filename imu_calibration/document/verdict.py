@@ -10,9 +10,12 @@ from imu_calibration.document.calibration import (
     HAND_AXES,
     SHOWN_NAMES,
     Calibration,
+    beyond_instruments,
     beyond_known,
     implausible,
     listed,
+    needs_accelerometer,
+    never_applied,
 )
 from imu_calibration.document.decision import (
     DECISION,
@@ -25,9 +28,16 @@ from imu_calibration.document.decision import (
     Verdict,
     decide,
     lines_of,
+    most_cautious,
     reason_of,
     same_directions,
     worse_regimes,
+)
+from imu_calibration.document.outcome import (
+    dropped_of,
+    dropped_text,
+    is_complete,
+    parameter_count,
 )
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
@@ -323,16 +333,13 @@ def _left_out(calibration):
 
 
 def _lost(calibration):
-    dropped = calibration.statistics.get('dropped')
+    dropped = dropped_of(calibration)[0]
     if not dropped:
         return []
-    total, used = (
-        sum(dropped.values()),
-        sum((calibration.statistics.get('samples_used') or {}).values()),
-    )
     text = 'dropped: ' + ', '.join(f'{count} {reason}' for reason, count in dropped.items())
-    many = total > LOST_SHARE * max(used, 1)
-    return [Reason(NOTE, text, 'find the cause' if many else '', key='inspect')]
+    if many := dropped_text(*dropped_of(calibration)):
+        return [Reason(WARNING, many, 'find the cause', key='inspect')]
+    return [Reason(NOTE, text, '')]
 
 
 def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
@@ -351,25 +358,20 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         Largest standard deviation of a determined parameter.
 
     """
-    decisions = {sensor: _decision(calibration, sensor) for sensor in SENSORS}
-    found = list(calibration.requested.values())
-    share = np.where(calibration.model.requested, calibration.own_sd / tolerances, 0.0)
+    decisions = _decisions(calibration)
+    count = parameter_count(calibration)
+    counted = np.array([name in calibration.requested for name in calibration.param_names])
+    share = np.where(counted, calibration.own_sd / tolerances, 0.0)
     worst = int(np.argmax(share))
-    limiting = (calibration.param_names[worst], float(share[worst])) if found else ('', 0.0)
+    limiting = ('', 0.0)
+    if count.requested:
+        limiting = (calibration.param_names[worst], float(share[worst]))
     if common := calibration.common_scale:
         limiting = max(
             limiting, (COMMON_SCALE, common['sd'] / common['tolerance']), key=lambda pair: pair[1]
         )
-    within = found.count(DETERMINED)
     reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
-    reasons.append(
-        _parameters(
-            calibration,
-            within,
-            limiting,
-            complete=within == len(found) and set(decisions.values()) == {HELPS},
-        )
-    )
+    reasons.append(_parameters(count, limiting, complete=is_complete(decisions, count)))
     reasons += (
         _undetermined(calibration)
         + _blind(calibration)
@@ -387,8 +389,8 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     return Verdict(
         decisions,
         (*reasons, *_left_out(calibration), *_lost(calibration)),
-        within,
-        len(found),
+        count.determined,
+        count.requested,
         limiting,
     )
 
@@ -429,9 +431,18 @@ def _decided(calibration, sensor, word):
     )
 
 
-def _decision(calibration, sensor):
-    found = decide(calibration.proof.get(sensor))
-    return UNPROVEN if found is HELPS and _periodic(calibration, sensor) else found
+def _decisions(calibration):
+    """Return sensor -> decision; at best UNPROVEN for an uncertain clock or refused values."""
+    found = {}
+    for sensor in SENSORS:
+        word = decide(calibration.proof.get(sensor))
+        doubtful = _periodic(calibration, sensor) or beyond_instruments(calibration, sensor)
+        if word is HELPS and doubtful:
+            word = UNPROVEN
+        found[sensor] = word
+    if needs_accelerometer(calibration, found):
+        found['gyroscope'] = most_cautious([found['gyroscope'], UNPROVEN])
+    return found
 
 
 def _reason(calibration, sensor):
@@ -439,7 +450,10 @@ def _reason(calibration, sensor):
         '; unproven, because stamps that are late by a period of this motion without rests would'
         ' give the same errors'
     )
-    return reason_of(calibration.proof.get(sensor)) + more * _periodic(calibration, sensor)
+    reason = reason_of(calibration.proof.get(sensor)) + more * _periodic(calibration, sensor)
+    if why := never_applied(calibration, sensor):
+        reason += f'; not applied: {why}'
+    return reason
 
 
 def _periodic(calibration, sensor):
@@ -453,12 +467,12 @@ def _periodic(calibration, sensor):
     )
 
 
-def _parameters(calibration, within, limiting, *, complete):
+def _parameters(count, limiting, *, complete):
     name, share = limiting
     limit = f'; limiting: {name}, its sd is {share:.2g} of its tolerance' if name else ''
     return Reason(
         PARAMETERS,
-        f'{within} of {len(calibration.requested)} parameters are within their tolerance{limit}',
+        f'{count.determined} of {count.requested} parameters are within their tolerance{limit}',
         "compensate with it: 'imu_calibration compensate', or compensator_node" if complete else '',
     )
 

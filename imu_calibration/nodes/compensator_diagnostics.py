@@ -10,7 +10,7 @@ from imu_calibration.compensation.compensate import outside_conditions
 from imu_calibration.compensation.health import FOLLOWED, HARMS, HOLDS, MOVED, UNIT, WAITING
 from imu_calibration.core.units import HOTTEST_C
 from imu_calibration.document.decision import decisions_text
-from imu_calibration.estimation.solution import LACKING
+from imu_calibration.document.outcome import parameter_count
 from imu_calibration.nodes.adoption import Adopted
 from imu_calibration.nodes.diagnostics import (
     ERROR,
@@ -277,12 +277,13 @@ class CompensatorDiagnostics:
         if adopted is None:
             return values
         calibration, compensation = adopted.calibration, adopted.compensation
+        count = parameter_count(calibration)
         values |= {
             'decision': decisions_text(calibration.decisions),
             'not corrected': ', '.join(adopted.used.refused) or 'none',
             'date': calibration.conditions.get('date', ''),
-            'parameters': len(calibration.status),
-            'not determined': sum(status in LACKING for status in calibration.status),
+            'parameters': count.requested,
+            'not determined': len(count.lacking),
             'messages': compensation.received,
             'corrected': compensation.corrected,
             **compensation.counts,

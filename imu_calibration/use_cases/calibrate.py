@@ -18,16 +18,18 @@ from imu_calibration.calibration.hand_workflow import (
     check_by_hand,
     gravity_of,
 )
-from imu_calibration.calibration.result import CalibrationResult, exit_code, summary
+from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration import Calibration, never_applied
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import Verdict
+from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.document.verdict import judged
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import Choices, inputs_of, made_from, provenance_with
 from imu_calibration.use_cases.recordings import (
@@ -61,11 +63,17 @@ class Calibrated:
         return self.result.verdict
 
     @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        return shortcomings(self.calibration)
+
+    @property
     def exit_code(self) -> int:
         """
         0 when each sensor helps and nothing is missing, otherwise 3.
 
-        Nothing is missing when every requested parameter is determined and no message was lost.
+        Nothing is missing when every requested parameter of the sensors is determined and at most
+        1 % of the samples were dropped.
         """
         return exit_code(self.calibration)
 
@@ -256,7 +264,8 @@ def check(
             ),
             (),
         )
-    return replace(result, notes=(*notes, *_notes(recording, calibration)))
+    refused = {sensor: why for sensor in SENSORS if (why := never_applied(calibration, sensor))}
+    return replace(result, notes=(*notes, *_notes(recording, calibration)), refused=refused)
 
 
 def _gravity(options, calibration):

@@ -17,6 +17,7 @@ from imu_calibration.core.progress import counter
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.outcome import dropped_text, exit_code_of
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
 from imu_calibration.use_cases.choices import noise_of
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
@@ -52,10 +53,19 @@ class Compensated:
         """
         0 when all is corrected, otherwise 3.
 
-        The code is 3 when part of it could not be read, or when the decision on a sensor is not
+        The code is 3 when more than 1 % could not be read, or when the decision on a sensor is not
         `helps`.
         """
-        return 3 if self.lost or self.refused or self.cautions else 0
+        return exit_code_of(self.reasons)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        lines = [f'the {sensor} is not corrected: {why}' for sensor, why in self.refused.items()]
+        lines += self.cautions
+        if lost := dropped_text(self.lost, self.count):
+            lines.append(lost)
+        return lines
 
     def __repr__(self):
         return '\n'.join([f'<Compensated: {self.count} samples>', *self.warnings])

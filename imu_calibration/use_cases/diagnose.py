@@ -11,12 +11,12 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
     diagnose_recording,
     diagnose_without_table,
 )
-from imu_calibration.calibration.result import exit_code
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import Choices, inputs_of, provenance_with
 from imu_calibration.use_cases.recordings import Stand
@@ -59,8 +59,13 @@ class Diagnosed:
         return self.result.document
 
     @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        return shortcomings(self.calibration)
+
+    @property
     def exit_code(self) -> int:
-        """0 when every requested parameter is determined and no message was lost, otherwise 3."""
+        """That of the calibration."""
         return exit_code(self.calibration)
 
     def plot(self, number: int = 1) -> Drawn:

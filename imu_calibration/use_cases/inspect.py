@@ -18,6 +18,7 @@ from imu_calibration.calibration.hand_workflow import (
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.document.outcome import dropped_text, exit_code_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
@@ -61,15 +62,21 @@ class RecordingSummary:
         """
         1 where a calibration would be wrong, 3 where it may suffer, otherwise 0.
 
-        The code is also 3 where data are lost or unusable.
+        The code is also 3 where more than 1 % of the data are lost or unusable.
         """
-        # Whether spikes need a warning is decided in the findings.
-        dropped = any(set(stream.dropped) - {'spike'} for stream in self.streams.values())
-        if self.refused:
-            return 1
-        return (
-            3 if self.lost or dropped or unusable(self.findings) or warnings(self.findings) else 0
-        )
+        return 1 if self.refused else exit_code_of(self.reasons)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is not 0, a line each."""
+        lines = [finding.text for finding in warnings(self.findings)]
+        received = self.streams['imu'].count if 'imu' in self.streams else 0
+        dropped = dict(self.lost)
+        if count := unusable(self.findings):
+            dropped['unusable'] = count
+        if lost := dropped_text(dropped, received):
+            lines.append(lost)
+        return lines
 
 
 def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 
-from imu_calibration.allan.document import exit_code, lines, noise_to_text
+from imu_calibration.allan.document import exit_code, lines, noise_to_text, shortcomings
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
 from imu_calibration.core.progress import report
@@ -33,8 +33,13 @@ class IdentifiedNoise:
 
     @property
     def exit_code(self) -> int:
-        """0 when every required figure is determined and no message was lost, otherwise 3."""
+        """0 when every required figure is determined and few messages were lost, otherwise 3."""
         return exit_code(self.figures)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        return shortcomings(self.figures)
 
     @property
     def warnings(self) -> tuple[str, ...]:

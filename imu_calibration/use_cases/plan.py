@@ -17,7 +17,8 @@ from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.progress import report
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration import Calibration, listed
+from imu_calibration.document.outcome import exit_code_of
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
 from imu_calibration.estimation.solution import tolerances_of
@@ -71,9 +72,17 @@ class Planned:
 
         A joint is bounded when it has a range or is declared endless.
         """
-        return (
-            3 if self.plan.missing or (self.table is not None and missing_ranges(self.table)) else 0
-        )
+        return exit_code_of(self.reasons)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        lines = []
+        if self.plan.missing:
+            lines.append(f'above the tolerance after this plan: {listed(self.plan.missing)}')
+        if self.table is not None and (unbounded := missing_ranges(self.table)):
+            lines.append(f'joints without a range: {", ".join(unbounded)}')
+        return lines
 
     @property
     def notes(self) -> list[str]:

@@ -23,12 +23,13 @@ from imu_calibration.calibration.coverage import (
 from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.calibration.hand_workflow import HandResult
 from imu_calibration.calibration.live_poses import EMPTY_SCAN, hand_coverage
-from imu_calibration.calibration.result import CalibrationResult, exit_code
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.references.gravity.hand_parameters import HandOptions
@@ -395,6 +396,11 @@ class View:
     """The sphere; None where only a file is known."""
     seconds: float = 0.0
     """Until the middle of the last window."""
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        return shortcomings(self.calibration)
 
     @property
     def exit_code(self) -> int:

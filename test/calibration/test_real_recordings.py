@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
-from imu_calibration.calibration.result import exit_code
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.core.documents import from_text
+from imu_calibration.document.outcome import exit_code
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from msg_adapters.bag import open_recording

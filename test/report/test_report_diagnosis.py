@@ -15,10 +15,10 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
-from imu_calibration.calibration.result import exit_code
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import DECISION, PARAMETERS
+from imu_calibration.document.outcome import exit_code
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table

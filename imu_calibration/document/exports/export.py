@@ -33,6 +33,7 @@ from imu_calibration.document.exports.loss import (
     standard_motion,
 )
 from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
+from imu_calibration.document.outcome import exit_code_of
 from imu_calibration.document.trust import Usable, caveats, usable
 from imu_calibration.effects.base import SENSORS, UNITS, Role
 
@@ -57,7 +58,12 @@ class Export:
     @property
     def exit_code(self) -> int:
         """0 written, 3 without the numbers of one sensor."""
-        return 3 if self.refused else 0
+        return exit_code_of(self.reasons)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        return [f'the {sensor} is not corrected: {why}' for sensor, why in self.refused.items()]
 
 
 def export(

@@ -1,0 +1,123 @@
+"""
+Outcome of a calibration: parameters that count, samples left out, and the exit code.
+
+Verbs, nodes, exports and reports use these functions, so that they agree.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from imu_calibration.document.calibration import Calibration, listed, never_applied
+from imu_calibration.document.decision import HELPS, SensorDecision, reason_of
+from imu_calibration.estimation.solution import DETERMINED
+
+DROPPED_SHARE = 0.01
+"""Share of the samples up to which dropped samples are a note; above it the exit code is 3."""
+COMPLETE, INCOMPLETE = 0, 3
+"""Exit codes of a result: complete, or written with reasons why it is not."""
+
+
+@dataclass(frozen=True)
+class ParameterCount:
+    """Requested parameters of the sensors: how many, and which are not determined."""
+
+    requested: int
+    """Requested parameters; those of the reference do not count."""
+    lacking: tuple[str, ...]
+    """Names of those that are weak or held."""
+
+    @property
+    def determined(self) -> int:
+        """Requested parameters that are determined."""
+        return self.requested - len(self.lacking)
+
+    @property
+    def text(self) -> str:
+        """The count as it is printed everywhere."""
+        return f'{self.determined} of {self.requested} parameters determined'
+
+
+def parameter_count(calibration: Calibration) -> ParameterCount:
+    """Return the count of the requested parameters of the sensors."""
+    requested = calibration.requested
+    lacking = tuple(name for name, status in requested.items() if status != DETERMINED)
+    return ParameterCount(len(requested), lacking)
+
+
+def missing(calibration: Calibration) -> str:
+    """Return which requested parameters are not determined, as text; '' when all are."""
+    count = parameter_count(calibration)
+    if not count.lacking:
+        return ''
+    return (
+        f'{len(count.lacking)} of {count.requested} parameters not determined'
+        f' ({listed(count.lacking)})'
+    )
+
+
+def is_complete(decisions: Mapping[str, SensorDecision], count: ParameterCount) -> bool:
+    """Return whether every sensor helps and every requested parameter is determined."""
+    return set(decisions.values()) == {HELPS} and not count.lacking
+
+
+def dropped_text(dropped: Mapping[str, int], kept: int) -> str:
+    """
+    Return why dropped samples make a result incomplete; '' up to DROPPED_SHARE of the samples.
+
+    Parameters
+    ----------
+    dropped : mapping
+        Reason -> samples that were not used because of a fault.
+    kept : int
+        Samples without a fault.
+
+    """
+    count = sum(dropped.values())
+    share = count / max(count + kept, 1)
+    if share <= DROPPED_SHARE:
+        return ''
+    reasons = ', '.join(f'{number} {reason}' for reason, number in dropped.items() if number)
+    return (
+        f'{100 * share:.2g} % of the samples are dropped, more than {100 * DROPPED_SHARE:g} %:'
+        f' {reasons}'
+    )
+
+
+def dropped_of(calibration: Calibration) -> tuple[dict[str, int], int]:
+    """Return (reason -> dropped samples, samples without a fault) of a calibration."""
+    statistics = calibration.statistics
+    dropped = dict(statistics.get('dropped') or {})
+    if unusable := statistics.get('unusable'):
+        dropped['unusable'] = unusable
+    # samples between windows have no fault: they count as kept
+    kept = sum((statistics.get('samples_used') or {}).values())
+    kept += sum((statistics.get('stream') or {}).values())
+    return dropped, kept
+
+
+def shortcomings(calibration: Calibration) -> list[str]:
+    """Return the reasons for which the exit code is 3, a line each; empty for 0."""
+    lines = []
+    for sensor, word in calibration.decisions.items():
+        if word is not HELPS:
+            why = never_applied(calibration, sensor) or calibration.decision_reasons.get(sensor)
+            lines.append(f'{sensor} {word}: {why or reason_of(calibration.proof.get(sensor))}')
+    for line in (missing(calibration), dropped_text(*dropped_of(calibration))):
+        if line:
+            lines.append(line)
+    return lines
+
+
+def exit_code_of(reasons: Sequence[str]) -> int:
+    """Return 3 when there are reasons why a result is incomplete, otherwise 0."""
+    return INCOMPLETE if reasons else COMPLETE
+
+
+def exit_code(calibration: Calibration) -> int:
+    """
+    Return 0 when the calibration of every sensor is complete, else 3.
+
+    It is 0 when each sensor helps, every requested parameter of the sensors is determined and at
+    most DROPPED_SHARE of the samples were dropped.
+    """
+    return exit_code_of(shortcomings(calibration))

@@ -1,0 +1,122 @@
+"""One rule for the decision, the counts, the next step and the exit code of a calibration."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.cli.main import main
+from imu_calibration.document.calibration import HAND_AXES, true_calibration
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.decision import HELPS, UNPROVEN
+from imu_calibration.document.outcome import (
+    dropped_text,
+    exit_code,
+    missing,
+    parameter_count,
+    shortcomings,
+)
+from imu_calibration.document.trust import caveats, refused_sensors
+from imu_calibration.document.verdict import judge
+from imu_calibration.effects.sensor_model import SensorModel
+
+PROOF = {
+    sensor: {
+        'before': 1.0,
+        'after': 0.1,
+        'ci95': [0.05, 0.2],
+        'unit': unit,
+        'windows': 30,
+    }
+    for sensor, unit in (('accelerometer', 'm/s^2'), ('gyroscope', 'rad/s'))
+}
+
+
+def proven(model=None, **changes):
+    """Return a calibration that helps each sensor, with all parameters determined."""
+    model = model or SensorModel(('bias', 'matrix'), ('bias', 'matrix'))
+    values = changes.pop('values', model.start())
+    found = true_calibration(model, values, 'imu', simulated={})
+    covariance = np.eye(len(values)) * 1e-8
+    return replace(
+        found,
+        covariance=covariance,
+        proof=PROOF,
+        decision={},
+        decision_reasons={},
+        **changes,
+    )
+
+
+def with_scale(scale, **changes):
+    """Return a proven calibration with one scale factor of the accelerometer."""
+    model = SensorModel(('bias', 'matrix'), ('bias', 'matrix'))
+    values = model.start()
+    values[model.param_names.index('accelerometer.matrix.xx')] = scale
+    return proven(model, values=values, **changes)
+
+
+def verdict_of(calibration):
+    """Return its verdict with tolerances that all standard deviations meet."""
+    return judge(calibration, np.ones(len(calibration.values)))
+
+
+@pytest.mark.parametrize('count, code', [(4, 0), (150, 0), (170, 3)])
+def test_few_dropped_samples_do_not_change_the_exit_code(count, code):
+    found = proven(statistics={'dropped': {'imu spike': count}, 'samples_used': {'all': 16_000}})
+    assert exit_code(found) == code
+    assert [str(count) in line for line in shortcomings(found)] == [True] * (code == 3)
+    assert bool(dropped_text({'imu spike': count}, 16_000)) == (code == 3)
+
+
+def test_a_sensor_that_compensation_refuses_never_helps():
+    good, bad = with_scale(1.02), with_scale(3.0)
+    assert set(good.decisions.values()) == {HELPS} and not refused_sensors(good)
+    assert bad.decisions == {'accelerometer': UNPROVEN, 'gyroscope': HELPS}
+    assert verdict_of(bad).decisions == bad.decisions and list(refused_sensors(bad)) == [
+        'accelerometer'
+    ]
+    assert exit_code(good) == 0 and exit_code(bad) == 3
+    steps = [
+        [reason.next for reason in verdict_of(each).reasons if 'compensate' in reason.next]
+        for each in (good, bad)
+    ]
+    assert [len(each) for each in steps] == [1, 0]
+    stated = replace(bad, decision=dict.fromkeys(PROOF, 'helps'))  # as in an earlier file
+    assert stated.decisions['accelerometer'] is UNPROVEN and exit_code(stated) == 3
+
+
+def test_by_hand_the_gyroscope_does_not_help_without_the_axes_of_the_accelerometer():
+    bad = with_scale(3.0, gauge={'axes': HAND_AXES})
+    assert set(bad.decisions.values()) == {UNPROVEN} == set(verdict_of(bad).decisions.values())
+    assert set(refused_sensors(bad)) == set(PROOF)
+
+
+def test_parameters_of_the_reference_do_not_count():
+    model = SensorModel(
+        ('bias', 'matrix'), ('bias', 'matrix'), reference=('time_offset', 'encoder_zero')
+    )
+    status = [
+        'held' if name.startswith('reference.') else 'determined' for name in model.param_names
+    ]
+    found = proven(model, status=tuple(status))
+    count = parameter_count(found)
+    own = [name for name in model.param_names if not name.startswith('reference.')]
+    assert (count.determined, count.requested) == (len(own), len(own))
+    verdict = verdict_of(found)
+    assert (verdict.within, verdict.requested) == (len(own), len(own)) and verdict.complete
+    assert missing(found) == '' and caveats(found) == [] and exit_code(found) == 0
+    assert f'{len(own)} determined' in repr(found) and 'held' not in repr(found)
+
+
+def test_quiet_and_json_list_the_reasons_of_a_3(tmp_path, capsys):
+    path = tmp_path / 'calibration.yaml'
+    path.write_text(calibration_to_text(with_scale(3.0)))
+    arguments = ['export', str(path), '--to', 'kalibr', '--output']
+    assert main([*arguments, str(tmp_path / 'a.yaml'), '--json']) == 3
+    reasons = json.loads(capsys.readouterr().out)['reasons']
+    assert len(reasons) == 1 and 'accelerometer' in reasons[0]
+    assert main([*arguments, str(tmp_path / 'b.yaml'), '--quiet']) == 3
+    printed = capsys.readouterr()
+    assert printed.out == '' and reasons[0] in printed.err
