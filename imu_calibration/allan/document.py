@@ -20,8 +20,8 @@ from imu_calibration.allan.terms import GAUSS_MARKOV, TIME_KEY, Term
 from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.core.documents import finite, from_text, to_text
 from imu_calibration.core.errors import DocumentError
+from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.units import NOISE_QUANTITY, STANDARD_GRAVITY, for_people, significant
-from imu_calibration.document.outcome import dropped_text, exit_code_of
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
 

@@ -27,6 +27,7 @@ from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.compensation.compensate import invertible
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import TemperatureSamples
 from imu_calibration.document.calibration import Calibration
@@ -39,7 +40,6 @@ from imu_calibration.document.decision import (
     reason_of,
     worse_regimes,
 )
-from imu_calibration.document.outcome import exit_code_of
 from imu_calibration.document.trust import end_of, judged_from_of, uncorrected_on_table
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel

@@ -168,7 +168,7 @@ def run(options: Namespace) -> int:
         for reason in reasons:
             complain(f'{prog}: exit code {code}: {printable(reason)}')
     if options.json:
-        print(json_text(options.verb, code, document, reasons))
+        print(json_text(options.verb, code, document, reasons=reasons))
     return code
 
 
@@ -181,7 +181,7 @@ CLI_FORMAT = 'imu_calibration/cli/1'
 
 
 def json_text(
-    verb: str, exit_code: int, document: Mapping[str, Any], reasons: Sequence[str] = ()
+    verb: str, exit_code: int, document: Mapping[str, Any], *, reasons: Sequence[str] = ()
 ) -> str:
     """
     Return one JSON document: format, verb, exit code, its reasons, and the result or the error.

@@ -4,17 +4,13 @@ Outcome of a calibration: parameters that count, samples left out, and the exit 
 Verbs, nodes, exports and reports use these functions, so that they agree.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.document.calibration import Calibration, listed, never_applied
 from imu_calibration.document.decision import HELPS, SensorDecision, reason_of
 from imu_calibration.estimation.solution import DETERMINED
-
-DROPPED_SHARE = 0.01
-"""Share of the samples up to which dropped samples are a note; above it the exit code is 3."""
-COMPLETE, INCOMPLETE = 0, 3
-"""Exit codes of a result: complete, or written with reasons why it is not."""
 
 
 @dataclass(frozen=True)
@@ -60,29 +56,6 @@ def is_complete(decisions: Mapping[str, SensorDecision], count: ParameterCount) 
     return set(decisions.values()) == {HELPS} and not count.lacking
 
 
-def dropped_text(dropped: Mapping[str, int], kept: int) -> str:
-    """
-    Return why dropped samples make a result incomplete; '' up to DROPPED_SHARE of the samples.
-
-    Parameters
-    ----------
-    dropped : mapping
-        Reason -> samples that were not used because of a fault.
-    kept : int
-        Samples without a fault.
-
-    """
-    count = sum(dropped.values())
-    share = count / max(count + kept, 1)
-    if share <= DROPPED_SHARE:
-        return ''
-    reasons = ', '.join(f'{number} {reason}' for reason, number in dropped.items() if number)
-    return (
-        f'{100 * share:.2g} % of the samples are dropped, more than {100 * DROPPED_SHARE:g} %:'
-        f' {reasons}'
-    )
-
-
 def dropped_of(calibration: Calibration) -> tuple[dict[str, int], int]:
     """Return (reason -> dropped samples, samples without a fault) of a calibration."""
     statistics = calibration.statistics
@@ -106,11 +79,6 @@ def shortcomings(calibration: Calibration) -> list[str]:
         if line:
             lines.append(line)
     return lines
-
-
-def exit_code_of(reasons: Sequence[str]) -> int:
-    """Return 3 when there are reasons why a result is incomplete, otherwise 0."""
-    return INCOMPLETE if reasons else COMPLETE
 
 
 def exit_code(calibration: Calibration) -> int:

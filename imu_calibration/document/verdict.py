@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.units import error_text, for_people, significant
 from imu_calibration.document.calibration import (
     HAND_AXES,
@@ -33,12 +34,7 @@ from imu_calibration.document.decision import (
     same_directions,
     worse_regimes,
 )
-from imu_calibration.document.outcome import (
-    dropped_of,
-    dropped_text,
-    is_complete,
-    parameter_count,
-)
+from imu_calibration.document.outcome import dropped_of, is_complete, parameter_count
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, HELD, Status

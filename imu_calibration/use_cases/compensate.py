@@ -13,11 +13,11 @@ from imu_calibration.compensation.stream import (
     requested_transfer,
 )
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import counter
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.outcome import dropped_text, exit_code_of
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
 from imu_calibration.use_cases.choices import noise_of
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures

@@ -18,7 +18,7 @@ from imu_calibration.calibration.hand_workflow import (
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.document.outcome import dropped_text, exit_code_of
+from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding

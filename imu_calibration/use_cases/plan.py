@@ -14,11 +14,11 @@ import numpy as np
 from imu_calibration.calibration.table_calibration import calibration_of_saved
 from imu_calibration.core import documents
 from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.progress import report
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, listed
-from imu_calibration.document.outcome import exit_code_of
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
 from imu_calibration.estimation.solution import tolerances_of

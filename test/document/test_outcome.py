@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from imu_calibration.cli.main import main
+from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.document.calibration import HAND_AXES, true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import HELPS, UNPROVEN
 from imu_calibration.document.outcome import (
-    dropped_text,
     exit_code,
     missing,
     parameter_count,

@@ -1204,7 +1204,7 @@ BY_SENSOR = _of(
     ),
     (
         'both sensors have the proof of one',
-        '_decision',
+        '_decisions',
         '_1.proof.get(_2)',
         "_1.proof.get('gyroscope')",
         'test_verdict_by_sensor.py::test_each_sensor_has_its_own_decision',

@@ -12,6 +12,7 @@ import imu_calibration
 from imu_calibration.allan.document import BASIS
 from imu_calibration.allan.figures import Densities, NoiseFigures
 from imu_calibration.core.errors import InputError, did_you_mean
+from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import to_mapping
@@ -33,7 +34,6 @@ from imu_calibration.document.exports.loss import (
     standard_motion,
 )
 from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
-from imu_calibration.document.outcome import exit_code_of
 from imu_calibration.document.trust import Usable, caveats, usable
 from imu_calibration.effects.base import SENSORS, UNITS, Role
 
