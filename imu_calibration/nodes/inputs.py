@@ -11,7 +11,7 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
@@ -230,13 +230,30 @@ class MatchedInput:
             if self.type_name in types
             and name != self.topic_name
             and not name.endswith(NOT_RAW)
-            and self.node.count_publishers(name)
+            and self._has_source(name)
         ]
         if not there:
-            return 'no topic of that type has a publisher'
+            return 'no other node publishes that type; see that the driver runs'
         near = get_close_matches(self.topic_name, there, MAX_NAMED_TOPICS, 0.0)
         more = f' (or {", ".join(near[1:])})' if near[1:] else ''
         return f'there is {near[0]}{more}; listen to it with -r {self.topic}:={near[0]}'
+
+    def _has_source(self, name: str) -> bool:
+        """Return whether a node that is neither this one nor a compensator publishes a topic."""
+        own = self.node.get_fully_qualified_name()
+        for found in self.node.get_publishers_info_by_topic(name):
+            if node_of(found) != own and not self._is_compensator(found):
+                return True
+        return False
+
+    def _is_compensator(self, publisher) -> bool:
+        """Return whether the node of a publisher reloads a calibration, as compensators do."""
+        name, space = publisher.node_name, publisher.node_namespace
+        try:
+            services = self.node.get_service_names_and_types_by_node(name, space)
+        except NodeNameNonExistentError:
+            return False
+        return any(service == f'{node_of(publisher)}/reload' for service, _ in services)
 
 
 class BatchInput(MatchedInput):
