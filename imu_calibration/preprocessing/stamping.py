@@ -201,6 +201,50 @@ def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     return StampLine(COUNTED, period, low - origin, high - origin, at_once if arrivals else 1.0)
 
 
+FIT_SDS, FIT_SDS_OF_ONE = 1.0, 2.0
+"""
+Distance between computed times and stamps of a part, in scatters of the stamps about their own
+clock, beyond which they do not fit; the second one is that of one sample.
+"""
+
+
+def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bool) -> list[slice]:
+    """
+    Return the parts between gaps in which the stamps fit a clock better than the computed times.
+
+    Parameters
+    ----------
+    stamp, times : array, shape (n,)
+        Recorded and computed times, ns.
+    period : float
+        Sampling period, ns.
+    arrivals : bool
+        Whether stamps are times of arrival, of which the earliest fit.
+
+    """
+    step = np.diff(stamp)
+    if len(step) < MIN_PERIOD_STEPS:
+        return []
+    usual = float(np.median(step))
+    usual = usual if MIN_REGULAR_STEP * period < usual < period else period
+    long = step > MAX_REGULAR_STEP * usual
+    # the scatter about a line through the numbers, without lost samples and with them
+    scatter = np.inf
+    for number_step in (np.ones(len(step)), np.where(long, np.rint(step / usual), 1.0)):
+        number = np.concatenate([[0.0], np.cumsum(number_step)])
+        line = np.polynomial.Polynomial.fit(number, stamp, 1)(number)
+        scatter = min(scatter, float(np.std(stamp - line)))
+    edges = [0, *(np.flatnonzero(long) + 1), len(stamp)]
+    found = []
+    for start, stop in zip(edges, edges[1:]):
+        late = stamp[start:stop] - times[start:stop]
+        off = late.min() if arrivals else late.mean()
+        limit = FIT_SDS + FIT_SDS_OF_ONE / np.sqrt(stop - start)
+        if abs(off) > limit * scatter + MIN_REGULAR_STEP * usual:
+            found.append(slice(int(start), int(stop)))
+    return found
+
+
 CLOCK_BLOCK = LAG
 """Samples that give one point of the clock; the stamps are classified again after as many."""
 LOSS_REACH = 32
@@ -247,6 +291,7 @@ class CountedClock:
     def _begin(self) -> None:
         """Reset everything except the period."""
         self._origin_ns: int | None = None
+        self._stamp = self._told = np.zeros(0)
         self._next = 0.0
         self._before = np.zeros((2, 0))
         self._block: np.ndarray | None = None
@@ -297,7 +342,7 @@ class CountedClock:
         if self._block is not None:
             self._tell(self._block)
             self._follow()
-        self._block = number
+        self._block, self._stamp = number, stamp
 
     def _numbered(self, stamp: np.ndarray, count: int) -> np.ndarray:
         """
@@ -331,6 +376,16 @@ class CountedClock:
         )
         points = np.vstack([ends[0], points, ends[1]])
         times = np.interp(number, points[:, 0], points[:, 1])
+        recorded = np.zeros(len(times), bool)
+        for part in misfits(self._stamp, times, self._period, arrivals=self._arrivals):
+            recorded[part] = True
+        mixed = np.where(recorded, self._stamp, times)
+        if np.any(np.diff(np.append(self._told, mixed)) <= 0):
+            # a computed part beside a recorded one, or this block and the one before, overlap
+            mixed = self._stamp
+        if recorded.any() or mixed is self._stamp:
+            times, self._points = mixed, self._points[-1:]
+        self._told = times[-1:]
         self._times.append(self._origin_ns + np.rint(times).astype(np.int64))
 
     def _follow(self) -> None:

@@ -175,3 +175,42 @@ def test_symmetric_jitter_in_order_is_no_lateness(rate, draw):
         # The mean of 64 scatters by 0.37 ms; values that keep the order are late by 0.3 ms at 200
         # Hz.
         assert abs(off.mean()) < 0.6 and off.std() < 0.7
+
+
+def lossy_and_late(seed, *, rate_hz, lateness, share, burst, seconds=100.0):
+    """
+    Return (samples, errors of their stamps in ns): losses in bursts, lateness grows with the rate.
+
+    Stamps are strictly increasing.
+    """
+    rng = np.random.default_rng(seed)
+    time = np.arange(int(seconds * rate_hz)) / rate_hz
+    turning = np.abs(np.sin(2 * np.pi * time / 7)) * (np.sin(2 * np.pi * time / 40) > -0.3)
+    late = lateness * turning * rng.exponential(1.0, len(time)) + 1e-4 * rng.random(len(time))
+    stamp = np.maximum.accumulate(time + late) + 1e-9 * np.arange(len(time))
+    keep, at = np.ones(len(time), bool), 0
+    while at < len(time):
+        at += int(rng.exponential(burst / share))
+        lost = 1 + int(rng.exponential(burst))
+        keep[at : at + lost] = False
+        at += lost
+    imu = samples(START + np.rint(1e9 * stamp).astype(np.int64), keep)
+    return imu, START + np.rint(1e9 * time).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ('rate_hz', 'lateness', 'share', 'burst'),
+    ((200.0, 4e-3, 0.1, 8), (200.0, 4e-3, 0.2, 20), (100.0, 8e-3, 0.1, 8)),
+)
+def test_computed_times_across_bursts_of_losses_are_no_worse_than_the_stamps(
+    rate_hz, lateness, share, burst
+):
+    imu, true = lossy_and_late(4, rate_hz=rate_hz, lateness=lateness, share=share, burst=burst)
+    cleaner = BlockCleaner()
+    kept = [imu for cleaned in cleaner.all_of([SampleBlock(imu)]) for _, imu in cleaned.imu]
+    found = ImuSamples.concatenate(kept)
+    computed = found.stamp_ns - true[found.rate_s[:, 0].astype(int)]
+    recorded = imu.stamp_ns - true[imu.rate_s[:, 0].astype(int)]
+    assert computed.std() < 1.2 * recorded.std()
+    assert np.abs(computed).max() < 1.2 * np.abs(recorded).max()
+    assert len(imu) - len(found) < 0.002 * len(imu)
