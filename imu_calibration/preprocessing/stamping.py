@@ -386,7 +386,7 @@ class CountedClock:
         if recorded.any() or mixed is self._stamp:
             times, self._points = mixed, self._points[-1:]
         self._told = times[-1:]
-        self._times.append(self._origin_ns + np.rint(times).astype(np.int64))
+        self._times.append((self._origin_ns or 0) + np.rint(times).astype(np.int64))
 
     def _follow(self) -> None:
         """Update the period; keep the last two points."""
