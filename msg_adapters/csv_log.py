@@ -18,6 +18,7 @@ import numpy as np
 
 from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
+from imu_calibration.core.progress import remark
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.full_scale import relate_turns
@@ -689,6 +690,9 @@ class ConvertedLog:
 
     def __init__(self, path: Path):
         log, folder = read_csv(path), mkdtemp(prefix='imu_calibration_')
+        remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
+        if log.n_dropped:
+            remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.bag = Path(folder, path.stem)
         write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')

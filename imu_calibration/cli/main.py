@@ -133,7 +133,7 @@ def run(options: Namespace) -> int:
     """
     from imu_calibration.cli.parser import complain
     from imu_calibration.core.errors import ImuCalibrationError, printable
-    from imu_calibration.core.progress import listening
+    from imu_calibration.core.progress import listening, reading_remarks
 
     prog, reasons = f'imu_calibration {options.verb}', ()
     try:
@@ -144,6 +144,7 @@ def run(options: Namespace) -> int:
                 stack.enter_context(
                     listening(stack.enter_context(ProgressBars(verbose=options.verbose)))
                 )
+                stack.enter_context(reading_remarks(complain))
             code, document, reasons = options.run(options)
     except BrokenPipeError:
         sys.stdout = None  # a later flush would fail again

@@ -40,6 +40,26 @@ def listening(listener: Listener | None) -> Iterator[None]:
         _listener.reset(token)
 
 
+_reader: ContextVar[Callable[[str], None] | None] = ContextVar('reader', default=None)
+
+
+@contextmanager
+def reading_remarks(reader: Callable[[str], None] | None) -> Iterator[None]:
+    """Send the remarks of this context to a reader."""
+    token = _reader.set(reader)
+    try:
+        yield
+    finally:
+        _reader.reset(token)
+
+
+def remark(text: str) -> None:
+    """Send one line about an assumption, such as guessed units, to the reader, if there is one."""
+    reader = _reader.get()
+    if reader is not None:
+        reader(text)
+
+
 def report(phase: str, done: float = 0.0, total: float = 0.0) -> None:
     """Report the amount done of a phase."""
     listener = _listener.get()

@@ -403,3 +403,11 @@ def test_dropped_lines_are_counted(tmp_path, imu, capsys):
     assert (log.n_dropped, len(log.imu)) == (2, len(imu) - 2)
     assert main(['convert', str(path), '--output', str(tmp_path / 'bag')]) == 0
     assert 'dropped: 2' in capsys.readouterr().out
+
+
+def test_the_guess_is_printed_when_a_log_is_read_directly(tmp_path, imu, capsys):
+    path = write(tmp_path / 'guess.csv', PLAIN, seconds(imu), imu.force_s, imu.rate_s)
+    main(['inspect', str(path)])
+    printed = capsys.readouterr().err.replace('\n', ' ')
+    for columns in read_csv(path).columns:
+        assert str(columns) in printed
