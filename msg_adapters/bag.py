@@ -295,7 +295,8 @@ class Recording:
             yield last
 
     def _decoders(self, joint_names, frame_id):
-        source, decoders = self.source, {}
+        source = self.source
+        decoders: dict[str, Decoder] = {}
         for topic in filter(None, (self.imu_topic, self.joint_topic, self.temperature_topic)):
             message_type = source.types[topic]
             standard = not source.ros1 and is_standard(

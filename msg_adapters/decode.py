@@ -108,6 +108,8 @@ class Decoder:
 
     def _standard(self, data):
         """Return a message as standard CDR; no bytes for one that cannot be read."""
+        # Called only with a definition that is not the standard one.
+        assert self.deserialize is not None
         try:
             return standard_bytes(self.deserialize(data), self.message_type)
         # Rosbags' generated readers raise many kinds on broken bytes, and fields of other

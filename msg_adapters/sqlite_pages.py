@@ -6,7 +6,7 @@ Only the file format's documented table b-tree is used (sqlite.org/fileformat2.h
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,7 +70,8 @@ class PageReader:
         self.stretch_pages = PAGES_BYTES // self.page_size
         self.n_pages = os.fstat(self.file.fileno()).st_size // self.page_size
         self.root = root
-        self.damaged_pages, self.damaged_rows, self.last_id = 0, 0, None
+        self.damaged_pages, self.damaged_rows = 0, 0
+        self.last_id: int | None = None
         for _ in self._leaves():
             pass
         self.scanning = self.damaged_pages > 0
@@ -83,7 +84,7 @@ class PageReader:
         """Close the file."""
         self.file.close()
 
-    def stretches(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def stretches(self) -> Generator[tuple[np.ndarray, np.ndarray], None, None]:
         """Yield (buffer, starts of the pages in it) over the leaves."""
         if self.scanning:
             for first in range(1, self.n_pages + 1, self.stretch_pages):

@@ -104,6 +104,8 @@ class StorageFile:
         """
         if n_before >= LARGEST_STRETCH:
             return self._lose(f'messages that expand beyond {LARGEST_STRETCH} bytes', 1)
+        # Called only where `unpack` is given.
+        assert self.unpack is not None
         try:
             return self.unpack(data)
         except Exception as error:  # decompressors raise various errors on damaged data
@@ -139,6 +141,5 @@ def read_ahead(pieces: Generator[Piece, None, None]) -> Generator[Piece, None, N
         finally:
             for future in waiting:
                 future.cancel()
-            thread.submit(
-                pieces.close
-            )  # not here: an interruption may have left the thread within the generator
+            # In the thread, because an interruption may have left it within the generator.
+            thread.submit(pieces.close)

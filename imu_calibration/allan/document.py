@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import toeplitz
@@ -132,7 +133,7 @@ def _entry(terms, unit):
 
 def _trends(sensor, axes):
     names = dict.fromkeys(trend.name for axis in axes for trend in axis.trends)
-    found = {}
+    found: dict[str, Any] = {}
     for name in names:
         trends = [
             next((trend for trend in axis.trends if trend.name == name), None) for axis in axes

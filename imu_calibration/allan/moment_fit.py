@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dtrtri
@@ -417,6 +418,10 @@ class _Score:
     def __init__(self, moments, fit, excess):
         self.moments, self.fit, self._excess, self._tails = moments, fit, excess, {}
 
+    def at(self, value: float) -> tuple[Any, np.ndarray, list[np.ndarray]]:
+        """Return the fit with the parameter fixed, its direction, and those of the free ones."""
+        raise NotImplementedError
+
     def tails(self, value):
         """
         Return the probabilities of a larger and of a smaller misfit than observed.
@@ -519,11 +524,10 @@ def _tails(moments, fit, direction, others, excess):
     own = _beside(whiten(direction), [whiten(other) for other in others])
     expected = moments.design(fit.processes) @ fit.coefficients
     size = np.linalg.norm(own)
-    score = float(own @ whiten(moments.target - expected)) / size
+    score = float(own @ whiten(moments.target - expected) / size)
     weights = whiten.weights(own / size)
-    return pearson_tails(
-        score, _third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target))
-    )
+    third_moment = _third_moment(weights, covariance, np.maximum(expected, 1e-9 * moments.target))
+    return pearson_tails(score, float(third_moment))
 
 
 def _beside(own, others):

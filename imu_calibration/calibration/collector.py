@@ -193,9 +193,12 @@ def _unpacked(column, numbers):
     if name == 'mixed':
         each = [iter(values) for values in columns]
         return [next(each[number]) for number in size]
-    kind, rows = SAVED_TYPES[name], list(zip(*columns, strict=True)) or [()] * size
+    kind: Any = SAVED_TYPES[name]
+    rows = list(zip(*columns, strict=True)) or [()] * size
+    # The test narrows the type to an instance or a class; only classes are saved.
+    construct: Any = kind
     if is_dataclass(kind):
-        return [kind(*row) for row in rows]
+        return [construct(*row) for row in rows]
     keys = _unpacked(parts[1], numbers)
     return [kind(dict(zip(keys, row)) if issubclass(kind, dict) else row) for row in rows]
 

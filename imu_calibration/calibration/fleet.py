@@ -181,9 +181,9 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
 
 
 def _spread(name, unit, found):
-    nothing = (float('nan'), '')
     if not found:
-        return Spread(name, unit, 0, *[float('nan')] * 3, nothing, nothing)
+        missing = float('nan')
+        return Spread(name, unit, 0, missing, missing, missing, (missing, ''), (missing, ''))
     value, sd = (np.array(column) for column in list(zip(*found, strict=True))[:2])
     low, high = found[int(np.argmin(value))], found[int(np.argmax(value))]
     spread = float(value.std(ddof=1)) if len(value) > 1 else float('nan')

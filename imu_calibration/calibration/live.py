@@ -37,7 +37,6 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import setting
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
@@ -384,6 +383,8 @@ class LiveCalibration:
         if self._first_temperature_c is None:
             return []
         self._begin(self._asked.with_reference_temperature(self._first_temperature_c))
+        # Made by `_begin`.
+        assert self._collector is not None
         blocks, self._waiting = self._waiting, []
         return [window for held_back in blocks for window in self._collector.push(held_back)]
 
@@ -508,12 +509,14 @@ class LiveCalibration:
     def _residual(self, window):
         every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
         some = slice(every // 2 if len(window) > every // 2 else 0, None, every)
-        residuals = self.result.residuals_of(
-            window
-        )  # of all samples: a lag interpolates between them
+        # Residuals exist after a solution of the gathered windows.
+        assert self.result is not None and self._collector is not None
+        # Of all samples, because a lag interpolates between them.
+        residuals = self.result.residuals_of(window)
         return ImuSamples(
             window.stamp_ns[some],
-            *(residuals[sensor][some] for sensor in SENSORS),
+            residuals['accelerometer'][some],
+            residuals['gyroscope'][some],
             self._collector.gathered.frame_id,
         )
 

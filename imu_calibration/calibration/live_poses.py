@@ -306,7 +306,8 @@ class LiveByHand:
         )
         if saved is not None:
             self._store.load(saved)
-        self._pacer, self._unsearched, self._reported_ns = SolvePacer(SEARCH_SHARE), 0, None
+        self._pacer, self._unsearched = SolvePacer(SEARCH_SHARE), 0
+        self._reported_ns: int | None = None
         self._shown: tuple[tuple, Coverage] | None = None
         self.found = EMPTY_SCAN
         self.result: HandResult | None = None
@@ -393,6 +394,8 @@ class LiveByHand:
 
     def _newly_over(self):
         imu, found = self._store.samples(), self.found
+        if imu is None or found.poses is None:
+            return []
         over = found.rests if not found.resting else found.rests[:-1]
         new = [
             k

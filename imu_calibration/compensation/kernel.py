@@ -232,12 +232,12 @@ def _worked_out(rows, indent):
 
     for row in rows:
         factors = {key: [f if f.isidentifier() else name_of(f) for f in key] for key in row}
-        sums.append(
-            {
-                (name_of(' * '.join(found)) if len(found) > 1 else found[0],) if key else (): row[
-                    key
-                ]
-                for key, found in factors.items()
-            }
-        )
+        # A product of several factors becomes one name; the constant has none.
+        terms: dict[tuple[str, ...], float] = {}
+        for key, names_of_key in factors.items():
+            if len(names_of_key) > 1:
+                terms[(name_of(' * '.join(names_of_key)),)] = row[key]
+            else:
+                terms[tuple(names_of_key)] = row[key]
+        sums.append(terms)
     return lines, [as_text(terms) for terms in sums]

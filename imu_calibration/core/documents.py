@@ -220,7 +220,8 @@ def _check_key(event, mapping, what):
     mapping[3] = not mapping[3]
     if mapping[3]:  # this is a value
         return
-    key = getattr(event, 'value', None)
+    # The value of a scalar key; keys of other kinds have none.
+    key: Any = getattr(event, 'value', None)
     if key in mapping[2] or (key == '<<' and event.implicit[0]):
         raise DocumentError(
             f'a {what} must not repeat or merge keys, this one has {shortened(key)!r} again in line'

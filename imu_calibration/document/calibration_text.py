@@ -351,7 +351,9 @@ def _model(document):
             entries[sensor, name] = part[name]
     return (
         SensorModel(
-            *(tuple(members[s]) for s in SECTIONS),
+            tuple(members['accelerometer']),
+            tuple(members['gyroscope']),
+            tuple(members['reference']),
             joint_names=joint_names,
             temperature_ref_c=float(document.get('reference_temperature_c', 25.0)),
             catalogue=catalogue,
@@ -507,7 +509,7 @@ def to_mapping(calibration: Calibration) -> dict:
 
 def _section(calibration, section):
     effects = [effect for effect in calibration.model.effects if effect.section == section]
-    entries = {'effects': [effect.name for effect in effects]}
+    entries: dict[str, Any] = {'effects': [effect.name for effect in effects]}
     for effect in effects:
         part = calibration.model.slices[effect.key]
         status = np.array(calibration.status, dtype=object)[part].reshape(effect.shape)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -133,7 +134,9 @@ recording.
 
 def _adopted(calibration):
     """Return notes on the changes of the model by the recording."""
-    names = {change: calibration.statistics.get(change) or [] for change in CHANGES}
+    names: dict[str, Any] = {}
+    for change in CHANGES:
+        names[change] = calibration.statistics.get(change) or []
     names['added'] = [_with_size(calibration, name) for name in names['added']]
     if held := names['not_believed']:
         names['not_believed'] = [f'{name} ({value:.3g})' for name, value in held.items()][

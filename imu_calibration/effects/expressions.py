@@ -156,8 +156,9 @@ def _checked(node, text, depth):
             return ast.copy_location(ast.Name(name, ast.Load()), node)
         case ast.Name(id=name):
             raise _Refused(node.col_offset, f"the unknown name '{name[:30]}'")
-        case ast.Constant(value=value) if (
-            type(value) in (int, float) and abs(value) < MAX_COLUMN_NUMBER
+        # Booleans are integers in Python, and no numbers of a formula.
+        case ast.Constant(value=int() | float() as value) if (
+            not isinstance(value, bool) and abs(value) < MAX_COLUMN_NUMBER
         ):
             return ast.copy_location(ast.Constant(float(value)), node)
     raise _Refused(node.col_offset, 'an operation that is not arithmetic')

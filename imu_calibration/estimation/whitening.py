@@ -102,7 +102,9 @@ class Whitening:
 
     def _with_session_offsets(self, white):
         """Multiply with ``(I + s^2 u u')^(-1/2)`` in each session, in place."""
-        for index in self._sessions if self._ones is not None else ():
+        if self._ones is None:
+            return white
+        for index in self._sessions:
             ones = self._ones[index]
             square = (ones**2).sum(axis=0)
             shrink = (1 - 1 / np.sqrt(1 + self._session_variance * square)) / square

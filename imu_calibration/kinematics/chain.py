@@ -358,21 +358,24 @@ class _Constants(NamedTuple):
 def _constants(table):
     """Return the `_Constants`: thousands of short windows share one table."""
     columns = {name: column for column, name in enumerate(table.joint_names)}
-    links = tuple(
-        _Link(
-            joint,
-            np.array(joint.axis),
-            np.array(joint.xyz),
-            joint.mat_before.T,
-            columns[joint.source],
-            *((1.0, 0.0) if joint.mimic is None else (joint.mimic.multiplier, joint.mimic.offset)),
-            axis_error_directions(np.array(joint.axis)),
+    links = []
+    for joint in table.joints:
+        mimic = joint.mimic
+        links.append(
+            _Link(
+                joint,
+                np.array(joint.axis),
+                np.array(joint.xyz),
+                joint.mat_before.T,
+                columns[joint.source],
+                1.0 if mimic is None else mimic.multiplier,
+                0.0 if mimic is None else mimic.offset,
+                axis_error_directions(np.array(joint.axis)),
+            )
         )
-        for joint in table.joints
-    )
     mount_xyz = np.zeros(3) if table.mount_xyz is None else np.array(table.mount_xyz)
     constants = _Constants(
-        _base_columns(table), links, mount_xyz, table.mat_sl, table.gravity_value
+        _base_columns(table), tuple(links), mount_xyz, table.mat_sl, table.gravity_value
     )
     for array in (
         constants.base,

@@ -157,8 +157,9 @@ def _interpolated(time, step, derivatives, target, backwards):
     right = np.clip(np.searchsorted(time, target, side='right'), 1, len(time) - 1)
     inside = (step[right - 1] <= LINKED) & (target >= time[right - 1]) & (target <= time[right])
     start = right[inside] - 1
-    ends = (derivatives.take(at, axis=2) for at in (start, start + 1))
-    between = _hermite(*ends, step[start], target[inside] - time[start])
+    left = derivatives.take(start, axis=2)
+    right = derivatives.take(start + 1, axis=2)
+    between = _hermite(left, right, step[start], target[inside] - time[start])
     if inside.all():
         return between
     moved = np.empty((*derivatives.shape[:2], len(target)))

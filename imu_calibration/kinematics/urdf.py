@@ -336,7 +336,7 @@ def _origin(joint):
         )
         for name in ('xyz', 'rpy')
     )
-    return np.array(xyz), rotation_from_rpy(rpy)
+    return np.array(xyz), rotation_from_rpy(np.array(rpy))
 
 
 def _mimic(robot, joint):
@@ -372,8 +372,13 @@ def _limits(joint):
         if limit is not None and limit.velocity and math.isfinite(limit.velocity)
         else None
     )
+    lower, upper = ends
     return JointLimits(
-        *ends, speed, endless=endless, described=frozenset(('lower', 'upper', 'speed', 'endless'))
+        lower,
+        upper,
+        speed,
+        endless=endless,
+        described=frozenset(('lower', 'upper', 'speed', 'endless')),
     )
 
 

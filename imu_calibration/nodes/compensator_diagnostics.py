@@ -57,12 +57,8 @@ class CompensatorDiagnostics:
 
     def __init__(self, node: Any):
         self._node, self._counts = node, {}
-        self._received, self._last_change, self._last_source, self._last_stamps = (
-            0,
-            monotonic(),
-            '',
-            None,
-        )
+        self._received, self._last_change, self._last_source = 0, monotonic(), ''
+        self._last_stamps: tuple[Any, Any] | None = None
         self._temperature: float | None = None
         self._temperature_at, self._unusable_temperatures = monotonic(), ''
         self._stamps_at: dict = {}

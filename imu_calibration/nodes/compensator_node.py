@@ -181,7 +181,7 @@ class CompensatorNode(Node):
 
     def _take_over(self):
         wanted = self._wanted
-        if self._current is not None:
+        if self._current is not None and wanted is not None:
             wanted.follow(self._current)
         self._current = wanted
         return wanted

@@ -56,7 +56,8 @@ class LiveCompensation(SampleCompensation):
         )
         self._taken, self._rate_cov, self._force_cov = -1, b'', b''
         self._no_rate = self._no_force = self._absent = self._odd = False
-        self._orientation_in, self._orientation_out, self._no_orientation = None, b'', False
+        self._orientation_in: bytes | None = None
+        self._orientation_out, self._no_orientation = b'', False
         self._can_saturate = any(np.isfinite(self.levels))
 
     def follow(self, before: 'LiveCompensation') -> None:  # type: ignore[override]
@@ -184,6 +185,8 @@ class LiveCompensation(SampleCompensation):
         """
         Return the orientation turned into the target frame: quaternion and bytes of the covariance.
         """
+        # Called only with a transfer.
+        assert self.transfer is not None
         quaternion, covariance = self._message.orientation(data)
         if covariance != self._orientation_in:
             given = self._message.unpacked(covariance)

@@ -197,6 +197,8 @@ class PlannerWorker(threading.Thread):
         self.doing = Activity.AWAITING_CALIBRATION
         calibration = self._peers.measure()
         if calibration is not None:
+            # A measurement follows a motion, which the campaign has chosen.
+            assert self.campaign is not None
             self.campaign.take(calibration)
         if self._wanted > 0:
             self._wanted -= 1
@@ -209,6 +211,8 @@ class PlannerWorker(threading.Thread):
         if not self._wanted or self._ending:
             return None
         self.doing = Activity.PLANNING
+        # Motions are wanted only after the campaign is made, at a known position.
+        assert self.campaign is not None and self.driver.position is not None
         decision = self.campaign.decide(self.driver.position, self.elapsed)
         self.worst, self.outside = (
             self.campaign.worst,

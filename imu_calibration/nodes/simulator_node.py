@@ -10,8 +10,10 @@ without points the table stops). out: imu/data_raw (sensor_msgs/Imu), joint_stat
 import queue
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from rclpy.node import Node
@@ -233,7 +235,7 @@ class SimulatorNode(Node):
             causes=causes,
         )
         self._trajectories = queue.Queue()
-        self._driven = {'followed': 0, 'refused': 0, 'why refused': ''}
+        self._driven: dict[str, Any] = {'followed': 0, 'refused': 0, 'why refused': ''}
         self._publish_truth(model, values)
         kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
         kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [
@@ -291,7 +293,7 @@ class SimulatorNode(Node):
             table = Table.from_mapping(profile.table)
         return table, TableController(
             profile,
-            table.joint_names,
+            tuple(table.joint_names),
             limits=limits_of(table),
             settings=self._controller,
             repeat=settings.repeat,
@@ -333,7 +335,7 @@ class SimulatorNode(Node):
 
     def _batch(self, block, until):
         encode = partial(encode_joints, with_velocity=self.settings.velocity)
-        parts = [
+        parts: list[tuple[Any, Any, Callable]] = [
             (self._to['imu/data_raw'], block.imu, encode_imu),
             (self._to['joint_states'], block.joints, encode),
         ]

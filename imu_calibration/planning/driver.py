@@ -410,6 +410,8 @@ class Driver:
     def _straying(self):
         """Return the fault of path tracking, '' for none."""
         watch = self._watch
+        # Called only during a motion.
+        assert watch is not None
         if watch.has_strayed:
             joint = watch.suspect()
             return (

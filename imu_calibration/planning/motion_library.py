@@ -357,7 +357,7 @@ class MotionLibrary:
                     )
         for pair in pairs:
             if self.limits.endless[list(pair)].all():
-                for place in self._subset(TOGETHER_PLACES, sum(pair)):
+                for place in self._subset(TOGETHER_PLACES, int(pair[0] + pair[1])):
                     for sense in (1.0, -1.0):
                         rates = np.zeros(len(self.names))
                         rates[list(pair)] = self.limits.speed[list(pair)].min() * np.array(

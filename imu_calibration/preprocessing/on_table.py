@@ -502,10 +502,11 @@ def _best_shift(windows, table):
     )
     most = min(int(LARGEST_SHIFT / period), len(measured) // 2)
     power = [(line**2).sum(axis=1, keepdims=True) for line in (measured, reference)]
-    products, *energies = (
-        _correlations(*pair, most)
-        for pair in ((measured, reference), (power[0], inside), (inside, power[1]))
-    )
+    products = _correlations(measured, reference, most)
+    energies = [
+        _correlations(power[0], inside, most),
+        _correlations(inside, power[1], most),
+    ]
     paired = np.logical_and(*(energy > 0.5 * whole.sum() for energy, whole in zip(energies, power)))
     shares = np.where(
         paired, products * np.abs(products) / np.maximum(np.prod(energies, axis=0), 1e-300), 0.0

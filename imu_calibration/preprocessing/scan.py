@@ -56,7 +56,8 @@ class ChunkSeries:
     """
 
     def __init__(self, chunk_time: float = CHUNK_SECONDS, capacity: int = MAX_SCAN_CHUNKS):
-        self.size, self._chunk_time, self._capacity = None, chunk_time, capacity
+        self.size: int | None = None
+        self._chunk_time, self._capacity = chunk_time, capacity
         self.n_samples = 0
         self.n_changed = np.zeros(6, np.int64)
         self.n_repeated = 0
@@ -110,6 +111,8 @@ class ChunkSeries:
         self._last = columns[:, -1:].copy()
 
     def _cut(self):
+        # Called with samples, after the size of a chunk is chosen.
+        assert self._rest is not None and self.size is not None
         stamp_ns, columns = self._rest
         n = len(stamp_ns) // self.size
         used = n * self.size

@@ -2,6 +2,8 @@
 Single outlying readings: a glitch on the bus, a corrupt message; dropped before any averaging.
 """
 
+from typing import Any
+
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, runs_of
@@ -61,7 +63,8 @@ class SpikeFilter:
         self._begin()
 
     def _begin(self):
-        self._held, self._values, self._first = None, np.zeros((0, 6)), 0
+        self._held: Any = None
+        self._values, self._first = np.zeros((0, 6)), 0
         self._noise, self._n_noise, self._step = np.zeros((1, 6)), 0, np.full(6, np.inf)
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:

@@ -109,7 +109,7 @@ class MotionChunks:
         self._start_ns: int | None = None
         self._first_joint_ns: int | None = None
         self._chunk = 0
-        self._previous_ns = None
+        self._previous_ns: int | None = None
         self._after_loss = False
 
     @property
@@ -201,6 +201,8 @@ class MotionChunks:
                     self._chunk, int((passed - self._margin_ns - self._start_ns) // self._chunk_ns)
                 )
             return False
+        # Set by the first samples, which are necessary for `oldest`.
+        assert self._start_ns is not None
         self._chunk = (oldest - self._start_ns) // self._chunk_ns
         return self._next_start_ns() + self._chunk_ns + self._margin_ns <= passed
 
@@ -255,6 +257,7 @@ class MotionChunks:
             resting=phase == STILL,
         )
         after_gap = self._after_gaps(imu.stamp_ns[core], limit)
+        # Position, velocity, acceleration and jerk of the joints.
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
         self._draw_curves(motion, time[core], phase[core], runs)
@@ -266,7 +269,15 @@ class MotionChunks:
                 imu.stamp_ns[core],
                 imu.force_s[core],
                 imu.rate_s[core],
-                JointMotion(time[core] + self.time_origin, *motion, branch, vibration),
+                JointMotion(
+                    time[core] + self.time_origin,
+                    motion[0],
+                    motion[1],
+                    motion[2],
+                    motion[3],
+                    branch,
+                    vibration,
+                ),
                 temperature,
                 phase[core],
                 quiet[core],
@@ -313,6 +324,8 @@ class MotionChunks:
         phase = np.full(len(time), LOST, np.int8)
         level = np.zeros((len(time), runs[0].position.shape[1] if runs else 1))
         steps = np.zeros(level.shape)
+        # Set by the first samples.
+        assert self._start_ns is not None
         for k, run in enumerate(runs):
             first = (
                 self._first_joint_ns is not None

@@ -59,7 +59,7 @@ class StreamCheck:
         self._before_held = None
         self._held = None
         self._newest_raw = None
-        self._times = None
+        self._times: SampleTimes | None = None
         self._spikes, self._filtered_epoch = SpikeFilter(), 0
 
     @property

@@ -3,6 +3,7 @@
 from collections import Counter, deque
 from enum import IntEnum
 from math import ceil
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
@@ -320,7 +321,7 @@ def _period(samples):
     return (samples.time[-1] - samples.time[0]) / max(len(samples) - 1, 1)
 
 
-_USES = (*tuple(WindowKind)[1:], *tuple(UnusedReason)[1:])
+_USES: tuple[Any, ...] = (*tuple(WindowKind)[1:], *tuple(UnusedReason)[1:])
 _STATIC, _SPIN, _DYNAMIC, _SETTLING, _NOT_QUIET, _TURN_ON, _TOO_SHORT, _REST_TOO_SHORT = range(
     len(_USES)
 )
@@ -344,7 +345,7 @@ class WindowCutter:
         self._waiting = None
         self._phase_before = None
         self._disturbed = self._ramped = -np.inf
-        self._open = None
+        self._open: tuple[Any, Any] | None = None
         self._wander = WanderLimit()
 
     def change(self, settings: WindowSettings, short_rest: float) -> None:

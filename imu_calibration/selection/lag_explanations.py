@@ -330,7 +330,8 @@ class _Option:
 
 def _option(hypothesis, judges, sensor):
     cost = _cost(hypothesis, hypothesis.chosen, judges, sensor) + PENALTY * len(hypothesis.kind)
-    return _Option(sensor, hypothesis.kind, cost, *hypothesis.lags(sensor), hypothesis.values)
+    lags, covariance = hypothesis.lags(sensor)
+    return _Option(sensor, hypothesis.kind, cost, lags, covariance, hypothesis.values)
 
 
 def _none(hypothesis, judges, sensor):

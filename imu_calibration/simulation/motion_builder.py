@@ -66,7 +66,7 @@ class Segment:
     """Time over which the sines fade in and out, s; at most half the duration."""
 
     @property
-    def end(self) -> float:
+    def end(self) -> np.ndarray:
         """Joint positions at the end, rad, shape (n_joints,)."""
         return self.start + self.shift + 0.5 * (self.rate_from + self.rate_to) * self.duration
 
@@ -103,6 +103,9 @@ class Segment:
             (step(rise) - step(fall)) * self.fade**-order
             for order, step in enumerate(_POSITION_STEP)
         ]
+        # A segment has all three, or none.
+        assert self.amplitude is not None
+        assert self.frequency is not None and self.phase is not None
         for amplitude, frequency, phase in zip(
             self.amplitude, self.frequency, self.phase, strict=True
         ):
@@ -323,8 +326,15 @@ class MotionBuilder:
 
     def _append(self, kind, duration, rate_from=None, rate_to=None, shift=None, **sines):
         zero = np.zeros(self.n_joints)
-        parts = [zero if part is None else part for part in (rate_from, rate_to, shift)]
-        segment = Segment(kind, float(duration), self._position, *parts, **sines)
+        segment = Segment(
+            kind,
+            float(duration),
+            self._position,
+            zero if rate_from is None else rate_from,
+            zero if rate_to is None else rate_to,
+            zero if shift is None else shift,
+            **sines,
+        )
         self.segments += (segment,)
         self._position = segment.end
         return self

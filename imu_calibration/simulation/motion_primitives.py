@@ -209,9 +209,8 @@ def _body_rates(builder, _rng, sample):
     """
     for rates in avrutov_rates_deg(sample):
         speed = np.linalg.norm(rates)
-        builder.move(pose_deg(rates if speed else [0, 0, 1], np.nan)).rest(2.0).spin(
-            [[speed, 0.0, 0.0]], 10.0
-        )
+        upright = rates if speed else np.array([0.0, 0.0, 1.0])
+        builder.move(pose_deg(upright, np.nan)).rest(2.0).spin([[speed, 0.0, 0.0]], 10.0)
 
 
 def _gimbal_rates(builder, _rng, sample):

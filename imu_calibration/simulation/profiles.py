@@ -317,11 +317,10 @@ def _separating(
     Many angles, three speeds both ways, swings at several frequencies: separates similar effects.
     """
     angles = 2 * np.pi * (np.arange(n_angles) + 0.25) / n_angles
-    rings = [
-        direction
-        for c, s in zip(np.cos(angles), np.sin(angles))
-        for direction in ([c, s, 0.0], [0.0, c, s], [s, 0.0, c])
-    ]
+    rings = []
+    for c, s in zip(np.cos(angles), np.sin(angles)):
+        for direction in ([c, s, 0.0], [0.0, c, s], [s, 0.0, c]):
+            rings.append(np.array(direction))
     run(
         builder,
         rng,

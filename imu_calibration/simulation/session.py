@@ -321,7 +321,9 @@ class LiveSimulation:
         )
         if not self.causes:
             return outputs
-        felt = Felt(*self._true_motion(time), *outputs)
+        force, rate = outputs
+        true_force, true_rate = self._true_motion(time)
+        felt = Felt(true_force, true_rate, force, rate)
         for cause in self.causes:
             felt = cause(felt)
         return felt.force, felt.rate

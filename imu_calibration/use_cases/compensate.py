@@ -177,6 +177,8 @@ def compensate(
 
 def _in_memory(recording, calibration, transfer, *, late, used):
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
+    # A recording in memory has samples of an IMU.
+    assert block.imu is not None
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
     return _outcome(
         _corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {}, used

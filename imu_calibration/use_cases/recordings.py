@@ -174,6 +174,8 @@ def _hash_of(recording):
     if not isinstance(recording, SampleBlock):
         return files.hash_of(existing(recording))
     imu = recording.imu
+    # A recording in memory has samples of an IMU.
+    assert imu is not None
     return sha256(imu.stamp_ns.tobytes() + imu.force_s.tobytes() + imu.rate_s.tobytes()).hexdigest()
 
 

@@ -79,6 +79,8 @@ class Simulated:
         files.write_text(Path(path) / 'table.yaml', documents.to_text(self.table.to_mapping()))
 
     def __repr__(self):
+        # A simulation has both streams.
+        assert self.samples.imu is not None and self.samples.joints is not None
         return (
             f'<Simulated: {self.duration:.0f} s, {len(self.samples.imu)} Imu,'
             f' {len(self.samples.joints)} JointState>'

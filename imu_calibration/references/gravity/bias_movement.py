@@ -70,8 +70,11 @@ def _of_norms(time, residual, base):
     added = np.hstack([power[:, None] * back for power in powers.T])
     known, new = orthonormal_basis(base), orthonormal_basis(np.hstack([base, added]))
     spare = len(time) - new.shape[1]
+    square_before = np.sum((residual - known @ (known.T @ residual)) ** 2)
+    square_after = np.sum((residual - new @ (new.T @ residual)) ** 2)
     if spare < MIN_DRIFT_FREEDOM or not _shown(
-        *(np.sum((residual - basis @ (basis.T @ residual)) ** 2) for basis in (known, new)),
+        square_before,
+        square_after,
         new.shape[1] - known.shape[1],
         spare,
     ):
