@@ -251,9 +251,7 @@ def fit_with_time(
     moments: Moments, processes: tuple[NoiseProcess, ...], fixed: dict[int, float] | None = None
 ) -> MomentFit:
     """
-    Fit given processes and.
-
-    As the last one, a Gauss-Markov process whose correlation time is estimated too.
+    Fit given processes, and as the last one a Gauss-Markov process of unknown correlation time.
 
     With fixed weights the best time minimises the weighted sum of squares; the weights are updated
     until the time converges.

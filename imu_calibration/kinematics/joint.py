@@ -229,9 +229,9 @@ class JointNames(Sequence):
     @classmethod
     def of(cls, names: Sequence[str], errors: Mapping[str, Any] | None = None) -> 'JointNames':
         """
-        Return `names` unchanged, or.
+        Return `names`, or if None the rotating joints without parallel neighbours.
 
-        If None and `errors` is not given, the rotating joints without parallel neighbours.
+        The second only if `errors` is not given.
         """
         if isinstance(names, cls):
             return names

@@ -96,6 +96,22 @@ def force_error(length: float, where: str = 'at rest') -> InputError | None:
     return None
 
 
+def refuse_force_unit(force: np.ndarray) -> None:
+    """
+    Raise the error of `force_error` for raw specific forces, (n, 3), that are not in m/s^2.
+
+    The median length decides, so that a motion in part of them does not. Readings that are zero or
+    not finite are no measurement of gravity.
+    """
+    length = np.linalg.norm(force, axis=1)
+    length = length[np.isfinite(length) & (length > 0.0)]
+    if len(length) == 0:
+        return
+    error = force_error(float(np.median(length)), 'in the recording')
+    if error is not None:
+        raise error
+
+
 def wrong_rate_unit(text: str) -> CheckFinding:
     """Return the refusal of rates in a unit that a nominal scaling would put right."""
     return CheckFinding('rate_unit', REFUSE, text, key='nominal')

@@ -211,9 +211,9 @@ class JointRun:
 
     def covered(self, time: np.ndarray, before: bool, after: bool) -> np.ndarray:
         """
-        Return a mask of the instants between the readings or.
+        Return a mask of the instants between the readings.
 
-        Where the joints rest, within two periods of the first or last.
+        Where the joints rest, also of those within two periods of the first or last reading.
         """
         reach = 2 * np.median(np.diff(self.time))
         low = self.time[0] - (reach if before and self.phase[0] == STILL else 0.0)

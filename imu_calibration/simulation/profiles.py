@@ -46,9 +46,9 @@ def within_limits(
     n_other: int = 20,
 ) -> None:
     """
-    Poses, swings of one joint and of two at once (with at most `n_other` other joints) and.
+    Poses, swings of one joint and of two at once, and spins of a joint without an end.
 
-    Where a joint has no end, spins.
+    Two joints swing with at most `n_other` other joints.
     """
     limits, count = builder.limits, builder.n_joints
     lower, upper = (

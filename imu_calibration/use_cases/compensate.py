@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 
+import numpy as np
+
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.compensation.stream import (
     CompensationStream,
@@ -19,10 +21,13 @@ from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
+from imu_calibration.preprocessing.value_checks import refuse_force_unit
 from imu_calibration.use_cases.choices import noise_of
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
 
 CORRECTED_TOPIC = '/imu/data_corrected'
+UNIT_READINGS = 20000
+"""Readings at the start of a bag that the unit is checked on before anything is written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +146,7 @@ def compensate(
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
         refuse_corrected(bag.imu_topic)
+        _refuse_bag_unit(recording, topics)
         stream = CompensationStream(
             calibration, temperature=temperatures(recording, topics), transfer=transfer
         )
@@ -175,10 +181,26 @@ def compensate(
         return _outcome(None, stream, lost, used)
 
 
+def _refuse_bag_unit(recording, topics):
+    """Check the unit at the start of a bag, in a pass of its own: nothing is written before."""
+    forces, count = [], 0
+    with open_bag(recording, topics, want_joints=False) as bag:
+        for block in bag.blocks():
+            if block.imu is None:
+                continue
+            forces.append(block.imu.force_s)
+            count += len(block.imu)
+            if count >= UNIT_READINGS:
+                break
+    if forces:
+        refuse_force_unit(np.concatenate(forces))
+
+
 def _in_memory(recording, calibration, transfer, *, late, used):
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
     # A recording in memory has samples of an IMU.
     assert block.imu is not None
+    refuse_force_unit(block.imu.force_s)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
     return _outcome(
         _corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {}, used

@@ -90,9 +90,9 @@ class Diagnosed:
 
     def save(self, folder: str | PathLike) -> None:
         """
-        Write diagnosis.json, report.html, the extended calibration.yaml and.
+        Write diagnosis.json, report.html and the extended calibration.yaml into a folder.
 
-        With proposed formulas, extended.yaml into a folder.
+        With proposed formulas also extended.yaml.
         """
         files.write_texts(
             folder,

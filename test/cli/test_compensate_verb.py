@@ -10,11 +10,13 @@ from test_adapters_copy import raw_messages
 
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.covariance import Uncertainty
+from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.signal_history import ThermalBranch
+from imu_calibration.use_cases.compensate import compensate as compensate_samples
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS
 from msg_adapters.write import write_session
@@ -226,3 +228,31 @@ def test_what_cannot_be_done_is_refused_in_one_line(tmp_path, capsys, more, word
     error = capsys.readouterr().err
     assert code == 1 and words in error and error.count('\n') == 1
     assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(
+    'per_si, code',
+    [
+        (1 / 9.80665, 'force_unit'),
+        (1e3 / 9.80665, 'force_unit'),
+        (2048 / 9.80665, 'force_unit'),
+        (0.01, 'without_gravity'),
+    ],
+)
+def test_readings_in_another_unit_are_refused_before_anything_is_written(
+    tmp_path, per_si, code, capsys
+):
+    """Readings in g, mg, counts or without gravity: biases in m/s^2 do not belong to them."""
+    write_case(tmp_path, 'usual')
+    with open_recording(tmp_path / 'bag', '/imu/data_raw', want_joints=False) as recording:
+        imu = ImuSamples.concatenate(
+            [block.imu for block in recording.blocks() if block.imu is not None]
+        )
+    other = replace(imu, force_s=imu.force_s * per_si)
+    write_session(tmp_path / 'other', other)
+    assert compensate(tmp_path, bag='other') == 1
+    assert 'm/s^2' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+    with pytest.raises(InputError) as error:
+        compensate_samples(other, tmp_path / 'calibration.yaml')
+    assert error.value.code == code

@@ -446,9 +446,9 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
 
 def naming(names: Sequence[str], session: int) -> Callable:
     """
-    Return a function that calls another one and.
+    Return a function that calls another one.
 
-    With several recordings, puts the recording's name before its error.
+    With several recordings, the name of the recording is put before its error.
     """
 
     def call(function, *arguments, **options):
