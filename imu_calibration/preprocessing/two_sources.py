@@ -77,7 +77,7 @@ class TwoSourceSearch:
             observed += f', and {100 * self.equal_stamp_share:.0f} % of the stamps are double'
         return (
             f'the readings must be those of one IMU, {observed}: two IMUs in one stream; give each'
-            ' its own topic, or select one in a text log with convert --where COLUMN=VALUE'
+            ' its own topic, or select the rows of one when a text log is converted'
         )
 
     def require_one(self) -> None:

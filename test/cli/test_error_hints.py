@@ -267,7 +267,8 @@ def test_the_command_line_says_its_option(capsys, tmp_path):
 
 def test_the_live_session_by_hand_says_the_parameter_of_its_node():
     class Solved:
-        status_by_name, undetermined = {COMMON_SCALE: 'weak'}, ()
+        status_by_name = requested = {COMMON_SCALE: 'weak'}
+        undetermined = ()
 
     found = PoseScan([slice(0, 9)] * 9, None, 9, 8, {}, 0.0)
     assert hand_status(found, Solved, step='', hints=HINTS['calibration_node']).message.endswith(
