@@ -445,7 +445,7 @@ class _Table:
             name, equals, value = condition.partition('=')
             if not equals or not value.strip():
                 raise InputError(
-                    f'a condition must be COLUMN=VALUE, got {condition!r}; correct --where',
+                    f'a condition must be COLUMN=VALUE, got {condition!r}; correct the column or its value',
                     code='where',
                 )
             column, value, kept, seen = self.column(name.strip()), value.strip(), [], Counter()
@@ -463,7 +463,7 @@ class _Table:
                 most = ', '.join(cell for cell, _ in seen.most_common(5))
                 raise InputError(
                     f'rows of {self.path} must fulfil {condition}, got none; {name} is'
-                    f' {shortened(most, 100)}; correct --where',
+                    f' {shortened(most, 100)}; correct the column or its value',
                     code='where',
                 )
             lines = kept
