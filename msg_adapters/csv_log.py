@@ -445,7 +445,7 @@ class _Table:
             name, equals, value = condition.partition('=')
             if not equals or not value.strip():
                 raise InputError(
-                    f'a condition must be COLUMN=VALUE, got {condition!r}; correct the column or its value',
+                    f'a condition must be COLUMN=VALUE, got {condition!r}; correct it',
                     code='where',
                 )
             column, value, kept, seen = self.column(name.strip()), value.strip(), [], Counter()
