@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from imu_calibration.core.errors import InputError, did_you_mean, shortened
+from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.compression import LARGEST_CHUNK, decompress
 from msg_adapters.csv_log import SUFFIXES, CsvBag
@@ -515,7 +516,9 @@ class Ros1File:
                     yield _raw(pending)
                     pending = []
         except Exception as error:  # rosbags raises various errors on damaged files
-            self.lost[f'messages after damage ({error})'] = max(expected - n_read, 1)
+            extent = '' if expected > n_read else f' {UNKNOWN_EXTENT}'
+            lost = max(expected - n_read, 1)
+            self.lost[f'messages{extent} after damage ({error})'] = lost
         if pending:
             yield _raw(pending)
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from imu_calibration.core.documents import open_regular
+from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from msg_adapters.compression import decompress_chunk, largest_content
 from msg_adapters.layout import Packed, clean_name, overlapping
 from msg_adapters.storage import StorageFile, Stretch, read_ahead
@@ -391,7 +392,7 @@ class McapFile(StorageFile):
             messages, others, end = walk(buffer)
             self._register(others)
             if not whole or end < len(buffer):
-                self._lose('chunks that end early', 1)
+                self._lose(f'chunks that end early, {UNKNOWN_EXTENT}', 1)
         yield messages
 
     def _records(self):
@@ -441,7 +442,10 @@ class McapFile(StorageFile):
         Or None.
         """
         following = self._following(position)
-        self._lose('bytes that are no whole record', max((following or self.size) - position, 1))
+        self._lose(
+            f'bytes that are no whole record, messages {UNKNOWN_EXTENT}',
+            max((following or self.size) - position, 1),
+        )
         return following
 
     def _following(self, position):

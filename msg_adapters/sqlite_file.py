@@ -18,6 +18,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed, clean_name
 from msg_adapters.sqlite_pages import PageReader
@@ -150,9 +151,11 @@ class SqliteFile(StorageFile):
                     yield Stretch(rows.topic_id, partial(self._pack, rows), rows.received_ns)
         finally:
             reader.close()
-            for name, count in (('pages', reader.damaged_pages), ('rows', reader.damaged_rows)):
-                if count:
-                    self.lost[f'unreadable {name} of {self.path.name}'] = count
+            if reader.damaged_pages:
+                # A page that cannot be read has an unknown number of rows.
+                self._lose(f'unreadable pages {UNKNOWN_EXTENT}', reader.damaged_pages)
+            if reader.damaged_rows:
+                self._lose('unreadable rows', reader.damaged_rows)
 
     def _root(self):
         """
@@ -212,7 +215,7 @@ class SqliteFile(StorageFile):
             try:
                 rows.extend(islice(cursor, STRETCH_ROWS))
             except sqlite3.Error as error:
-                self._lose(f'rest after damage ({error})', 1)
+                self._lose(f'rest {UNKNOWN_EXTENT} after damage ({error})', 1)
             usable = [row for row in rows if tuple(map(type, row)) == (int, int, bytes)]
             if len(usable) < len(rows):
                 self._lose('rows with values of other types', len(rows) - len(usable))

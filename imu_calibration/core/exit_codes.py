@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 
 DROPPED_SHARE = 0.01
 """Share of the samples up to which dropped samples are a note; above it the exit code is 3."""
+UNKNOWN_EXTENT = 'of unknown extent'
+"""Part of the reason of a loss whose count is a lower bound, such as a damaged file."""
 COMPLETE, INCOMPLETE = 0, 3
 """Exit codes of a result: complete, or written with reasons why it is not."""
 
@@ -11,6 +13,8 @@ COMPLETE, INCOMPLETE = 0, 3
 def dropped_text(dropped: Mapping[str, int], kept: int) -> str:
     """
     Return why dropped samples make a result incomplete; '' up to DROPPED_SHARE of the samples.
+
+    A loss of unknown extent is always a reason, because its share is not known.
 
     Parameters
     ----------
@@ -22,6 +26,9 @@ def dropped_text(dropped: Mapping[str, int], kept: int) -> str:
     """
     count = sum(dropped.values())
     share = count / max(count + kept, 1)
+    unknown = [reason for reason, number in dropped.items() if number and UNKNOWN_EXTENT in reason]
+    if unknown:
+        return f'an unknown share of the samples is lost: {", ".join(unknown)}'
     if share <= DROPPED_SHARE:
         return ''
     reasons = ', '.join(f'{number} {reason}' for reason, number in dropped.items() if number)

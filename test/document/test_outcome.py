@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.cli.main import main
-from imu_calibration.core.exit_codes import dropped_text
+from imu_calibration.core.exit_codes import UNKNOWN_EXTENT, dropped_text
 from imu_calibration.document.calibration import HAND_AXES, true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import HELPS, UNPROVEN
@@ -120,3 +120,8 @@ def test_quiet_and_json_list_the_reasons_of_a_3(tmp_path, capsys):
     assert main([*arguments, str(tmp_path / 'b.yaml'), '--quiet']) == 3
     printed = capsys.readouterr()
     assert printed.out == '' and reasons[0] in printed.err
+
+
+def test_a_loss_of_unknown_extent_is_a_reason_at_any_count():
+    assert dropped_text({f'bytes {UNKNOWN_EXTENT}': 1}, 16_000)
+    assert not dropped_text({f'bytes {UNKNOWN_EXTENT}': 0, 'imu spike': 1}, 16_000)

@@ -298,7 +298,7 @@ def two_instances(path, imu):
 
 def test_one_of_two_instances_is_selected(tmp_path, imu):
     path = two_instances(tmp_path / 'two.csv', imu)
-    with refused(InputError, 'one_source', '50 %', '--where'):
+    with refused(InputError, 'one_source', '50 %'):
         read_csv(path)
     assert_read(read_csv(path, where=['unit=3']), imu)
     other = read_csv(path, where=['unit=7.0']).imu

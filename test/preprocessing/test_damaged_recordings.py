@@ -107,7 +107,9 @@ def test_a_hole_costs_the_hole(bags, tmp_path, storage):
     data[middle : middle + 4000] = b'\xa5' * 4000
     (bag / storage_file(folder / storage).name).write_bytes(data)
     code, document = calibrate(bag, tmp_path / 'out')
-    assert code == 3
+    # The rows of a damaged page are counted, and are less than 1 %; the extent of a damaged chunk
+    # is not known.
+    assert code == (0 if storage == 'sqlite3' else 3)
     assert any(storage_file(bag).name in reason for reason in document['statistics']['dropped'])
     assert used(document) > 0.7 * n_samples
     assert errors(document).max() < 4.5
