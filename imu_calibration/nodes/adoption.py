@@ -266,13 +266,15 @@ def adopt(
         calibration = calibration_from_text(text)
         used = trust.usable(calibration, anyway=settings.anyway, live=True)
         _require_same_frame(calibration, before)
+        # Compiled before its readings are compared: a document of nested powers is refused here.
+        compensation = _prepared(used.calibration, settings, frames, before)
         anchor = used.calibration
         if from_topic:
             anchor = _anchor_from_topic(used.calibration, settings, before)
         return Adopted(
             calibration,
             used,
-            _prepared(used.calibration, settings, frames, before),
+            compensation,
             version_of(text),
             source,
             anchor,
