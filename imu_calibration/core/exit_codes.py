@@ -28,7 +28,7 @@ def dropped_text(dropped: Mapping[str, int], kept: int) -> str:
     share = count / max(count + kept, 1)
     unknown = [reason for reason, number in dropped.items() if number and UNKNOWN_EXTENT in reason]
     if unknown:
-        return f'an unknown share of the samples is lost: {", ".join(unknown)}'
+        return f'an unknown share of the samples is dropped: {", ".join(unknown)}'
     if share <= DROPPED_SHARE:
         return ''
     reasons = ', '.join(f'{number} {reason}' for reason, number in dropped.items() if number)
