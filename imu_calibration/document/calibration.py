@@ -12,10 +12,19 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.scales import (
+    DOUBTFUL,
+    IMPOSSIBLE,
+    POSSIBLE_SCALE,
+    USUAL_SCALE,
+    ScaleRange,
+    scale_range,
+)
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, significant, with_sd
 from imu_calibration.document.decision import (
     BY_DEFINITION,
     HARMS,
+    HELPS,
     UNPROVEN,
     SensorDecision,
     Verdict,
@@ -388,8 +397,6 @@ def one_significant(distance: np.ndarray, sd: np.ndarray) -> bool:
     return bool(np.any(np.abs(distance) > MIN_COEFFICIENT_SDS * sd))
 
 
-DIAGONAL = (0.5, 2.0)
-"""Scale factors that an instrument in SI units can have: data sheets promise a few per cent."""
 OFF_DIAGONAL = 0.5
 """
 Largest off-diagonal element: axes 30 degrees from orthogonal; the mount is part of the table
@@ -399,20 +406,66 @@ LARGEST_BIAS = {'accelerometer': 16 * STANDARD_GRAVITY, 'gyroscope': 4000 * DEG}
 """The largest full scales of such sensors, m/s^2 and rad/s."""
 
 
+def worst_scale(calibration: Calibration, sensor: str) -> float:
+    """Return the scale factor of a sensor that lies worst in the table of `core.scales`."""
+    diagonal = np.diag(np.asarray(calibration.of(sensor, Role.LINEAR)))
+    smallest, largest = float(diagonal.min()), float(diagonal.max())
+    return max(smallest, largest, key=lambda factor: list(ScaleRange).index(scale_range(factor)))
+
+
+def scale_supported(calibration: Calibration, sensor: str) -> bool:
+    """
+    Return whether the data support scale factors far from one.
+
+    All are determined, and the corrected readings have smaller errors on held-out data.
+    """
+    model, names = calibration.model, calibration.param_names
+    part = model.part(sensor, Role.LINEAR)
+    diagonal = range(part.start, part.stop, 4)  # entries 0, 4 and 8 of nine
+    states = {calibration.status_by_name[names[index]] for index in diagonal}
+    entry = calibration.proof.get(sensor)
+    # without a proof the file states the decision: the true parameters of a simulation
+    word = decide(entry) if entry else calibration.decision.get(sensor)
+    return states == {DETERMINED} and word == HELPS
+
+
+def scale_questions(calibration: Calibration) -> dict[str, str]:
+    """Return sensor -> question, where a scale factor is possible but not usual."""
+    low, high = USUAL_SCALE
+    questions = {}
+    for sensor in SENSORS:
+        factor = worst_scale(calibration, sensor)
+        if scale_range(factor) is DOUBTFUL:
+            questions[sensor] = (
+                f'is the unit of the {sensor} right, and the full-scale range or rate that its'
+                f' driver assumes? A scale factor is usually {low:g} to {high:g}, it is'
+                f' {significant(factor)}'
+            )
+    return questions
+
+
 def beyond_instruments(calibration: Calibration, sensor: str) -> str:
     """
     Return which value of a sensor's matrix or bias belongs to no instrument, with the limit.
 
-    '' where none does.
+    '' where none does. A scale factor that is possible but not usual (`core.scales`) needs the
+    support of the data.
     """
     matrix, bias = (np.asarray(calibration.of(sensor, role)) for role in (Role.LINEAR, Role.OFFSET))
-    diagonal, off = np.diag(matrix), np.abs(matrix - np.diag(np.diag(matrix))).max()
-    for value in (diagonal.min(), diagonal.max()):
-        if not DIAGONAL[0] <= value <= DIAGONAL[1]:
-            return (
-                f'a scale factor must be {DIAGONAL[0]:g} to {DIAGONAL[1]:g}, it is'
-                f' {significant(value)}'
-            )
+    off = np.abs(matrix - np.diag(np.diag(matrix))).max()
+    factor = worst_scale(calibration, sensor)
+    if scale_range(factor) is IMPOSSIBLE:
+        low, high = POSSIBLE_SCALE
+        return (
+            f'a scale factor must be {low:g} to {high:g}, it is {significant(factor)}; state the'
+            ' unit of the readings'
+        )
+    if scale_range(factor) is DOUBTFUL and not scale_supported(calibration, sensor):
+        low, high = USUAL_SCALE
+        return (
+            f'a scale factor outside {low:g} to {high:g} must be determined and help on held-out'
+            f' data, {significant(factor)} is not; state the unit of the readings'
+        )
     if off > OFF_DIAGONAL:
         return (
             f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is'

@@ -13,6 +13,7 @@ from imu_calibration.document.calibration import (
     HAND_AXES,
     Calibration,
     beyond_instruments,
+    scale_questions,
     with_nominal,
 )
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN, reason_of
@@ -345,8 +346,11 @@ def caveats(calibration: Calibration) -> list[str]:
     """
     Return the caveats for a user of the calibration in addition to the decisions, a line each.
     """
+    lines = uncorrected_lines(calibration.statistics)
     text = missing(calibration)
-    return uncorrected_lines(calibration.statistics) + ([text] if text else [])
+    if text:
+        lines.append(text)
+    return [*lines, *scale_questions(calibration).values()]
 
 
 def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Calibration:

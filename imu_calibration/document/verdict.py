@@ -18,6 +18,7 @@ from imu_calibration.document.calibration import (
     listed,
     needs_accelerometer,
     never_applied,
+    scale_questions,
 )
 from imu_calibration.document.decision import (
     DECISION,
@@ -58,6 +59,16 @@ LOUDER_ONLY = 'without structure in time: noise or vibration that is larger in m
 """Description of residuals that are larger in motion, but not correlated."""
 LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
+
+
+def _doubtful_scales(calibration):
+    """Return a warning for each sensor with a scale factor that a wrong unit may explain."""
+    return [
+        Reason(
+            WARNING, question, 'state the unit of the readings', key='nominal', sensors=(sensor,)
+        )
+        for sensor, question in scale_questions(calibration).items()
+    ]
 
 
 def _worse(calibration):
@@ -377,7 +388,8 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         + _implausible(calibration)
         + misfits(calibration)
     )
-    reasons += _strange_causes(calibration) + _worse(calibration) + _unused_rests(calibration)
+    reasons += _doubtful_scales(calibration) + _strange_causes(calibration)
+    reasons += _worse(calibration) + _unused_rests(calibration)
     reasons += [Reason(NOTE, line, '') for line in uncorrected_lines(calibration.statistics)]
     reasons += (
         _adopted(calibration)

@@ -68,7 +68,7 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
     """
     if rest is None or len(rest.ranges) <= LEAST_TURNS:
         return None
-    centre = rest.sphere[0] if rest.sphere is not None else np.zeros(3)
+    centre = rest.sphere.centre if rest.sphere is not None else np.zeros(3)
     up = unit_rows(rest.force - centre)
     whole = np.abs(chunks.duration / np.median(chunks.duration) - 1) < 0.5
     turns = []

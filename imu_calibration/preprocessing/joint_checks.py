@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from imu_calibration.core.samples import runs_of, smallest_step
+from imu_calibration.core.scales import IMPOSSIBLE, scale_range
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
@@ -289,7 +290,7 @@ def _rate_units(moments):
             'the IMU: probably degrees; convert them in the driver of the table',
         )
     elif (
-        not 0.5 < ratio < 2.0
+        scale_range(ratio) is IMPOSSIBLE
         and np.linalg.norm(cross) ** 2 > RELATED * np.trace(measured) * np.trace(reference) / 3
     ):
         yield wrong_rate_unit(

@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.core.samples import AlignedArrays, runs_of
 from imu_calibration.kinematics.rotations import unit_rows
+from imu_calibration.kinematics.sphere import Sphere, fit_sphere
 
 CHUNK_SECONDS = 0.25
 """
@@ -191,10 +192,8 @@ class Rest:
         return np.linalg.norm(self.force, axis=1)
 
     @property
-    def sphere(self) -> tuple[np.ndarray, float] | None:
-        """
-        Centre (the bias) and radius of the sphere on which the readings of many poses lie, or None.
-        """
+    def sphere(self) -> Sphere | None:
+        """The sphere on which the readings of many poses lie; its centre is the bias; or None."""
         return self._sphere() if len(self.force) >= LEAST_POSES else None
 
     @property
@@ -205,26 +204,19 @@ class Rest:
         Or None.
         """
         found = self._sphere() if len(self.force) >= LEAST_FACES else None
-        return None if found is None else found[0]
+        return None if found is None else found.centre
 
     def _sphere(self):
-        scaled = self.force / np.median(self.norm)
-        design = np.column_stack([2 * scaled, np.ones(len(scaled))])
-        *centre, rest = np.linalg.lstsq(design, (scaled**2).sum(axis=1), rcond=None)[0]
-        centre = np.array(centre)
-        spread = np.linalg.eigvalsh(np.cov(unit_rows(scaled - centre).T))[0]
-        if spread < LEAST_SPREAD or np.linalg.norm(centre) > FARTHEST:
-            return None
-        return centre * np.median(self.norm), float(
-            np.sqrt(rest + centre @ centre) * np.median(self.norm)
-        )
+        found = fit_sphere(self.force)
+        far = np.linalg.norm(found.centre) > FARTHEST * np.median(self.norm)
+        return None if far or found.spread < LEAST_SPREAD else found
 
     @property
     def length(self) -> float:
         """
         Gravity in the units of the accelerometer: the radius of the sphere, else the median length.
         """
-        return float(np.median(self.norm)) if self.sphere is None else self.sphere[1]
+        return float(np.median(self.norm)) if self.sphere is None else self.sphere.radius
 
 
 def find_rest(chunks: Chunks) -> Rest | None:

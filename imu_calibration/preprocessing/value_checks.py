@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.scales import IMPOSSIBLE, USUAL, scale_range
 from imu_calibration.core.units import (
     DEG,
     GRAVITY_PLACE_SHARE,
@@ -89,7 +90,7 @@ def force_error(length: float, where: str = 'at rest') -> InputError | None:
             key='imu_topic',
             code='without_gravity',
         )
-    if not 3.0 < length < 30.0:
+    if scale_range(length / STANDARD_GRAVITY) is IMPOSSIBLE:
         return InputError(
             f'{said}counts or volts?; convert it in the driver', key='nominal', code='force_unit'
         )
@@ -137,7 +138,7 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             )
         elif _full_scale(evidence) is not None:
             return
-        elif not 0.5 < ratio < 2.0:
+        elif scale_range(ratio) is IMPOSSIBLE:
             yield wrong_rate_unit(f'{came}counts or volts?; {convert}')
         else:
             yield CheckFinding(
@@ -164,11 +165,13 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if factor is None:
         return
     came = f'angular rates are {factor:.3g} times the rotation of gravity from one rest to the next'
+    if scale_range(factor) is not USUAL:
+        came += ': is their unit right? If it is'
     if abs(np.log2(factor)) % 1 == 0:
         yield CheckFinding(
             'full_scale',
             WARNING,
-            f'{came}: the driver converts for {factor:.3g} times the full-scale range that is set;'
+            f'{came}, the driver converts for {factor:.3g} times the full-scale range that is set;'
             ' correct its setting (a calibration would include the factor in the matrix, and be'
             ' wrong after the correction)',
         )
@@ -176,7 +179,7 @@ def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(
             'full_scale',
             WARNING,
-            f'{came}: the scale of the driver is wrong; correct it, or check that the IMU was at'
+            f'{came}, the scale of the driver is wrong; correct it, or check that the IMU was at'
             ' rest',
         )
 
@@ -285,10 +288,15 @@ def _clipped(end, held, size):
     return end.n_clipped if not frozen or end.n_clipped > frozen + 2 * size else 0
 
 
+def _is_force(length):
+    """Return whether a length can be that of gravity in m/s^2."""
+    return scale_range(length / STANDARD_GRAVITY) is not IMPOSSIBLE
+
+
 def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The biases are such as sensors have."""
     rest = evidence.rest
-    if rest is None or rest.bias is None or not 3.0 < evidence.length < 30.0:
+    if rest is None or rest.bias is None or not _is_force(evidence.length):
         # With few attitudes, a steady spin about the vertical is not distinguishable from rest
         return
     found = {'accelerometer': rest.bias, 'gyroscope': rest.rate}
@@ -313,20 +321,23 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The accelerometer reads local gravity within 2 per cent."""
     rest = evidence.rest
-    if rest is None or not 3.0 < evidence.length < 30.0:
+    if rest is None or not _is_force(evidence.length):
         return
     off = rest.length / evidence.gravity - 1
     if rest.sphere is not None:
-        bias = np.linalg.norm(rest.sphere[0])
+        bias = np.linalg.norm(rest.sphere.centre)
         what = f'{len(rest.force)} poses, bias of {bias:.2f} m/s^2 subtracted'
     else:
         what = f'median of {len(rest.force)} stretches' if len(rest.force) > 1 else 'one stretch'
+    cause = 'scale or bias is wrong'
+    if scale_range(1.0 + off) is not USUAL:
+        cause = 'is the unit right? If it is, ' + cause
     if abs(off) > GRAVITY_SHARE:
         yield CheckFinding(
             'gravity',
             WARNING,
             f'gravity must read {evidence.gravity:.3f} m/s^2 within 2 %, the accelerometer reads'
-            f' {rest.length:.3f} ({what}), {100 * off:+.1f} %: scale or bias is wrong (gravity'
+            f' {rest.length:.3f} ({what}), {100 * off:+.1f} %: {cause} (gravity'
             f' differs by {100 * GRAVITY_PLACE_SHARE} % between sites)',
         )
     else:

@@ -24,7 +24,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration, never_applied
+from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
@@ -265,7 +265,10 @@ def check(
             (),
         )
     refused = {sensor: why for sensor in SENSORS if (why := never_applied(calibration, sensor))}
-    return replace(result, notes=(*notes, *_notes(recording, calibration)), refused=refused)
+    questions = scale_questions(calibration).values()
+    return replace(
+        result, notes=(*notes, *questions, *_notes(recording, calibration)), refused=refused
+    )
 
 
 def _gravity(options, calibration):

@@ -8,7 +8,8 @@ import pytest
 
 from imu_calibration.cli.main import main
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT, dropped_text
-from imu_calibration.document.calibration import HAND_AXES, true_calibration
+from imu_calibration.core.scales import scale_range
+from imu_calibration.document.calibration import HAND_AXES, scale_questions, true_calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import HELPS, UNPROVEN
 from imu_calibration.document.outcome import (
@@ -85,6 +86,32 @@ def test_a_sensor_that_compensation_refuses_never_helps():
     assert [len(each) for each in steps] == [1, 0]
     stated = replace(bad, decision=dict.fromkeys(PROOF, 'helps'))  # as in an earlier file
     assert stated.decisions['accelerometer'] is UNPROVEN and exit_code(stated) == 3
+
+
+@pytest.mark.parametrize(
+    'scale, place',
+    [(0.6, 'usual'), (1.7, 'usual'), (0.59, 'doubtful'), (2.5, 'doubtful')]
+    + [(0.39, 'impossible'), (2.51, 'impossible'), (-0.49, 'impossible'), (np.nan, 'impossible')],
+)
+def test_one_table_of_scale_factors(scale, place):
+    found = with_scale(scale)
+    assert scale_range(scale) == place
+    assert list(scale_questions(found)) == ['accelerometer'] * (place == 'doubtful')
+    assert list(refused_sensors(found)) == ['accelerometer'] * (place == 'impossible')
+    assert (exit_code(found) == 3) == (place == 'impossible')
+
+
+def test_a_doubtful_scale_without_the_support_of_the_data_is_refused():
+    found = with_scale(0.5)
+    weak = replace(found, status=('weak',) * len(found.status))
+    unproven = replace(found, proof={}, decision={})
+    assert [list(refused_sensors(each)) for each in (found, weak, unproven)] == [
+        [],
+        ['accelerometer'],
+        ['accelerometer'],
+    ]
+    assert scale_questions(found)['accelerometer'] in caveats(found)
+    assert exit_code(found) == 0 and exit_code(weak) == 3
 
 
 def test_by_hand_the_gyroscope_does_not_help_without_the_axes_of_the_accelerometer():

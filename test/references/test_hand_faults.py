@@ -16,6 +16,8 @@ from imu_calibration.calibration.hand_workflow import HandRecording, evident_res
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
+from imu_calibration.document.calibration import scale_questions
+from imu_calibration.document.trust import refused_sensors
 from imu_calibration.estimation.solution import of_fit, reasons_held, with_weak_replaced
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.preprocessing.checks import Preflight
@@ -106,6 +108,40 @@ def test_preflight_names_the_full_scale_factor(session, factor):
     assert not [
         f for f in looked_at(session[0]) if f.check == 'full_scale' and f.severity != 'good'
     ]
+
+
+# scales and biases far from the nominal ones
+
+
+@pytest.mark.parametrize('factor', [0.43, 0.55, 1.8, 2.4])
+def test_force_at_another_scale_does_not_end_on_the_mirrored_branch(session, factor):
+    """Steps from the identity passed zero for half of the scale: the matrix was -0.5."""
+    imu, _, _ = session
+    usual = calibrated(imu).accelerometer[1]
+    scaled = calibrated(replace(imu, force_s=factor * imu.force_s))
+    assert scaled.accelerometer[1] == pytest.approx(factor * usual, abs=2e-4)
+    assert 'held' not in scaled.statuses
+
+
+@pytest.mark.parametrize('bias', [(0.0, 0.0, 11.0), (-14.0, 0.0, 9.0), (0.0, 23.0, 0.0)])
+def test_a_large_bias_does_not_spoil_the_gyroscope(session, bias):
+    """The directions of gravity contained the bias; the rates were called 4.76 times too high."""
+    imu, _, truth = session
+    usual = calibrated(imu)
+    biased = calibrated(replace(imu, force_s=imu.force_s + np.array(bias)))
+    assert biased.statistics['gyro_factor'] == 1.0
+    assert biased.accelerometer[0] == pytest.approx(usual.accelerometer[0] + bias, abs=2e-3)
+    assert rate_error(biased, truth) < 1.5 * rate_error(usual, truth)
+
+
+def test_a_scale_far_from_one_is_questioned_and_applied_where_the_data_support_it(session):
+    halved = replace(session[0], force_s=0.52 * session[0].force_s, rate_s=2.2 * session[0].rate_s)
+    options = CalibrationOptions(gravity=GRAVITY)
+    result = evident_result(read_by_hand([SampleBlock(halved)]), options)[0]
+    assert set(scale_questions(result.calibration)) == {'accelerometer', 'gyroscope'}
+    assert not refused_sensors(result.calibration)
+    unit = [f for f in looked_at(halved) if f.check in ('gravity', 'full_scale')]
+    assert [f.severity for f in unit] == ['warning', 'warning']
 
 
 # clipped turns

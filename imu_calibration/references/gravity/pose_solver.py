@@ -5,7 +5,7 @@ First guess, and the covariance due to gravity, the Earth's rate and the model e
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -22,6 +22,7 @@ from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import GRAVITY, UNMODELLED_EARTH_RATE, total
 from imu_calibration.estimation.solver import OUTLIER_P_VALUE
 from imu_calibration.kinematics.rotations import unit_rows
+from imu_calibration.kinematics.sphere import fit_sphere
 from imu_calibration.references.gravity.equations import (
     COMPONENTS,
     SCATTER_SD,
@@ -89,32 +90,79 @@ def _model_error(reference, found):
     )
 
 
+LEAST_SPREAD = 0.02
+"""Spread of the directions (1/3 when they are even) from which on a sphere is a starting point."""
+NORM_SD_SHARE = 1e-3
+"""Sd of the lengths of gravity in the search for a starting point, as a share of gravity."""
+
+
 def first_state(model: HandModel, poses: Poses) -> State:
     """
     Return a `State` from the norms in poses, which determine directions too, and the rates at rest.
+
+    The norms have a mirrored solution, ``matrix -> -matrix``, and Gauss-Newton steps from the
+    nominal values end there, or nowhere, for scale factors or biases far from the nominal ones.
+    The search therefore begins in several places, and the best solution with a positive diagonal is
+    returned.
     """
-    values, nominal, priors, gravity = (
-        model.nominal.copy(),
-        model.nominal,
-        model.priors,
-        model.gravity,
-    )
-    own = model.base_index('accelerometer')
-    own = own[~model.withheld[own]]
-    for _ in range(MAX_NEWTON_STEPS):
-        residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
-        rows = np.vstack([columns[:, own] / (1e-3 * gravity), np.diag(1 / priors[own])])
-        target = np.concatenate(
-            [residual / (1e-3 * gravity), (nominal - values)[own] / priors[own]]
-        )
-        step = np.linalg.lstsq(rows, target, rcond=None)[0]
-        values[own] += step
-        if np.max(np.abs(step)) < 1e-10:
-            break
+    estimates = [_by_norms(model, poses, start) for start in _starting_points(model, poses)]
+    costs = [estimate.cost for estimate in estimates]
+    values = estimates[int(np.argmin(costs))].values
     bias, matrix, *_ = model.linear(values)
     true = np.linalg.solve(matrix, (poses.force - bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)
     return State(values, unit_rows(true), np.zeros_like(poses.rate))
+
+
+def _starting_points(model, poses):
+    """Return parameter vectors: nominal, with the scale of the norms, and with the sphere."""
+    bias_at = model.model.part('accelerometer', Role.OFFSET)
+    matrix_at = model.model.part('accelerometer', Role.LINEAR)
+    starts = [model.nominal.copy()]
+    usual = float(np.median(np.linalg.norm(poses.force, axis=1)))
+    scaled = model.nominal.copy()
+    scaled[matrix_at] *= usual / model.gravity
+    starts.append(scaled)
+    sphere = fit_sphere(poses.force)
+    if sphere.spread > LEAST_SPREAD:
+        with_sphere = model.nominal.copy()
+        with_sphere[bias_at] = sphere.centre
+        with_sphere[matrix_at] *= sphere.radius / model.gravity
+        starts.append(with_sphere)
+    return starts
+
+
+@dataclass(frozen=True, eq=False)
+class _NormEstimate:
+    """End of a search that begins in one place."""
+
+    values: np.ndarray
+    """Parameters, those of the accelerometer estimated, shape (n,)."""
+    cost: float
+    """Sum of the squared residuals and of the distances from the priors, in sds."""
+
+
+def _by_norms(model, poses, values):
+    """Return the `_NormEstimate` from Gauss-Newton steps that begin at `values`."""
+    nominal, priors = model.nominal, model.priors
+    norm_sd = NORM_SD_SHARE * model.gravity
+    own = model.base_index('accelerometer')
+    own = own[~model.withheld[own]]
+    nowhere = _NormEstimate(model.nominal.copy(), np.inf)
+    for _ in range(MAX_NEWTON_STEPS):
+        residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
+        rows = np.vstack([columns[:, own] / norm_sd, np.diag(1 / priors[own])])
+        target = np.concatenate([residual / norm_sd, (nominal - values)[own] / priors[own]])
+        step = np.linalg.lstsq(rows, target, rcond=None)[0]
+        values[own] += step
+        # beyond zero lies the mirrored solution, or none
+        if not np.isfinite(values).all() or np.diag(model.linear(values)[1]).min() <= 0.0:
+            return nowhere
+        if np.max(np.abs(step)) < 1e-10:
+            break
+    residual = model.norm_rows(values, poses.force, **poses.conditions)[0]
+    distance = (nominal - values)[own] / priors[own]
+    return _NormEstimate(values, float(np.sum((residual / norm_sd) ** 2) + distance @ distance))
 
 
 def _of_gravity(model, values, relative_sd):
