@@ -1,8 +1,8 @@
 """
 One table of the scale factors that a sensor in SI units can have, for all checks and decisions.
 
-Data sheets promise a few per cent. A factor far from one is usually a wrong unit, a wrong full-scale
-range, or a wrong sampling rate in a driver that multiplies increments.
+Data sheets promise a few per cent. A factor far from one is usually a wrong unit, a wrong
+full-scale range, or a wrong sampling rate in a driver that multiplies increments.
 """
 
 from enum import StrEnum
