@@ -127,6 +127,11 @@ class StampedDerivative:
         self._sums = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._age = 0
 
+    @property
+    def n_used(self) -> int:
+        """Number of samples in the derivative of now; 0 while there are too few of them."""
+        return len(self._window) if len(self._window) >= self._least else 0
+
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return the derivative (x, y, z) after one more sample, per second."""
         if self._newest is not None:
@@ -197,12 +202,24 @@ class StampedDerivative:
         for x, y, z in list(other._window)[-self.taps :]:
             self._add(x, y, z)
 
-    def push_block(self, stamp_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
+    def push_block(
+        self, stamp_ns: np.ndarray, values: np.ndarray, full: np.ndarray | None = None
+    ) -> np.ndarray:
         """
         Return the derivatives after each of the samples of a block, shape (n, 3).
 
         The same as `push` one by one.
+
+        Parameters
+        ----------
+        stamp_ns : ndarray, shape (n,)
+        values : ndarray, shape (n, 3)
+        full : ndarray of bool, shape (n,), optional
+            Becomes true where the window was full.
+
         """
+        if full is None:
+            full = np.empty(len(values), bool)
         out = np.empty(values.shape)
         steps = np.diff(stamp_ns) / self._period_ns
         bounds = np.concatenate(
@@ -216,8 +233,10 @@ class StampedDerivative:
             for k in range(start, end):
                 if k == start + self.taps + 1 and self._newest == stamp_ns[k - 1]:
                     self._regular(stamp_ns, values, k, end, out)
+                    full[k:end] = True
                     break
                 out[k] = self.push(int(stamp_ns[k]), *values[k].tolist())
+                full[k] = self.n_used == self.taps
         return out
 
     def _regular(self, stamp_ns, values, start, end, out):
@@ -263,6 +282,10 @@ class TimedDerivative:
         self._stamps: deque[int] = deque()
         self._values: deque[tuple] = deque()
         self.alpha: tuple = NO_SLOPE
+        self.n_used = 0
+        """
+        Number of samples of the derivative at equal steps with that noise; 0 without a derivative.
+        """
 
     def push(self, stamp_ns: int, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Return the derivative (x, y, z) after one more sample, per second."""
@@ -282,8 +305,11 @@ class TimedDerivative:
             self._stamps.popleft()
             self._values.popleft()
         if 8 * spread[n - 1] < self._enough:
-            self.alpha = NO_SLOPE
+            self.alpha, self.n_used = NO_SLOPE, 0
         else:
+            # Sxx of n equal steps is about n^3 / 12.
+            share = min(float(spread[n - 1]) / self._enough, 1.0)
+            self.n_used = min(max(round(self.taps * share ** (1 / 3)), 2), self.taps)
             values = np.array(self._values)[::-1]
             self.alpha = tuple(
                 (-1e9 * (past[:n] - past[:n].mean()) @ values / spread[n - 1]).tolist()
@@ -297,6 +323,7 @@ class TimedDerivative:
             other._values.copy(),
             other.alpha,
         )
+        self.n_used = min(other.n_used, self.taps)
 
 
 def typical_period(stamp_ns: Sequence[float] | np.ndarray) -> float | None:

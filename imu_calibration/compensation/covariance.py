@@ -1,6 +1,6 @@
 """Uncertainty of corrected samples from noise and parameters, to first order."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,6 +58,14 @@ class Sensitivity:
     """Sum of the squared weights of the earlier readings, 1/s^2."""
     slope_error: SlopeError
     """Error of the derivative in the present motion."""
+
+    def with_slope_error(self, slope_error: SlopeError) -> 'Sensitivity':
+        """Return the same with another derivative of the rate: its weights and its error."""
+        weights = slope_error.weights
+        if weights is None:
+            return replace(self, slope_error=slope_error)
+        newest, earlier = float(weights[0]), float(weights[1:] @ weights[1:])
+        return replace(self, newest=newest, earlier=earlier, slope_error=slope_error)
 
     def covariances(
         self, force_cov: np.ndarray, rate_cov: np.ndarray, with_parameters: bool = True
@@ -166,13 +174,14 @@ class Uncertainty:
         jacobian = gain[:, :6] @ self._parameter_slopes(
             np.array(true), self._inverse_rate @ sample[6:], beside
         )
-        return Sensitivity(
+        sensitivity = Sensitivity(
             gain,
             jacobian @ self._covariance @ jacobian.T,
             self._newest,
             self._earlier,
-            slope_error or SlopeError(),
+            SlopeError(),
         )
+        return sensitivity.with_slope_error(slope_error or SlopeError())
 
     def _slope(self, sample, step, beside):
         above, below = (

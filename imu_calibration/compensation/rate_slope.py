@@ -6,7 +6,7 @@ By equal steps or by least squares over the stamps, and its error.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,15 +43,36 @@ AGREE = 4
 Reviews in a row that replace irregular stamps by counted ones: so many blocks contain new stamps
 only.
 """
-RECENT_SPAN = 1.0, 64, 2048
+RECENT_SPAN = 5.0, 64, 2048
 """
-Seconds, smallest and largest number of samples from which the error of the derivative is estimated.
+Seconds, smallest and largest number of samples of which the derivatives are stored: they show how
+large it may be after a gap.
+"""
+PRESENT_SPAN = 1.0
+"""Seconds of them, at least the smallest number, that show the error in a full window."""
+POSSIBLE = 3.0
+"""
+Standard deviation of each component of the angular acceleration before any motion was seen,
+rad/s^2: robots and vehicles that start a turn have 1 to 5 rad/s^2.
+"""
+START_SPAN = 0.01, 0.05
+"""
+Seconds between the oldest and the newest reading from which the size of the derivative is estimated
+before the kind of the stamps is known: below the first one the noise is larger than any motion,
+above the second one the motion changes.
 """
 ROUGH = 0.02
 """
 Seconds over which the rate is compared where there is no derivative: the longest delay that a
 derivative may have.
 """
+EQUAL_STEPS = 0.005
+"""
+The first steps of a stream are those of a clock, before there are enough for `describe_stamps`, if
+they differ by at most this share.
+"""
+UNKNOWN = (float('nan'),) * 3
+"""Stored where the window was not full."""
 WITHOUT = (
     ': no angular acceleration, the lever-arm effect is not corrected and the covariance includes'
     ' its size'
@@ -66,7 +87,16 @@ class SlopeError:
     moment: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
     """Mean of error times error, noise of the rate included, (rad/s^2)^2, shape (3, 3)."""
     noise_gain: float = 0.0
-    """That noise is this times the covariance of the rate, 1/s^2."""
+    """
+    That noise is this times the covariance of the rate, 1/s^2.
+
+    Negative where noise is missing in `moment`.
+    """
+    weights: np.ndarray | None = None
+    """
+    Weights of the newest to the oldest reading in the derivative, 1/s, shape (n,); None: those of
+    the full window.
+    """
 
     def covariance(self, rate_cov: np.ndarray) -> np.ndarray:
         """
@@ -120,6 +150,12 @@ class RateSlope:
         self._doubtful: list[tuple] = []
         self._recent: deque[tuple] = deque(maxlen=RECENT_SPAN[1])
         self._all_of_it: SlopeError | None = None
+        self.restarts, self.n_changes = 0, 0
+        """Number of windows begun, and of samples after which the error is no longer the same."""
+        self._n_young = CLOCK_BLOCK
+        """Samples of a new window for which the error is estimated again after each."""
+        self._age = 0
+        """Samples in the derivative since its window was begun, at most `_n_young`."""
         self.n_without = 0
         """Samples without a derivative because their stamps are frozen."""
 
@@ -143,16 +179,31 @@ class RateSlope:
         self._due -= 1
         if not self._due:
             self._review()
+        if self.line is None and self._begins_equally():
+            period_ns = (stamp_ns - self._stamps[0]) / (len(self._stamps) - 1)
+            self.settle(StampLine(REGULAR, period_ns))
         if self._tracker is None:
             self.n_without += self.line is not None
+            self.n_changes += self.line is None
             self._recent.append((x, y, z))
             return NO_SLOPE
+        before = self._tracker.n_used
         if self._longest_ns:
             slope = self._count_on(self._tracker, step_ns, (x, y, z))
         else:
             slope = self._tracker.push(stamp_ns, x, y, z)
+        n_used = self._tracker.n_used
         self._slope = slope
-        self._recent.append(slope)
+        self._recent.append(slope if n_used == self._tracker.taps else UNKNOWN)
+        # In a new window each sample changes the derivative's noise, delay and error.
+        if n_used < before:
+            self.restarts += 1
+            self._n_young = self._tracker.taps
+        if n_used < before or not n_used:
+            self._age = 0
+        if self._age < self._n_young:
+            self._age += 1
+            self.n_changes += 1
         return slope
 
     def push_block(self, stamp_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -168,12 +219,30 @@ class RateSlope:
                 assert isinstance(self._tracker, StampedDerivative), (
                     'regular stamps have equal steps'
                 )
-                out[start:stop] = self._tracker.push_block(stamp_ns[start:stop], values[start:stop])
-                self._note(stamp_ns[start:stop], values[stop - 1], out[start:stop])
+                full = np.empty(stop - start, bool)
+                out[start:stop] = self._tracker.push_block(
+                    stamp_ns[start:stop], values[start:stop], full
+                )
+                shown = np.where(full[:, None], out[start:stop], UNKNOWN)
+                self._note(stamp_ns[start:stop], values[stop - 1], out[start:stop], shown)
             if stop < len(values):
                 out[stop] = self.push(int(stamp_ns[stop]), *values[stop].tolist())
             start = stop + 1
         return out
+
+    def _begins_equally(self) -> bool:
+        """
+        Return whether the first stamps are those of a clock.
+
+        Samples of a packet have equal steps too, but are together shorter than `START_SPAN`.
+        """
+        if len(self._stamps) > stamping.MIN_PERIOD_STEPS:
+            return False
+        steps = np.diff(np.array(self._stamps, np.int64))
+        total_ns = float(steps.sum())
+        if len(steps) < 2 or total_ns < 1e9 * START_SPAN[0]:
+            return False
+        return float(np.ptp(steps)) <= EQUAL_STEPS * total_ns / len(steps)
 
     def settle(self, line: StampLine) -> None:
         """
@@ -181,6 +250,7 @@ class RateSlope:
 
         The window is kept while the period is unchanged.
         """
+        is_first = self.line is None and bool(self._stamps)
         self.line, self._doubtful, self._agreeing = line, [], 0
         self._longest_ns = (
             line.high_ns - line.low_ns + stamping.MAX_REGULAR_STEP * line.period_ns
@@ -194,7 +264,11 @@ class RateSlope:
                 else self._stamps[-2]
             )
             return
-        self._all_of_it = self._size_of_all(np.array(self._recent).reshape(-1, 3))
+        if is_first:
+            self._all_of_it = self._size_at_start()
+        else:
+            self._all_of_it = self._size_of_all(np.array(self._recent).reshape(-1, 3))
+        stamps, readings = list(self._stamps)[:-1], list(self._recent)
         self.derivative = self._tracker = None
         if not _stand_still(line):
             self.derivative = self._choose(line.period_ns * 1e-9)
@@ -204,6 +278,14 @@ class RateSlope:
         seconds, least, most = RECENT_SPAN
         self._recent = deque(maxlen=int(min(max(seconds * 1e9 / line.period_ns, least), most)))
         self._slope, self._young = NO_SLOPE, True
+        self._age, self._n_young = 0, CLOCK_BLOCK
+        # Counted samples need the number of lost ones, which these stamps do not show yet.
+        if is_first and self._tracker is not None and not self._longest_ns:
+            for stamp_ns, reading in zip(stamps[-len(readings) :], readings[-len(stamps) :]):
+                slope = self._tracker.push(stamp_ns, *reading)
+                self._recent.append(
+                    slope if self._tracker.n_used == self._tracker.taps else UNKNOWN
+                )
         self._changed()
 
     def _suits(self, line: StampLine) -> bool:
@@ -218,6 +300,7 @@ class RateSlope:
         """Settle for the stamps of another one, with the motion that it has seen."""
         if before.line is not None:
             self.settle(before.line)
+            self._all_of_it = before._all_of_it
             self._recent.extend(list(before._recent))
 
     def follow(self, before: 'RateSlope') -> None:
@@ -237,36 +320,69 @@ class RateSlope:
         Return the recent error of the derivative.
 
         The error of a delayed derivative is the change of the true one in that time, estimated a
-        delay later: ``alpha(t + delay) - alpha(t)``. Without one the error is the whole derivative,
-        from the rate over `ROUGH` seconds; also after a change of the stamps, until there is new
-        motion.
+        delay later: ``alpha(t + delay) - alpha(t)``. Without one the error is the whole derivative:
+        its size before the gap, or from the rate over `ROUGH` seconds; also after a change of the
+        stamps, until there is new motion. Before any motion was seen it is `POSSIBLE`.
         """
         recent = np.array(list(self._recent)).reshape(-1, 3)
-        if len(recent) < stamping.MIN_PERIOD_STEPS and self._all_of_it is not None:
-            return self._all_of_it
-        if self.derivative is None:
+        if self.line is None:
+            return self._size_at_start()
+        if self.derivative is None or self._tracker is None:
+            if len(recent) < stamping.MIN_PERIOD_STEPS and self._all_of_it is not None:
+                return self._all_of_it
             return self._size_of_all(recent)
-        late = (self.derivative.taps - 1) / 2
+        n_used = self._tracker.n_used
+        if not n_used:
+            return replace(self._size_of_all(recent), weights=np.zeros(1))
+        if n_used == self._tracker.taps:
+            n_present = PRESENT_SPAN / self._tracker.period
+            recent = recent[-int(max(n_present, RECENT_SPAN[1])) :]
+        # A window with fewer samples has a shorter delay.
+        weights = CausalDerivative(n_used, self._tracker.period).weights
+        late = (n_used - 1) / 2
         lag = max(round(late + 0.01), 1)
-        if len(recent) <= lag + 1:
-            return SlopeError()
-        share, weights = (late / lag) ** 2, self.derivative.weights
-        apart = np.convolve(weights, [1.0] + [0.0] * (lag - 1) + [-1.0])
-        return SlopeError(
-            share * _moment(recent[lag:] - recent[:-lag]), share * float(apart @ apart)
-        )
+        change = _known(recent[lag:] - recent[:-lag])
+        if not len(change):
+            return replace(self._size_of_all(recent), weights=weights)
+        share = (late / lag) ** 2
+        apart = np.convolve(self.derivative.weights, [1.0] + [0.0] * (lag - 1) + [-1.0])
+        return SlopeError(share * _moment(change), share * float(apart @ apart), weights)
+
+    def _size_at_start(self) -> SlopeError:
+        """
+        Return the size of the derivative before the kind of the stamps is known.
+
+        With the least-squares slope b over stamps t of the last readings, ``E[alpha alpha'] = b b'
+        + N / Sxx``, ``Sxx = sum((t - mean t)^2)``, N the covariance of the rate.
+        """
+        n = min(len(self._stamps), len(self._recent))
+        least, most = START_SPAN
+        stamps = np.array(list(self._stamps)[len(self._stamps) - n :], np.int64)
+        readings = np.array(list(self._recent)[len(self._recent) - n :]).reshape(-1, 3)
+        if n:
+            age = (stamps.max() - stamps) * 1e-9
+            stamps, readings = stamps[age <= most], readings[age <= most]
+        if not len(stamps) or np.ptp(stamps) * 1e-9 < least:
+            return SlopeError(POSSIBLE**2 * np.eye(3), weights=np.zeros(1))
+        time = (stamps - stamps[0]) * 1e-9
+        time = time - time.mean()
+        spread = float(time @ time)
+        slope = time @ readings / spread
+        return SlopeError(np.outer(slope, slope), -1.0 / spread, np.zeros(1))
 
     def _size_of_all(self, rates: np.ndarray) -> SlopeError:
         """Return the size of the derivative, from rates, or from the derivative in use."""
-        if self.derivative is not None and len(rates):
-            return SlopeError(
-                _moment(rates), float(self.derivative.weights @ self.derivative.weights)
-            )
+        if self.derivative is not None:
+            slopes = _known(rates)
+            if len(slopes):
+                weights = self.derivative.weights
+                return SlopeError(_moment(slopes), float(weights @ weights))
+            return self._all_of_it or SlopeError(POSSIBLE**2 * np.eye(3))
         step = np.diff(np.array(list(self._stamps)[-len(rates) :], np.int64))
         step = step[np.abs(step) <= PAUSE_NS]
         period = max(float(step.mean()) * 1e-9, 0.0) if len(step) else 0.0
         if len(rates) < 3 or not period:
-            return SlopeError()
+            return SlopeError(POSSIBLE**2 * np.eye(3))
         lag = int(min(max(round(ROUGH / period), 1), len(rates) - 2))
         return SlopeError(
             _moment((rates[lag:] - rates[:-lag]) / (lag * period)), 2.0 / (lag * period) ** 2
@@ -363,7 +479,9 @@ class RateSlope:
         )
         return start + (int(due[unusual][0]) if unusual.any() else stop)
 
-    def _note(self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray) -> None:
+    def _note(
+        self, stamp_ns: np.ndarray, reading: np.ndarray, slopes: np.ndarray, shown: np.ndarray
+    ) -> None:
         """Store the state after a block that was processed as a whole."""
         self._stamps.extend(stamp_ns[-REVIEWED_STAMPS:].tolist())
         self._newest, self._reading, self._slope = (
@@ -372,7 +490,7 @@ class RateSlope:
             tuple(slopes[-1].tolist()),
         )
         self._due = (self._due - len(stamp_ns) - 1) % CLOCK_BLOCK + 1
-        self._recent.extend(map(tuple, slopes[-(self._recent.maxlen or len(slopes)) :].tolist()))
+        self._recent.extend(map(tuple, shown[-(self._recent.maxlen or len(shown)) :].tolist()))
 
 
 def _stand_still(line: StampLine) -> bool:
@@ -389,6 +507,11 @@ def _usual(stamps: np.ndarray, period_ns: float) -> np.ndarray:
         np.abs((stamps[..., -1] - stamps[..., 0]) / (period_ns * max(step.shape[-1], 1)) - 1)
         <= CHANGED[REGULAR]
     )
+
+
+def _known(rows: np.ndarray) -> np.ndarray:
+    """Return the rows without `UNKNOWN`."""
+    return rows[np.isfinite(rows).all(axis=1)]
 
 
 def _moment(rows: np.ndarray) -> np.ndarray:

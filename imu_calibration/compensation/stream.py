@@ -416,6 +416,7 @@ class SampleCompensation:
         )
         self.revision = 0
         """Number of updates of the covariances."""
+        self._n_changes = self._restarts = 0
         self._uncertainty = Uncertainty(calibration, transfer)
         self.refresh()
 
@@ -456,6 +457,8 @@ class SampleCompensation:
         if squared > self.fastest_squared:
             self.fastest_squared = squared
         self.corrected += 1
+        if self.needs_slope and self.slope.n_changes != self._n_changes:
+            self._follow_slope()
         return vx, vy, vz, ux, uy, uz
 
     def covariances(
@@ -485,6 +488,16 @@ class SampleCompensation:
             slope_error=self.slope.error() if self.needs_slope else None,
         )
         self.revision += 1
+
+    def _follow_slope(self) -> None:
+        """Update the covariances while the derivative is not yet that of a full window."""
+        # The rest of the covariances is slow to compute, and changes with the motion only.
+        if not self._n_changes or self.slope.restarts != self._restarts:
+            self.refresh()
+        else:
+            self._sensitivity = self._sensitivity.with_slope_error(self.slope.error())
+            self.revision += 1
+        self._n_changes, self._restarts = self.slope.n_changes, self.slope.restarts
 
     def prepare(self, before: 'SampleCompensation') -> None:
         """

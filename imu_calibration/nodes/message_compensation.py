@@ -96,6 +96,8 @@ class LiveCompensation(SampleCompensation):
         corrected = self.correct(stamp_ns or sent_ns, *readings)
         if corrected is None:
             return None
+        if self._taken != self.revision:
+            self._take_covariances(data)
         if self.watch is not None:
             corrected = self.watch.follow(stamp_ns or sent_ns, readings, corrected)
         if self._odd:

@@ -140,7 +140,7 @@ def test_an_absent_quantity_is_left_untouched(absent, present):
 
 def test_covariances_are_taken_anew_at_the_present_motion():
     live = LiveCompensation(random_calibration(2))
-    data = messages(imu_samples(60))
+    data = messages(imu_samples(200))  # a new slope changes the covariance after each sample
     before = [live(d) for d in data][-1]
     fast = patch_imu(data[-1], rate_s=(20.0, -30.0, 25.0))
     live(fast)

@@ -953,6 +953,13 @@ SIGNS = _of(
         'test_compensation_covariance.py',
     ),
     (
+        'unknown angular acceleration left out of the published covariance',
+        'RateSlope.error',
+        'replace(self._size_of_all(_1), weights=np.zeros(1))',
+        'SlopeError()',
+        'test_covariance_of_a_new_slope.py',
+    ),
+    (
         'delay of the derivative left out of the published covariance',
         'Sensitivity.covariances',
         'self.earlier * _1 + _2',
