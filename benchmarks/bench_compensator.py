@@ -101,14 +101,20 @@ def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0
         text=True,
     )
     source = _source(raw, rate, seconds, environment) if raw == corrected else None
-    sink.stdout.readline()
+    _line(sink)
     source = source or _source(raw, rate, seconds, environment)
-    source.stdout.readline()
+    _line(source)
     before = cpu_seconds()
-    sent = json.loads(source.stdout.readline())
+    sent = json.loads(_line(source))
     used = cpu_seconds() - before
     source.communicate(timeout=60)
     return sent, json.loads(sink.communicate(timeout=60)[0]), used
+
+
+def _line(process):
+    """Return the next line that a process prints."""
+    assert process.stdout is not None, 'both processes print into a pipe'
+    return process.stdout.readline()
 
 
 def _source(topic, rate, seconds, environment):
@@ -125,8 +131,9 @@ def compare(nodes, seconds, environment, rate=1000.0):
     direct = []
     for _ in range(max(1, round(seconds / TURN))):
         for node in nodes:
+            raw, corrected = node.topics
             sent, came, used = run_once(
-                *node.topics, rate, min(TURN, seconds), environment, node.cpu_seconds
+                raw, corrected, rate, min(TURN, seconds), environment, node.cpu_seconds
             )
             node.cpu += used
             node.messages += came['came']
@@ -145,9 +152,10 @@ def highest_rate(node, environment, seconds):
     """
     Return [(requested rate, actual rate, lost messages)] with rising rates until messages are lost.
     """
+    raw, corrected = node.topics
     rows = []
     for rate in RATES:
-        sent, came, _ = run_once(*node.topics, rate, seconds, environment)
+        sent, came, _ = run_once(raw, corrected, rate, seconds, environment)
         rows.append((rate, sent['rate'], sent['sent'] - came['came']))
         if rows[-1][2]:
             break

@@ -8,6 +8,7 @@ import json
 import struct
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -99,8 +100,9 @@ def sink(topic):
         late.append(now - seconds * 10**9 - nanoseconds)
 
     group = relay_loop.OutsideExecutor()
+    callback: Callable[..., None] = record
     subscription = node.create_subscription(
-        Imu, topic, record, input_qos(reliable=True), raw=True, callback_group=group
+        Imu, topic, callback, input_qos(reliable=True), raw=True, callback_group=group
     )
     nowhere = node.create_publisher(Imu, topic + '/nowhere', output_qos())
     deadline = time.monotonic() + 20.0
@@ -146,7 +148,8 @@ def main():
             topic, rate, seconds = arguments[:split]
             source(topic, float(rate), float(seconds))
         else:
-            {'sink': sink, 'relay': plain_relay}[part](*arguments[:split])
+            others: dict[str, Callable[..., None]] = {'sink': sink, 'relay': plain_relay}
+            others[part](*arguments[:split])
     except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
         pass
     rclpy.try_shutdown()

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from matplotlib.figure import Figure
 
-from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.document import files
 from imu_calibration.document.exports.export import all_targets
 from imu_calibration.effects.base import AXES, SENSORS
@@ -115,9 +115,16 @@ def covariances(path):
     save(drawn, path)
 
 
+def warm_temperatures() -> TemperatureSamples:
+    """Return the temperatures of the recording `warm`."""
+    found = temperatures('warm', Topics())
+    assert found is not None, 'the recording was simulated with temperatures'
+    return found
+
+
 def rest_against_temperature(imu):
     """Return (temperature, mean rate) of each second at rest."""
-    warm, size = temperatures('warm', Topics()), 100
+    warm, size = warm_temperatures(), 100
     count = len(imu) // size
     blocks = imu.rate_s[: count * size].reshape(count, size, 3)
     still = np.ptp(blocks, axis=1).max(axis=1) < 0.01
@@ -142,10 +149,8 @@ def warming_up(path):
 
 def when_to_store(path):
     drawn, axis = figure()
-    known, warm = (
-        files.read_calibration('warm_result/calibration.yaml'),
-        temperatures('warm', Topics()),
-    )
+    known = files.read_calibration('warm_result/calibration.yaml')
+    warm = warm_temperatures()
     axis.plot(
         (warm.stamp_ns - warm.stamp_ns[0]) * 1e-9,
         warm.temperature_c,

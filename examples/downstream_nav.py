@@ -108,7 +108,8 @@ class DeadReckoning:
     def __init__(self):
         self._stops = StopDetector(np.repeat(list(NOISE.values()), 3))
         self._first = self._before = None
-        self.attitude, self.velocity, self.position = None, np.zeros(3), np.zeros(3)
+        self.attitude: Rotation | None = None
+        self.velocity, self.position = np.zeros(3), np.zeros(3)
 
     def step(self, stamp_ns, rate, force):
         """Process a sample; return whether the position is available."""
@@ -159,6 +160,7 @@ class Navigator:
         found, message = self._reckoning, self._message()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
         message.header.frame_id, message.child_frame_id = 'odom', 'imu_link'
+        assert found.attitude is not None, 'a position is available only with an attitude'
         pose = message.pose.pose
         pose.position.x, pose.position.y, pose.position.z = found.position.tolist()
         pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = (

@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ FACTOR = 4.0
 """Simulated seconds per second."""
 HIDDEN, PROFILE = 'soft_spring', 'six_faces'
 """Physical fault of the simulated IMU; first motion."""
-SIMULATOR = {
+SIMULATOR: dict[str, Any] = {
     'table_file': TABLE,
     'seed': 1,
     'imu_seed': 5,
@@ -79,10 +80,13 @@ class Watcher:
         self.node.create_subscription(
             String,
             'imu/calibration',
-            lambda message: self.documents.append((time.monotonic(), message.data)),
+            self._document,
             latched_qos(),
         )
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._note, 100)
+
+    def _document(self, message):
+        self.documents.append((time.monotonic(), message.data))
 
     def _note(self, message):
         self.status |= {status.name: status for status in message.status}

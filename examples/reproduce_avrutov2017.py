@@ -19,7 +19,7 @@ TILT = np.deg2rad(2 / 60)
 ENCODER = np.deg2rad(1.5 / 3600)
 EARTH_RATE = 15.041 / 3600 * np.sin(np.deg2rad(50.45))
 K, MATRIX = 1e-3, 0.01
-PRINTED = {
+PRINTED: dict[int, list[list[float]]] = {
     1: [[2.5, 2.5, 2.5], [1.0, -0.01, 0.009999], [0.01, 1.0, -0.009999], [-0.009999, 0.01, 1.0]],
     2: [
         [2.5, 2.5, 2.5],
@@ -47,7 +47,7 @@ def readings(order='ZYX', axis='z', angles=ANGLES):
     return avrutov.gravity_readings(avrutov.turn(order, [angles] * 3), axis)
 
 
-def samples():
+def samples() -> list[tuple[int, str, str, np.ndarray, np.ndarray]]:
     """
     Return number, title, model, inputs and nominal coefficients of the four samples.
 

@@ -69,7 +69,9 @@ def texts(path):
             elif len(node.value.split()) > 3:
                 yield 'message', node.lineno, CODE.sub(' ', node.value)
         elif isinstance(node, ast.JoinedStr):
-            text = ''.join(v.value if isinstance(v, ast.Constant) else ' X ' for v in node.values)
+            text = ''.join(
+                str(v.value) if isinstance(v, ast.Constant) else ' X ' for v in node.values
+            )
             if len(text.split()) > 3:
                 yield 'message', node.lineno, CODE.sub(' ', text)
     for token in tokenize.generate_tokens(io.StringIO(source).readline):

@@ -43,7 +43,7 @@ def documented(tree):
                 and isinstance(each.value, ast.Constant)
                 and isinstance(each.value.value, str)
             ):
-                lines.update(range(each.lineno, each.end_lineno + 1))
+                lines.update(range(each.lineno, (each.end_lineno or each.lineno) + 1))
     return lines
 
 

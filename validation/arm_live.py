@@ -14,10 +14,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from examples.processes import NodeProcesses, local_environment
-from imu_calibration.between_imus.arm import estimate_arm
+from imu_calibration.between_imus.arm import RelativeArm, estimate_arm
 from imu_calibration.between_imus.pair import clipped
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.compensation.compensate import Transfer, compensate
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from msg_adapters.bag import open_recording
 from msg_adapters.imu import FIELDS
@@ -47,16 +48,16 @@ GUARD = 4
 class Case:
     """Two IMUs of one board with the inputs of the node and of the comparison."""
 
-    imu_a: object
-    """The stretch of A, ImuSamples."""
+    imu_a: ImuSamples
+    """The stretch of A."""
     force_b: np.ndarray
     """Calibrated specific force of B at A's stamps, m/s^2, shape (n, 3)."""
     usable: np.ndarray
     """Moving, and neither clipped nor just after clipping, shape (n,)."""
     calibration: str
     """calibration.yaml of A."""
-    arm: object
-    """RelativeArm from A to B."""
+    arm: RelativeArm
+    """From A to B."""
 
     @property
     def pose_of_a(self):

@@ -15,6 +15,7 @@ import argparse
 import re
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -201,7 +202,7 @@ def exchanged(calibration, finding, mate, measured):
             )
         },
     )
-    names = {
+    names: dict[str, Any] = {
         f'{part}_model': '+'.join(getattr(less.with_effect(sensor, mate), part)) or 'none'
         for part in ('accelerometer', 'gyroscope', 'reference')
     }

@@ -192,11 +192,13 @@ def run(folder, plots):
     section = Section('Recordings of hardware predict one another')
     for first, second in ONE_UNIT:
         for made, used in ((first, second), (second, first)):
+            found, holds = outcome(*transfer(folder, made, used))
             section.claim(
                 f'calibrated on {made}, compensated on {used}: error after / before',
                 'below 1, in no motion above 1.05, or refused with a sentence',
-                *outcome(*transfer(folder, made, used)),
-                True,
+                found,
+                holds,
+                headline=True,
             )
         pair = [transfer(folder, name, name)[0] for name in (first, second)]
         if not any(isinstance(found, Exception) for found in pair):
@@ -210,12 +212,14 @@ def run(folder, plots):
             )
     for name in RECORDINGS:
         for made, used in ((0, 1), (1, 0)):
+            found, holds = outcome(*transfer(folder, name, name, (made, used)))
             section.claim(
                 f'{name}: half {made + 1} calibrates, half {used + 1} is compensated: error after /'
                 ' before',
                 'below 1, in no motion above 1.05, or refused',
-                *outcome(*transfer(folder, name, name, (made, used))),
-                made == 0,
+                found,
+                holds,
+                headline=made == 0,
             )
     groups = halves_together(folder)
     section.claim(
@@ -226,6 +230,8 @@ def run(folder, plots):
         True,
     )
     for what, found, noticed in must_be_refused(folder):
-        section.claim(f'shaft_yaw_medium, {what}', 'refused, or said', found, noticed, True)
+        section.claim(
+            f'shaft_yaw_medium, {what}', 'refused, or said', found, noticed, headline=True
+        )
     section.say(text('cross'))
     return section

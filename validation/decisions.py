@@ -6,10 +6,11 @@ Sensors that are calibrated on one session and judged on a second session of the
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -191,7 +192,7 @@ def _by_hand(seed, *, poses, faces=False):
     )
 
 
-KINDS = {
+KINDS: dict[str, Callable[..., Any]] = {
     'clean': _on_table,
     'flexible mount': partial(_on_table, cause='flexible_mount'),
     'late driver on a shaft': partial(

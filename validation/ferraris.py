@@ -94,7 +94,7 @@ def _matrix_rows(sensor, ours, theirs, found):
     for pair, (_, _, name) in zip(
         np.array([angles_between(ours), angles_between(theirs)]).T, PAIRS
     ):
-        i, j = name
+        i, j = name[0], name[1]
         sd = np.degrees(
             np.hypot(found.sd_of(f'{sensor}.matrix.{i}{j}'), found.sd_of(f'{sensor}.matrix.{j}{i}'))
         )

@@ -11,6 +11,7 @@ line for each recording and the table. Reserved seeds: draw them once, after the
 import argparse
 import json
 import time
+from typing import Any
 
 import numpy as np
 
@@ -140,7 +141,7 @@ def _second_session(block, table, kind, unit, motion):
 
     It is the rms error when corrected by the chosen model over that by bias and matrix only.
     """
-    plain = {
+    plain: dict[str, Any] = {
         'accelerometer_model': 'bias+matrix',
         'gyroscope_model': 'bias+matrix',
         'reference_model': 'none',
@@ -148,13 +149,15 @@ def _second_session(block, table, kind, unit, motion):
     }
     second = make_world(kind, unit, motion + 500_000)
     errors = []
-    for choices in ({}, plain):
+    every_effect: dict[str, Any] = {}
+    for choices in (every_effect, plain):
         try:
             corrected = compensate(
                 block_of(second), calibrate(block, table, **choices).calibration, anyway=True
             ).imu
         except ImuCalibrationError as error:
             return {'refused': str(error)[:200]}
+        assert corrected is not None, 'a block with IMU samples has them after compensation'
         errors.append(
             [
                 np.sqrt(np.nanmean((values - true) ** 2))
@@ -164,7 +167,7 @@ def _second_session(block, table, kind, unit, motion):
                 )
             ]
         )
-    return dict(zip(SENSORS, np.divide(*errors).tolist()))
+    return dict(zip(SENSORS, np.divide(errors[0], errors[1]).tolist()))
 
 
 def table_of(rows):

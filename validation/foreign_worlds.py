@@ -9,6 +9,7 @@ mask) or the fact that it has none, and the names that describe it correctly. Tw
 act at a place, twenty do not; a world without a cause is made with the kind 'nothing'.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -78,12 +79,12 @@ class Scene:
     warm: np.ndarray
     rng: np.random.Generator
     axis: int
-    added_force: np.ndarray = None
-    added_rate: np.ndarray = None
-    seen_angle: np.ndarray = None
-    clock: object = None
+    added_force: np.ndarray
+    added_rate: np.ndarray
+    seen_angle: np.ndarray
+    clock: Callable[[np.ndarray], np.ndarray]
     """Function from true time to stamps, s."""
-    thin: object = None
+    thin: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
     """Function from a number of samples to (kept samples, their stamps in samples)."""
     truth: dict = field(default_factory=dict)
 

@@ -65,7 +65,9 @@ def write(folder, *, data, recordings, sessions, plan):
     """Write the documents of all sources into `folder`."""
     folder.mkdir(parents=True)
     writer = Writer(folder)
-    sources = [('sample', SAMPLE, SAMPLE / 'table.yaml', None)]
+    sources: list[tuple[str, Path, Path | None, Path | None]] = [
+        ('sample', SAMPLE, SAMPLE / 'table.yaml', None)
+    ]
     for name in recordings:
         bag = data / name
         table = bag / 'table.yaml'

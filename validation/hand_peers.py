@@ -60,7 +60,7 @@ def imu_tk(imu, ranges, gravity, without=None):
     ]
     return sensor, _gyroscope(
         *_other_turns(turns, sensor.directions(force), pieces, without),
-        imu.rate_s[first].mean(axis=0),
+        bias=imu.rate_s[first].mean(axis=0),
         loss='linear',
     )
 
@@ -81,7 +81,7 @@ def imu_calib(imu, ranges, gravity, without=None):
     ]
     return sensor, _gyroscope(
         *_other_turns(turns, sensor.directions(_means(imu, rests)), rests, without),
-        imu.rate_s[first].mean(axis=0),
+        bias=imu.rate_s[first].mean(axis=0),
         loss='soft_l1',
     )
 
@@ -165,7 +165,7 @@ def _other_turns(turns, up, rests, without):
     return [turns[k] for k in used], up[used], up[used + 1]
 
 
-def _gyroscope(turns, first, last, bias, loss):
+def _gyroscope(turns, first, last, *, bias, loss):
     """
     Return the gyroscope, bias and matrix, that turns gravity from rest to rest.
 

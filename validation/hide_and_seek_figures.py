@@ -132,7 +132,7 @@ def _table(rows, parts):
             name: np.mean([first_is_right(row) for row in effects if row['hidden'][0] == name])
             for name in names
         }
-        low = [name for name in sorted(names, key=shares.get) if shares[name] < LEAST]
+        low = [name for name in sorted(names, key=shares.__getitem__) if shares[name] < LEAST]
         lines.append(
             f'| the same for each of the {len(names)} effects, all grades and noises together, the'
             f' worst | 85 % | {100 * min(shares.values()):.0f} %'

@@ -4,8 +4,10 @@ MPU-9150 by hand against published biases, and turn angles against two peers.
 The angles are of turns that were not used.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +66,7 @@ def left_out_turns(imu, gravity):
     same for all methods: those of the norm fit to all poses.
     """
     ranges = find_still(imu)
-    methods = {
+    methods: dict[str, Callable[..., Any]] = {
         'ours': partial(ours_without, gather_by_hand(imu, ranges)),
         'imu_tk': imu_tk,
         'imu-calib': imu_calib,

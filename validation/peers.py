@@ -14,6 +14,7 @@ from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.use_cases.calibrate import calibrate
@@ -101,7 +102,7 @@ def plain_on_a_table(block, table):
         SensorModel(
             accelerometer=('bias', 'matrix'),
             gyroscope=('bias', 'matrix'),
-            joint_names=tuple(table.joint_names),
+            joint_names=JointNames.of(table.joint_names),
         ),
     )
     windows = gatherer.push(block) + gatherer.finish()

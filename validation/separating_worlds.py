@@ -21,11 +21,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count, islice
+from typing import Any
 
 import numpy as np
 
 from imu_calibration.core.errors import ImuCalibrationError
-from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.samples import (
+    ImuSamples,
+    JointSamples,
+    SampleBlock,
+    TemperatureSamples,
+)
 from imu_calibration.kinematics.table import Table
 from imu_calibration.planning.planner import Plan
 from imu_calibration.preprocessing.window_finder import MotionGatherer
@@ -108,16 +114,18 @@ def _spin_one_way(builder, up, speed):
 
 def appended(first: SampleBlock, second: SampleBlock) -> SampleBlock:
     """Return two recordings as one, the second some time after the first."""
+    assert first.imu and first.joints and first.temperature, 'simulated sessions have all three'
+    assert second.imu and second.joints and second.temperature, 'simulated sessions have all three'
     shift = first.imu.stamp_ns[-1] + to_ns(PAUSE) - second.imu.stamp_ns[0]
-    later = [
-        replace(part, stamp_ns=part.stamp_ns + shift)
-        for part in (second.imu, second.joints, second.temperature)
-    ]
+    later = SampleBlock(
+        replace(second.imu, stamp_ns=second.imu.stamp_ns + shift),
+        replace(second.joints, stamp_ns=second.joints.stamp_ns + shift),
+        replace(second.temperature, stamp_ns=second.temperature.stamp_ns + shift),
+    )
     return SampleBlock(
-        *(
-            type(b).concatenate([a, b])
-            for a, b in zip((first.imu, first.joints, first.temperature), later, strict=True)
-        )
+        ImuSamples.concatenate([first.imu, later.imu]),
+        JointSamples.concatenate([first.joints, later.joints]),
+        TemperatureSamples.concatenate([first.temperature, later.temperature]),
     )
 
 
@@ -126,7 +134,7 @@ def run(world: World) -> dict:
     hidden, start = world.hidden(), time.process_time()
     first = world.session(0, world.round(), hidden)
     table = Table.from_mapping(first.table)
-    row = {'seed': world.seed, 'hidden': world.effect, 'factor': world.factor}
+    row: dict[str, Any] = {'seed': world.seed, 'hidden': world.effect, 'factor': world.factor}
     found = diagnose(first.block, table)
     row['before'] = names(found)
     if not is_class(row['before']):

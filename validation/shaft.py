@@ -3,6 +3,7 @@
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
@@ -26,7 +27,7 @@ def read(folder, name):
 def calibrations(folder, name):
     """Return {'default', 'with lag': Calibration or the refusal as text}."""
     table, blocks = read(folder, name)
-    found = {}
+    found: dict[str, Calibration | str] = {}
     for what, options in (('default', CalibrationOptions()), ('with lag', WITH_LAG)):
         try:
             found[what] = calibrate([lambda: iter(blocks)], table, options).calibration

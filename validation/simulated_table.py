@@ -7,6 +7,7 @@ Our calibration must give its truth back.
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -32,7 +33,7 @@ POSES = tuple(
 )
 """Angles of the two axes, deg."""
 REST_S, SPINS, SPIN_DEG = 8.0, (30.0, 90.0, 180.0), 720.0
-TRUTH = {
+TRUTH: dict[str, dict[str, Any]] = {
     'accelerometer': {
         'bias': (0.12, -0.2, 0.3),
         'matrix': ((1.004, 0.002, -0.003), (0.001, 0.997, 0.002), (-0.002, 0.004, 1.006)),

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -206,6 +206,19 @@ class Calibration:
             for name, status in self.status_by_name.items()
             if name not in nuisances and status != FIXED and name.partition('.')[0] in SENSORS
         }
+
+    @overload
+    def compensate(self, samples: ImuSamples, *, temperature_c: Any = None) -> ImuSamples: ...
+
+    @overload
+    def compensate(
+        self,
+        samples: np.ndarray,
+        rate_s: np.ndarray,
+        *,
+        time: np.ndarray | None = None,
+        temperature_c: Any = None,
+    ) -> tuple[np.ndarray, np.ndarray]: ...
 
     def compensate(
         self,

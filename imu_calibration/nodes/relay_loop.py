@@ -8,15 +8,14 @@ other callbacks of the node run in a second thread with the public executor.
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-
-from imu_calibration.nodes.inputs import MatchedInput
+from rclpy.subscription import Subscription
 
 try:
     from rclpy.impl.implementation_singleton import rclpy_implementation as _inner
@@ -61,8 +60,14 @@ def available() -> bool:
     )
 
 
+class Subscribed(Protocol):
+    """A source of messages, such as `inputs.MatchedInput`."""
+
+    subscription: Subscription
+
+
 def relay(
-    node: Node, source: MatchedInput, publisher: Publisher, *, convert: Callable[[bytes, dict], Any]
+    node: Node, source: Subscribed, publisher: Publisher, *, convert: Callable[[bytes, dict], Any]
 ) -> None:
     """
     Publish the result of `convert` for each message until the context ends.
@@ -71,7 +76,7 @@ def relay(
     ----------
     node : rclpy.node.Node
         Its other callbacks run in a second thread.
-    source : inputs.MatchedInput
+    source : Subscribed
         In a callback group `OutsideExecutor`; its subscription may change.
     publisher : rclpy.publisher.Publisher
     convert : callable
