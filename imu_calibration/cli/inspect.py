@@ -62,9 +62,9 @@ def run(options: Options) -> VerbResult:
         show_findings(out, look.findings, hints)
         for reason, count in look.lost.items():
             out.print(f'lost: {count} {reason}')
-        code, more = _judge(out, look, hints)
-        codes.append(max(look.exit_code, code))
-        reasons += [*look.reasons, *more]
+        reason = _judge(out, look, hints)
+        codes.append(look.exit_code or (3 if reason else 0))
+        reasons += [*look.reasons, *([reason] if reason else [])]
         if look.by_hand is not None:
             _show_by_hand(out, look.by_hand, hints)
     if set(codes) == {1}:  # no topic is usable: also one line on standard error, as every refusal
@@ -161,16 +161,14 @@ def _step(step_ns):
 
 
 def _judge(out, look, hints):
-    """Print the motions and parameters that were found; return (exit code, its reasons)."""
-    from imu_calibration.document.outcome import exit_code, shortcomings
-
+    """Print the motions and parameters that were found; return why there are none, or ''."""
     result = look.calibrated
     if result is None or look.refused:
-        return 0, []
+        return ''
     if isinstance(result, ImuCalibrationError):
         why = f'not usable for calibration: {result.with_hint(hints)}'
         out.print(why)
-        return 3, [why]
+        return why
     out.print()
     for kind, count in result.calibration.statistics['windows'].items():
         out.print(
@@ -178,7 +176,7 @@ def _judge(out, look, hints):
             ' samples'
         )
     _show_parameters(out, result.calibration)
-    return exit_code(result.calibration), shortcomings(result.calibration)
+    return ''
 
 
 def _show_by_hand(out, found, hints):

@@ -19,6 +19,7 @@ from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
+from imu_calibration.document.outcome import shortcomings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
@@ -60,15 +61,28 @@ class RecordingSummary:
     @property
     def exit_code(self) -> int:
         """
-        1 where a calibration would be wrong, 3 where it may suffer, otherwise 0.
+        1 where a calibration would be wrong, 3 where it is incomplete or may suffer, otherwise 0.
 
-        The code is also 3 where more than 1 % of the data are lost or unusable.
+        Where a complete calibration results from the recording the code is 0, as that of
+        `calibrate`, whatever the warnings; on a table it is always that of `calibrate`.
         """
         return 1 if self.refused else exit_code_of(self.reasons)
 
     @property
+    def result(self) -> TableResult | HandResult | None:
+        """Result of the calibration on a table or by hand; None without one."""
+        for result in (self.calibrated, self.by_hand):
+            if result is not None and not isinstance(result, ImuCalibrationError):
+                return result
+        return None
+
+    @property
     def reasons(self) -> list[str]:
         """Why the exit code is not 0, a line each."""
+        if self.result is not None:
+            lacking = shortcomings(self.result.calibration)
+            if not lacking or self.result is self.calibrated:
+                return lacking
         lines = [finding.text for finding in warnings(self.findings)]
         received = self.streams['imu'].count if 'imu' in self.streams else 0
         dropped = dict(self.lost)

@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT, dropped_text
 from imu_calibration.core.scales import scale_range
 from imu_calibration.document.calibration import HAND_AXES, scale_questions, true_calibration
@@ -21,6 +23,8 @@ from imu_calibration.document.outcome import (
 from imu_calibration.document.trust import caveats, refused_sensors
 from imu_calibration.document.verdict import judge
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.use_cases.inspect import RecordingSummary
 
 PROOF = {
     sensor: {
@@ -152,3 +156,25 @@ def test_quiet_and_json_list_the_reasons_of_a_3(tmp_path, capsys):
 def test_a_loss_of_unknown_extent_is_a_reason_at_any_count():
     assert dropped_text({f'bytes {UNKNOWN_EXTENT}': 1}, 16_000)
     assert not dropped_text({f'bytes {UNKNOWN_EXTENT}': 0, 'imu spike': 1}, 16_000)
+
+
+def test_a_warning_changes_the_code_of_inspect_only_without_a_complete_calibration():
+    """`calibrate` gives 0 for a complete calibration, with any warning."""
+    found = (CheckFinding('stamps', WARNING, 'some stamps repeat'),)
+    look = RecordingSummary(None, {}, found, {}, None)
+    complete = proven()
+    weak = replace(complete, status=('weak',) * len(complete.status))
+    whole, lacking = SimpleNamespace(calibration=complete), SimpleNamespace(calibration=weak)
+    refusal = InputError('no interval at rest', code='no_rest')
+    assert exit_code(complete) == 0
+    for on_table, by_hand, code in (
+        (None, None, 3),
+        (refusal, None, 3),
+        (whole, None, 0),
+        (None, whole, 0),
+        (lacking, None, 3),
+        (None, lacking, 3),
+    ):
+        assert replace(look, calibrated=on_table, by_hand=by_hand).exit_code == code
+    assert replace(look, calibrated=lacking).reasons == shortcomings(weak)
+    assert replace(look, findings=(), by_hand=lacking).exit_code == 0

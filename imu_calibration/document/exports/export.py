@@ -34,7 +34,7 @@ from imu_calibration.document.exports.loss import (
     standard_motion,
 )
 from imu_calibration.document.exports.target import Noise, Numbers, Page, Readings, Target
-from imu_calibration.document.trust import Usable, caveats, usable
+from imu_calibration.document.trust import Usable, caveats, refused_sensors, usable
 from imu_calibration.effects.base import SENSORS, UNITS, Role
 
 
@@ -104,11 +104,13 @@ def export(
         When no sensor should be corrected with the calibration.
 
     """
-    used = (
-        Usable(calibration)
-        if target.whole or target.only_noise
-        else usable(calibration, anyway=anyway)
-    )
+    if target.whole:
+        # The file has the decisions too; a refused sensor is nevertheless a reason for exit code 3.
+        used = Usable(calibration, refused_sensors(calibration, anyway=anyway))
+    elif target.only_noise:
+        used = Usable(calibration)
+    else:
+        used = usable(calibration, anyway=anyway)
     applied = used.calibration
     if rate is not None and not 0 < rate < np.inf:
         raise InputError(
