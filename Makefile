@@ -38,8 +38,9 @@ PIP = $(PY) -m pip --disable-pip-version-check --no-input install --quiet
 # Four processes on two cores: live tests mostly wait. conftest.py orders the files. test/run_lanes.py repeats live tests that failed.
 LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 4
+README_TEST = test/cli/test_pages.py
 
-.PHONY: help setup demo demo-check live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
+.PHONY: help setup demo demo-check readme-check live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
@@ -67,6 +68,10 @@ demo-check: $(STAMP)
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && set -o pipefail && \
 	  $(PY) examples/demo.py --output "$$folder/demo" | tee "$$folder/log" && $(PY) tools/demo_figures.py "$$folder/log"
 
+# Every code block of the README runs, or has its reason in NOT_RUN of the test; a skipped test fails.
+readme-check: $(STAMP)
+	$(PY) -m pytest $(PLUGINS) -n 2 --dist load --fail-skipped $(README_TEST)
+
 live-demo: $(STAMP)
 	@$(PY) examples/live_demo.py --output $(OUTPUT)
 
@@ -78,8 +83,9 @@ test-long: $(STAMP)
 	$(LANES) long -- $(PROCESSES) --dist load $(TEST_OPTIONS)
 
 # All lanes in one call, where tests of several lanes share what their file makes once.
+# After `make readme-check` the test of the README is left out with README_CHECKED=yes.
 test-all: $(STAMP)
-	$(LANES) core live long -- $(PROCESSES) --dist loadfile $(TEST_OPTIONS)
+	$(LANES) core live long -- $(PROCESSES) --dist loadfile $(if $(README_CHECKED),--ignore=$(README_TEST)) $(TEST_OPTIONS)
 
 # The core lane: no DDS, no other processes, no browser. Two processes, because no test waits.
 test-fast: $(STAMP)
@@ -96,8 +102,8 @@ lint: lint-code lint-types lint-size lint-words
 lint-tools: $(STAMP)-lint
 
 lint-code: $(STAMP)-lint
-	$(VENV)/bin/ruff format --check --quiet .
-	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check --quiet --output-format concise .
+	$(VENV)/bin/ruff check --output-format concise .
 
 lint-types: $(STAMP)-lint
 	$(VENV)/bin/mypy

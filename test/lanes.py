@@ -57,6 +57,11 @@ def _library_calls():
     return frame is not None and '-packages' in frame.f_code.co_filename
 
 
+def pytest_addoption(parser):
+    """Add the option of checks in which nothing may be left out."""
+    parser.addoption('--fail-skipped', action='store_true', help='a skipped test fails')
+
+
 def pytest_configure():
     """Guard the functions that start processes and DDS participants."""
     starts = 'start a process'
@@ -96,8 +101,13 @@ def pytest_runtest_protocol(item):
 def pytest_runtest_makereport(item, call):
     """
     Attach the processor time to the last report of a test, which also arrives from other processes.
+
+    With ``--fail-skipped`` a skipped test fails, with the reason of the skip.
     """
     report = yield
+    if report.skipped and item.config.getoption('fail_skipped'):
+        report.outcome = 'failed'
+        report.longrepr = f'E   {item.nodeid} was skipped: {report.longrepr[-1]}'
     if call.when == 'teardown':
         report.user_properties.append(('processor_seconds', _processor_time() - item.stash[_start]))
     return report
