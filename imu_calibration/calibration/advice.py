@@ -326,7 +326,7 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     for name, status, sd, tolerance in zip(
         hand.param_names, hand.statuses, hand.judged_sd, hand.tolerances, strict=True
     ):
-        if status in LACKING:
+        if status in LACKING and name.split('.')[0] not in hand.hand_model.absent:
             lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
     parts = {
         sensor: [hand.param_names.index(name) for name in lacking[sensor]]

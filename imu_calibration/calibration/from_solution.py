@@ -165,6 +165,7 @@ def document(
     changes: ModelChanges,
     uncorrected: Uncorrected,
     tested: Collection[str] = (),
+    absent: tuple[str, ...] = (),
 ) -> Calibration:
     """
     Return the Calibration for a solution, with statuses and the verdict.
@@ -185,6 +186,8 @@ def document(
         values.
     tested : names, optional
         Parameters that are replaced by a likelihood-ratio test.
+    absent : sensors, optional
+        Sensors without readings.
 
     """
     final = solution.model.at(solution.values)
@@ -214,6 +217,7 @@ def document(
         held_reason=reasons_held(
             solution.held, solution.param_names, solution.replaced, tested=tested
         ),
+        absent=absent,
     )
     return judged(calibration, tolerances)
 

@@ -4,7 +4,7 @@ A calibration by hand.
 With the effects that it supports, and with the document and result of a calibration on a table.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -108,7 +108,8 @@ def solve_by_evidence(
         investigate_by_hand,
     )  # here, because its import is slow
 
-    if as_asked or len(data.poses.start) < MIN_FOLD_POSES:
+    # The search compares both sensors in poses and turns: with one sensor it has no data.
+    if as_asked or data.absent or len(data.poses.start) < MIN_FOLD_POSES:
         return EvidentHand(solve_by_hand(data, options))
     found, asked = investigate_by_hand(data, options), _asked(data, options)
     while faint := _faint(hand := _solved(data, found, options), found, asked):
@@ -314,7 +315,8 @@ def read_by_hand(
         When no usable sample remains.
 
     """
-    cleaner = BlockCleaner(nominal=nominal, watchers=[] if preflight is None else [preflight])
+    watchers = [] if preflight is None else [preflight]
+    cleaner = BlockCleaner(nominal=nominal, watchers=watchers, one_sensor=True)
     joined, temperatures = JoinedParts(), []
     for cleaned in cleaner.all_of(blocks):
         for _, imu in cleaned.imu:
@@ -433,6 +435,7 @@ def hand_result(
         changes=evident.changes,
         uncorrected=uncorrected_by_hand(hand),
         tested=CROSS_TERMS,
+        absent=hand.hand_model.absent,
     )
     needed = {
         name: (item['needs'], float('nan'))
@@ -516,8 +519,18 @@ def check_by_hand(
         else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
     )
     corrected = compensate_samples(calibration, recording.imu, warm)
+    # Of an absent sensor either the readings or the parameters have no meaning.
+    absent = {*calibration.absent, *recording.imu.absent}
+    if absent == set(SENSORS):
+        raise InputError(
+            'a calibration must be of a sensor that the recording has, it is of the'
+            f' {calibration.sensors[0]} only and the recording has no readings of it; give another'
+            ' recording',
+            code='absent',
+        )
+    gravity = gravity_of(calibration, options)
     return CheckResult(
-        prove_readings(data, recording.imu, corrected, gravity=gravity_of(calibration, options)),
+        prove_readings(data, recording.imu, corrected, gravity=gravity, absent=absent),
         recording.findings,
     )
 
@@ -532,27 +545,30 @@ def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
 
 
 def prove_readings(
-    data: HandData, before: ImuSamples, after: ImuSamples, *, gravity: float
+    data: HandData,
+    before: ImuSamples,
+    after: ImuSamples,
+    *,
+    gravity: float,
+    absent: Collection[str] = (),
 ) -> dict:
     """
     Return the proof of corrected samples `after` against the raw ones.
 
-    Sensor -> entry of a document (see `calibration.proof`).
+    Sensor -> entry of a document (see `calibration.proof`); none of the sensors `absent`.
     """
     poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
     lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
-    norms, rest = (
-        entry_of(errors, UNITS[sensor]) | {'seconds': rested}
-        for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate)))
-    )
-    proof = {
-        'accelerometer': norms | {'regimes': {'rest': norms}},
-        'gyroscope': rest | {'regimes': {'rest': rest}},
-    }
-    if len(turns) >= TURNS_LEAST:
+    proof, rest = {}, {}
+    for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate)), strict=True):
+        if sensor not in absent:
+            rest = entry_of(errors, UNITS[sensor]) | {'seconds': rested}
+            proof[sensor] = rest | {'regimes': {'rest': rest}}
+    # The directions at both ends of a turn are those of the corrected accelerometer.
+    if not absent and len(turns) >= TURNS_LEAST:
         up = unit_rows(force)
         # the first corrected readings are NaN where they need an angular acceleration
         errors = (

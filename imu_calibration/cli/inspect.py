@@ -103,7 +103,11 @@ def _document(look):
     if found is None:
         return document
     return document | {
-        'status': dict(zip(found.calibration.param_names, found.calibration.status, strict=True)),
+        'status': {
+            name: status
+            for name, status in found.calibration.status_by_name.items()
+            if name in found.calibration.param_names
+        },
         'needs': list(found.calibration.undetermined),
     }
 

@@ -76,6 +76,8 @@ class CompensationStream:
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
         self._fastest, self._temperatures = 0.0, []
         self._last: dict[str, Any] = {}
+        self.measured = dict.fromkeys(SENSORS, False)
+        """Sensor -> whether a finite reading of it was received."""
 
     def correct(self, imu: ImuSamples) -> Corrected:
         """
@@ -93,6 +95,8 @@ class CompensationStream:
         has_force, has_rate = (
             np.isfinite(values).all(axis=1) for values in (imu.force_s, imu.rate_s)
         )
+        self.measured['accelerometer'] |= bool(has_force.any())
+        self.measured['gyroscope'] |= bool(has_rate.any())
         slope = np.zeros_like(imu.rate_s)
         slope[has_rate] = self.slope.push_block(imu.stamp_ns[has_rate], imu.rate_s[has_rate])
         force_s, rate_s = (

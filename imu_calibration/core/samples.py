@@ -134,6 +134,11 @@ class ImuSamples(AlignedArrays):
     Corrected specific force and rate that belong to the readings, shape (n, 6), where a calibration
     is checked.
     """
+    absent: tuple[str, ...] = ()
+    """
+    Sensors without readings, 'accelerometer' or 'gyroscope'; their columns are constant and have no
+    meaning.
+    """
 
 
 @dataclass(frozen=True, eq=False)

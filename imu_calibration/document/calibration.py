@@ -92,6 +92,11 @@ class Calibration:
     """
     held_reason: dict[str, str] = field(default_factory=dict)
     """Held parameter -> the reason (`status.reasons_held`)."""
+    absent: tuple[str, ...] = ()
+    """
+    Sensors without readings in the recording: their parameters are nominal, without a decision, and
+    their readings are not corrected.
+    """
     judgement: Verdict | None = None
     """The verdict with its reasons one by one, where it was not read from a file."""
 
@@ -99,6 +104,11 @@ class Calibration:
     def param_names(self) -> list[str]:
         """Names in the order of `values`."""
         return self.model.param_names
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors that were calibrated."""
+        return tuple(sensor for sensor in SENSORS if sensor not in self.absent)
 
     @property
     def sd(self) -> np.ndarray:
@@ -110,8 +120,10 @@ class Calibration:
         """
         {'sd', 'tolerance', 'status'} of the accelerometer's common scale by hand.
 
-        It is {} where gravity counts as exact.
+        It is {} where gravity counts as exact, and without an accelerometer.
         """
+        if 'accelerometer' in self.absent:
+            return {}
         return self.statistics.get('by_hand', {}).get('common_scale', {})
 
     @property
@@ -126,9 +138,15 @@ class Calibration:
 
     @property
     def status_by_name(self) -> dict[str, str]:
-        """Status of each parameter and of the common scale, by name."""
-        common = {COMMON_SCALE: self.common_scale['status']} if self.common_scale else {}
-        return dict(zip(self.param_names, self.status)) | common
+        """Status of each parameter of the sensors with readings, and of the common scale."""
+        found = {
+            name: status
+            for name, status in zip(self.param_names, self.status)
+            if name.partition('.')[0] not in self.absent
+        }
+        if self.common_scale:
+            found[COMMON_SCALE] = self.common_scale['status']
+        return found
 
     def value(self, sensor: str, effect: str) -> np.ndarray:
         """Return the value of one effect in its documented shape."""
@@ -179,10 +197,11 @@ class Calibration:
         """
         Sensor -> decision: the more cautious of that in the file and that of the proof.
 
-        UNPROVEN without both, and at best UNPROVEN where compensation refuses the values.
+        UNPROVEN without both, and at best UNPROVEN where compensation refuses the values. An absent
+        sensor has none.
         """
         found = {}
-        for sensor in SENSORS:
+        for sensor in self.sensors:
             known = [SensorDecision(self.decision[sensor])] if sensor in self.decision else []
             if self.proof.get(sensor) or not known:
                 known.append(decide(self.proof.get(sensor)))
@@ -304,6 +323,8 @@ NUMBER_COLUMNS = ('value', 'sd')
 def parameter_rows(calibration: Calibration) -> Iterator[tuple[str, ...]]:
     """Yield the cells of each parameter in the order of `PARAMETER_HEADINGS`."""
     for effect in calibration.model.effects:
+        if effect.sensor in calibration.absent:
+            continue
         part = calibration.model.slices[effect.key]
         for k, index in enumerate(range(part.start, part.stop)):
             factor, unit = for_people(effect.unit_of(k), calibration.param_names[index])
@@ -494,19 +515,23 @@ def beyond_instruments(calibration: Calibration, sensor: str) -> str:
 
 def needs_accelerometer(calibration: Calibration, decisions: Mapping[str, SensorDecision]) -> bool:
     """Return whether the gyroscope cannot be corrected: its axes by hand are not available."""
-    if calibration.gauge.get('axes') != HAND_AXES:
+    if calibration.gauge.get('axes') != HAND_AXES or len(calibration.sensors) < len(SENSORS):
         return False
     return bool(
         decisions['accelerometer'] is HARMS or beyond_instruments(calibration, 'accelerometer')
     )
 
 
+ABSENT = 'the recording of the calibration has no readings of it'
+"""Why compensation leaves the readings of an absent sensor as they are."""
 AXES_MISSING = 'its axes depend on the accelerometer'
 """Why compensation refuses the gyroscope of a calibration by hand."""
 
 
 def never_applied(calibration: Calibration, sensor: str) -> str:
     """Return why compensation refuses the values of a sensor; '' where it does not."""
+    if sensor in calibration.absent:
+        return ABSENT
     if why := beyond_instruments(calibration, sensor):
         return why
     if sensor == 'gyroscope' and needs_accelerometer(calibration, calibration.decisions):

@@ -113,6 +113,7 @@ KEYS_OF_PARTS = {
     'covariance': {},
     'covariance_terms': {},
     'frame_id': _is_text,
+    'absent': lambda value: _is_list_of(SENSORS.__contains__)(value) and len(value) < len(SENSORS),
     'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
     'joint_names': lambda value: (
         _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MAX_DOCUMENT_JOINTS
@@ -312,6 +313,7 @@ def parts_of(document: Mapping) -> dict[str, Any]:
             if reason
         },
         'undetermined': tuple(document.get('undetermined_directions') or ()),
+        'absent': tuple(document.get('absent') or ()),
         'notes': tuple(document.get('notes') or ()),
         **{
             name: dict(document.get(name) or {})
@@ -483,6 +485,8 @@ def to_mapping(calibration: Calibration) -> dict:
         'frame_id': calibration.frame_id,
         'gauge': dict(calibration.gauge),
     }
+    if calibration.absent:
+        document['absent'] = list(calibration.absent)
     if calibration.model.definitions:
         document['effects'] = plain(calibration.model.definitions)
     for section in SECTIONS:

@@ -267,9 +267,11 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
 
     """
     words, refused = calibration.decisions, refused_sensors(calibration, anyway=anyway, live=live)
-    if refused.keys() == set(SENSORS):
+    if refused.keys() == set(calibration.sensors):
         first = min(refused, key=lambda sensor: words[sensor] is not HARMS)
-        consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(SENSORS)
+        consent = refused_sensors(calibration, anyway=True, live=live).keys() != set(
+            calibration.sensors
+        )
         text = (
             'a calibration must help a sensor on held-out data to be applied, this one does not: '
             f'{first} {refused[first]}; calibrate again'
@@ -277,7 +279,7 @@ def usable(calibration: Calibration, *, anyway: bool = False, live: bool = False
         raise DocumentError(text, key='anyway' if consent else None, code='no_sensor_helps')
     cautions = tuple(
         f'{sensor} {_text(calibration, sensor)}'
-        for sensor in SENSORS
+        for sensor in calibration.sensors
         if sensor not in refused and words[sensor] is not HELPS
     )
     return Usable(
@@ -296,15 +298,16 @@ def refused_sensors(
     )
     refused = {
         sensor: _text(calibration, sensor)
-        for sensor in SENSORS
+        for sensor in calibration.sensors
         if calibration.decisions[sensor] not in accepted
     }
-    for sensor in SENSORS:
+    for sensor in calibration.sensors:
         if why := beyond_instruments(calibration, sensor) or (
             live and _mostly_undetermined(calibration, sensor)
         ):
             refused[sensor] = why
-    if 'accelerometer' in refused and calibration.gauge.get('axes') == HAND_AXES:
+    by_hand = calibration.gauge.get('axes') == HAND_AXES
+    if by_hand and 'accelerometer' in refused and 'gyroscope' in calibration.sensors:
         refused.setdefault('gyroscope', AXES_MISSING)
     return refused
 
@@ -335,11 +338,11 @@ def _text(calibration, sensor):
 
 def usage(calibration: Calibration) -> str:
     """Return a line with the sensor that is corrected if only one is; '' otherwise."""
-    refused = refused_sensors(calibration)
-    if len(refused) != 1:
-        return 'compensation corrects neither sensor with it' if refused else ''
-    corrected = next(s for s in SENSORS if s not in refused)
-    return f'compensation corrects the {corrected} with it; the {next(iter(refused))} is unchanged'
+    unchanged = [*refused_sensors(calibration), *calibration.absent]
+    if len(unchanged) != 1:
+        return 'compensation corrects neither sensor with it' if unchanged else ''
+    corrected = next(sensor for sensor in SENSORS if sensor not in unchanged)
+    return f'compensation corrects the {corrected} with it; the {unchanged[0]} is unchanged'
 
 
 def caveats(calibration: Calibration) -> list[str]:

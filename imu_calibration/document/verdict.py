@@ -300,7 +300,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     Return notes on biases that move from window to window by more than the tolerance on their mean.
     """
     reasons, by_hand = [], calibration.gauge.get('axes') == HAND_AXES
-    for sensor in SENSORS:
+    for sensor in calibration.sensors:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
         if scatter > tolerances[part][0]:
@@ -381,6 +381,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
             limiting, (COMMON_SCALE, common['sd'] / common['tolerance']), key=lambda pair: pair[1]
         )
     reasons = [_decided(calibration, sensor, word) for sensor, word in decisions.items()]
+    reasons += _absent(calibration)
     reasons.append(_parameters(count, limiting, complete=is_complete(decisions, count)))
     reasons += (
         _undetermined(calibration)
@@ -420,11 +421,24 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
     return replace(
         calibration,
         decision={sensor: str(word) for sensor, word in found.decisions.items()},
-        decision_reasons={sensor: _reason(calibration, sensor) for sensor in SENSORS},
+        decision_reasons={sensor: _reason(calibration, sensor) for sensor in calibration.sensors},
         notes=tuple(lines_of(reason for reason in found.reasons if reason.word is not DECISION)),
         judgement=found,
         statistics=calibration.statistics | {'parameters': counts},
     )
+
+
+def _absent(calibration):
+    return [
+        Reason(
+            NOTE,
+            f'the recording has no readings of the {sensor}: it is not calibrated, and its readings'
+            ' are not corrected',
+            '',
+            sensors=(sensor,),
+        )
+        for sensor in calibration.absent
+    ]
 
 
 def _decided(calibration, sensor, word):
@@ -445,7 +459,7 @@ def _decided(calibration, sensor, word):
 def _decisions(calibration):
     """Return sensor -> decision; at best UNPROVEN for an uncertain clock or refused values."""
     found = {}
-    for sensor in SENSORS:
+    for sensor in calibration.sensors:
         word = decide(calibration.proof.get(sensor))
         doubtful = _periodic(calibration, sensor) or beyond_instruments(calibration, sensor)
         if word is HELPS and doubtful:
@@ -533,7 +547,7 @@ def _strange_causes(calibration):
 
 def _blind(calibration):
     reasons = []
-    for sensor in SENSORS:
+    for sensor in calibration.sensors:
         own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
         matrix_held = all(
             status == HELD

@@ -38,12 +38,35 @@ def one_source(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         yield CheckFinding(two_sources.CHECK, REFUSE, imu.two_sources, key=two_sources.KEY)
 
 
+def both_sensors(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Both sensors have readings, from the beginning."""
+    imu = evidence.streams.get('imu')
+    if imu is None or not imu.absent:
+        return
+    sensor = imu.absent[0]
+    if imu.n_late:
+        yield CheckFinding(
+            'absent',
+            WARNING,
+            f'the {sensor} must measure from the beginning, it has no readings at first and'
+            f' {imu.n_late} later, which are not used; cut the beginning of the recording',
+        )
+        return
+    yield CheckFinding(
+        'absent',
+        NOTE,
+        f'the recording has no readings of the {sensor}: only the other sensor is processed',
+    )
+
+
 def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """No output is constant while other axes move."""
     chunks, range_ = evidence.chunks, evidence.chunks.range
     if not len(chunks):
         return
     for sensor, part in SENSOR_COLUMNS.items():
+        if sensor in evidence.absent:
+            continue
         noisy = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
@@ -290,6 +313,7 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 CHECKS = (
     one_source,
+    both_sensors,
     value_checks.force_unit,
     stamps,
     clocks,

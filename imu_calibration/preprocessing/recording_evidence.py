@@ -51,6 +51,12 @@ class RecordingEvidence:
     still_joints_ns: np.ndarray
     """First and last stamp of each stretch in which no joint position changes, shape (n, 2)."""
 
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Sensors without readings; their columns in `chunks` have no meaning."""
+        imu = self.streams.get('imu')
+        return () if imu is None else imu.absent
+
     @cached_property
     def frozen(self) -> dict[str, np.ndarray]:
         """Sensor -> in which chunks it gives one reading again and again, bool, shape (n,)."""

@@ -207,6 +207,8 @@ class Rest:
         return None if found is None else found.centre
 
     def _sphere(self):
+        if not np.median(self.norm) > 0.0:  # an accelerometer that reads zero has no sphere
+            return None
         found = fit_sphere(self.force)
         far = np.linalg.norm(found.centre) > FARTHEST * np.median(self.norm)
         return None if far or found.spread < LEAST_SPREAD else found
@@ -329,6 +331,9 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
     flat = {
         sensor: (chunks.range[:, part] == 0).all(axis=1) for sensor, part in SENSOR_COLUMNS.items()
     }
+    for sensor, flags in flat.items():
+        if flags.all():  # an absent sensor, or one without any reading: no part of it is frozen
+            flat[sensor] = np.zeros(len(chunks), bool)
     found = {sensor: in_long_runs(flags) for sensor, flags in flat.items()}
     rest = (
         find_rest(chunks.select(~np.logical_or(*flat.values())))

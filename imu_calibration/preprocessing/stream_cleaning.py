@@ -15,6 +15,7 @@ from imu_calibration.core.samples import (
     SampleBlock,
     TemperatureSamples,
 )
+from imu_calibration.preprocessing.absent_sensor import SensorPresence
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
@@ -44,10 +45,19 @@ class StreamCheck:
     an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps, each of which starts a new
     epoch. Where the stamps of an IMU follow a clock only loosely (packets, times of arrival,
     milliseconds, jitter), the times of its samples are computed first (see `sample_times`).
+
+    Parameters
+    ----------
+    one_sensor : bool
+        Whether an IMU with one sensor is accepted (`absent_sensor`); otherwise its samples are not
+        finite.
+
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, one_sensor: bool = False) -> None:
         self.counts = Counter()
+        self.presence = SensorPresence() if one_sensor else None
+        """Which sensors an IMU stream has."""
         self.sources = TwoSourceSearch()
         """Whether an IMU stream holds the readings of two sensors."""
         self.epoch = 0
@@ -79,6 +89,14 @@ class StreamCheck:
         """
         if samples is None or not len(samples):
             return []
+        if self.presence is not None and isinstance(samples, ImuSamples):
+            samples = self.presence.push(samples)
+        return self._checked(samples)
+
+    def _checked(self, samples):
+        """Return the accepted samples of a piece with known sensors, as `push` does."""
+        if not len(samples):
+            return []
         samples = self._finite(samples)
         if isinstance(samples, ImuSamples):
             self.sources.push(samples)
@@ -86,8 +104,10 @@ class StreamCheck:
 
     def finish(self) -> list[tuple[int, Any]]:
         """Return the buffered samples, as `push` does."""
+        waiting = None if self.presence is None else self.presence.finish()
+        accepted = [] if waiting is None else self._checked(waiting)
         held, self._held = self._held, None
-        return self._without_spikes(
+        return accepted + self._without_spikes(
             ([] if held is None else self._accept(held)) + self._end_epoch(), ended=True
         )
 
@@ -109,6 +129,8 @@ class StreamCheck:
             *self._extent_ns,
             None if self._times is None else self._times.odd_line(self._n_accepted),
             two_sources=self.sources.requirement if self.sources.found else '',
+            absent=() if self.presence is None else self.presence.absent,
+            n_late=0 if self.presence is None else self.presence.n_late,
         )
 
     def _without_spikes(self, accepted, ended=False):
@@ -269,6 +291,10 @@ class StreamStatistics:
     """Samples with stamp zero, for which the time of arrival was used."""
     two_sources: str = ''
     """Refusal of an IMU with the readings of two sensors (`TwoSourceSearch`); '' for one sensor."""
+    absent: tuple[str, ...] = ()
+    """Sensors without readings."""
+    n_late: int = 0
+    """Samples with readings of a sensor that had none at first; they are not used."""
 
     @property
     def rate(self) -> float:
@@ -394,6 +420,8 @@ class BlockCleaner:
         For recordings in volts or counts.
     watchers : sequence of Watcher
         Receivers of each cleaned block.
+    one_sensor : bool
+        Whether an IMU with one sensor is accepted, as for `StreamCheck`.
 
     """
 
@@ -402,9 +430,11 @@ class BlockCleaner:
         joint_names: Sequence[str] = (),
         nominal: NominalScaling | None = None,
         watchers: Sequence[Watcher] = (),
+        *,
+        one_sensor: bool = False,
     ):
         self._names, self._nominal, self._watchers = tuple(joint_names), nominal, watchers
-        self._checks = {name: StreamCheck() for name in STREAMS}
+        self._checks = {name: StreamCheck(one_sensor=one_sensor) for name in STREAMS}
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
         self._ready: dict[str, list[tuple[int, Any]]] = {name: [] for name in STREAMS}
         self.lost: Counter[str] = Counter()

@@ -57,8 +57,8 @@ MIN_CONVERTER_STEP = 1e-6
 def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Specific force is in m/s^2."""
     length = evidence.length
-    if length is None:
-        return
+    if length is None or 'accelerometer' in evidence.absent or not evidence.n_changed[:3].any():
+        return  # outputs that never change are no unit: see the check of frozen outputs
     if (
         error := force_error(length, 'at rest' if evidence.rest is not None else 'in the middle')
     ) is not None:
@@ -321,7 +321,7 @@ def bias(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """The accelerometer reads local gravity within 2 per cent."""
     rest = evidence.rest
-    if rest is None or not _is_force(evidence.length):
+    if rest is None or 'accelerometer' in evidence.absent or not _is_force(evidence.length):
         return
     off = rest.length / evidence.gravity - 1
     if rest.sphere is not None:
@@ -350,7 +350,12 @@ def repeated_readings(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every message carries a new measurement."""
     frozen = evidence.chunks.size * int(np.logical_and(*evidence.frozen.values()).sum())
     share = (evidence.n_repeated - frozen) / max(evidence.n_samples, 1)
-    if share > REPEATED_SHARE and evidence.quiet_range.all():
+    noisy = [
+        evidence.quiet_range[part].all()
+        for sensor, part in SENSOR_COLUMNS.items()
+        if sensor not in evidence.absent
+    ]
+    if share > REPEATED_SHARE and all(noisy):
         yield CheckFinding(
             'repeated_readings',
             WARNING,

@@ -29,7 +29,6 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.document.verdict import judged
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import Choices, inputs_of, made_from, provenance_with
 from imu_calibration.use_cases.recordings import (
@@ -264,7 +263,10 @@ def check(
             ),
             (),
         )
-    refused = {sensor: why for sensor in SENSORS if (why := never_applied(calibration, sensor))}
+    refused = {}
+    for sensor in calibration.sensors:
+        if why := never_applied(calibration, sensor):
+            refused[sensor] = why
     questions = scale_questions(calibration).values()
     return replace(
         result, notes=(*notes, *questions, *_notes(recording, calibration)), refused=refused

@@ -19,7 +19,7 @@ from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import counter
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.calibration import ABSENT, Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
 from imu_calibration.preprocessing.value_checks import refuse_force_unit
 from imu_calibration.use_cases.choices import noise_of
@@ -209,9 +209,12 @@ def _in_memory(recording, calibration, transfer, *, late, used):
 
 def _outcome(imu, stream, lost, used):
     against = [*used.lines, *caveats(stream.calibration)]
-    return Compensated(
-        imu, stream.count, against + stream.warnings(), lost, dict(used.refused), used.cautions
-    )
+    refused = dict(used.refused)
+    for sensor in stream.calibration.absent:
+        if stream.measured[sensor]:  # readings that nothing is known about pass unchanged
+            refused[sensor] = ABSENT
+            against.append(f'the {sensor} is not corrected: {ABSENT}')
+    return Compensated(imu, stream.count, against + stream.warnings(), lost, refused, used.cautions)
 
 
 def _corrected(imu, corrected, transfer, late):

@@ -33,7 +33,11 @@ from imu_calibration.references.gravity.bias_movement import (
     without_movement,
 )
 from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
-from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
+from imu_calibration.references.gravity.g_sensitivity import (
+    NO_EVIDENCE,
+    g_sensitivity_evidence,
+    shown,
+)
 from imu_calibration.references.gravity.hand_parameters import (
     CROSS_TERMS,
     HandModel,
@@ -82,6 +86,11 @@ excluded.
 """
 MAX_SETTLED_CHANGE = 0.03
 """Relative change of a time constant below which its columns are not recomputed."""
+ABSENT_SD = 1.0
+"""
+Standard deviation of the means of an absent sensor, SI: without weight against any reading. Its
+parameters are held, so that it enters no result.
+"""
 POSES_FULL = 12
 """
 The nine accelerometer parameters need one equation per attitude; further ones determine the scatter
@@ -246,6 +255,8 @@ class HandData:
     """`TurnData` between consecutive poses, then those of known angle."""
     statistics: dict
     """Attitudes, excluded turns, noise and period of the samples."""
+    absent: tuple[str, ...] = ()
+    """Sensors without readings."""
 
 
 def gather_by_hand(
@@ -259,7 +270,8 @@ def gather_by_hand(
     time = sample_times(imu)
     poses = average_poses(imu, _as_ranges(imu, stills), temperature_c)
     attitudes = distinct_attitudes(poses.force)
-    if attitudes < MIN_ATTITUDES:
+    # Without an accelerometer gravity is not measured: rests determine the gyroscope's bias.
+    if attitudes < MIN_ATTITUDES and 'accelerometer' not in imu.absent:
         raise NotObservableError(
             f'calibration by hand needs at least {MIN_ATTITUDES} different attitudes held still'
             f' ({POSES_FULL} or more for all parameters), got {attitudes} in {len(poses.start)}'
@@ -268,6 +280,10 @@ def gather_by_hand(
             key='table',
             code='too_few_attitudes',
         )
+    if imu.absent:
+        # A turn relates both sensors.
+        statistics = {'attitudes': attitudes, 'turns_dropped': {}, **noise_statistics(poses)}
+        return HandData(without_sensors(poses, imu.absent), [], statistics, imu.absent)
     turns, dropped = collect_turns(time, imu, poses=poses, temperature_c=temperature_c)
     turns += [
         known_turn_data(time, imu, turn, poses=poses, temperature_c=temperature_c)
@@ -290,6 +306,8 @@ def solve_by_hand(
     """
     report('solving')
     free = _solved(data, options, point)
+    if 'accelerometer' in data.absent:
+        return free
     model, poses = free.hand_model, free.used_poses
     up = directions(model, poses)
     names = off_axis_lacking(up)
@@ -314,7 +332,10 @@ def _missed_by(hand, turn):
 def _solved(data, options, point, *, untested=()):
     """Return the calibration with the cross terms `untested` held at their prior."""
     poses, turns = data.poses, data.turns
-    default, evidence = default_gyroscope(poses)
+    if data.absent:  # the g-sensitivity relates both sensors
+        default, evidence = BASE, dict(NO_EVIDENCE)
+    else:
+        default, evidence = default_gyroscope(poses)
     reference_c = (
         25.0 if poses.temperature_c is None else float(np.round(np.mean(poses.temperature_c)))
     )
@@ -325,7 +346,7 @@ def _solved(data, options, point, *, untested=()):
         point=point or {},
         catalogue=options.catalogue,
     )
-    model = HandModel(sensors, options.gravity, untested=untested)
+    model = HandModel(sensors, options.gravity, untested=untested, absent=data.absent)
     thermal = [effect.name for effect in model.extras if 'temperature' in effect.needs]
     if thermal and poses.temperature_c is None:
         raise InputError(
@@ -429,6 +450,21 @@ def _settled(model, found):
     return all(
         found.held[k] or abs(found.state.values[k] / time - 1) <= MAX_SETTLED_CHANGE
         for k, time in known
+    )
+
+
+def without_sensors(poses: Poses, absent: Sequence[str]) -> Poses:
+    """Return poses in which the means of absent sensors have no weight."""
+    force_sem, rate_sem = poses.force_sem, poses.rate_sem
+    if 'accelerometer' in absent:
+        force_sem = np.full_like(force_sem, ABSENT_SD)
+    if 'gyroscope' in absent:
+        rate_sem = np.full_like(rate_sem, ABSENT_SD)
+    return replace(
+        poses,
+        force_sem=force_sem,
+        rate=np.zeros_like(poses.rate) if 'gyroscope' in absent else poses.rate,
+        rate_sem=rate_sem,
     )
 
 

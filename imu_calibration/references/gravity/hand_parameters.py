@@ -69,6 +69,8 @@ class HandModel:
     """
     untested: tuple[str, ...] = ()
     """Cross terms that are held at their prior, because no attitude tests them."""
+    absent: tuple[str, ...] = ()
+    """Sensors without readings; all their parameters are held."""
 
     def __post_init__(self):
         """Refuse effects that are not observable by hand."""
@@ -98,8 +100,9 @@ class HandModel:
 
     @cached_property
     def withheld(self) -> np.ndarray:
-        """Mask of the parameters in `untested`, shape (n,)."""
-        return np.isin(self.model.param_names, self.untested)
+        """Mask of the parameters in `untested` and of absent sensors, shape (n,)."""
+        of_absent = [name.partition('.')[0] in self.absent for name in self.model.param_names]
+        return np.isin(self.model.param_names, self.untested) | np.array(of_absent, bool)
 
     @cached_property
     def nominal(self) -> np.ndarray:

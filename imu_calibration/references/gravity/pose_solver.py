@@ -105,9 +105,11 @@ def first_state(model: HandModel, poses: Poses) -> State:
     The search therefore begins in several places, and the best solution with a positive diagonal is
     returned.
     """
-    estimates = [_by_norms(model, poses, start) for start in _starting_points(model, poses)]
-    costs = [estimate.cost for estimate in estimates]
-    values = estimates[int(np.argmin(costs))].values
+    values = model.nominal.copy()
+    if 'accelerometer' not in model.absent:
+        estimates = [_by_norms(model, poses, start) for start in _starting_points(model, poses)]
+        costs = [estimate.cost for estimate in estimates]
+        values = estimates[int(np.argmin(costs))].values
     bias, matrix, *_ = model.linear(values)
     true = np.linalg.solve(matrix, (poses.force - bias).T).T
     values[model.gyro_bias] = poses.rate.mean(0)

@@ -1,0 +1,82 @@
+"""An IMU with one sensor: an accelerometer without a gyroscope, or the reverse."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.units import STANDARD_GRAVITY
+
+MIN_ABSENT_SAMPLES = 2000
+"""
+Samples without a finite reading of a sensor after which it counts as absent, where the other sensor
+has readings; some drivers start one sensor later. A shorter stream decides at its end.
+"""
+PLACEHOLDERS = {
+    'accelerometer': (0.0, 0.0, STANDARD_GRAVITY),
+    'gyroscope': (0.0, 0.0, 0.0),
+}
+"""Constant columns of an absent sensor, SI: finite, so that they are at rest all the time."""
+
+
+class SensorPresence:
+    """
+    Finds which sensors an IMU stream has, independent of its division into pieces.
+
+    The first samples are held until both sensors have a finite reading, or one of them counts as
+    absent. A message states absence by a covariance of -1, a text log by missing columns; both are
+    NaN in the samples.
+    """
+
+    def __init__(self) -> None:
+        self.absent: tuple[str, ...] = ()
+        self.n_late = 0
+        self._decided = False
+        self._held: ImuSamples | None = None
+
+    def push(self, samples: ImuSamples) -> ImuSamples:
+        """Return the samples that can be processed, none while it is not known which exist."""
+        if self._decided:
+            return self._without_absent(samples)
+        if self._held is not None:
+            samples = ImuSamples.concatenate([self._held, samples])
+        missing = _missing(samples.select(slice(MIN_ABSENT_SAMPLES)))
+        if missing and len(samples) < MIN_ABSENT_SAMPLES:
+            self._held = samples
+            return samples.select(slice(0))
+        return self._decide(missing, samples)
+
+    def finish(self) -> ImuSamples | None:
+        """Return the samples that were held, or None."""
+        if self._held is None:
+            return None
+        return self._decide(_missing(self._held), self._held)
+
+    def _decide(self, missing, samples):
+        self._decided, self._held = True, None
+        # Without a reading of either sensor the samples are not finite, and none is absent.
+        if len(missing) == 1:
+            self.absent = missing
+        return self._without_absent(samples)
+
+    def _without_absent(self, samples):
+        """Return samples with placeholders for the readings of the absent sensor."""
+        if not self.absent:
+            return samples
+        sensor = self.absent[0]
+        own = samples.force_s if sensor == 'accelerometer' else samples.rate_s
+        self.n_late += int(np.count_nonzero(np.isfinite(own).all(axis=1)))
+        constant = np.tile(PLACEHOLDERS[sensor], (len(samples), 1))
+        if sensor == 'accelerometer':
+            return replace(samples, force_s=constant, absent=self.absent)
+        return replace(samples, rate_s=constant, absent=self.absent)
+
+
+def _missing(samples):
+    """Return the sensors without a finite reading."""
+    missing = []
+    if not np.isfinite(samples.force_s).all(axis=1).any():
+        missing.append('accelerometer')
+    if not np.isfinite(samples.rate_s).all(axis=1).any():
+        missing.append('gyroscope')
+    return tuple(missing)
