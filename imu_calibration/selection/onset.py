@@ -1,7 +1,7 @@
 """
 Parameters that change at one moment.
 
-Exchanged axes, a displaced mount, a belt that slipped, a clock that was set.
+Biases after a shock, exchanged axes, a displaced mount, a belt that slipped, a clock that was set.
 """
 
 from collections.abc import Sequence
@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
@@ -19,7 +21,7 @@ from imu_calibration.selection.explained_share import (
     ExplainedWindows,
 )
 from imu_calibration.selection.linearised_problem import LinearisedProblem
-from imu_calibration.selection.parameter_space import matrix_of_each
+from imu_calibration.selection.parameter_space import ParameterSpace, mean_whitening
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import largest_axes, residuals
 
@@ -28,21 +30,24 @@ MIN_ONSET_WINDOWS = MIN_FOLD_WINDOWS + 1
 Least number of moving windows before and after an onset: the longer part, without the window of the
 onset, can be searched.
 """
-SUDDEN = 0.5
+SUDDEN = 1e-3
 """
-Largest share of the excess of a gradual change that an onset may have: above it the change may be
-gradual.
+Least share of its gain by which an onset exceeds the gain of a gradual change of the same
+parameters; a gradual change has five times as many parameters and gains more.
 """
 GRADUAL = 5
-"""
-Degree of the polynomial in time of a gradual change. A step keeps a tenth of its variance beside
-such a polynomial, a clock that bends with the temperature hardly anything.
-"""
+"""Degree of the polynomial in time of a gradual change."""
+COARSE = 40
+"""Moments that are tried first; then all about the best of them."""
+NO_WEIGHT = 1e8
+"""Factor on the variance of the mean of a window that does not count."""
 LIKELY = 16.0
 """
 A moment between two windows is refined if its loss is at most the least one and this (a likelihood
 ratio of 3e-4).
 """
+BIAS_OF = 'bias of '
+"""Begin of the name of a group of biases."""
 SIMPLER = 1.25
 """
 A group of fewer parameters is preferred if its excess is at most this many times the least one.
@@ -58,7 +63,7 @@ class Onset:
     time_sd: float
     """Its standard deviation, s."""
     what: str
-    """Name of the effect of the reference, or the sensors whose matrices change."""
+    """Name of the effect of the reference, or the sensors of which biases or matrices change."""
     before: dict[str, float]
     """Parameter -> value before the moment."""
     after: dict[str, float]
@@ -71,8 +76,8 @@ class Onset:
     """Share of the excess over noise that the second state removes."""
     axes: tuple[str, ...] = ()
     """
-    Axes whose rows of the matrices change, the largest change first; empty for an effect of the
-    reference.
+    Axes of which the biases or rows of the matrices change, the largest change first; empty for an
+    effect of the reference.
     """
 
     def to_mapping(self) -> dict:
@@ -108,9 +113,9 @@ def find_onset(
 
     For each group of parameters and each moment between two windows, the model ``columns @ values +
     after * columns[:, group] @ change`` is fitted with the noise at rest. The onset must remove
-    `MIN_EXPLAINED_SHARE` of the excess, and its excess must be at most half that of a gradual
-    change of the same parameters (a polynomial in time of degree `GRADUAL`). The moment is then
-    refined to the sample at which the residuals of both states are least.
+    `MIN_EXPLAINED_SHARE` of the significant excess, and more than a gradual change of the same
+    parameters removes (a polynomial in time of degree `GRADUAL`). The moment is then refined to
+    the sample at which the residuals of both states are least.
     """
     used, space, groups = (
         problem.search.indices(chosen),
@@ -119,53 +124,54 @@ def find_onset(
     )
     every = np.array(list(dict.fromkeys([*used, *(k for group in groups.values() for k in group)])))
     small, time = space.restricted(every), space.recording.time
-    each = matrix_of_each(small, explained.floor.noise)
-    total, count = each.sum(axis=0), explained.n_means + explained.n_within
-    base, noise = np.arange(len(used)), SIGNIFICANT_REST * np.sqrt(2 * count)
+    rows = _Rows(small, explained.floor.noise)
+    base = np.arange(len(used))
     moving = np.cumsum(space.recording.moving)
     allowed = np.flatnonzero(
         (moving >= MIN_ONSET_WINDOWS) & (moving[-1] - moving >= MIN_ONSET_WINDOWS)
     )
-    single = _fit(total, base, small)[0] - count
-    if single < noise or not len(allowed):
+    if not len(allowed):
         return None
-    after = total - np.cumsum(each, axis=0)[allowed]
-    curves = _curves(time)
-    along = np.tensordot(curves, each, (0, 0))
-    between = np.tensordot(curves[:, :, None] * curves[:, None, :], each, (0, 0))
     found = []
     for name, group in groups.items():
         at = np.flatnonzero(np.isin(every, group))
         own = np.union1d(base, at)
-        fits = [
-            _fit(total, own, small, _Change(at, part[None], part[None, None])) for part in after
-        ]
-        losses = np.array([loss for loss, *_ in fits])
-        best, likely = int(np.argmin(losses)), allowed[losses < losses.min() + LIKELY]
-        excess, gradual = (
-            fits[best][0] - count,
-            _fit(total, own, small, _Change(at, along, between))[0] - count,
-        )
-        if excess < (1 - MIN_EXPLAINED_SHARE) * single and excess < SUDDEN * gradual:
+        losses = _losses_of_moments(rows, own, at, allowed)
+        last = min(losses, key=losses.__getitem__)
+        likely = sorted(k for k, loss in losses.items() if loss < losses[last] + LIKELY)
+        # The change lies within one of the windows about the moment, which hold both states: all
+        # models are compared without them.
+        clear = ~np.isin(np.arange(len(time)), (last, last + 1))
+        apart = _Rows(small, explained.floor.noise, clear)
+        change = apart.changes(at, _after(last, len(time)))
+        alone, step = apart.fit(base), apart.fit(own, change)
+        gradual = apart.fit(own, apart.changes(at, _curves(time)))
+        single, noise = apart.significant_excess(base, alone)
+        excess = apart.significant_excess(own, step, change)[0]
+        explains = excess < (1 - MIN_EXPLAINED_SHARE) * single
+        if explains and gradual.loss - step.loss > SUDDEN * (alone.loss - step.loss):
             found.append(
-                (
-                    len(group),
-                    excess,
+                _Candidate(
                     name,
-                    likely[[0, -1]] + (0, 1),
                     group,
                     every[own],
-                    fits[best][1:],
+                    ends=(likely[0], likely[-1] + 1),
+                    excess=excess,
+                    noise=noise,
+                    share=1 - excess / single,
+                    fit=step,
                 )
             )
     if not found:
         return None
-    most = SIMPLER * max(min(excess for _, excess, *_ in found), noise)
-    _, excess, name, ends, group, own, (values, change, sd) = min(
-        entry for entry in found if entry[1] <= most
-    )
+    # The fewest parameters that do, then the least excess.
+    most = SIMPLER * max(min(max(entry.excess, entry.noise) for entry in found), 0.0)
+    good = [entry for entry in found if entry.excess <= most]
+    chosen_one = min(good, key=lambda entry: (len(entry.group), entry.excess))
+    name, group = chosen_one.name, chosen_one.group
+    change, sd = chosen_one.fit.change, chosen_one.fit.change_sd
     full, changed = np.zeros(problem.space.size), np.zeros(problem.space.size)
-    full[own], changed[group] = values, change
+    full[chosen_one.own], changed[group] = chosen_one.fit.values, change
     states = [problem.absolute(full), problem.absolute(full) + changed]
     model, names = problem.recording.model, [problem.space.names[k] for k in group]
     units = {
@@ -174,14 +180,15 @@ def find_onset(
         for k, label in enumerate(effect.param_names())
     }
     moment, moment_sd = _refined(
-        windows, table, model, states=states, between=space.recording.time[ends]
+        windows, table, model, states=states, between=time[list(chosen_one.ends)]
     )
     before, after = (dict(zip(names, state[group].tolist())) for state in states)
-    axes = (
-        ()
-        if name in _of_reference(model)
-        else largest_axes(np.maximum(change**2 - sd**2, 0.0).reshape(-1, 3, 3).sum(axis=(0, 2)))
-    )
+    axes = ()
+    if name not in _of_reference(model):
+        # Three biases or nine elements of a matrix, row by row, of each sensor of the group.
+        excess_of_change = np.maximum(change**2 - sd**2, 0.0)
+        per_row = 1 if name.startswith(BIAS_OF) else 3
+        axes = largest_axes(excess_of_change.reshape(-1, 3, per_row).sum(axis=(0, 2)))
     return Onset(
         moment,
         moment_sd,
@@ -190,21 +197,252 @@ def find_onset(
         after,
         dict(zip(names, sd.tolist())),
         {label: units[label] for label in names},
-        1 - max(excess, 0.0) / single,
+        chosen_one.share,
         axes,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Least squares of some parameters, with changes of a group along functions of time."""
+
+    loss: float
+    """Sum of squares of the residual and the prior."""
+    values: np.ndarray
+    """Values of the parameters."""
+    change: np.ndarray
+    """Changes along the functions, all parameters of the group for each."""
+    change_sd: np.ndarray
+    """Their standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A group of parameters that changes, at the moment at which this fits best."""
+
+    name: str
+    group: np.ndarray
+    """Parameters that change."""
+    own: np.ndarray
+    """Parameters of the fit."""
+    ends: tuple[int, int]
+    """Windows between which the moment lies."""
+    excess: float
+    """Squares that remain beyond noise, without the windows about the moment."""
+    noise: float
+    """Limit of an excess that is significant."""
+    share: float
+    """Share of the excess that the second state removes."""
+    fit: _Fit
+    """The first state and the change."""
+
+
+@dataclass(frozen=True, eq=False)
+class _RowsOfAxis:
+    """Rows ``[columns | residual]`` of one axis of a sensor."""
+
+    places: np.ndarray
+    """Places of the columns in the normal matrix, that of the residual last, shape (p + 1,)."""
+    whitening: Whitening
+    mean: np.ndarray
+    """Means of the windows, shape (n, p + 1)."""
+    white: np.ndarray
+    """The same, independent and of unit variance."""
+    within: np.ndarray
+    """Products of the white rows within each window, shape (n, p + 1, p + 1)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Means of the windows of a sensor, or rows within them."""
+
+    normal: np.ndarray
+    """Normal matrix of the columns and the residual, shape (q + 1, q + 1)."""
+    expected: float
+    """Expectation of the squares from noise."""
+
+
+class _Rows:
+    """
+    Rows of all windows, or of some, and their normal matrix.
+
+    A change of a parameter along a function f of time has the column ``f * column``. It is made
+    independent after the product: the bias processes connect the windows, so that the product with
+    independent rows would be another one.
+
+    Parameters
+    ----------
+    space : ParameterSpace
+        The parameters that may be fitted.
+    noise : dict
+        Sensor -> NoiseModel.
+    clear : ndarray, shape (n,), optional
+        Windows that count; all where not given.
+
+    """
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        noise: dict[str, NoiseModel],
+        clear: np.ndarray | None = None,
+    ):
+        self.space, moving, kind = space, space.recording.moving, space.recording.kind
+        clear = np.ones(len(kind), bool) if clear is None else clear
+        counted = moving & clear
+        self.axes, self._parts = [], []
+        # A mean of a window with both states is one of no weight.
+        scatter = np.where(clear, 1.0, NO_WEIGHT)[:, None] * np.ones(3)
+        expected_means = 3.0 * clear.sum()
+        expected_within = 3.0 * (space.recording.count - 1)[counted].sum()
+        for sensor in SENSORS:
+            of_means = _Part(np.zeros((space.size + 1,) * 2), expected_means)
+            of_within = _Part(np.zeros((space.size + 1,) * 2), expected_within)
+            self._parts += [of_means, of_within]
+            whitenings = mean_whitening(space, noise, sensor, scatter=scatter)
+            for axis, (whitening, mean) in enumerate(zip(whitenings, space.mean[sensor])):
+                within = np.zeros((len(kind), mean.shape[1], mean.shape[1]))
+                if counted.any():
+                    variance = np.array(
+                        [noise[sensor].row_variance(name)[axis] for name in kind[counted]]
+                    )
+                    products = np.concatenate(list(space.within_each(sensor, axis, counted)))
+                    within[counted] = products / variance[:, None, None]
+                white = whitening(mean[:, None])[:, 0]
+                places = space.places(sensor, axis)
+                of_means.normal[np.ix_(places, places)] += white.T @ white
+                of_within.normal[np.ix_(places, places)] += within.sum(axis=0)
+                self.axes.append(_RowsOfAxis(places, whitening, mean, white, within))
+        self.normal = sum(part.normal for part in self._parts)
+
+    def significant_excess(self, own, fit, changes=None):
+        """
+        Return (squares beyond the expectation from noise, limit of a significant excess).
+
+        Both of the parts (means of windows, within windows, each of one sensor) of which the
+        excess is significant, at a _Fit of the parameters `own` and of changes.
+        """
+        residual = self.space.reduced(own, fit.values)
+        excess, number = 0.0, 0.0
+        for k, part in enumerate(self._parts):
+            squares = residual @ part.normal @ residual
+            if changes is not None:
+                cross, own_squares = changes.cross[k], changes.squares[k]
+                squares -= 2 * residual @ cross @ fit.change
+                squares += fit.change @ own_squares @ fit.change
+            beyond = squares - part.expected
+            if beyond > SIGNIFICANT_REST * np.sqrt(2 * part.expected):
+                excess, number = excess + beyond, number + part.expected
+        return float(excess), float(SIGNIFICANT_REST * np.sqrt(2 * number))
+
+    def changes(self, at, functions):
+        """
+        Return the _Changes of parameters along functions of time.
+
+        Parameters
+        ----------
+        at : ndarray
+            Places of the parameters.
+        functions : ndarray, shape (n, m)
+            Their values in each window.
+
+        """
+        count, m = len(at), functions.shape[1]
+        cross = np.zeros((len(self._parts), len(self.normal), m * count))
+        squares = np.zeros((len(self._parts), m * count, m * count))
+        for number, rows in enumerate(self.axes):
+            of_means = 2 * (number // 3)
+            of_within = of_means + 1
+            own = np.flatnonzero(np.isin(rows.places[:-1], at))
+            if not len(own):
+                continue
+            order = np.searchsorted(at, rows.places[own])
+            places = (np.arange(m)[:, None] * count + order).ravel()
+            columns = functions[:, :, None] * rows.mean[:, None, own]
+            white = rows.whitening(columns.reshape(len(columns), 1, -1))[:, 0]
+            of_parameters = rows.within[:, :, own]
+            along = np.einsum('wm,wpo->pmo', functions, of_parameters).reshape(len(rows.places), -1)
+            both = np.einsum(
+                'wm,wl,wqo->mqlo', functions, functions, of_parameters[:, own], optimize=True
+            )
+            at_cross, at_squares = np.ix_(rows.places, places), np.ix_(places, places)
+            cross[of_means][at_cross] += rows.white.T @ white
+            cross[of_within][at_cross] += along
+            squares[of_means][at_squares] += white.T @ white
+            squares[of_within][at_squares] += both.reshape(len(places), -1)
+        return _Changes(cross, squares)
+
+    def fit(self, own, changes=None):
+        """
+        Return the _Fit of the parameters `own`, with their priors, and of some changes.
+        """
+        known = 1 / self.space.prior_sd[own] ** 2
+        prior = self.space.prior_mean[own]
+        normal = self.normal[np.ix_(own, own)] + np.diag(known)
+        right = self.normal[own, -1] + prior * known
+        if changes is not None:
+            cross = changes.cross.sum(axis=0)
+            normal = np.block([[normal, cross[own]], [cross[own].T, changes.squares.sum(axis=0)]])
+            right = np.concatenate([right, cross[-1]])
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+        inverse /= np.outer(scale, scale)
+        values = inverse @ right
+        loss = self.normal[-1, -1] + (prior**2 * known).sum() - right @ values
+        count = len(own)
+        return _Fit(float(loss), values[:count], values[count:], np.sqrt(np.diag(inverse)[count:]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Changes:
+    """Normal matrices of changes of c parameters along m functions, the functions first."""
+
+    cross: np.ndarray
+    """With the columns of the parameters and the residual, of each part, (parts, q + 1, m c)."""
+    squares: np.ndarray
+    """With one another, shape (parts, m c, m c)."""
+
+
+def _after(last, count):
+    """Return 1 in each window after the window `last`, shape (count, 1)."""
+    return (np.arange(count) > last).astype(float)[:, None]
+
+
+def _losses_of_moments(rows, own, at, allowed):
+    """
+    Return last window before a moment -> loss of the fit with a change there.
+
+    Some moments first, then all near the best one.
+    """
+    count = len(rows.axes[0].mean)
+    coarse = np.unique(np.linspace(0, len(allowed) - 1, min(COARSE, len(allowed))).astype(int))
+    losses = {}
+    for tried in ('coarse', 'near'):
+        numbers = coarse
+        if tried == 'near':
+            best = min(losses, key=losses.__getitem__)
+            place = int(np.searchsorted(allowed[coarse], best))
+            numbers = np.arange(
+                coarse[max(place - 1, 0)], coarse[min(place + 1, len(coarse) - 1)] + 1
+            )
+        for last in allowed[numbers].tolist():
+            if last not in losses:
+                losses[last] = rows.fit(own, rows.changes(at, _after(last, count))).loss
+    return losses
 
 
 def _groups(model):
     """Return name -> parameters of each group that may change suddenly."""
     numbers = np.arange(len(model.param_names))
-    matrices = {sensor: numbers[model.part(sensor, Role.LINEAR)] for sensor in SENSORS}
-    of_reference = {name: numbers[part] for name, part in _of_reference(model).items()}
-    return {
-        **of_reference,
-        **matrices,
-        ' and '.join(SENSORS): np.concatenate(list(matrices.values())),
-    }
+    groups = {name: numbers[part] for name, part in _of_reference(model).items()}
+    both = ' and '.join(SENSORS)
+    # A shock or a new start of a sensor changes its biases, a displaced mount its matrix.
+    for prefix, role in ((BIAS_OF, Role.OFFSET), ('', Role.LINEAR)):
+        parts = {sensor: numbers[model.part(sensor, role)] for sensor in SENSORS}
+        for sensor, part in parts.items():
+            groups[prefix + sensor] = part
+        groups[prefix + both] = np.concatenate(list(parts.values()))
+    return groups
 
 
 def _of_reference(model):
@@ -215,44 +453,6 @@ def _curves(time):
     """Return the Legendre polynomials of degree 1 to `GRADUAL` over the times, shape (k, m)."""
     middle, half = 0.5 * (time[0] + time[-1]), max(0.5 * (time[-1] - time[0]), 1e-9)
     return np.polynomial.legendre.legvander((time - middle) / half, GRADUAL)[:, 1:]
-
-
-@dataclass(frozen=True, eq=False)
-class _Change:
-    """Changes of some parameters along m functions of time, of q parameters with the residual."""
-
-    places: np.ndarray
-    """Parameters that change, shape (n,)."""
-    along: np.ndarray
-    """Normal matrices of the windows weighted with each function, shape (m, q + 1, q + 1)."""
-    between: np.ndarray
-    """The same for the product of two functions, shape (m, m, q + 1, q + 1)."""
-
-
-def _fit(total, own, small, change=None):
-    """
-    Return (loss, values, changes, sds of the changes) of the parameters `own`.
-
-    The changes are in the order of the functions of `change`, all its parameters for each.
-    """
-    known = 1 / small.prior_sd[own] ** 2
-    normal, right = (
-        total[np.ix_(own, own)] + np.diag(known),
-        total[own, -1] + small.prior_mean[own] * known,
-    )
-    if change is not None:
-        at = change.places
-        cross = np.concatenate([part[np.ix_(own, at)] for part in change.along], axis=1)
-        squares = np.block([[part[np.ix_(at, at)] for part in row] for row in change.between])
-        normal = np.block([[normal, cross], [cross.T, squares]])
-        right = np.concatenate([right, *(part[at, -1] for part in change.along)])
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(
-        normal / np.outer(scale, scale), rcond=1e-12, hermitian=True
-    ) / np.outer(scale, scale)
-    values, count = inverse @ right, len(own)
-    loss = total[-1, -1] + (small.prior_mean[own] ** 2 * known).sum() - right @ values
-    return float(loss), values[:count], values[count:], np.sqrt(np.diag(inverse)[count:])
 
 
 def _refined(windows, table, model, *, states, between):

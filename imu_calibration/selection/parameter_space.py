@@ -364,25 +364,6 @@ def within_of_axis(
     return total
 
 
-def matrix_of_each(space: ParameterSpace, noise: dict[str, NoiseModel]) -> np.ndarray:
-    """Return the normal matrix of each window, shape (k, q + 1, q + 1)."""
-    moving, kind = space.recording.moving, space.recording.kind
-    total = np.zeros((len(kind), space.size + 1, space.size + 1))
-    for sensor in SENSORS:
-        variance = np.array([noise[sensor].row_variance(name) for name in kind[moving]]).reshape(
-            -1, 3
-        )
-        for axis, rows in enumerate(white_means(space, noise, sensor)):
-            at = space.places(sensor, axis)
-            own = rows[:, :, None] * rows[:, None, :]
-            own[moving] += (
-                np.concatenate(list(space.within_each(sensor, axis, moving)))
-                / variance[:, axis, None, None]
-            )
-            total[:, at[:, None], at] += own
-    return total
-
-
 def scatter_of_each(
     space: ParameterSpace, noise: dict[str, NoiseModel], values: np.ndarray
 ) -> dict[str, np.ndarray]:
@@ -420,6 +401,22 @@ def white_means(
 
     `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
     """
+    return [
+        whitening(rows[:, None])[:, 0]
+        for whitening, rows in zip(
+            mean_whitening(space, noise, sensor, scatter=scatter), space.mean[sensor]
+        )
+    ]
+
+
+def mean_whitening(
+    space: ParameterSpace,
+    noise: dict[str, NoiseModel],
+    sensor: str,
+    *,
+    scatter: np.ndarray | None = None,
+) -> list[Whitening]:
+    """Return for each axis the Whitening of `white_means`, with its arguments."""
     recording, own = space.recording, noise[sensor]
     variance = (
         own.variance_beside_bias(
@@ -435,6 +432,6 @@ def white_means(
             recording.time,
             recording.sessions,
             processes=own.bias_processes,
-        )(rows[:, None])[:, 0]
-        for axis, rows in enumerate(space.mean[sensor])
+        )
+        for axis in range(3)
     ]

@@ -13,7 +13,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.selection.investigation import investigate
 
 from worlds.hiding import record
-from worlds.moments import Clock, Moment
+from worlds.moments import Clock, Moment, Wander
 
 FEW = (
     'time_offset',
@@ -86,6 +86,31 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     assert diagnosis.onset is onset and set(onset.to_mapping()['parameters']) == set(changes)
     assert any(f'{onset.time:.1f} +-' in line for line in diagnosis_lines(diagnosis))
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
+
+
+@pytest.mark.parametrize(
+    'shock, what, axes',
+    [
+        (((0.03, -0.02, 0.025), (2e-3, -1e-3, 1.5e-3)), 'accelerometer and gyroscope', 'xyz'),
+        (((0.0, 0.0, 0.0), (0.0, 2e-3, 0.0)), 'gyroscope', 'y'),
+    ],
+)
+def test_a_step_of_the_biases_is_found_with_both_states(shock, what, axes):
+    recording, found = investigated(Moment('shock', shock=shock))
+    onset = found.onset
+    assert onset.what == f'bias of {what}' and onset.share > 0.95 and set(onset.axes) == set(axes)
+    assert abs(onset.time - moment_of(recording, 0.55)) < 1.5 and onset.time_sd < 1.5
+    truth = dict(zip(('accelerometer', 'gyroscope'), shock))
+    for name, before in onset.before.items():
+        sensor, axis = name.split('.')[0], 'xyz'.index(name[-1])
+        change = onset.after[name] - before
+        assert abs(change - truth[sensor][axis]) < 4 * onset.sd[name], name
+    assert not found.named
+
+
+def test_a_wandering_bias_is_no_onset():
+    found = investigated(Wander(sd=(0.02, 1.2e-3)))[1]
+    assert found.onset is None
 
 
 @pytest.mark.parametrize('cause', [None, Moment('creep'), Clock(share=0.35, bend=4e-3)])

@@ -47,10 +47,12 @@ class Moment(Cause):
     After a share of the session the sensor or the table changes.
 
     Then the axes x and y are exchanged ('axes'), the sensor is turned by `turn` ('mount', 'creep':
-    gradually), or a joint slips ('belt').
+    gradually), a joint slips ('belt'), or a shock changes the biases by `shock` ('shock').
     """
 
-    def __init__(self, kind, share=0.55, turn=(0.01, -0.006, 0.008), joint=1, slip=0.03):
+    def __init__(
+        self, kind, share=0.55, turn=(0.01, -0.006, 0.008), joint=1, slip=0.03, shock=(None, None)
+    ):
         super().__init__()
         self.kind, self.share, self.turn, self.joint, self.slip = (
             kind,
@@ -59,9 +61,13 @@ class Moment(Cause):
             joint,
             slip,
         )
+        self.shock = shock
 
     def delivered(self, time, outputs, rate_s):
-        """Exchange the axes of the accelerometer."""
+        """Exchange the axes of the accelerometer, or add the change of the biases."""
+        if self.kind == 'shock':
+            after = (time > self.share * time[-1])[:, None]
+            return [output + after * np.array(step) for output, step in zip(outputs, self.shock)]
         if self.kind != 'axes':
             return outputs
         return [
@@ -86,3 +92,20 @@ class Moment(Cause):
         error = np.zeros_like(motion.position)
         error[:, self.joint] = self.slip * (time > self.share * time[-1]) * (self.kind == 'belt')
         return error, np.zeros_like(error)
+
+
+class Wander(Cause):
+    """Biases that walk at random: `sd` of each sensor at the end, m/s^2 and rad/s."""
+
+    def __init__(self, sd, seed=3):
+        super().__init__()
+        self.sd, self.seed = sd, seed
+
+    def delivered(self, time, outputs, rate_s):
+        """Add the walk."""
+        rng = np.random.default_rng(self.seed)
+        share = np.sqrt(np.diff(time, prepend=time[0]) / (time[-1] - time[0]))[:, None]
+        return [
+            output + sd * np.cumsum(share * rng.normal(size=output.shape), axis=0)
+            for output, sd in zip(outputs, self.sd)
+        ]
