@@ -16,6 +16,7 @@ import os
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,21 +30,41 @@ from imu_calibration.document import files  # noqa: E402
 
 G, DEG = 9.80665, np.pi / 180
 TABLE = ROOT / 'config' / 'table_simulated.yaml'
-FACTOR = 4.0
-"""Simulated seconds per second."""
-HIDDEN, PROFILE = 'soft_spring', 'six_faces'
-"""Physical fault of the simulated IMU; first motion."""
+PROFILE = 'six_faces'
+"""First motion."""
 SIMULATOR: dict[str, Any] = {
     'table_file': TABLE,
     'seed': 1,
     'imu_seed': 5,
     'imu_rate': 100.0,
     'joint_rate': 100.0,
-    'time_factor': FACTOR,
     'truth': True,
-    'hide': HIDDEN,
     'hide_size': 2.0,
 }
+
+
+@dataclass(frozen=True)
+class Length:
+    """How much of the demonstration is carried out."""
+
+    time_factor: float
+    """Simulated seconds per second."""
+    hidden: str
+    """Physical fault of the simulated IMU, '' for none."""
+    separations: int
+    """Largest number of motions that separate causes; 0: no diagnosis."""
+    planned_seconds: float
+    """Simulated seconds that the planner has."""
+
+    @property
+    def simulator(self) -> dict[str, Any]:
+        """Parameters of the simulator."""
+        return SIMULATOR | {'time_factor': self.time_factor, 'hide': self.hidden}
+
+
+COMPLETE = Length(4.0, 'soft_spring', separations=2, planned_seconds=900.0)
+SMALLEST = Length(12.0, '', separations=0, planned_seconds=20.0)
+"""The same nodes and steps without a fault and its diagnosis."""
 START = 1_800_000_000.0
 PATIENCE = 240.0
 
@@ -162,7 +183,7 @@ def differences(samples, truth):
     return np.arange(count // rate, dtype=float), *means
 
 
-def run(domain_id, folder, output):
+def run(domain_id, folder, output, *, length=COMPLETE):
     """Carry out the demonstration in a DDS domain."""
     begin = time.monotonic()
     deadline = begin + PATIENCE
@@ -170,7 +191,7 @@ def run(domain_id, folder, output):
     with NodeProcesses(domain_id) as processes:
         print(
             f'ROS_DOMAIN_ID {domain_id}: starting calibration_node, simulator_node and'
-            f' planner_node; hidden effect of the IMU: {HIDDEN}',
+            f' planner_node; hidden effect of the IMU: {length.hidden or "none"}',
             flush=True,
         )
         calibration_node = processes.start(
@@ -181,7 +202,8 @@ def run(domain_id, folder, output):
             'planner_node',
             {
                 'table_file': TABLE,
-                'time_limit': 900.0,
+                'time_limit': length.planned_seconds,
+                'separations': length.separations,
                 'first_speed': 0.6,
                 'stall_patience': 15.0,
                 'silence': 5.0,
@@ -190,7 +212,12 @@ def run(domain_id, folder, output):
         watcher = Watcher(processes)
         simulator = processes.start(
             'simulator_node',
-            {**SIMULATOR, 'profile': PROFILE, 'start_time': START, 'wait_for_subscribers': 2},
+            {
+                **length.simulator,
+                'profile': PROFILE,
+                'start_time': START,
+                'wait_for_subscribers': 2,
+            },
         )
         try:
             first_motion(watcher, deadline)
@@ -202,15 +229,15 @@ def run(domain_id, folder, output):
             compensator = processes.start(
                 'compensator_node', {'calibration_file': folder / 'live.yaml'}
             )
-            errors = compare(watcher, processes, deadline)
+            errors = compare(watcher, processes, deadline, simulated=length.simulator)
             codes.append(processes.end(compensator))
         finally:
             watcher.close()
     if errors is not None:
-        picture(output / 'live_demo.png', watcher, calibration, errors)
+        picture(output / 'live_demo.png', watcher, calibration, errors=errors, hidden=length.hidden)
         print(f'written: {output / "live_demo.png"}')
     print(f'exit codes of the nodes: {codes}; {time.monotonic() - begin:.0f} s')
-    separated = (
+    separated = not length.separations or (
         any(values.get('separating') == 'True' for _, _, values in watcher.drive)
         and watcher.drive[-1][2].get('mates', '') == ''
     )
@@ -242,7 +269,7 @@ def drive(watcher, deadline):
         raise SystemExit(f'the planner stopped: {watcher.drive[-1][1]}')
 
 
-def compare(watcher, processes, deadline):
+def compare(watcher, processes, deadline, *, simulated):
     """
     Compensate another motion of the same IMU.
 
@@ -254,7 +281,7 @@ def compare(watcher, processes, deadline):
     simulator = processes.start(
         'simulator_node',
         {
-            **SIMULATOR,
+            **simulated,
             'profile': 'tumbling',
             'seed': 4,
             'start_time': START + 10_000.0,
@@ -304,7 +331,7 @@ def events(drive):
         previous = event or previous
 
 
-def picture(path, watcher, calibration, errors):
+def picture(path, watcher, calibration, *, errors, hidden):
     """
     Draw standard deviations over time, the planner's actions, and the errors.
 
@@ -376,7 +403,10 @@ def picture(path, watcher, calibration, errors):
         xlabel='s of another motion',
         ylabel='error of the accelerometer, mg',
         yscale='log',
-        title=f'hidden effect: {HIDDEN}; effects in the final model: {", ".join(found) or "none"}',
+        title=(
+            f'hidden effect: {hidden or "none"}; effects in the final model:'
+            f' {", ".join(found) or "none"}'
+        ),
     )
     errors_axes.legend(loc='upper right')
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -394,6 +424,12 @@ if __name__ == '__main__':
     parser.add_argument(
         '--output', type=Path, default=Path('demo'), help='folder for the picture, default demo'
     )
+    parser.add_argument(
+        '--smallest',
+        action='store_true',
+        help='the same steps in about half a minute, without a fault and its diagnosis',
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        sys.exit(run(options.domain_id, Path(temporary), options.output))
+        length = SMALLEST if options.smallest else COMPLETE
+        sys.exit(run(options.domain_id, Path(temporary), options.output, length=length))
