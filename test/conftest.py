@@ -65,6 +65,28 @@ def few_candidates(request):
         yield
 
 
+class BlankCanvas:
+    """Stands for the canvas of a figure that nobody looks at."""
+
+    def print_svg(self, text, metadata):
+        text.write('<svg viewBox="0 0 1 1"></svg>')
+
+
+@pytest.fixture(scope='module', autouse=True)
+def no_layout(request):
+    """
+    Paint the figures of reports, but do not lay them out, which is a quarter of a calibration.
+
+    Files below test/report and those with `LAID_OUT` set have complete figures.
+    """
+    from imu_calibration.report import figures
+
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name != 'report' and not hasattr(request.module, 'LAID_OUT'):
+            patch.setattr(figures, '_laid_out', lambda figure: BlankCanvas())
+        yield
+
+
 def pytest_configure(config):
     """
     Keep the order of the files that `pytest_collection_modifyitems` gives.

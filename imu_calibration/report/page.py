@@ -1,5 +1,6 @@
 """Rendering of a page, and the numbers in it with their digits."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,12 @@ def render(template: str, **content: Any) -> str:
 
     Numbers are printed by the filters `number`, `fixed`, `in_unit` and `chance`.
     """
+    return _environment().get_template(template).render(**content)
+
+
+@cache
+def _environment():
+    """Return the templates with their filters; each is compiled once per process."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -42,7 +49,7 @@ def render(template: str, **content: Any) -> str:
         'UNITS': UNITS,
         'DEG': DEG,
     }
-    return environment.get_template(template).render(**content)
+    return environment
 
 
 def text(value: float | None, digits: int = 3) -> str:

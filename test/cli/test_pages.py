@@ -19,6 +19,7 @@ from msg_adapters.write import write_session
 
 from worlds.hand_sessions import simulate
 
+LAID_OUT = True  # the commands of the README draw what users see
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 ROOT = Path(__file__).resolve().parents[2]
