@@ -67,7 +67,7 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
             station.watch_imu('imu/residual'),
         )
         station.watch_diagnostics()
-        station.calibration_node(tmp_path, resume=True)
+        station.calibration_node(tmp_path, resume=True, diagnosis_period=60.0)
         compensator = station.start('compensator_node')
         for part in ('beginning', 'ending'):
             player = station.play(bags / part, RATE, subscribers=1)
@@ -175,7 +175,9 @@ def test_a_hidden_effect_is_named_live(tmp_path):
     with Station() as station:
         documents = station.watch_documents()
         station.watch_diagnostics()
-        station.calibration_node(tmp_path, table_file=tmp_path / 'table.yaml')
+        station.calibration_node(
+            tmp_path, table_file=tmp_path / 'table.yaml', diagnosis_period=60.0
+        )
         station.until(
             lambda: values_of(station, 'diagnosis').get('outcome') == 'waiting',
             'the first diagnostics',

@@ -383,7 +383,9 @@ def write_tolerances(path, factor):
 def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_path):
     with Loop(tmp_path / 'out.txt') as loop:
         loop.begin(
-            tmp_path, {'tolerances_file': write_tolerances(tmp_path / 'tolerances.yaml', 2.0)}
+            tmp_path,
+            {'tolerances_file': write_tolerances(tmp_path / 'tolerances.yaml', 2.0)},
+            {'diagnosis_period': 60.0},
         )
         loop.spin_for(2.0)
         assert (

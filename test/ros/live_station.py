@@ -87,6 +87,7 @@ class Station:
             'table_file': TABLE,
             'save_file': Path(folder) / 'calibration.yaml',
             'solve_share': 0.2,
+            'diagnosis_period': 0.0,  # a test that needs a diagnosis asks for it
         }
         return self.start('calibration_node', fixed | parameters, **options)
 

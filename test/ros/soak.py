@@ -66,7 +66,9 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
     with Station() as station:
         station.watch_diagnostics()
         running = {
-            'calibration_node': station.calibration_node(folder, autosave_period=10.0),
+            'calibration_node': station.calibration_node(
+                folder, autosave_period=10.0, diagnosis_period=60.0
+            ),
             'compensator_node': station.start('compensator_node'),
         }
         station.until(lambda: len(station.status) > 2, 'the nodes')
