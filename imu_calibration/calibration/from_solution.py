@@ -22,6 +22,7 @@ from imu_calibration.estimation.solution import (
     REJECTED,
     Solution,
     reasons_held,
+    remedy,
     statuses,
     with_term,
 )
@@ -131,15 +132,22 @@ def motions_needed(
     """
     Return undetermined parameter -> (best motion, its sd after a minute of it).
 
-    The motion is the one that would serve best a parameter that is not determined.
+    The motion is the one that would serve best a parameter that is not determined; where no motion
+    serves it, the remedy for the cause and NaN (`estimation.solution.remedy`).
     """
-    return observability.needed_motions(
+    needed = observability.needed_motions(
         solution,
         tolerances,
         table.gravity_value,
         prior_sd=make_prior(solution.model).sd,
         possible=possible_motions(table),
     )
+    for name in needed:
+        index = solution.param_names.index(name)
+        text = remedy(solution.terms, index, tolerances[index])
+        if text:
+            needed[name] = (text, float('nan'))
+    return needed
 
 
 def possible_motions(table: Table) -> tuple[Motion, ...] | None:

@@ -12,6 +12,7 @@ def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=f'a recording of the calibrated IMU: {BAG}')
     parser.common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
+    parser.add_gravity()
     parser.add_recording('without it: by hand')
 
 

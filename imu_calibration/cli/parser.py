@@ -196,12 +196,8 @@ class OneLineParser(argparse.ArgumentParser):
         self.add_stand(without)
         self.add_topics()
 
-    def add_session(self, *, searched: bool = True) -> None:
-        """
-        Add the options of a calibration.
-
-        Local gravity, recording, labels of the result, and model (`add_model`).
-        """
+    def add_gravity(self) -> None:
+        """Add the options of the local gravity."""
         self.common(
             '--gravity',
             type=float,
@@ -213,6 +209,14 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--height', metavar='M', type=float, help='and height above the ellipsoid, default 0 m'
         )
+
+    def add_session(self, *, searched: bool = True) -> None:
+        """
+        Add the options of a calibration.
+
+        Local gravity, recording, labels of the result, and model (`add_model`).
+        """
+        self.add_gravity()
         self.add_recording('without it: by hand, gravity is the reference')
         self.common(
             '--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml'

@@ -38,6 +38,28 @@ GRAVITY = 'gravity'
 UNMODELLED_EARTH_RATE = 'earth_rate'
 """The Earth's rate, where it is not modelled."""
 
+REMEDIES = {
+    (GRAVITY,): 'give the local gravity, or the latitude from which it follows',
+    (MODEL_ERROR, DRIFT, REJECTED): 'find the cause of the residual: more motions do not help',
+}
+"""Terms that more data do not reduce -> what does."""
+
+
+def remedy(terms: 'Terms', index: int, tolerance: float) -> str:
+    """
+    Return how a parameter gets within its tolerance if more data do not help; '' if they do.
+
+    More data reduce noise, bias processes and the uncertainty of held parameters. Where these are
+    within the tolerance, ``sum of their variances <= tolerance^2``, the largest of the other terms
+    decides.
+    """
+    variances = {name: float(term[index, index]) for name, term in terms.items()}
+    fixed = {names: sum(variances.get(name, 0.0) for name in names) for names in REMEDIES}
+    if sum(variances.values()) - sum(fixed.values()) > tolerance**2:
+        return ''
+    largest = max(fixed, key=lambda names: fixed[names])
+    return REMEDIES[largest] if fixed[largest] > 0 else ''
+
 
 def total(terms: Terms) -> np.ndarray:
     """Return the covariance, the sum of its terms."""

@@ -11,6 +11,13 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
 from imu_calibration.estimation.observability import MOTIONS, OTHER_MOUNT, motions_about
+from imu_calibration.estimation.solution import (
+    GRAVITY,
+    MODEL_ERROR,
+    REMEDIES,
+    SAMPLE_NOISE,
+    remedy,
+)
 from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate
@@ -70,6 +77,36 @@ def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
             == pytest.approx(0.8 * 9.8 * np.linalg.norm(piece.rate_s[0]))
             for piece in motion.make(9.8)
         )
+
+
+def test_an_uncertain_gravity_needs_its_value_and_no_spins():
+    """0.03 m/s^2 in 9.8 m/s^2 is 0.3 % of scale; more data do not reduce it."""
+    session = make_session(3, profile='quick', noise='realistic', grade='industrial')
+    table = Table.from_mapping(session.table | {'gravity_sd': 0.03})
+    result = calibrate(SampleBlock(session.imu, session.joints), table, model_as_asked=True).result
+    scales = [f'accelerometer.matrix.{axis}' for axis in ('xx', 'yy', 'zz')]
+    needed = motions_needed(result.solution, result.tolerances, table)
+    assert {needed[name][0] for name in scales} == {REMEDIES[GRAVITY,]}
+    reasons = [reason for reason in result.verdict.reasons if 'matrix.xx' in reason.what]
+    assert [reason.next for reason in reasons] == [REMEDIES[GRAVITY,]]
+
+
+@pytest.mark.parametrize(
+    ('noise', 'misfit', 'gravity', 'cause'),
+    (
+        (0.5, 2.0, 1.0, MODEL_ERROR),
+        (0.5, 1.0, 2.0, GRAVITY),
+        (2.0, 3.0, 0.0, None),
+        (0.5, 0.0, 0.0, None),
+    ),
+)
+def test_the_remedy_of_a_weak_parameter_is_that_of_its_largest_term(noise, misfit, gravity, cause):
+    terms = {
+        name: np.diag([0.0, sd**2])
+        for name, sd in ((SAMPLE_NOISE, noise), (MODEL_ERROR, misfit), (GRAVITY, gravity))
+    }
+    expected = [text for names, text in REMEDIES.items() if cause in names]
+    assert [remedy(terms, 1, 1.0)] == (expected or [''])
 
 
 def test_compare_says_that_off_diagonal_terms_include_the_mounting():
