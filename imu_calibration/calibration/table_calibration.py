@@ -31,6 +31,7 @@ from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.progress import report
 from imu_calibration.core.samples import TemperatureSamples
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.change import CHANGE, RegimeChange
 from imu_calibration.document.decision import (
     HELPS,
     UNPROVEN,
@@ -348,6 +349,15 @@ class CheckResult:
     """Notes on the result."""
     refused: dict[str, str] = field(default_factory=dict)
     """Sensor of which compensation refuses the values -> why."""
+    changes: tuple[RegimeChange, ...] = ()
+    """Error now against the held-out error in the file of the calibration, by regime."""
+    change_limit: float = CHANGE
+    """Factor of the error from which a significant change counts."""
+
+    @property
+    def changed(self) -> tuple[RegimeChange, ...]:
+        """The changes that are significantly larger than the limit."""
+        return tuple(each for each in self.changes if each.exceeds(self.change_limit))
 
     @property
     def helps(self) -> bool:
@@ -356,7 +366,7 @@ class CheckResult:
 
     @property
     def exit_code(self) -> int:
-        """0 where the decision on each sensor is `helps`, otherwise 3."""
+        """0 where the decision on each sensor is `helps` and no error has changed, otherwise 3."""
         return exit_code_of(self.reasons)
 
     @property
@@ -364,11 +374,32 @@ class CheckResult:
         """Why the exit code is 3, a line each."""
         if not self.proof:
             return self.lines
-        return [
+        lines = [
             self._line(sensor, entry)
             for sensor, entry in self.proof.items()
             if sensor not in self.helped
         ]
+        changed = {each.sensor for each in self.changed}
+        return lines + [line for sensor, line in self._since().items() if sensor in changed]
+
+    def _since(self):
+        """Return sensor -> how its error compares with that on the day of the calibration."""
+        lines = {}
+        for sensor in dict.fromkeys(each.sensor for each in self.changes):
+            changed = [each for each in self.changed if each.sensor == sensor]
+            if changed:
+                parts = ', '.join(f'{each.regime}: {each.text}' for each in changed)
+                lines[sensor] = f'{sensor}: the error has changed since the calibration, {parts}'
+            else:
+                largest = max(
+                    (each for each in self.changes if each.sensor == sensor),
+                    key=lambda each: each.factor,
+                )
+                lines[sensor] = (
+                    f'{sensor}: the error is as on the day of the calibration, at most'
+                    f' {largest.text} in {largest.regime}'
+                )
+        return lines
 
     def decision(self, sensor: str) -> SensorDecision:
         """Return the decision on a sensor; at best UNPROVEN where compensation refuses it."""
@@ -398,6 +429,7 @@ class CheckResult:
                 for sensor, entry in self.proof.items()
                 for line in worse_regimes(entry)
             ),
+            *self._since().values(),
         ]
 
     def __str__(self):

@@ -1,6 +1,9 @@
 """``imu_calibration check``: is a calibration still good on this recording?"""
 
+from dataclasses import asdict
+
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
+from imu_calibration.document.change import CHANGE
 
 EXAMPLES = (
     'later_session --calibration result/calibration.yaml --table table.yaml',
@@ -12,6 +15,14 @@ def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=f'a recording of the calibrated IMU: {BAG}')
     parser.common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
+    parser.common(
+        '--change',
+        metavar='FACTOR',
+        type=float,
+        default=CHANGE,
+        help=f'factor of the stored error from which a significant change counts, default {CHANGE}',
+    )
+    parser.add_page('check.html')
     parser.add_gravity()
     parser.add_recording('without it: by hand')
 
@@ -20,21 +31,65 @@ def run(options: Options) -> VerbResult:
     """
     Print the errors before and after with their interval and the decision.
 
-    Exit code 0 when it helps each sensor, otherwise 3.
+    Exit code 0 when it helps each sensor and no error has changed, otherwise 3.
     """
     from imu_calibration.cli.show import show_table, warn
     from imu_calibration.cli.terminal import Terminal
-    from imu_calibration.core.units import error_text
-    from imu_calibration.document.decision import ratio_text
+    from imu_calibration.document import files
     from imu_calibration.preprocessing.checks import warnings
+    from imu_calibration.report.answer_page import answer_page
     from imu_calibration.use_cases.calibrate import check
 
-    found = check(options.bag, options.calibration, options.stand(), **options.choices())
+    page = options.page('check.html')
+    found = check(
+        options.bag,
+        options.calibration,
+        options.stand(),
+        change=options.change,
+        **options.choices(),
+    )
     warn([finding.to_mapping() for finding in warnings(found.findings)])
-    out, numbers = Terminal.of(), ('seconds', 'before', 'after', 'after / before, 95 %')
+    out, table = Terminal.of(), _table(found)
+    show_table(out, table.columns, list(table.rows), numbers=table.numbers)
+    out.print(str(found))
+    if page is not None:
+        headline, *lines = str(found).split('\n')
+        text = answer_page(
+            'Check of a calibration',
+            headline,
+            lines,
+            table=table,
+            good=not found.exit_code,
+            lead=(
+                'Errors on the new recording before and after correction, and in the file of the'
+                ' calibration on held-out data. A sensor has changed where the 95 % interval of now'
+                f' / stored lies above {found.change_limit:g} in a kind of motion.'
+            ),
+            facts={'recording': str(options.bag), 'calibration': str(options.calibration)},
+        )
+        files.write_texts(page.parent, {page.name: text})
+        out.print(f'written: {page}')
+    document = {
+        'proof': found.proof,
+        'helps': found.helps,
+        'changes': [asdict(each) for each in found.changes],
+        'changed': bool(found.changed),
+    }
+    return VerbResult(found.exit_code, document, found.reasons)
+
+
+def _table(found):
+    """Return the errors by sensor and motion: before, after, and against the stored one."""
+    from imu_calibration.core.units import error_text
+    from imu_calibration.document.decision import ratio_text
+    from imu_calibration.report.answer_page import AnswerTable
+
+    numbers = ('seconds', 'before', 'after', 'after / before, 95 %', 'stored', 'now / stored, 95 %')
+    since = {(each.sensor, each.regime): each for each in found.changes}
     rows = []
     for sensor, entry in found.proof.items():
         for motion, part in (('all', entry), *entry['regimes'].items()):
+            change = since.get((sensor, motion))
             rows.append(
                 (
                     sensor,
@@ -45,8 +100,8 @@ def run(options: Options) -> VerbResult:
                         for when in ('before', 'after')
                     ),
                     ratio_text(part),
+                    '-' if change is None else error_text(change.stored, change.unit),
+                    '-' if change is None else f'{change.low:.2g} to {change.high:.2g}',
                 )
             )
-    show_table(out, ('sensor', 'motion', *numbers), rows, numbers=numbers)
-    out.print(str(found))
-    return VerbResult(found.exit_code, {'proof': found.proof, 'helps': found.helps}, found.reasons)
+    return AnswerTable(('sensor', 'motion', *numbers), numbers, tuple(rows))

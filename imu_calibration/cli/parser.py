@@ -196,6 +196,11 @@ class OneLineParser(argparse.ArgumentParser):
         self.add_stand(without)
         self.add_topics()
 
+    def add_page(self, name: str) -> None:
+        """Add the options of a page that shows the answer."""
+        self.common('--output', metavar='DIR', help=f'folder for {name}, the answer as one page')
+        self.common('--force', action='store_true', help=f'replace an existing {name}')
+
     def add_gravity(self) -> None:
         """Add the options of the local gravity."""
         self.common(
@@ -303,6 +308,14 @@ class Options(argparse.Namespace):
     def hints(self) -> dict[str, str]:
         """Return {key of an error: option}, of the options that this verb has."""
         return {key: '--' + key.replace('_', '-') for key in ERROR_KEYS if key in vars(self)}
+
+    def page(self, name: str) -> Path | None:
+        """Return the path of the page of `add_page`, None without --output."""
+        if self.output is None:
+            return None
+        from imu_calibration.report.answer_page import page_in
+
+        return page_in(self.output, name, force=self.force)
 
     def require_place(self, bags: Sequence[str]) -> None:
         """

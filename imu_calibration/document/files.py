@@ -201,6 +201,25 @@ def output_folder(path: str) -> Iterator[Path]:
         raise
 
 
+def require_new(path: str | PathLike[str], *, force: bool) -> None:
+    """
+    Refuse to replace an existing file without consent.
+
+    Raises
+    ------
+    InputError
+        If the file exists and `force` is false.
+
+    """
+    if not force and Path(path).exists():
+        raise InputError(
+            f'an existing file must not be replaced silently, {path} exists; choose another one, or'
+            ' overwrite it',
+            key='force',
+            code='file_exists',
+        )
+
+
 def write_text(path: str | PathLike[str], text: str) -> None:
     """Write a text file atomically; raises as `write_whole`."""
     write_whole(path, text.encode(), to_disk=False)

@@ -26,6 +26,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.change import CHANGE, changes_since, checked_limit
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.document.verdict import judged
@@ -225,12 +226,15 @@ def check(
     recording: str | PathLike | SampleBlock,
     calibration: Calibration | str | PathLike,
     table: Stand | None = None,
+    *,
+    change: float = CHANGE,
     **choices: Unpack[Choices],
 ) -> CheckResult:
     """
-    Test whether a calibration helps on a recording.
+    Test whether a calibration helps on a recording, and whether its error has changed.
 
-    The error before and after, by sensor and kind of motion.
+    The error before and after, by sensor and kind of motion, and the error now against the held-out
+    error in the file.
 
     Parameters
     ----------
@@ -240,6 +244,8 @@ def check(
     table : path-like, Table or Arm, optional
         The reference of this recording; it need not be the one of the calibration. Without it
         gravity is: the IMU held still in some attitudes, and the turns between them.
+    change : float
+        Factor of the error from which a significant change counts, at least 1.
     choices
         See `Choices`; the topics, the window settings and the local gravity apply.
 
@@ -249,6 +255,7 @@ def check(
         When the recording cannot be used, or is of an IMU that is not on the table.
 
     """
+    limit = checked_limit(change)
     calibration = files.given_calibration(calibration)
     options, table, sources = inputs_of([recording], table, choices)
     if table is None:
@@ -268,8 +275,15 @@ def check(
         if why := never_applied(calibration, sensor):
             refused[sensor] = why
     questions = scale_questions(calibration).values()
+    changes = changes_since(calibration.proof, result.proof)
+    if result.proof and not changes:
+        notes = (*notes, 'the file has no held-out error of the same kinds of motion to compare')
     return replace(
-        result, notes=(*notes, *questions, *_notes(recording, calibration)), refused=refused
+        result,
+        notes=(*notes, *questions, *_notes(recording, calibration)),
+        refused=refused,
+        changes=changes,
+        change_limit=limit,
     )
 
 

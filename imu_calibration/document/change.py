@@ -1,0 +1,112 @@
+"""Whether the error of a calibration has changed since its recording, by regime of motion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+
+CHANGE = 1.5
+"""
+Factor of the error from which a significant change counts, a convention: with it the error of a
+calibration that halved an error still has three quarters of the error before.
+"""
+QUANTILE = 1.96
+"""Of the normal distribution, for 95 %."""
+SMALLEST_SHARE = 1e-3
+"""Smallest lower end of an interval as a share of its upper end: its logarithm is finite."""
+
+
+@dataclass(frozen=True)
+class RegimeChange:
+    """Error of one sensor in one regime of motion, now and on the day of the calibration."""
+
+    sensor: str
+    """Sensor."""
+    regime: str
+    """Kind of motion."""
+    unit: str
+    """Unit of the errors."""
+    stored: float
+    """Held-out error in the file of the calibration."""
+    now: float
+    """Error on the new recording."""
+    low: float
+    """Lower end of the 95 % interval of now / stored."""
+    high: float
+    """Upper end."""
+
+    @property
+    def factor(self) -> float:
+        """Error now / error on the day."""
+        return self.now / self.stored
+
+    def exceeds(self, limit: float) -> bool:
+        """Return whether the complete interval lies above a factor."""
+        return self.low > limit
+
+    @property
+    def text(self) -> str:
+        """The factor with its interval."""
+        return f'a factor of {self.factor:.2g} ({self.low:.2g} to {self.high:.2g})'
+
+
+def checked_limit(limit: float) -> float:
+    """Return the factor from which a change counts; raises an InputError below 1."""
+    if not (np.isfinite(limit) and limit >= 1.0):
+        raise InputError(
+            f'the factor from which a change counts must be at least 1, got {limit:g}; correct it',
+            code='change_limit',
+        )
+    return limit
+
+
+def changes_since(stored: Mapping[str, Any], proof: Mapping[str, Any]) -> tuple[RegimeChange, ...]:
+    """
+    Return the changes of the error in the regimes that both proofs have, with the same unit.
+
+    With the standard deviations s, s' of the logarithms of both errors, from the intervals of
+    after / before, the interval of now / stored is ``exp(+-1.96 sqrt(s^2 + s'^2))`` about the
+    ratio.
+
+    Parameters
+    ----------
+    stored, proof : mapping
+        Sensor -> entry (`calibration.proof.prove`): of the file, and of the new recording.
+
+    """
+    found = []
+    for sensor, entry in proof.items():
+        before = stored.get(sensor) or {}
+        regimes = before.get('regimes') or {}
+        for regime, part in (entry.get('regimes') or {}).items():
+            earlier = regimes.get(regime)
+            if not earlier or not earlier['after'] > 0.0 or not part['after'] > 0.0:
+                continue
+            unit = part.get('unit', entry['unit'])
+            if earlier.get('unit', before['unit']) != unit:
+                continue
+            ratio = part['after'] / earlier['after']
+            spread = np.exp(QUANTILE * np.hypot(_log_sd(earlier), _log_sd(part)))
+            found.append(
+                RegimeChange(
+                    sensor,
+                    regime,
+                    unit,
+                    float(earlier['after']),
+                    float(part['after']),
+                    float(ratio / spread),
+                    float(ratio * spread),
+                )
+            )
+    return tuple(found)
+
+
+def _log_sd(part):
+    """Return the standard deviation of the logarithm of an error, from its interval."""
+    low, high = part['ci95']
+    if not high > 0.0:
+        return 0.0
+    return float(np.log(high / max(low, SMALLEST_SHARE * high)) / (2.0 * QUANTILE))
