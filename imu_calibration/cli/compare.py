@@ -11,15 +11,18 @@ def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('first', metavar='A.yaml')
     parser.add_argument('second', metavar='B.yaml')
+    parser.add_page('compare.html')
 
 
 def run(options: Options) -> VerbResult:
-    """Compare and print."""
+    """Compare and print; exit code 3 where the calibrations of the IMU disagree."""
     from imu_calibration.cli.show import show_table
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.core.units import for_people, with_sd
     from imu_calibration.document import comparison, files
+    from imu_calibration.report.answer_page import AnswerTable, answer_page
 
+    page = options.page('compare.html')
     result = comparison.compare(
         files.read_calibration(options.first), files.read_calibration(options.second)
     )
@@ -39,8 +42,30 @@ def run(options: Options) -> VerbResult:
                 '-' if row.ratio is None else f'{row.ratio:.1f}',
             )
         )
-    show_table(out, ('parameter', *numbers[:-1], 'unit', 'in sd'), shown, numbers=numbers)
-    out.print('\n'.join(result.lines))
-    return VerbResult(
-        0, {'rows': [asdict(row) for row in result.rows], 'lines': list(result.lines)}
+    table = AnswerTable(
+        ('parameter', *numbers[:-1], 'unit', 'in sd'), numbers, tuple(map(tuple, shown))
     )
+    show_table(out, table.columns, shown, numbers=numbers)
+    out.print('\n'.join(result.lines))
+    if page is not None:
+        text = answer_page(
+            'Two calibrations',
+            result.lines[-1],
+            result.lines[:-1],
+            table=table,
+            good=bool(result.agree),
+            lead=(
+                'Differences in combined standard deviations; a group of parameters differs at 1 %'
+                ' over all groups.'
+            ),
+            facts={'A': options.first, 'B': options.second},
+        )
+        files.write_texts(page.parent, {page.name: text})
+        out.print(f'written: {page}')
+    document = {
+        'rows': [asdict(row) for row in result.rows],
+        'lines': list(result.lines),
+        'agree': result.agree,
+        'reference_agree': result.reference_agree,
+    }
+    return VerbResult(result.exit_code, document, result.reasons)

@@ -1,17 +1,25 @@
-"""Whether two calibrations of the same IMU agree."""
+"""
+Whether two calibrations of the same IMU agree.
 
-from dataclasses import dataclass
+The IMU is judged apart from table and clock, in one convention of axes and origin.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import Role
+from imu_calibration.core.exit_codes import exit_code_of
+from imu_calibration.document.calibration import HAND_AXES, Calibration
+from imu_calibration.document.exports.affine import lower_times_rotation
+from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.solution import FIXED, HELD
 
 COMPARISON_P_VALUE = 0.01
 """Significance level: two calibrations differ when the p-value is below this."""
+TABLE_AXES = 'mount'
+"""Axes of a calibration on a table: those of the mount."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +51,23 @@ class Comparison:
     """One Row per common parameter."""
     agree: bool | None
     """
-    Whether no group differs significantly, corrected for the number of groups; None when undecided.
+    Whether no group of the IMU differs significantly, corrected for the number of groups; None when
+    undecided.
     """
     lines: tuple
     """The verdict as text."""
+    reference_agree: bool | None = None
+    """The same for table and clock; None when undecided, or without common parameters."""
+
+    @property
+    def exit_code(self) -> int:
+        """3 where the calibrations of the IMU disagree, otherwise 0."""
+        return exit_code_of(self.reasons)
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why the exit code is 3, a line each."""
+        return [line for line in self.lines if self.agree is False]
 
 
 def moved_beyond_sd(first: Calibration, second: Calibration) -> bool:
@@ -65,7 +86,12 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
     Compare two calibrations, group by group.
 
     The squared distance of a group of k parameters, ``d' (P1 + P2)^-1 d``, is chi-square with k
-    degrees of freedom when both are honest; groups are judged at 1 % over all groups (Holm).
+    degrees of freedom when both are honest; groups are judged at 1 % over all groups (Holm), those
+    of the IMU apart from those of table and clock.
+
+    Where the conventions of axes differ, or the matrices of two tables disagree, both are brought
+    to the axes of the accelerometer (`in_accelerometer_axes`): the rotation of the IMU on the table
+    is no property of the IMU.
 
     Raises
     ------
@@ -81,6 +107,78 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
             code='nothing_in_common',
         )
     notes = _notes(first, second)
+    axes = {first.gauge.get('axes'), second.gauge.get('axes')}
+    if len(axes) == 2 and axes == {TABLE_AXES, HAND_AXES}:
+        return _compared(
+            in_accelerometer_axes(first),
+            in_accelerometer_axes(second),
+            common,
+            [*notes, 'both are compared in the axes of the accelerometer'],
+        )
+    found = _compared(first, second, common, notes)
+    if found.agree is False and axes == {TABLE_AXES}:
+        turned = _compared(
+            in_accelerometer_axes(first),
+            in_accelerometer_axes(second),
+            common,
+            [*notes, 'the IMU is mounted differently: compared in the axes of the accelerometer'],
+        )
+        if turned.agree:
+            return turned
+    return found
+
+
+def in_accelerometer_axes(calibration: Calibration) -> Calibration:
+    """
+    Return the same calibration in the axes of the accelerometer, origin at its sensitive points.
+
+    With the accelerometer matrix ``M = L Q``, L lower triangular with positive diagonal, Q a
+    rotation, and with the true quantities ``Q f``, ``Q w``: matrices M to ``M Q'``, lever arms r to
+    ``Q (r - mean of r)``, the response K to specific force to ``K Q'``. The covariance follows by
+    differences. Other effects are unchanged: they are small, and so is the rotation.
+    """
+    model = calibration.model
+    values = _turned(model, calibration.values)
+    jacobian = np.empty((len(values),) * 2)
+    for k, sd in enumerate(calibration.sd):
+        step = np.zeros(len(values))
+        step[k] = max(1e-3 * sd, 1e-7)
+        above = _turned(model, calibration.values + step)
+        below = _turned(model, calibration.values - step)
+        jacobian[:, k] = (above - below) / (2 * step[k])
+    status = list(calibration.status)
+    part = model.part('accelerometer', Role.LINEAR)
+    upper = np.flatnonzero(np.triu(np.ones((3, 3)), 1).ravel())
+    for index in (part.start + upper).tolist() if part.stop > part.start else ():
+        status[index] = FIXED
+    return replace(
+        calibration,
+        values=values,
+        covariance=jacobian @ calibration.covariance @ jacobian.T,
+        status=tuple(status),
+        covariance_terms={},
+        gauge={**calibration.gauge, 'axes': HAND_AXES},
+    )
+
+
+def _turned(model, values):
+    """Return the values in the axes of the accelerometer."""
+    found = values.copy()
+    matrix = model.value('accelerometer', Role.LINEAR, values)
+    rotation = lower_times_rotation(matrix)[1]
+    for effect in model.effects:
+        part = model.slices[effect.key]
+        own = values[part]
+        if effect.role in (Role.LINEAR, Role.CROSS) and effect.sensor in SENSORS:
+            found[part] = (own.reshape(3, 3) @ rotation.T).ravel()
+        elif effect.role is Role.ARMS:
+            arms = own.reshape(3, 3)
+            found[part] = ((arms - arms.mean(axis=0)) @ rotation.T).ravel()
+    return found
+
+
+def _compared(first, second, common, notes):
+    """Compare the common parameters of two calibrations as they are."""
     a, b = ([c.param_names.index(name) for name in common] for c in (first, second))
     difference = second.values[b] - first.values[a]
     parts = [
@@ -108,11 +206,20 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         for name, i, j, s, h, d in zip(common, a, b, sd, held, difference)
     )
     groups = _groups(common, difference, covariance, held) if len(parts) == 2 else []
-    rejected = _holm(groups)
+    reference = {
+        name.rpartition('.')[0]
+        for effect in first.model.effects
+        if effect.in_reference or effect.sensor == 'reference'
+        for name in effect.param_names()
+    }
+    of_imu = [group for group in groups if group[0] not in reference]
+    of_reference = [group for group in groups if group[0] in reference]
+    rejected_reference = _holm(of_reference)
+    rejected = _holm(of_imu)
     lines = notes + [
         f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}'
         for name, chi2, k, p in groups
-        if name in rejected
+        if name in rejected | rejected_reference
     ]
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
     if rejected & linear and 'mount' in (first.gauge.get('axes'), second.gauge.get('axes')):
@@ -130,8 +237,13 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
             ' are unknown'
         )
         return Comparison(rows, None, tuple(lines))
+    reference_agree = None
+    if of_reference:
+        reference_agree = not rejected_reference
+        word = 'agree' if reference_agree else 'differ'
+        lines.append(f'table and clock {word}, which is no property of the IMU')
     lines.append('the calibrations disagree' if rejected else 'the calibrations agree')
-    return Comparison(rows, not rejected, tuple(lines))
+    return Comparison(rows, not rejected, tuple(lines), reference_agree)
 
 
 def _ratio(difference, sd):

@@ -10,12 +10,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusal import refused
+from scipy.spatial.transform import Rotation
 
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.comparison import COMPARISON_P_VALUE, compare
+from imu_calibration.document.comparison import (
+    COMPARISON_P_VALUE,
+    compare,
+    in_accelerometer_axes,
+)
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED, FIXED, HELD
 
@@ -118,6 +123,60 @@ def test_the_command_line_prints_each_parameter_and_the_verdict(tmp_path, capsys
     one = draw(np.random.default_rng(7))
     (tmp_path / 'a.yaml').write_text(calibration_to_text(one))
     (tmp_path / 'b.yaml').write_text(calibration_to_text(moved(one, 'accelerometer.bias.x', 1.0)))
-    assert main(['compare', str(tmp_path / 'a.yaml'), str(tmp_path / 'b.yaml')]) == 0
+    files = [str(tmp_path / 'a.yaml'), str(tmp_path / 'b.yaml')]
+    page = tmp_path / 'page' / 'compare.html'
+    assert main(['compare', *files, '--output', str(page.parent)]) == 3
+    assert 'accelerometer.bias.x' in page.read_text()
+    before = page.read_bytes()
+    assert main(['compare', files[0], files[0], '--output', str(page.parent)]) == 1
+    assert page.read_bytes() == before
+    assert main(['compare', files[0], files[0], '--output', str(page.parent), '--force']) == 0
+    assert page.read_bytes() != before
     printed = capsys.readouterr().out
     assert all(name in printed for name in one.param_names)
+
+
+def rotated(calibration, rotation, axes):
+    """Return the same IMU with true quantities in other axes."""
+    values = calibration.values.copy()
+    turn = np.eye(len(values))
+    for name in ('accelerometer.matrix', 'gyroscope.matrix', 'accelerometer.accel_size_effect'):
+        start = calibration.param_names.index(f'{name}.xx')
+        turn[start : start + 9, start : start + 9] = np.kron(np.eye(3), rotation)
+    return replace(
+        calibration,
+        values=turn @ values,
+        covariance=turn @ calibration.covariance @ turn.T,
+        gauge={'origin': 'mount', 'axes': axes},
+    )
+
+
+@pytest.mark.parametrize('axes', ('mount', 'accelerometer_lower_triangular'))
+def test_a_rotation_of_the_axes_is_no_disagreement(axes):
+    """Two degrees are 350 sds of an entry; a change of the IMU is found in any axes."""
+    rng = np.random.default_rng(8)
+    agreeing = 0
+    for seed in range(40):
+        first, second = draw(rng), draw(rng)
+        turn = Rotation.from_rotvec(np.radians(2.0) * rng.normal(size=3)).as_matrix()
+        other = rotated(second, turn, 'mount')
+        if axes != 'mount':
+            other = in_accelerometer_axes(other)
+        agreeing += bool(compare(first, other).agree)
+        sd = other.sd[other.param_names.index('gyroscope.matrix.zx')]
+        assert compare(first, moved(other, 'gyroscope.matrix.zx', 40 * sd)).agree is False
+    assert agreeing >= 38
+
+
+def test_the_clock_of_another_session_is_no_disagreement_of_the_imu():
+    model = SensorModel(reference=('time_offset',))
+    count = len(model.param_names)
+    one = Calibration(
+        model, model.start(), 1e-8 * np.eye(count), (DETERMINED,) * count, 'imu', {'axes': 'mount'}
+    )
+    name = next(name for name in model.param_names if name.startswith('reference.'))
+    other = moved(one, name, 0.4)
+    found = compare(one, other)
+    assert (found.agree, found.reference_agree, found.exit_code) == (True, False, 0)
+    found = compare(one, moved(one, 'gyroscope.bias.x', 0.4))
+    assert (found.agree, found.reference_agree, found.exit_code) == (False, True, 3)
