@@ -27,6 +27,7 @@ SECTIONS = (
     'cross',
     'decisions',
     'misfit',
+    'scatter',
     'shaft',
     'boards',
     'arm_live',

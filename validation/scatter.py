@@ -1,0 +1,49 @@
+"""
+Standard deviations on a table against the scatter over many simulated sessions.
+
+White noise and wandering biases; an IMU, a tilt and an arm of each seed.
+"""
+
+from validation.section import Section, text
+
+SESSIONS = 120
+
+
+def run(folder, plots):
+    """Return the section."""
+    from worlds.scatter import scatter, windows_of_a_short_session
+
+    section = Section('Reported standard deviations and the scatter over sessions')
+    found = scatter(windows_of_a_short_session(), range(SESSIONS))
+    section.claim(
+        f'{SESSIONS} simulated sessions on a table: mean square of errors over reported sd',
+        '0.95 to 1.05',
+        f'{found.mean_square:.3f}',
+        0.95 <= found.mean_square <= 1.05,
+    )
+    section.claim(
+        'share of errors within the 95 % interval',
+        '0.935 to 0.965',
+        f'{found.coverage:.4f}',
+        0.935 <= found.coverage <= 0.965,
+    )
+    section.claim(
+        'sd of the errors of each parameter over its median reported sd',
+        '0.77 to 1.20',
+        f'{found.least_ratio:.2f} to {found.largest_ratio:.2f}',
+        found.least_ratio >= 1 / 1.3 and found.largest_ratio <= 1.20,
+    )
+    section.claim(
+        'reported sd above 1.5 times the median one of the parameter',
+        'below 5 %',
+        f'{found.widest_share:.1%}',
+        found.widest_share < 0.05,
+    )
+    section.claim(
+        'rms error over the Cramer-Rao bound of an estimator that knows the noise',
+        'at most 1.05',
+        f'{found.over_bound:.3f}',
+        found.over_bound <= 1.05,
+    )
+    section.say(text('scatter'))
+    return section
