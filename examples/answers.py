@@ -16,6 +16,7 @@ import re
 import shlex
 import subprocess
 import tempfile
+from functools import cache
 from pathlib import Path
 
 from imu_calibration.cli.main import main as imu_calibration
@@ -25,6 +26,19 @@ PAGES = ROOT / 'docs/answers'
 BLOCK = re.compile(r'^```console\n(.*?)^```$', flags=re.M | re.S)
 FILTERS = ('grep', 'head', 'tail', 'cat', 'printf')
 """Permitted programs in addition to `imu_calibration`."""
+
+
+@cache
+def verb_output(_folder: str, arguments: tuple[str, ...]) -> str:
+    """
+    Return both outputs of a command line of `imu_calibration` in the current folder.
+
+    A page repeats a command to show another part of its output: it is run once.
+    """
+    stream = io.StringIO()
+    with contextlib.redirect_stdout(stream), contextlib.redirect_stderr(stream):
+        imu_calibration(list(arguments))
+    return stream.getvalue()
 
 
 def run(command: str) -> str:
@@ -38,10 +52,7 @@ def run(command: str) -> str:
     for stage in command.split(' | '):
         name, *arguments = shlex.split(stage)
         if name == 'imu_calibration':
-            stream = io.StringIO()
-            with contextlib.redirect_stdout(stream), contextlib.redirect_stderr(stream):
-                imu_calibration(arguments)
-            output = stream.getvalue()
+            output = verb_output(os.getcwd(), tuple(arguments))
         elif name in FILTERS:
             output = subprocess.run(
                 [name, *arguments], input=output, capture_output=True, text=True, check=False
