@@ -144,6 +144,7 @@ def open_recording(
     want_joints: bool | str = True,
     want_temperature: bool | str = True,
     frame_id: str | None = None,
+    raw: Sequence[str] = (),
 ) -> 'Recording':
     """
     Open a bag and choose its topics.
@@ -165,6 +166,8 @@ def open_recording(
         topic is ambiguous.
     frame_id : str, optional
         Frame of the Imu messages that are read; needed for a topic with messages of several frames.
+    raw : sequence of str
+        Quantities of a text log ('force', 'rate') that are not converted to SI.
 
     Returns
     -------
@@ -177,7 +180,7 @@ def open_recording(
 
     """
     path = Path(path)
-    source = _open_source(path)
+    source = _open_source(path, tuple(raw))
     try:
         topics = _listed(source)
         imu = _choose(path, topics, IMU_TYPE, imu_topic, required=True)
@@ -373,7 +376,7 @@ def _block(parts, decoders):
     )
 
 
-def _open_source(path):
+def _open_source(path, raw=()):
     if not path.exists():
         raise InputError(
             f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file,'
@@ -386,7 +389,7 @@ def _open_source(path):
         )
     try:
         if path.suffix.lower() in SUFFIXES:
-            return CsvBag(path)
+            return CsvBag(path, raw)
         return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
     except InputError:
         raise

@@ -3,7 +3,7 @@ A copy of a recording with an additional corrected Imu topic; all other data are
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
 
@@ -31,6 +31,7 @@ def copy_with_corrected(
     mat_ts: np.ndarray | None = None,
     late_ns: int = 0,
     source_frame_id: str | None = None,
+    raw: Sequence[str] = (),
 ) -> dict[str, int]:
     """
     Write a bag with all topics of another one, and the corrected Imu messages.
@@ -61,6 +62,8 @@ def copy_with_corrected(
         Subtracted from the stamps of the corrected messages.
     source_frame_id : str, optional
         Frame of the messages that are corrected; see `msg_adapters.bag.open_recording`.
+    raw : sequence of str
+        As for `msg_adapters.bag.open_recording`.
 
     Returns
     -------
@@ -74,7 +77,9 @@ def copy_with_corrected(
         removed.
 
     """
-    with open_recording(source, imu_topic, want_joints=False, want_temperature=False) as recording:
+    with open_recording(
+        source, imu_topic, want_joints=False, want_temperature=False, raw=raw
+    ) as recording:
         bag = recording.source
         _check(recording, corrected_topic)
         topics = [topic.name for topic in recording.topics]

@@ -19,6 +19,8 @@ import numpy as np
 from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.core.progress import remark
+from imu_calibration.core.readings import SPELLINGS as READING_SPELLINGS
+from imu_calibration.core.readings import UNIT_SIZES, unit_of
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.full_scale import relate_turns
@@ -32,8 +34,8 @@ HEAD_BYTES = 1 << 16
 """Bytes in which header, delimiter and first rows are found."""
 COLUMN_UNITS = {
     'time': {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9},
-    'force': {'m/s^2': 1.0, 'g': STANDARD_GRAVITY, 'mg': 1e-3 * STANDARD_GRAVITY},
-    'rate': {'rad/s': 1.0, 'deg/s': DEG, 'mdeg/s': 1e-3 * DEG},
+    'force': UNIT_SIZES['accelerometer'],
+    'rate': UNIT_SIZES['gyroscope'],
     'temperature': {'C': 1.0},
     'joint': {'rad': 1.0, 'deg': DEG},
 }
@@ -53,30 +55,15 @@ SPELLINGS = {
         'nsec': 'ns',
         'nanos': 'ns',
     },
-    'force': {
-        'm/s2': 'm/s^2',
-        'm/s²': 'm/s^2',
-        'm/s/s': 'm/s^2',
-        'm/sec^2': 'm/s^2',
-        'ms^-2': 'm/s^2',
-        'mps2': 'm/s^2',
-        'ms2': 'm/s^2',
-    },
-    'rate': {
-        'rads': 'rad/s',
-        'rps': 'rad/s',
-        'rad/sec': 'rad/s',
-        'rads^-1': 'rad/s',
-        'dps': 'deg/s',
-        '°/s': 'deg/s',
-        'deg/sec': 'deg/s',
-        'degs': 'deg/s',
-        'mdps': 'mdeg/s',
-    },
+    'force': READING_SPELLINGS['accelerometer'],
+    'rate': READING_SPELLINGS['gyroscope'],
     'temperature': {'c': 'C', '°c': 'C', 'degc': 'C', 'celsius': 'C'},
     'joint': {'rads': 'rad', '°': 'deg', 'degrees': 'deg', 'radians': 'rad'},
 }
 """Quantity -> spelling in headers -> unit."""
+SENSOR_OF = {'force': 'accelerometer', 'rate': 'gyroscope'}
+RAW_UNIT = 'raw'
+"""Unit of columns that are read without conversion."""
 COLUMN_PATTERNS = (
     (
         'time',
@@ -166,7 +153,11 @@ class CsvLog:
     over='ignore', invalid='ignore'
 )  # readings that are not finite are counted where samples are used
 def read_csv(
-    path: str | PathLike[str], columns: Sequence[str] = (), where: Sequence[str] = ()
+    path: str | PathLike[str],
+    columns: Sequence[str] = (),
+    where: Sequence[str] = (),
+    *,
+    raw: Sequence[str] = (),
 ) -> CsvLog:
     """
     Read a text log with a header line.
@@ -182,6 +173,8 @@ def read_csv(
     where : sequence of str
         Conditions ``COLUMN=VALUE``; only the rows that fulfil all are read, such as those of one
         of several IMUs in a log.
+    raw : sequence of str
+        Quantities, 'force' or 'rate', that are not converted to SI.
 
     Raises
     ------
@@ -197,6 +190,10 @@ def read_csv(
     found = [_parse(text) for text in columns]
     given = {(each.quantity, each.joint) for each in found}
     found += [each for each in _guess(table) if (each.quantity, each.joint) not in given]
+    found = [
+        replace(each, unit=RAW_UNIT, origin='given') if each.quantity in raw else each
+        for each in found
+    ]
     by_quantity = {each.quantity: each for each in found}
     for quantity in ('time', 'force', 'rate'):
         if quantity not in by_quantity:
@@ -214,7 +211,7 @@ def read_csv(
     force = _with_unit(
         by_quantity['force'], lambda: _force_unit(table.values(by_quantity['force'].names)), path
     )
-    force_s = table.values(force.names) * COLUMN_UNITS['force'][force.unit]
+    force_s = table.values(force.names) * _size_of(force)
     _require_one_imu(stamp_ns, force_s, table.values(by_quantity['rate'].names))
     rate = _with_unit(
         by_quantity['rate'],
@@ -228,9 +225,7 @@ def read_csv(
             temperature = TemperatureSamples(stamp_ns, table.values(each.names)[:, 0])
         elif each.quantity == 'joint':
             joints.append(_with_unit(each, lambda: None, path))
-    imu = ImuSamples(
-        stamp_ns, force_s, table.values(rate.names) * COLUMN_UNITS['rate'][rate.unit], 'imu_link'
-    )
+    imu = ImuSamples(stamp_ns, force_s, table.values(rate.names) * _size_of(rate), 'imu_link')
     used += joints
     taken = {name.removeprefix('-') for each in used for name in each.names}
     angles = {
@@ -273,7 +268,11 @@ def _parse(text):
     """Return the Columns of one assignment of `columns`."""
     label, _, rest = text.partition('=')
     quantity, _, joint = label.partition('.')
-    names, colon, unit = rest.rpartition(':')
+    counts = re.fullmatch(r'(.*?):(counts:.*)', rest)
+    if counts:
+        names, colon, unit = counts[1], ':', counts[2]
+    else:
+        names, colon, unit = rest.rpartition(':')
     if not colon:
         names, unit = rest, ''
     units = COLUMN_UNITS.get(quantity, {})
@@ -289,12 +288,21 @@ def _parse(text):
             f' rate, got {text!r}; {REMEDY}',
             key='columns',
         )
-    if unit is not None and unit not in units:
+    if unit is not None and unit.startswith('counts:') and quantity in SENSOR_OF:
+        unit = unit_of(SENSOR_OF[quantity], unit).unit
+    elif unit is not None and unit not in units:
         raise InputError(
             f'the unit of {quantity} must be one of {", ".join(units)}, got {unit!r}; correct'
             f' {text!r}'
         )
     return Columns(quantity, names, unit, joint, 'given')
+
+
+def _size_of(columns):
+    """Return the size in SI of the unit of force or rate."""
+    if columns.unit == RAW_UNIT:
+        return 1.0
+    return 1.0 / np.asarray(unit_of(SENSOR_OF[columns.quantity], columns.unit).scale)
 
 
 def _opened(path):
@@ -676,9 +684,9 @@ class CsvBag(Rosbag2):
 
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, raw: tuple[str, ...] = ()):
         status = path.stat()
-        self.converted = _converted(path, status.st_mtime_ns, status.st_size)
+        self.converted = _converted(path, status.st_mtime_ns, status.st_size, raw)
         super().__init__(self.converted.bag)
         self.path = path
 
@@ -688,8 +696,8 @@ class ConvertedLog:
     The temporary bag of a text log; its folder is removed with the last reference, or at exit.
     """
 
-    def __init__(self, path: Path):
-        log, folder = read_csv(path), mkdtemp(prefix='imu_calibration_')
+    def __init__(self, path: Path, raw: tuple[str, ...] = ()):
+        log, folder = read_csv(path, raw=raw), mkdtemp(prefix='imu_calibration_')
         remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
         if log.n_dropped:
             remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
@@ -699,10 +707,10 @@ class ConvertedLog:
 
 
 @lru_cache(maxsize=1)
-def _converted(path, _modified_ns, _size):
+def _converted(path, _modified_ns, _size, raw):
     """
     Return the ConvertedLog.
 
     A verb opens a recording several times, and converts an unchanged file once.
     """
-    return ConvertedLog(path)
+    return ConvertedLog(path, raw)

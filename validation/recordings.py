@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml
 
 from imu_calibration.calibration.hand_workflow import read_by_hand
-from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.units import STANDARD_GRAVITY
 from msg_adapters.bag import open_recording
 
@@ -40,7 +40,7 @@ def reference(folder, name):
 def nominal_of(folder, name):
     """Return the nominal scaling of a recording in counts, else None."""
     nominal = reference(folder, name).get('nominal')
-    return NominalScaling(**nominal) if nominal else None
+    return RawReadings.of_scales(**nominal) if nominal else None
 
 
 def gravity_of(folder, name):

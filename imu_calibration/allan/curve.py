@@ -10,7 +10,8 @@ import numpy as np
 
 from imu_calibration.allan.still_parts import StillPart
 from imu_calibration.allan.trends import AxisTrend, Parts, TrendReference
-from imu_calibration.core.samples import NominalScaling, SampleBlock
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 FULL = 65536
@@ -346,7 +347,7 @@ class RestReader:
     """Subtracted from the samples."""
     time_of: Callable[[int, np.ndarray], np.ndarray]
     """``time_of(epoch, stamp_ns)``: s since the beginning of the recording."""
-    nominal: NominalScaling | None = None
+    nominal: RawReadings | None = None
     """For recordings in volts or counts."""
 
     def read(self, *bare: Sink, raw: Sink | None = None) -> None:

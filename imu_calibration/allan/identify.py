@@ -16,7 +16,8 @@ from imu_calibration.allan.trends import MAX_TREND_BLOCKS, AxisTrend, Blocks, Tr
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import reported
-from imu_calibration.core.samples import NominalScaling, SampleBlock
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import DETERMINED
 
@@ -256,7 +257,7 @@ class NoiseIdentification:
 
 
 def identify_noise(
-    source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None
+    source: Callable[[], Iterable[SampleBlock]], nominal: RawReadings | None = None
 ) -> NoiseIdentification:
     """
     Identify the noise of an IMU from a recording that holds rest.
@@ -266,7 +267,7 @@ def identify_noise(
     source : callable
         Returns the blocks of the recording, from the beginning at each call; it is read twice, and
         again where a curve has a hump.
-    nominal : NominalScaling, optional
+    nominal : RawReadings, optional
         For recordings in volts or counts.
 
     Raises
@@ -298,7 +299,7 @@ def identify_noise(
 
 
 def read_rest(
-    source: Callable[[], Iterable[SampleBlock]], nominal: NominalScaling | None = None
+    source: Callable[[], Iterable[SampleBlock]], nominal: RawReadings | None = None
 ) -> RestingRecord:
     """
     Read a recording twice, first for parts at rest and trends, then for the Allan curves.

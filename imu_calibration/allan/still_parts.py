@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from imu_calibration.core.samples import NominalScaling, SampleBlock, runs_of
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import SampleBlock, runs_of
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import shrunk
 from imu_calibration.preprocessing.scan import CHUNK_SECONDS, Chunks, ChunkSeries, still_chunks
@@ -200,7 +201,7 @@ class Survey:
     """Frame of the messages."""
 
 
-def survey(blocks: Iterable[SampleBlock], nominal: NominalScaling | None = None) -> Survey:
+def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) -> Survey:
     """
     Read a recording once.
 

@@ -15,7 +15,8 @@ import numpy as np
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
-from imu_calibration.core.samples import NominalScaling, SampleBlock
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -276,7 +277,7 @@ class Collector:
         model: SensorModel,
         settings: WindowSettings = WindowSettings(),
         *,
-        nominal: NominalScaling | None = None,
+        nominal: RawReadings | None = None,
         session: int = 0,
         watchers: Sequence[Watcher] = (),
         windows: list | StoredWindows | None = None,
@@ -375,7 +376,7 @@ class GatherStep:
     """Defines the columns."""
     windows: WindowSettings = WindowSettings()
     """How windows are found."""
-    nominal: NominalScaling | None = None
+    nominal: RawReadings | None = None
     """For recordings in volts or counts."""
     names: tuple = ()
     """

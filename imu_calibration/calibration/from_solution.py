@@ -9,6 +9,7 @@ import numpy as np
 
 import imu_calibration
 from imu_calibration.core.documents import finite
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import judged
@@ -174,6 +175,7 @@ def document(
     uncorrected: Uncorrected,
     tested: Collection[str] = (),
     absent: tuple[str, ...] = (),
+    readings: RawReadings | None = None,
 ) -> Calibration:
     """
     Return the Calibration for a solution, with statuses and the verdict.
@@ -196,6 +198,8 @@ def document(
         Parameters that are replaced by a likelihood-ratio test.
     absent : sensors, optional
         Sensors without readings.
+    readings : RawReadings, optional
+        Units and axes of the recording; None: SI, axes not stated.
 
     """
     final = solution.model.at(solution.values)
@@ -226,6 +230,7 @@ def document(
             solution.held, solution.param_names, solution.replaced, tested=tested
         ),
         absent=absent,
+        readings=readings or RawReadings(),
     )
     return judged(calibration, tolerances)
 

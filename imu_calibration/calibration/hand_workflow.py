@@ -30,13 +30,8 @@ from imu_calibration.calibration.result import (
 from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_samples
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.samples import (
-    ImuSamples,
-    JoinedParts,
-    NominalScaling,
-    SampleBlock,
-    TemperatureSamples,
-)
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import ImuSamples, JoinedParts, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration, one_significant
 from imu_calibration.effects.base import SENSORS, UNITS, Role
@@ -301,7 +296,7 @@ class HandRecording:
 
 def read_by_hand(
     blocks: Iterable[SampleBlock],
-    nominal: NominalScaling | None = None,
+    nominal: RawReadings | None = None,
     preflight: Preflight | None = None,
 ) -> HandRecording:
     """
@@ -436,6 +431,7 @@ def hand_result(
         uncorrected=uncorrected_by_hand(hand),
         tested=CROSS_TERMS,
         absent=hand.hand_model.absent,
+        readings=options.nominal,
     )
     needed = {
         name: (item['needs'], float('nan'))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.base import Role
@@ -134,7 +134,7 @@ def _between_sd(axes, tangent, covariance, i, j):
 
 
 def in_paper_units(
-    derived: Derived, nominal: NominalScaling | Mapping | None = None
+    derived: Derived, nominal: RawReadings | Mapping | None = None
 ) -> tuple[tuple[str, str, np.ndarray, np.ndarray], ...]:
     """
     Return scale factors and biases in the units of the source papers.
@@ -147,7 +147,7 @@ def in_paper_units(
     Parameters
     ----------
     derived : Derived
-    nominal : NominalScaling, optional
+    nominal : RawReadings, optional
         The conversion with which the recording was read; None: the recording is in SI units.
 
     """
@@ -160,12 +160,12 @@ def in_paper_units(
             ('scale factor', f'{name}/{name}', derived.scale, derived.scale_sd),
             ('bias', unit, derived.bias * bias_factor, derived.bias_sd * bias_factor),
         )
-    nominal = nominal if isinstance(nominal, NominalScaling) else NominalScaling(**nominal)
-    offset, per_si = (
-        (nominal.accelerometer_offset, nominal.accelerometer_scale)
-        if accelerometer
-        else (nominal.gyroscope_offset, nominal.gyroscope_scale)
-    )
+    nominal = nominal if isinstance(nominal, RawReadings) else RawReadings.of_scales(**nominal)
+    stated = nominal.gyroscope
+    if accelerometer:
+        stated = nominal.accelerometer
+    offset = np.asarray(stated.offset)
+    per_si = np.asarray(stated.scale)
     return (
         (
             'scale factor',

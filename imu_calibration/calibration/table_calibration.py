@@ -29,6 +29,7 @@ from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.progress import report
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.change import CHANGE, RegimeChange
@@ -284,6 +285,7 @@ def conclude(
         proof=proof,
         changes=changes,
         uncorrected=uncorrected,
+        readings=options.nominal,
     )
     period = float(
         np.median([row.duration / max(row.count - 1, 1) for row in gathered.accumulator.rows])
@@ -513,9 +515,9 @@ def _with_corrected(source, calibration, options):
     stream = CompensationStream(calibration, temperature=temperature)
     for block in source():
         if block.imu is not None and len(block.imu):
-            found = stream.correct(
-                options.nominal.apply(block.imu) if options.nominal else block.imu
-            )
+            # The cleaner converts the raw readings of the block afterwards.
+            readings = options.nominal or RawReadings()
+            found = stream.correct(readings.apply(block.imu))
             block = replace(
                 block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate]))
             )

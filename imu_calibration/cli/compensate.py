@@ -60,6 +60,7 @@ def add_arguments(parser: OneLineParser) -> None:
         help="move the stamps back by the calibration's time_offset",
     )
     parser.add_topics(joints=False)
+    parser.add_readings()
 
 
 def run(options: Options) -> VerbResult:

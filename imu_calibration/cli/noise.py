@@ -31,13 +31,9 @@ def add_arguments(parser: OneLineParser) -> None:
         type=float,
         help='averaging time at which a random walk replaces other slow noise, default 100 s',
     )
-    parser.expert(
-        '--nominal',
-        metavar='FILE',
-        help='YAML with offsets and scales for recordings in volts or counts',
-    )
     parser.common('--no-report', action='store_true', help='write noise.yaml only')
     parser.add_topics(joints=False)
+    parser.add_readings()
 
 
 def run(options: Options) -> VerbResult:

@@ -255,9 +255,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.expert(
             '--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect'
         )
-        self.expert(
-            '--nominal', metavar='FILE', help='offsets and scales of recordings in volts or counts'
-        )
+        self.add_readings()
         self.expert(
             '--noise',
             metavar='FILE',
@@ -274,6 +272,23 @@ class OneLineParser(argparse.ArgumentParser):
             self.expert(
                 '--model-as-asked', action='store_true', help='add no effect to the requested model'
             )
+
+    def add_readings(self) -> None:
+        """Add the options that describe the readings of a recording."""
+        self.common(
+            '--accelerometer-unit',
+            metavar='UNIT',
+            help='of the readings: m/s^2, g, mg, counts:16384/g',
+        )
+        self.common(
+            '--gyroscope-unit',
+            metavar='UNIT',
+            help='rad/s, deg/s, urad/s, ..., counts:16.4/(deg/s)',
+        )
+        self.common('--axes', metavar='AXES', help='flu, frd, or forward, left, up: --axes=-x,y,-z')
+        self.expert(
+            '--nominal', metavar='FILE', help='units, scales and offsets of the readings, in a file'
+        )
 
     def add_effects(self, add: Callable[..., Any]) -> None:
         """Add the option of effects in addition to the catalogue, by `common` or `expert`."""

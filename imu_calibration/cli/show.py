@@ -63,7 +63,7 @@ def show_findings(out: Terminal, findings: tuple[CheckFinding, ...], hints: dict
                 (
                     (found.severity, STYLES[found.severity]),
                     (found.check.replace('_', ' '), 'bold'),
-                    with_hint(found.text, found.key, hints),
+                    with_hint(found.text, found.key, hints, value=found.value),
                 )
                 for found in ordered
             ]

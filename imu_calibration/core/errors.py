@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 
 ERROR_KEYS = (
+    'accelerometer_unit',
     'allow_xacro',
     'anyway',
     'calibration',
@@ -18,12 +19,12 @@ ERROR_KEYS = (
     'force',
     'frame_id',
     'gravity',
+    'gyroscope_unit',
     'imu_link',
     'imu_topic',
     'inspect',
     'jobs',
     'joint_topic',
-    'nominal',
     'noise',
     'scheduler',
     'setting',
@@ -34,7 +35,11 @@ ERROR_KEYS = (
     'urdf',
 )
 """Inputs that an error may request, and programs that a remedy may need."""
-OFFERS = {'anyway': ', or give your consent', 'nominal': ', or give a nominal scaling'}
+OFFERS = {
+    'accelerometer_unit': ', or state the unit of the readings',
+    'anyway': ', or give your consent',
+    'gyroscope_unit': ', or state the unit of the readings',
+}
 """Key -> a second remedy, which is offered only where the key has a name."""
 REMEDY_VERBS = {
     'diagnose': "run 'imu_calibration diagnose' to {}",
@@ -55,20 +60,22 @@ class ImuCalibrationError(Exception):
         The missing input, a key of `ERROR_KEYS`.
     code : str
         Stable name of the requirement that is not met, for programs and tests; the text may change.
+    value : str
+        Proposed value of the missing input, which is printed after its local name.
 
     """
 
-    def __init__(self, text: str = '', *, key: str | None = None, code: str = ''):
+    def __init__(self, text: str = '', *, key: str | None = None, code: str = '', value: str = ''):
         super().__init__(text)
-        self.key, self.code = key, code
+        self.key, self.code, self.value = key, code, value
 
     def named(self, name: str) -> 'ImuCalibrationError':
         """Return the error with the name of its subject before its text."""
-        return type(self)(f'{name}: {self}', key=self.key, code=self.code)
+        return type(self)(f'{name}: {self}', key=self.key, code=self.code, value=self.value)
 
     def with_hint(self, hints: dict[str, str]) -> str:
         """Return the text with the local name of the key; `hints` as for `with_hint`."""
-        return with_hint(str(self), self.key, hints)
+        return with_hint(str(self), self.key, hints, value=self.value)
 
 
 class InputError(ImuCalibrationError):
@@ -115,7 +122,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {close[0]}?' if close else ''
 
 
-def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
+def with_hint(text: str, key: str | None, hints: dict[str, str], *, value: str = '') -> str:
     """
     Return a text whose remedy is available in the program that prints it.
 
@@ -127,8 +134,12 @@ def with_hint(text: str, key: str | None, hints: dict[str, str]) -> str:
     hints : dict
         Key -> its local name, such as ``{'gravity': "parameter 'gravity'"}``, or for a key of
         `REMEDY_VERBS` a phrase with ``{}`` for the text; a key without a local name adds nothing.
+    value : str
+        Proposed value, printed after the local name.
 
     """
     if key in REMEDY_VERBS:
         return printable(hints.get(key, REMEDY_VERBS[key]).format(text))
-    return printable(f'{text}{OFFERS.get(key, "")} ({hints[key]})' if key in hints else text)
+    if key not in hints:
+        return printable(text)
+    return printable(f'{text}{OFFERS.get(key, "")} ({" ".join([hints[key], value]).strip()})')

@@ -256,28 +256,6 @@ class SampleBlock:
         )
 
 
-@dataclass(frozen=True)
-class NominalScaling:
-    """Nominal conversion of volts or counts to SI: ``SI = (reading - offset) / scale``."""
-
-    accelerometer_offset: float = 0.0
-    """Reading at zero specific force."""
-    accelerometer_scale: float = 1.0
-    """Reading per m/s^2."""
-    gyroscope_offset: float = 0.0
-    """Reading at zero rate."""
-    gyroscope_scale: float = 1.0
-    """Reading per rad/s."""
-
-    def apply(self, imu: ImuSamples) -> ImuSamples:
-        """Return the samples in SI."""
-        return replace(
-            imu,
-            force_s=(imu.force_s - self.accelerometer_offset) / self.accelerometer_scale,
-            rate_s=(imu.rate_s - self.gyroscope_offset) / self.gyroscope_scale,
-        )
-
-
 def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
     """
     Return (start, stop) of each run of true flags, half open, shape (n_runs, 2).

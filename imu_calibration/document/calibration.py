@@ -11,6 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.core.scales import (
     DOUBTFUL,
@@ -97,6 +98,8 @@ class Calibration:
     Sensors without readings in the recording: their parameters are nominal, without a decision, and
     their readings are not corrected.
     """
+    readings: RawReadings = RawReadings()
+    """Units and axes of the readings that it is for; the values are SI in axes of the source."""
     judgement: Verdict | None = None
     """The verdict with its reasons one by one, where it was not read from a file."""
 
@@ -254,9 +257,9 @@ class Calibration:
         ----------
         samples : ImuSamples, or array_like, shape (n, 3)
             Readings of one IMU in order of time, or measured specific force in the sensor frame,
-            m/s^2.
+            in the unit of `readings` (m/s^2 unless the calibration states another).
         rate_s : array_like, shape (n, 3), optional
-            Measured angular rate of the same samples, rad/s.
+            Measured angular rate of the same samples, in the unit of `readings` (rad/s).
         time : array_like, shape (n,), optional
             When the arrays were measured, s; needed where the sensitive points have lever arms.
         temperature_c : float, array_like of shape (n,), or TemperatureSamples, optional
@@ -271,6 +274,11 @@ class Calibration:
         """
         from imu_calibration.compensation.stream import compensate_readings
 
+        if isinstance(samples, ImuSamples):
+            samples = self.readings.apply(samples)
+        elif rate_s is not None:
+            samples = self.readings.accelerometer.convert(np.asarray(samples, float))
+            rate_s = self.readings.gyroscope.convert(np.asarray(rate_s, float))
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
     def __repr__(self):

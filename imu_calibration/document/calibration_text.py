@@ -11,6 +11,7 @@ import numpy as np
 
 from imu_calibration.core.documents import from_text, plain, to_text
 from imu_calibration.core.errors import DocumentError, InputError, shortened
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration, with_nominal
 from imu_calibration.document.decision import HARMS, SensorDecision
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
@@ -122,6 +123,7 @@ KEYS_OF_PARTS = {
     'joint_errors': _or_none(_is_joint_errors),
     'gauge': {},
     'provenance': {},
+    'readings': {},
     'undetermined_directions': _or_none(_is_list_of(_is_direction)),
     'statistics': {sensor: _NOISE for sensor in SENSORS},
     'conditions': {
@@ -315,6 +317,7 @@ def parts_of(document: Mapping) -> dict[str, Any]:
         'undetermined': tuple(document.get('undetermined_directions') or ()),
         'absent': tuple(document.get('absent') or ()),
         'notes': tuple(document.get('notes') or ()),
+        'readings': RawReadings.from_mapping(document.get('readings') or {}),
         **{
             name: dict(document.get(name) or {})
             for name in (
@@ -487,6 +490,9 @@ def to_mapping(calibration: Calibration) -> dict:
     }
     if calibration.absent:
         document['absent'] = list(calibration.absent)
+    readings = calibration.readings
+    if readings.axes or not readings.is_si:
+        document['readings'] = readings.to_mapping()
     if calibration.model.definitions:
         document['effects'] = plain(calibration.model.definitions)
     for section in SECTIONS:

@@ -65,7 +65,11 @@ def _doubtful_scales(calibration):
     """Return a warning for each sensor with a scale factor that a wrong unit may explain."""
     return [
         Reason(
-            WARNING, question, 'state the unit of the readings', key='nominal', sensors=(sensor,)
+            WARNING,
+            question,
+            'convert the readings in the driver',
+            key=f'{sensor}_unit',
+            sensors=(sensor,),
         )
         for sensor, question in scale_questions(calibration).items()
     ]

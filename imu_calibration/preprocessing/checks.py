@@ -8,6 +8,7 @@ adding one is adding an entry.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -370,7 +371,7 @@ class Preflight(EvidenceGatherer):
 
         """
         self.streams, self.lost = cleaner.statistics(), cleaner.lost
-        evidence = self.evidence(self.streams)
+        evidence = replace(self.evidence(self.streams), readings=cleaner.readings)
         self.findings = (
             tuple(finding for check in CHECKS for finding in check(evidence))
             if 'imu' in evidence.streams
@@ -384,7 +385,7 @@ def refuse(findings: tuple[CheckFinding, ...]) -> None:
     """Raise the first finding that makes the result wrong as an InputError."""
     for finding in findings:
         if finding.severity == REFUSE:
-            raise InputError(finding.text, key=finding.key, code=finding.check)
+            raise InputError(finding.text, key=finding.key, code=finding.check, value=finding.value)
 
 
 def warnings(findings: Sequence[CheckFinding]) -> list[CheckFinding]:

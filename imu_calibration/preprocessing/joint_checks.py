@@ -280,7 +280,8 @@ def _rate_units(moments):
     if 40 < ratio < 80:
         yield wrong_rate_unit(
             f'angular rates must be in rad/s, they are {ratio:.1f} times those of the joints:'
-            ' probably deg/s, gyroscope_scale 57.29578; convert them in the driver'
+            ' probably deg/s; convert them in the driver',
+            'deg/s',
         )
     elif 1 / 80 < ratio < 1 / 40:
         yield CheckFinding(

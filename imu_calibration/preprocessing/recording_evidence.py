@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import smallest_step
 from imu_calibration.preprocessing import scan
 from imu_calibration.preprocessing.full_scale import (
@@ -50,6 +51,8 @@ class RecordingEvidence:
     """Local gravity, m/s^2."""
     still_joints_ns: np.ndarray
     """First and last stamp of each stretch in which no joint position changes, shape (n, 2)."""
+    readings: RawReadings = RawReadings()
+    """Stated units, from which the readings were converted to SI."""
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -194,6 +197,8 @@ class CheckFinding:
     """Samples that are unusable because of it and that no other count holds."""
     key: str | None = None
     """The missing input, a key of `errors.ERROR_KEYS`."""
+    value: str = ''
+    """Proposed value of the missing input."""
 
     def named(self, name: str) -> 'CheckFinding':
         """Return the finding with the name of its recording before the text."""

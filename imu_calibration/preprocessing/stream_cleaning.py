@@ -8,13 +8,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import (
-    ImuSamples,
-    JointSamples,
-    NominalScaling,
-    SampleBlock,
-    TemperatureSamples,
-)
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.preprocessing.absent_sensor import SensorPresence
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
@@ -416,7 +411,7 @@ class BlockCleaner:
     ----------
     joint_names : sequence of str
         Order of the joints; by default unchanged.
-    nominal : NominalScaling, optional
+    nominal : RawReadings, optional
         For recordings in volts or counts.
     watchers : sequence of Watcher
         Receivers of each cleaned block.
@@ -428,7 +423,7 @@ class BlockCleaner:
     def __init__(
         self,
         joint_names: Sequence[str] = (),
-        nominal: NominalScaling | None = None,
+        nominal: RawReadings | None = None,
         watchers: Sequence[Watcher] = (),
         *,
         one_sensor: bool = False,
@@ -441,6 +436,11 @@ class BlockCleaner:
         """Messages that could not be converted to samples: reason -> count."""
         self.notes: Counter[str] = Counter()
         """Messages that were used with a modification: reason -> count."""
+
+    @property
+    def readings(self) -> RawReadings:
+        """Stated units of the readings."""
+        return self._nominal or RawReadings()
 
     @property
     def n_buffered(self) -> int:

@@ -7,11 +7,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.readings import (
+    SI_ACCELEROMETER,
+    UNIT_SIZES,
+    RawReadings,
+    SensorUnit,
+)
 from imu_calibration.core.scales import IMPOSSIBLE, USUAL, scale_range
 from imu_calibration.core.units import (
     DEG,
     GRAVITY_PLACE_SHARE,
-    OTHER_UNITS,
     STANDARD_GRAVITY,
     significant,
     unit_of_rest,
@@ -59,29 +64,55 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     length = evidence.length
     if length is None or 'accelerometer' in evidence.absent or not evidence.n_changed[:3].any():
         return  # outputs that never change are no unit: see the check of frozen outputs
-    if (
-        error := force_error(length, 'at rest' if evidence.rest is not None else 'in the middle')
-    ) is not None:
-        yield CheckFinding('force_unit', REFUSE, str(error), key=error.key or '')
+    where = 'at rest' if evidence.rest is not None else 'in the middle'
+    error = force_error(length, where, evidence.readings.accelerometer)
+    if error is not None:
+        yield CheckFinding('force_unit', REFUSE, str(error), key=error.key, value=error.value)
     else:
         yield CheckFinding(
             'force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}'
         )
 
 
-def force_error(length: float, where: str = 'at rest') -> InputError | None:
+def force_error(
+    length: float, where: str = 'at rest', stated: SensorUnit = SI_ACCELEROMETER
+) -> InputError | None:
     """
     Return the error for a median length of the specific force that is not gravity in m/s^2.
 
     None for one that can be.
+
+    Parameters
+    ----------
+    length : float
+        After the conversion from the stated unit, m/s^2.
+    where : str
+        Part of the recording with this length.
+    stated : SensorUnit
+        Unit of the readings as it was stated.
+
     """
     said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
-    if unit := unit_of_rest(length):
+    remedy = 'convert it in the driver'
+    raw_length = length
+    if not stated.is_si:
+        # The length of the readings, for the search of their unit.
+        raw_length = length * float(np.mean(stated.scale))
+        said = (
+            f'specific force must be in the stated unit {stated.unit}, the length of the readings'
+            f' {where} is {raw_length:.4g}: '
+        )
+        remedy = 'give the recording that the unit belongs to'
+    unit = unit_of_rest(raw_length)
+    if not stated.is_si and scale_range(raw_length / STANDARD_GRAVITY) is not IMPOSSIBLE:
+        unit = unit or 'm/s^2'
+    wrong = scale_range(length / STANDARD_GRAVITY) is IMPOSSIBLE
+    if unit and (wrong or stated.is_si):
         return InputError(
-            f'{said}it is probably {unit}, accelerometer_scale {OTHER_UNITS[unit]:.6g}; convert it'
-            ' in the driver',
-            key='nominal',
+            f'{said}it is probably {unit}; {remedy}',
+            key='accelerometer_unit',
             code='force_unit',
+            value=unit,
         )
     if length < LINEAR:
         return InputError(
@@ -90,51 +121,61 @@ def force_error(length: float, where: str = 'at rest') -> InputError | None:
             key='imu_topic',
             code='without_gravity',
         )
-    if scale_range(length / STANDARD_GRAVITY) is IMPOSSIBLE:
+    if wrong:
         return InputError(
-            f'{said}counts or volts?; convert it in the driver', key='nominal', code='force_unit'
+            f'{said}counts or volts?; {remedy}',
+            key='accelerometer_unit',
+            code='force_unit',
+            value='counts:NUMBER/g',
         )
     return None
 
 
-def refuse_force_unit(force: np.ndarray) -> None:
+def refuse_force_unit(force: np.ndarray, readings: RawReadings = RawReadings()) -> None:
     """
-    Raise the error of `force_error` for raw specific forces, (n, 3), that are not in m/s^2.
+    Raise the error of `force_error` for raw specific forces, (n, 3), that are in another unit.
 
     The median length decides, so that a motion in part of them does not. Readings that are zero or
     not finite are no measurement of gravity.
     """
-    length = np.linalg.norm(force, axis=1)
-    length = length[np.isfinite(length) & (length > 0.0)]
+    stated = readings.accelerometer
+    measured = np.isfinite(force).all(axis=1) & np.any(force != 0.0, axis=1)
+    length = np.linalg.norm(stated.convert(force[measured]), axis=1)
     if len(length) == 0:
         return
-    error = force_error(float(np.median(length)), 'in the recording')
+    error = force_error(float(np.median(length)), 'in the recording', stated)
     if error is not None:
         raise error
 
 
-def wrong_rate_unit(text: str) -> CheckFinding:
-    """Return the refusal of rates in a unit that a nominal scaling would put right."""
-    return CheckFinding('rate_unit', REFUSE, text, key='nominal')
+def wrong_rate_unit(text: str, unit: str = 'counts:NUMBER/(deg/s)') -> CheckFinding:
+    """Return the refusal of rates in another unit than rad/s, probably `unit`."""
+    return CheckFinding('rate_unit', REFUSE, text, key='gyroscope_unit', value=unit)
 
 
 def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Angular rate is in rad/s: gravity turns by the integral of the rates."""
     turning = evidence.turning
+    stated = evidence.readings.gyroscope
     largest = max((end.level for pair in evidence.ends[3:] for end in pair), default=0.0)
-    convert = 'convert them in the driver'
     if turning is not None:
         ratio = 1.0 / turning.factor
+        raw_ratio = ratio * float(np.mean(stated.scale))
+        wanted, convert = 'in rad/s', 'convert them in the driver'
+        if not stated.is_si:
+            wanted = f'in the stated unit {stated.unit}'
+            convert = 'give the recording that the unit belongs to'
         came = (
-            f'angular rates must be in rad/s, they are {significant(ratio)} times the rotation of'
+            f'angular rates must be {wanted}, they are {significant(ratio)} times the rotation of'
             ' the measured gravity: '
         )
-        if 0.6 < ratio * DEG < 1.6:
-            yield wrong_rate_unit(f'{came}probably deg/s, gyroscope_scale 57.29578; {convert}')
-        elif 0.6 < ratio / DEG < 1.6:
+        unit = _unit_of_ratio(raw_ratio)
+        if unit and scale_range(ratio) is IMPOSSIBLE:
+            yield wrong_rate_unit(f'{came}probably {unit}; {convert}', unit)
+        elif 0.6 < raw_ratio / DEG < 1.6:
             yield wrong_rate_unit(
-                f'{came}probably converted from deg/s twice, gyroscope_scale 0.01745329; convert'
-                ' them once'
+                f'{came}probably converted from deg/s twice; convert them once',
+                f'counts:{DEG:.7g}/(rad/s)',
             )
         elif _full_scale(evidence) is not None:
             return
@@ -148,11 +189,22 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 f' rates{_about(turning.axes)}',
             )
     elif largest > MAX_GYRO_RATE:
-        unit = 'deg/s' if largest < FASTEST_DEG else 'counts or volts'
+        unit, proposed = 'counts or volts', 'counts:NUMBER/(deg/s)'
+        if largest < FASTEST_DEG and stated.is_si:
+            unit = proposed = 'deg/s'
         yield wrong_rate_unit(
-            f'angular rates must be in rad/s, the largest is {largest:.4g}, faster than gyroscopes'
-            f' measure: {unit}?; {convert}'
+            f'angular rates must be in {stated.unit}, the largest is {largest:.4g} rad/s, faster'
+            f' than gyroscopes measure: {unit}?; convert them in the driver',
+            proposed,
         )
+
+
+def _unit_of_ratio(ratio):
+    """Return the unit of rates that are `ratio` times the true ones in rad/s; '' for none."""
+    for unit, size in UNIT_SIZES['gyroscope'].items():
+        if 0.6 < ratio * size < 1.6:
+            return unit
+    return ''
 
 
 def full_scale(evidence: RecordingEvidence) -> Iterator[CheckFinding]:

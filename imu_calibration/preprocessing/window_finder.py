@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples, JointSamples, NominalScaling, SampleBlock
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
@@ -58,7 +59,7 @@ class MotionGatherer:
         settings: WindowSettings = WindowSettings(),
         keep_unused: bool = False,
         *,
-        nominal: NominalScaling | None = None,
+        nominal: RawReadings | None = None,
         watchers: Sequence[Watcher] = (),
     ):
         self.cleaner = BlockCleaner(() if table is None else table.joint_names, nominal, watchers)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imu_calibration.allan.figures import NoiseFigures, bias_processes
-from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.effects.sensor_model import (
     DEFAULT_MODEL,
@@ -40,7 +40,7 @@ class CalibrationOptions:
     """{section: {effect: tolerance}}."""
     windows: WindowSettings = WindowSettings()
     """How windows are found."""
-    nominal: NominalScaling | None = None
+    nominal: RawReadings | None = None
     """For recordings in volts or counts."""
     gravity: float | None = None
     """

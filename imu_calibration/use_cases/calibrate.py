@@ -22,6 +22,7 @@ from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
+from imu_calibration.core.readings import UNIT_KEYS
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
@@ -31,7 +32,13 @@ from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import Choices, inputs_of, made_from, provenance_with
+from imu_calibration.use_cases.choices import (
+    Choices,
+    inputs_of,
+    made_from,
+    provenance_with,
+    readings_for,
+)
 from imu_calibration.use_cases.recordings import (
     Stand,
     jobs_for,
@@ -257,7 +264,11 @@ def check(
     """
     limit = checked_limit(change)
     calibration = files.given_calibration(calibration)
-    options, table, sources = inputs_of([recording], table, choices)
+    # The readings are those of the calibration, unless the choices state others.
+    described = {**choices, 'nominal': readings_for(calibration, choices)}
+    for name in UNIT_KEYS.values():
+        described.pop(name, None)
+    options, table, sources = inputs_of([recording], table, described)
     if table is None:
         result, notes = (
             check_by_hand(sources[0], calibration, options),

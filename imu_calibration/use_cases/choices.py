@@ -13,9 +13,11 @@ from typing import Any, NamedTuple, TypedDict
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import ImuCalibrationError, InputError
-from imu_calibration.core.samples import NominalScaling, SampleBlock
+from imu_calibration.core.readings import UNIT_KEYS, RawReadings, combined
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import override
 from imu_calibration.document import files
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
 from imu_calibration.estimation.observability import MOTIONS
@@ -75,8 +77,17 @@ class Choices(TypedDict, total=False):
     File or {section: {effect: standard deviation up to which it counts as determined}}; default
     config/tolerances.yaml.
     """
-    nominal: str | PathLike | NominalScaling | None
-    """File or scaling of recordings in volts or counts."""
+    nominal: str | PathLike | RawReadings | None
+    """File or description of the readings: unit, scale and offset per sensor, axes."""
+    accelerometer_unit: str | None
+    """Unit of the specific force in the recording, such as g or counts:16384/g; default m/s^2."""
+    gyroscope_unit: str | None
+    """Unit of the angular rate, such as deg/s or counts:16.4/(deg/s); default rad/s."""
+    axes: str | None
+    """
+    Axes of the readings: flu, frd, or the axes of the source that point forward, left and up, such
+    as x,-y,-z; default not stated.
+    """
     noise: str | PathLike | NoiseFigures | None
     """
     noise.yaml of this IMU: its bias instability, in place of the estimate from the recording; needs
@@ -154,10 +165,11 @@ def inputs_of(
 def topics_of(choices: Mapping[str, Any]) -> Topics:
     """Return the topics that were chosen."""
     return Topics(
-        *(
-            choices.get(name)
-            for name in ('imu_topic', 'joint_topic', 'temperature_topic', 'frame_id')
-        )
+        choices.get('imu_topic'),
+        choices.get('joint_topic'),
+        choices.get('temperature_topic'),
+        choices.get('frame_id'),
+        raw_columns(readings_of(choices), choices),
     )
 
 
@@ -175,7 +187,7 @@ def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
         choices.get('reference_model'),
         read(tolerances, catalogue),
         window_settings(choices.get('setting') or ()),
-        nominal_of(choices.get('nominal')),
+        readings_of(choices),
         gravity,
         catalogue,
         noise_of(choices.get('noise')),
@@ -217,18 +229,69 @@ def noise_of(chosen: str | PathLike | NoiseFigures | None) -> NoiseFigures | Non
     )
 
 
-def nominal_of(chosen: str | PathLike | NominalScaling | None) -> NominalScaling | None:
-    """Return the nominal scaling, read where it is a file."""
-    if chosen is None or isinstance(chosen, NominalScaling):
-        return chosen
-    mapping = files.read_mapping(chosen, 'nominal scaling')
-    known = NominalScaling.__dataclass_fields__
-    strange = sorted(set(mapping) - set(known))
-    if strange:
-        raise InputError(
-            f'{chosen} may name {", ".join(known)}; it names {", ".join(strange)}; correct it'
-        )
-    return NominalScaling(**{name: float(value) for name, value in mapping.items()})
+def readings_of(choices: Mapping[str, Any]) -> RawReadings | None:
+    """
+    Return the description of the readings that was chosen.
+
+    From the file or scaling `nominal` and from the stated units; None without any.
+
+    Raises
+    ------
+    InputError
+        When a unit does not exist, or a sensor is described by the file and by a unit.
+
+    """
+    nominal = choices.get('nominal')
+    stated = {name: choices.get(name) for name in (*UNIT_KEYS.values(), 'axes')}
+    if nominal is None and not any(stated.values()):
+        return None
+    mapping: Mapping[str, Any] = {}
+    if isinstance(nominal, RawReadings):
+        mapping = nominal.to_mapping()
+    elif nominal is not None:
+        mapping = files.read_mapping(nominal, 'description of readings')
+    for sensor, key in UNIT_KEYS.items():
+        described = any(str(name).startswith(sensor) for name in mapping)
+        if described and stated[key]:
+            raise InputError(
+                f'the unit of the {sensor} must be stated once, got {stated[key]} and the file'
+                ' of the readings; remove one',
+                key=key,
+                code='unit_twice',
+            )
+    base = RawReadings.from_mapping(mapping, 'the description of readings')
+    return combined(base, **stated)
+
+
+def readings_for(calibration: Calibration, choices: Mapping[str, Any]) -> RawReadings:
+    """
+    Return the description of readings to which a calibration is applied.
+
+    That of the calibration; a sensor, or axes, that the choices state replace its own.
+    """
+    stated = readings_of(choices)
+    if stated is None:
+        return calibration.readings
+    if choices.get('nominal') is not None:
+        return stated
+    named = {name: choices.get(name) for name in (*UNIT_KEYS.values(), 'axes')}
+    return combined(calibration.readings, **named)
+
+
+def raw_columns(readings: RawReadings | None, choices: Mapping[str, Any]) -> tuple[str, ...]:
+    """
+    Return the quantities of a text log that are read without conversion.
+
+    These are the ones with a stated unit: the description of the readings converts them.
+    """
+    if readings is None:
+        return ()
+    quantities = []
+    for quantity, sensor in (('force', 'accelerometer'), ('rate', 'gyroscope')):
+        stated = choices.get(UNIT_KEYS[sensor])
+        if stated or not getattr(readings, sensor).is_si:
+            quantities.append(quantity)
+    return tuple(quantities)
 
 
 MAX_SHOWN_COLUMNS = 3

@@ -17,12 +17,13 @@ from imu_calibration.compensation.stream import (
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import counter
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import ABSENT, Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
 from imu_calibration.preprocessing.value_checks import refuse_force_unit
-from imu_calibration.use_cases.choices import noise_of
+from imu_calibration.use_cases.choices import noise_of, raw_columns, readings_for
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
 
 CORRECTED_TOPIC = '/imu/data_corrected'
@@ -91,6 +92,9 @@ def compensate(
     imu_topic: str | None = None,
     temperature_topic: str | None = None,
     frame_id: str | None = None,
+    nominal: str | PathLike | RawReadings | None = None,
+    accelerometer_unit: str | None = None,
+    gyroscope_unit: str | None = None,
 ) -> Compensated:
     """
     Correct the calibrated errors in a recording.
@@ -120,6 +124,8 @@ def compensate(
         Topics to read.
     frame_id : str, optional
         frame_id of the Imu messages; required if the topic has messages of several.
+    nominal, accelerometer_unit, gyroscope_unit : optional
+        Units of these readings where they differ from those of the calibration, see `Choices`.
 
     Raises
     ------
@@ -134,26 +140,41 @@ def compensate(
     calibration = calibration if figures is None else with_measured_noise(calibration, figures)
     transfer = requested_transfer(target_frame, target_xyz, target_rpy)
     late = late_ns(calibration, correct_stamps)
+    units = {
+        'nominal': nominal,
+        'accelerometer_unit': accelerometer_unit,
+        'gyroscope_unit': gyroscope_unit,
+    }
+    readings = readings_for(calibration, units)
     if isinstance(recording, (ImuSamples, SampleBlock)):
-        return _in_memory(recording, calibration, transfer, late=late, used=used)
+        return _in_memory(recording, calibration, transfer, late=late, used=used, readings=readings)
     if output is not None and Path(output).exists():
         raise InputError(
             f'the output bag {output} must not exist yet; choose another name or remove it',
             code='exists_already',
         )
-    topics = Topics(imu_topic, None, temperature_topic, frame_id)
+    raw = raw_columns(readings, units)
+    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw)
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
         refuse_corrected(bag.imu_topic)
-        _refuse_bag_unit(recording, topics)
+        _refuse_bag_unit(recording, topics, readings)
         stream = CompensationStream(
             calibration, temperature=temperatures(recording, topics), transfer=transfer
         )
 
         def correct(imu):
             advance(len(imu))
-            return stream.correct(imu)
+            return stream.correct(readings.apply(imu))
+
+        def propagate(force_cov, rate_cov):
+            # Measured covariances are in the units of the readings.
+            if force_cov is not None:
+                force_cov = readings.accelerometer.convert_covariance(force_cov)
+            if rate_cov is not None:
+                rate_cov = readings.gyroscope.convert_covariance(rate_cov)
+            return stream.propagate(force_cov, rate_cov)
 
         if output is None:
             parts = [
@@ -172,16 +193,17 @@ def compensate(
             bag.imu_topic,
             corrected_topic=corrected_topic,
             correct=correct,
-            propagate=stream.propagate,
+            propagate=propagate,
             frame_id=target_frame or None,
             mat_ts=None if transfer is None else transfer.mat_ts,
             late_ns=late,
             source_frame_id=frame_id,
+            raw=raw,
         )
         return _outcome(None, stream, lost, used)
 
 
-def _refuse_bag_unit(recording, topics):
+def _refuse_bag_unit(recording, topics, readings):
     """Check the unit at the start of a bag, in a pass of its own: nothing is written before."""
     forces, count = [], 0
     with open_bag(recording, topics, want_joints=False) as bag:
@@ -193,17 +215,20 @@ def _refuse_bag_unit(recording, topics):
             if count >= UNIT_READINGS:
                 break
     if forces:
-        refuse_force_unit(np.concatenate(forces))
+        refuse_force_unit(np.concatenate(forces), readings)
 
 
-def _in_memory(recording, calibration, transfer, *, late, used):
+def _in_memory(recording, calibration, transfer, *, late, used, readings):
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
     # A recording in memory has samples of an IMU.
     assert block.imu is not None
-    refuse_force_unit(block.imu.force_s)
+    refuse_force_unit(block.imu.force_s, readings)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
     return _outcome(
-        _corrected(block.imu, stream.correct(block.imu), transfer, late), stream, {}, used
+        _corrected(block.imu, stream.correct(readings.apply(block.imu)), transfer, late),
+        stream,
+        {},
+        used,
     )
 
 

@@ -16,6 +16,7 @@ from imu_calibration.document.exports.loss import (
     temperature_at,
 )
 from imu_calibration.preprocessing.window_finder import session_truth
+from imu_calibration.use_cases.choices import raw_columns
 from imu_calibration.use_cases.recordings import (
     Stand,
     Topics,
@@ -71,7 +72,10 @@ def export_calibration(
     target = find_target(to)
     known = files.given_calibration(calibration)
     figures = None if noise is None else files.read_noise(noise)
-    motion = None if bag is None else _motion(known, bag, stand, topics)
+    motion = None
+    if bag is not None:
+        topics = topics._replace(raw=raw_columns(known.readings, {}))
+        motion = _motion(known, bag, stand, topics)
     found = export(known, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
     if output is not None:
         files.write_whole(output, found.content)
@@ -84,7 +88,10 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
     if stand is None:
         blocks = [block.imu for block in source_of(bag, topics)() if block.imu is not None]
         return recorded_motion(
-            calibration, ImuSamples.concatenate(blocks), temperature, name=name_of(bag)
+            calibration,
+            calibration.readings.apply(ImuSamples.concatenate(blocks)),
+            temperature,
+            name=name_of(bag),
         )
     table = table_of(stand, [bag], topics)
     imu, ref = session_truth(source_of(bag, topics, table.joint_names)(), table)

@@ -8,11 +8,12 @@ from imu_calibration.allan.document import exit_code, lines, noise_to_text, shor
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
 from imu_calibration.core.progress import report
-from imu_calibration.core.samples import NominalScaling, SampleBlock
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import warnings
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import nominal_of
+from imu_calibration.use_cases.choices import raw_columns, readings_of
 from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of
 
 
@@ -78,7 +79,9 @@ def noise(
     imu_topic: str | None = None,
     temperature_topic: str | None = None,
     frame_id: str | None = None,
-    nominal: str | PathLike | NominalScaling | None = None,
+    nominal: str | PathLike | RawReadings | None = None,
+    accelerometer_unit: str | None = None,
+    gyroscope_unit: str | None = None,
     horizon: float = HORIZON,
 ) -> IdentifiedNoise:
     """
@@ -92,8 +95,8 @@ def noise(
         Default /imu/data_raw and /imu/temperature, otherwise the only topics of their types.
     frame_id : str, optional
         frame_id of the Imu messages; required if the topic has messages of several.
-    nominal : path-like or NominalScaling, optional
-        For recordings in volts or counts.
+    nominal, accelerometer_unit, gyroscope_unit : optional
+        Units of the readings, see `Choices`.
     horizon : float
         Averaging time at which a random walk approximates the slow noise, s.
 
@@ -103,7 +106,15 @@ def noise(
         When the recording cannot be used, or it has no rest of sufficient length.
 
     """
-    topics = Topics(imu_topic, None, temperature_topic, frame_id)
-    result = identify_noise(source_of(recording, topics), nominal_of(nominal))
+    units = {
+        'nominal': nominal,
+        'accelerometer_unit': accelerometer_unit,
+        'gyroscope_unit': gyroscope_unit,
+    }
+    readings = readings_of(units)
+    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw_columns(readings, units))
+    result = identify_noise(source_of(recording, topics), readings)
     options = {name: value for name, value in topics.chosen().items() if value}
+    if readings is not None:
+        options['readings'] = readings.to_mapping()
     return IdentifiedNoise(result, figures_of(result, provenance_of([recording], options)), horizon)

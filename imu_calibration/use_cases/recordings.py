@@ -40,6 +40,8 @@ class Topics(NamedTuple):
     """sensor_msgs/Temperature, default /imu/temperature."""
     frame: str | None = None
     """frame_id of the Imu messages; None: that of all."""
+    raw: tuple[str, ...] = ()
+    """Quantities of a text log that are read without conversion to SI: 'force', 'rate'."""
 
     def chosen(self) -> dict[str, Any]:
         """Return them as arguments of `msg_adapters.bag.open_recording`."""
@@ -48,6 +50,7 @@ class Topics(NamedTuple):
             'joint_topic': self.joints,
             'temperature_topic': self.temperature,
             'frame_id': self.frame,
+            'raw': self.raw,
         }
 
 

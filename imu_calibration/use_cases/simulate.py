@@ -14,6 +14,7 @@ from typing import Unpack, cast
 from imu_calibration.core import documents
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import report
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, true_calibration
@@ -234,6 +235,10 @@ def replay(
     samples, lost = run_replay(
         source(), given, known.model, values=known.values, noise=noise, seed=seed
     )
-    truth = replace(known, provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}})
+    truth = replace(
+        known,
+        provenance={'simulated': {'seed': seed, 'replay': name_of(recording)}},
+        readings=RawReadings(axes=known.readings.axes),
+    )
     stamps = cast(ImuSamples, samples.imu).stamp_ns
     return Simulated(samples, given, truth, 1e-9 * float(stamps[-1] - stamps[0]), lost)

@@ -366,11 +366,13 @@ def test_xsens_counts_tells_no_stories(recordings):
     The gyroscope's answer to gravity is found and predicts.
     """
     from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_without_table
-    from imu_calibration.core.samples import NominalScaling
+    from imu_calibration.core.readings import RawReadings
     from imu_calibration.references.options import CalibrationOptions
     from msg_adapters.bag import open_recording
 
-    options = CalibrationOptions(nominal=NominalScaling(32768, 415, 32768, 4770))
+    options = CalibrationOptions(
+        nominal=RawReadings.of_scales(32768, 415, 32768, gyroscope_scale=4770)
+    )
     with open_recording(recordings / 'xsens_counts', want_joints=False) as recording:
         found = diagnose_without_table(
             recording.blocks, replace(options, gravity=9.81744)

@@ -151,7 +151,7 @@ def test_g_where_metres_per_second_squared_belong(capsys, tmp_path, home, sessio
     line = calibrate_refused(
         capsys, tmp_path, rewritten(tmp_path, imu, session[1]), home / 'table.yaml'
     )
-    assert 'm/s^2' in line and 'accelerometer_scale 0.101972' in line
+    assert 'm/s^2' in line and '--accelerometer-unit g' in line
 
 
 def test_g_by_hand(capsys, tmp_path, session):

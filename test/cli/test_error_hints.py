@@ -91,7 +91,8 @@ NAMED = {
 }
 UNREACHABLE = {
     'calibration_node': {
-        'nominal': 'readings are converted in the driver, which the error says',
+        'accelerometer_unit': 'readings are converted in the driver, which the error names',
+        'gyroscope_unit': 'readings are converted in the driver, which the error names',
         'anyway': 'no calibration is applied',
         'columns': 'no text log is read',
         'force': 'results of verbs',
@@ -105,7 +106,8 @@ UNREACHABLE = {
     'planner_node': {
         'anyway': 'no calibration is applied',
         **NAMED,
-        'nominal': 'no readings are compared',
+        'accelerometer_unit': 'no readings are compared',
+        'gyroscope_unit': 'no readings are compared',
         'gravity': 'no calibration is estimated',
         'calibration': 'with a plan for separation alone',
         'diagnose': 'no calibration is estimated',
@@ -205,9 +207,10 @@ def test_a_second_remedy_is_offered_only_where_it_exists():
     with pytest.raises(InputError) as refusal:
         check_force(1.0)
     error = refusal.value
-    assert 'nominal scaling (--nominal)' in error.with_hint({'nominal': '--nominal'})
+    unit = {'accelerometer_unit': '--accelerometer-unit'}
+    assert error.with_hint(unit).endswith('(--accelerometer-unit g)')
     for node in HINTS:
-        assert 'nominal' not in error.with_hint(HINTS[node]) and error.with_hint(
+        assert 'state the unit' not in error.with_hint(HINTS[node]) and error.with_hint(
             HINTS[node]
         ).endswith('convert it in the driver')
     assert with_hint('find the cause', 'diagnose', HINTS['calibration_node']).startswith(

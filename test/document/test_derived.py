@@ -16,7 +16,7 @@ from imu_calibration.calibration.installation_angles import (
     in_paper_units,
     split,
 )
-from imu_calibration.core.samples import NominalScaling
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.units import NOISE_QUANTITY, decimals, for_people, significant, with_sd
 from imu_calibration.core.units import STANDARD_GRAVITY as G
 from imu_calibration.document.calibration import Calibration
@@ -44,7 +44,7 @@ def test_zhangs_table_1_comes_back_from_its_matrix():
     found = derive(
         calibration_of(printed.matrix / G / per_si, (printed.bias - 2.4) / per_si), 'accelerometer'
     )
-    scale, bias = in_paper_units(found, NominalScaling(2.4, per_si))
+    scale, bias = in_paper_units(found, RawReadings.of_scales(2.4, per_si))
     assert (scale[1], bias[1]) == ('V/g', 'V')
     rows = (0, 2)  # the printed second row is no unit vector, by 48 ppm
     assert scale[2][list(rows)] == pytest.approx(zhang.TABLE_1_SCALE[list(rows)], rel=2e-9)
@@ -96,7 +96,7 @@ def test_a_perfect_sensor_has_the_bias_it_reads_and_no_surprise_at_zero_angles()
 def test_gyroscopes_are_given_in_degrees():
     scale, bias = in_paper_units(
         derive(calibration_of(np.eye(3)), 'gyroscope'),
-        NominalScaling(gyroscope_offset=2.5, gyroscope_scale=0.1 / DEG),
+        RawReadings.of_scales(gyroscope_offset=2.5, gyroscope_scale=0.1 / DEG),
     )
     assert scale[1] == 'V/(deg/s)' and scale[2] == pytest.approx([0.1] * 3)
     assert bias[2] == pytest.approx([2.5] * 3)

@@ -249,12 +249,12 @@ def in_kelvin(imu, joints, temperature):
 
 
 FAULTS = (
-    (in_g, 'force_unit', REFUSE, (0.101972,)),
-    (in_mg, 'force_unit', REFUSE, (101.972,)),
+    (in_g, 'force_unit', REFUSE, (1.0, 'g')),
+    (in_mg, 'force_unit', REFUSE, (1000.0, 'mg')),
     (in_counts, 'force_unit', REFUSE, ()),
     (in_counts, 'rate_unit', REFUSE, ()),
     (without_gravity, 'force_unit', REFUSE, ()),
-    (in_degrees, 'rate_unit', REFUSE, (57.29578,)),
+    (in_degrees, 'rate_unit', REFUSE, (56.1, 'deg')),
     (twice_converted, 'rate_unit', REFUSE, ()),
     (mirrored_gyroscope, 'handedness', REFUSE, ('gyroscope', 'accelerometer', 'y')),
     (gyroscope_axes_swapped, 'handedness', REFUSE, ('gyroscope', 'accelerometer', 'x', 'y')),
@@ -760,7 +760,7 @@ def test_inspect_returns_the_worst_code_of_all_imus(capsys, tmp_path, session, t
             topic = bag.add_topic(f'/imu_{k}', standard_definition(IMU_TYPE))
             bag.write(np.full(len(imu), topic), imu.stamp_ns, Packed.of_rows(encode_imu(imu)))
     assert main(['inspect', str(tmp_path / 'bag')]) == 3
-    assert 'accelerometer_scale 0.101972' in capsys.readouterr().out
+    assert '--accelerometer-unit g' in capsys.readouterr().out
     assert main(['inspect', str(tmp_path / 'bag'), '--imu-topic', f'/imu_{1 - bad}']) == 0
 
 

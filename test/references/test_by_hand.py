@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.live import LiveByHandSettings
 from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.samples import ImuSamples, NominalScaling
+from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_search import estimate_group_variances, student_factor
 from imu_calibration.kinematics.rotations import normal_gravity
@@ -345,7 +346,7 @@ def test_coarse_readings_have_the_noise_of_rounding(step):
 
 def test_counts_give_the_same_as_si():
     imu, ranges, _ = simulate(6)
-    nominal = NominalScaling(32768, 415, (32768, 32000, 33000), 4770)
+    nominal = RawReadings.of_scales(32768, 415, (32768, 32000, 33000), gyroscope_scale=4770)
     counts = ImuSamples(
         imu.stamp_ns, imu.force_s * 415 + 32768, imu.rate_s * 4770 + np.array([32768, 32000, 33000])
     )
@@ -589,7 +590,7 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
     changes. The gyroscope's offsets are those of another day and temperature: 0.5 deg/s is a usual
     turn-on spread of that grade.
     """
-    nominal = NominalScaling(32768, 415, 32768, 4770)
+    nominal = RawReadings.of_scales(32768, 415, 32768, gyroscope_scale=4770)
     imu = nominal.apply(load(recordings, 'xsens_counts'))
     ranges = find_still(imu)
     found = calibrate_by_hand(imu, HandOptions(9.81744), ranges)

@@ -1,0 +1,416 @@
+"""
+Description of the readings of a recording: unit, scale and offset per sensor, and the axes.
+
+A calibration stores it by value under `readings`, so that every program converts the readings as
+the calibration did::
+
+    SI = (reading - offset) / scale
+
+Axes are a statement, not a conversion: values and corrected readings remain in the axes of the
+source, to which frame_id and tf belong. Exports to programs with fixed axes convert.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError, shortened
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+
+UNIT_SIZES = {
+    'accelerometer': {
+        'm/s^2': 1.0,
+        'g': STANDARD_GRAVITY,
+        'mg': 1e-3 * STANDARD_GRAVITY,
+    },
+    'gyroscope': {
+        'rad/s': 1.0,
+        'mrad/s': 1e-3,
+        'urad/s': 1e-6,
+        'deg/s': DEG,
+        'mdeg/s': 1e-3 * DEG,
+    },
+}
+"""Sensor -> unit -> size of the unit in SI."""
+SI_UNITS = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
+SPELLINGS = {
+    'accelerometer': {
+        'm/s2': 'm/s^2',
+        'm/s²': 'm/s^2',
+        'm/s/s': 'm/s^2',
+        'm/sec^2': 'm/s^2',
+        'ms^-2': 'm/s^2',
+        'mps2': 'm/s^2',
+        'ms2': 'm/s^2',
+    },
+    'gyroscope': {
+        'rads': 'rad/s',
+        'rps': 'rad/s',
+        'rad/sec': 'rad/s',
+        'rads^-1': 'rad/s',
+        'µrad/s': 'urad/s',
+        'μrad/s': 'urad/s',
+        'dps': 'deg/s',
+        '°/s': 'deg/s',
+        'deg/sec': 'deg/s',
+        'degs': 'deg/s',
+        'mdps': 'mdeg/s',
+    },
+}
+"""Sensor -> spelling, in lower case -> unit."""
+COUNTS = 'counts'
+"""Unit of readings with a scale in a file; as an option it needs the scale, counts:16384/g."""
+COUNTS_PATTERN = re.compile(r'counts:([-+.\deE]+)/\(?([^()]+)\)?')
+UNIT_AGREEMENT = 1e-4
+"""Relative difference up to which the scale of a file may differ from that of its unit."""
+LARGEST = 1e12
+"""Scales and offsets above it occur with no converter."""
+AXES = {'flu': ((0, 1), (1, 1), (2, 1)), 'frd': ((0, 1), (1, -1), (2, -1))}
+"""Name -> (axis of the source, sign) of forward, left and up."""
+FLAT_KEYS = ('accelerometer_offset', 'accelerometer_scale', 'gyroscope_offset', 'gyroscope_scale')
+UNIT_KEYS = {'accelerometer': 'accelerometer_unit', 'gyroscope': 'gyroscope_unit'}
+"""Sensor -> key of `errors.ERROR_KEYS`, and name of the option, of its unit."""
+AXES_KEY = 'axes'
+"""Key of `errors.ERROR_KEYS`, and name of the option, of the axes."""
+Number = float | tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SensorUnit:
+    """Unit of the readings of one sensor: ``SI = (reading - offset) / scale``."""
+
+    unit: str
+    """Unit as it was stated, such as 'g' or 'counts:16384/g'."""
+    scale: Number = 1.0
+    """Reading per m/s^2 or rad/s, one number or one per axis."""
+    offset: Number = 0.0
+    """Reading at zero specific force or rate, one number or one per axis."""
+
+    @property
+    def is_si(self) -> bool:
+        """Whether the readings are in m/s^2 or rad/s without an offset."""
+        return not np.any(self.offset) and bool(np.all(np.equal(self.scale, 1.0)))
+
+    def convert(self, values: np.ndarray) -> np.ndarray:
+        """Return readings in SI, shape (..., 3)."""
+        return (values - np.asarray(self.offset, float)) / np.asarray(self.scale, float)
+
+    def convert_covariance(self, covariance: np.ndarray) -> np.ndarray:
+        """Return the covariance of readings, shape (3, 3), in SI: ``cov_ij / (s_i s_j)``."""
+        scale = np.broadcast_to(np.asarray(self.scale, float), 3)
+        return covariance / np.outer(scale, scale)
+
+    def to_mapping(self) -> dict:
+        """Return unit, scale and offset as plain data."""
+        return {'unit': self.unit, 'scale': _plain(self.scale), 'offset': _plain(self.offset)}
+
+
+SI_ACCELEROMETER = SensorUnit(SI_UNITS['accelerometer'])
+SI_GYROSCOPE = SensorUnit(SI_UNITS['gyroscope'])
+
+
+@dataclass(frozen=True)
+class RawReadings:
+    """Units and axes of the readings of an IMU."""
+
+    accelerometer: SensorUnit = SI_ACCELEROMETER
+    """Unit of the specific force."""
+    gyroscope: SensorUnit = SI_GYROSCOPE
+    """Unit of the angular rate."""
+    axes: str = ''
+    """'flu', 'frd' or a signed permutation such as 'x,-y,-z'; empty: not stated."""
+
+    @classmethod
+    def of_scales(
+        cls,
+        accelerometer_offset: Number = 0.0,
+        accelerometer_scale: Number = 1.0,
+        gyroscope_offset: Number = 0.0,
+        *,
+        gyroscope_scale: Number = 1.0,
+    ) -> 'RawReadings':
+        """Return the description of readings in volts or counts by offset and reading per SI."""
+        return cls(
+            _of_scale('accelerometer', accelerometer_scale, accelerometer_offset),
+            _of_scale('gyroscope', gyroscope_scale, gyroscope_offset),
+        )
+
+    @property
+    def is_si(self) -> bool:
+        """Whether both sensors are in SI."""
+        return self.accelerometer.is_si and self.gyroscope.is_si
+
+    def apply(self, imu: ImuSamples) -> ImuSamples:
+        """Return the samples in SI."""
+        if self.is_si:
+            return imu
+        return replace(
+            imu,
+            force_s=self.accelerometer.convert(imu.force_s),
+            rate_s=self.gyroscope.convert(imu.rate_s),
+        )
+
+    def to_mapping(self) -> dict:
+        """Return the part `readings` of a document."""
+        found = {
+            'accelerometer': self.accelerometer.to_mapping(),
+            'gyroscope': self.gyroscope.to_mapping(),
+        }
+        return found | {'axes': self.axes} if self.axes else found
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any], place: str = 'readings') -> 'RawReadings':
+        """
+        Return the description in the part `readings` of a document, or in a file.
+
+        Parameters
+        ----------
+        mapping : mapping
+            ``{accelerometer: {unit, scale, offset}, gyroscope: ..., axes}``, all optional, or the
+            flat keys ``accelerometer_offset``, ``accelerometer_scale``, ...
+        place : str
+            Name of the mapping in errors.
+
+        Raises
+        ------
+        InputError
+            When a key is unknown, a unit is unknown, or a number is not usable.
+
+        """
+        known = (*SI_UNITS, 'axes', *FLAT_KEYS)
+        _require_known(mapping, known, place)
+        units = {}
+        for sensor in SI_UNITS:
+            entry = mapping.get(sensor)
+            flat = {
+                name: mapping[f'{sensor}_{name}']
+                for name in ('scale', 'offset')
+                if f'{sensor}_{name}' in mapping
+            }
+            if entry is not None and flat:
+                raise InputError(
+                    f'{place} must describe the {sensor} once, it has {sensor} and'
+                    f' {sensor}_{next(iter(flat))}; remove one',
+                    code='unit_twice',
+                )
+            units[sensor] = _sensor_unit(sensor, flat if entry is None else entry, place)
+        axes = mapping.get('axes')
+        if axes is None:
+            axes = ''
+        elif not isinstance(axes, str):
+            raise _axes_error(axes)
+        return cls(units['accelerometer'], units['gyroscope'], parse_axes(axes) if axes else '')
+
+    def mat_flu_source(self) -> np.ndarray | None:
+        """
+        Return the matrix from axes of the source to forward-left-up, shape (3, 3).
+
+        None while the axes are not stated. Example: diag(1, -1, -1) for 'frd'.
+        """
+        return _axes_matrix(self.axes) if self.axes else None
+
+
+def unit_of(sensor: str, text: str) -> SensorUnit:
+    """
+    Return the unit of an option.
+
+    Parameters
+    ----------
+    sensor : str
+        'accelerometer' or 'gyroscope'.
+    text : str
+        'm/s^2', 'g', 'mg', 'rad/s', 'deg/s', 'counts:16384/g', 'counts:16.4/(deg/s)',
+        'counts:16.4/dps', ...
+
+    Raises
+    ------
+    InputError
+        When there is no such unit.
+
+    """
+    unit = _spelled(sensor, text)
+    sizes = UNIT_SIZES[sensor]
+    if unit in sizes:
+        return SensorUnit(unit, 1.0 / sizes[unit])
+    counts = COUNTS_PATTERN.fullmatch(unit)
+    if counts is not None:
+        per = _spelled(sensor, counts[2])
+        try:
+            number = float(counts[1])
+        except ValueError:
+            number = math.nan
+        if per in sizes and 0.0 < number < LARGEST:
+            label = per if per.isalpha() or sensor == 'accelerometer' else f'({per})'
+            return SensorUnit(f'counts:{counts[1]}/{label}', number / sizes[per])
+    raise InputError(
+        f'the unit of the {sensor} must be {", ".join(sizes)} or counts:NUMBER/UNIT, got'
+        f' {shortened(repr(text))}; state one of them',
+        key=UNIT_KEYS[sensor],
+        code='unit_unknown',
+    )
+
+
+def parse_axes(text: str) -> str:
+    """
+    Return the axes of an option: 'flu', 'frd', or the signed permutation in its plain spelling.
+
+    A signed permutation names the axes of the source that point forward, left and up: 'x,-y,-z' is
+    'frd'.
+
+    Raises
+    ------
+    InputError
+        When it is none, or describes left-handed axes.
+
+    """
+    name = text.strip().lower()
+    if name not in AXES:
+        name = ','.join(part.strip().removeprefix('+') for part in name.split(','))
+    if np.linalg.det(_axes_matrix(name)) < 0:
+        raise InputError(
+            f"axes must be right-handed, '{name}' is left-handed; reverse one sign or exchange two"
+            ' axes',
+            key=AXES_KEY,
+            code='axes_left_handed',
+        )
+    return name
+
+
+def combined(
+    base: RawReadings,
+    *,
+    accelerometer_unit: str | None = None,
+    gyroscope_unit: str | None = None,
+    axes: str | None = None,
+) -> RawReadings:
+    """Return a description with the units and axes that options state in place of its own."""
+    if accelerometer_unit:
+        base = replace(base, accelerometer=unit_of('accelerometer', accelerometer_unit))
+    if gyroscope_unit:
+        base = replace(base, gyroscope=unit_of('gyroscope', gyroscope_unit))
+    if axes:
+        base = replace(base, axes=parse_axes(axes))
+    return base
+
+
+def _axes_matrix(axes):
+    """Return the matrix from axes of the source to forward-left-up, shape (3, 3)."""
+    matrix = np.zeros((3, 3))
+    if axes in AXES:
+        for row, (column, sign) in enumerate(AXES[axes]):
+            matrix[row, column] = sign
+        return matrix
+    parts = axes.split(',')
+    for row, part in enumerate(parts[:3]):
+        letter = part.removeprefix('-')
+        if letter in ('x', 'y', 'z'):
+            matrix[row, 'xyz'.index(letter)] = -1.0 if part.startswith('-') else 1.0
+    if len(parts) != 3 or abs(abs(np.linalg.det(matrix)) - 1.0) > 0.5:
+        raise _axes_error(axes)
+    return matrix
+
+
+def _axes_error(axes):
+    return InputError(
+        'axes must be flu, frd or the axes of the source that point forward, left and up, such as'
+        f' x,-y,-z, got {shortened(repr(axes))}; correct them',
+        key=AXES_KEY,
+        code='axes_unknown',
+    )
+
+
+def _spelled(sensor, text):
+    text = text.strip()
+    return SPELLINGS[sensor].get(text.lower(), text)
+
+
+def _of_scale(sensor, scale, offset):
+    """Return the unit of readings that a scale describes; SI where it is 1 without an offset."""
+    known = SensorUnit(COUNTS, _number(scale), _number(offset))
+    return replace(known, unit=SI_UNITS[sensor]) if known.is_si else known
+
+
+def _sensor_unit(sensor, entry, place):
+    """Return the unit in a mapping of unit, scale and offset, each optional."""
+    place = f'{place}.{sensor}'
+    if not isinstance(entry, Mapping):
+        raise InputError(
+            f"'{place}' must be a mapping of unit, scale and offset, got {shortened(repr(entry))};"
+            ' correct it',
+            code='not_a_mapping',
+        )
+    _require_known(entry, ('unit', 'scale', 'offset'), place)
+    scale = _checked(entry.get('scale'), f'{place}.scale', positive=True)
+    offset = _checked(entry.get('offset'), f'{place}.offset', positive=False)
+    unit = entry.get('unit')
+    if unit is None:
+        return _of_scale(sensor, 1.0 if scale is None else scale, 0.0 if offset is None else offset)
+    if not isinstance(unit, str):
+        raise InputError(
+            f"'{place}.unit' must be a text, got {shortened(repr(unit))}; correct it",
+            key=UNIT_KEYS[sensor],
+            code='unit_unknown',
+        )
+    if unit == COUNTS:
+        if scale is None:
+            raise InputError(
+                f"'{place}' must have a scale with the unit counts, it has none; add the reading"
+                f' per {SI_UNITS[sensor]}, or write counts:NUMBER/UNIT',
+                code='scale_missing',
+            )
+        known = SensorUnit(COUNTS, scale)
+    else:
+        known = unit_of(sensor, unit)
+        if scale is not None and not np.allclose(scale, known.scale, rtol=UNIT_AGREEMENT, atol=0):
+            raise InputError(
+                f"'{place}.scale' must be that of its unit {unit}, {known.scale:.6g} per"
+                f' {SI_UNITS[sensor]}, got {_plain(scale)}; remove one of them',
+                code='unit_scale',
+            )
+        if scale is not None:
+            known = replace(known, scale=scale)
+    return known if offset is None else replace(known, offset=offset)
+
+
+def _require_known(mapping, known, place):
+    strange = sorted(str(name) for name in mapping if name not in known)
+    if strange:
+        raise InputError(
+            f'{place} may name {", ".join(known)}; it names {shortened(", ".join(strange))};'
+            ' correct it',
+            code='key_unknown',
+        )
+
+
+def _checked(value, place, *, positive):
+    """Return one number or three; None for None."""
+    if value is None:
+        return None
+    values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    good = len(values) in (1, 3)
+    for number in values:
+        numeric = isinstance(number, (int, float)) and not isinstance(number, bool)
+        good = good and numeric and abs(number) < LARGEST and (number > 0 or not positive)
+    if not good:
+        sort = 'a number above zero' if positive else 'a number'
+        raise InputError(
+            f"'{place}' must be {sort} or three, got {shortened(repr(value))}; correct it",
+            code='reading_number',
+        )
+    return _number(value if len(values) == 3 else values[0])
+
+
+def _number(value):
+    if np.ndim(value):
+        x, y, z = (float(number) for number in value)
+        return (x, y, z)
+    return float(value)
+
+
+def _plain(value):
+    return list(value) if isinstance(value, tuple) else float(value)
