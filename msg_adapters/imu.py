@@ -75,7 +75,12 @@ def decode_imu(layout: MessageLayout, packed: Packed) -> ImuSamples:
         if absent.any():
             values[absent] = np.nan
         readings[name] = values
-    return ImuSamples(layout.stamp_ns(packed), frame_id=layout.names[0], **readings)
+    return ImuSamples(
+        layout.stamp_ns(packed),
+        force_s=readings['force_s'],
+        rate_s=readings['rate_s'],
+        frame_id=layout.names[0],
+    )
 
 
 def patch_imu_group(

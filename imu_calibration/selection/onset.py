@@ -313,7 +313,7 @@ class _Rows:
                 of_means.normal[np.ix_(places, places)] += white.T @ white
                 of_within.normal[np.ix_(places, places)] += within.sum(axis=0)
                 self.axes.append(_RowsOfAxis(places, whitening, mean, white, within))
-        self.normal = sum(part.normal for part in self._parts)
+        self.normal = np.sum([part.normal for part in self._parts], axis=0)
 
     def significant_excess(self, own, fit, changes=None):
         """
