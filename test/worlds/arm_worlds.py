@@ -13,6 +13,7 @@ Run as a program it prints the figures of 40 worlds.
 import argparse
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -260,15 +261,21 @@ def truth(world):
     return values
 
 
+@lru_cache(maxsize=1)
+def calibrated(world):
+    """Return the calibration of a world, which several tests judge."""
+    from imu_calibration.calibration.table_calibration import calibrate
+
+    return calibrate([lambda: iter([world.block])], world.table).calibration
+
+
 def deviations(world):
     """
     Return {parameter: error in standard deviations}, and the calibration.
 
     The errors are of a calibration of the world.
     """
-    from imu_calibration.calibration.table_calibration import calibrate
-
-    calibration = calibrate([lambda: iter([world.block])], world.table).calibration
+    calibration = calibrated(world)
     found = dict(
         zip(
             calibration.param_names,
