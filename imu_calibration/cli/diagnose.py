@@ -44,7 +44,7 @@ def run(options: Options) -> VerbResult:
             found.save_overlay(options.mcap)
         also = (
             ''
-            if found.proposed is None
+            if found.transferable is None
             else ', and extended.yaml with the proposed formula in the model,'
         )
         for line in (

@@ -49,6 +49,15 @@ class Diagnosed:
         return self.result.proposed
 
     @property
+    def transferable(self) -> Calibration | None:
+        """
+        As `proposed`, with only those formulas that compensation of other recordings undoes.
+
+        Formulas in time, joints or attitude are quantities of this session.
+        """
+        return self.result.transferable
+
+    @property
     def findings(self) -> tuple:
         """Effects missing from the model, the strongest first."""
         return self.result.diagnosis.findings
@@ -92,7 +101,7 @@ class Diagnosed:
         """
         Write diagnosis.json, report.html and the extended calibration.yaml into a folder.
 
-        With proposed formulas also extended.yaml.
+        With proposed formulas that compensation undoes also extended.yaml.
         """
         files.write_texts(
             folder,
@@ -102,8 +111,8 @@ class Diagnosed:
                 'calibration.yaml': calibration_to_text(self.calibration),
                 **(
                     {}
-                    if self.proposed is None
-                    else {'extended.yaml': calibration_to_text(self.proposed)}
+                    if self.transferable is None
+                    else {'extended.yaml': calibration_to_text(self.transferable)}
                 ),
             },
         )

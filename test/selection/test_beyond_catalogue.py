@@ -409,3 +409,26 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
     assert [finding.effect for finding in found.findings] == [
         'gyro_g_sensitivity'
     ] and found.unexplained['gyroscope'].proposal is not None
+
+
+@pytest.mark.long
+def test_a_formula_of_the_session_is_not_written_into_a_model_for_other_sessions(tmp_path, capsys):
+    session = physics.make_session(
+        5, None, 'white', cause=Beyond('gyro_scale_settling', 5), profile='quick'
+    )
+    physics.write_bag(session, tmp_path / 'bag')
+    from imu_calibration.core import documents
+
+    (tmp_path / 'table.yaml').write_text(documents.to_text(session.table))
+    options = ['--table', str(tmp_path / 'table.yaml'), '--output', str(tmp_path / 'out')]
+    assert main(['diagnose', str(tmp_path / 'bag'), *options]) in (0, 3)
+    document = json.loads((tmp_path / 'out' / 'diagnosis.json').read_text())
+    terms = [
+        term['definition']['column']
+        for rest in document['unexplained'].values()
+        for proposal in rest['proposals']
+        for term in proposal['terms']
+    ]
+    assert any('time' in str(column) for column in terms)
+    assert not (tmp_path / 'out' / 'extended.yaml').exists()
+    assert 'left out of extended.yaml' in capsys.readouterr().out

@@ -81,6 +81,8 @@ class DiagnosisResult:
     """
     The calibration with the formulas proposed for the unexplained residual; None without a formula.
     """
+    transferable: Calibration | None = None
+    """As `proposed`, with only those formulas that compensation undoes; None without such one."""
 
     @property
     def document(self) -> dict[str, Any]:
@@ -99,7 +101,24 @@ class DiagnosisResult:
             for sensor, (value, sd) in self.lags.items()
         ]
         lag = [f'total lag: {", ".join(words)}'] * bool(words)
-        return [*diagnosis_lines(self.diagnosis), *(f'note: {note}' for note in self.notes), *lag]
+        return [
+            *diagnosis_lines(self.diagnosis),
+            *(f'note: {note}' for note in (*self.notes, *self.session_terms)),
+            *lag,
+        ]
+
+    @property
+    def session_terms(self) -> list[str]:
+        """Proposed formulas that apply to this session only, a line each."""
+        lines = []
+        for effect in _proposed_effects(self.diagnosis):
+            if effect.compensation == 'exact':
+                continue
+            lines.append(
+                f'{effect.groups[0].text[0]} contains a quantity of this session (time, table):'
+                ' compensation of other recordings cannot undo it, it is left out of extended.yaml'
+            )
+        return lines
 
     @property
     def notes(self) -> list[str]:
@@ -203,7 +222,18 @@ def diagnose_recording(
         calibrated.result,
         build_diagnosis(table, calibrated.found, calibrated=calibrated.result.solution),
     )
-    proposed = _with_proposals(source, table, options, result, diagnosis, provenance, reader)
+    effects = _proposed_effects(diagnosis)
+    proposed = _with_proposals(
+        source, table, options, result, diagnosis, provenance, reader, effects=effects
+    )
+    # Time, joints and attitude of another session are unknown to compensation. A model with such a
+    # formula would divide the error between the formula, which is not applied, and bias and matrix.
+    undone = [effect for effect in effects if effect.compensation == 'exact']
+    transferable = proposed
+    if len(undone) < len(effects):
+        transferable = _with_proposals(
+            source, table, options, result, diagnosis, provenance, reader, effects=undone
+        )
     traces = residual_traces(
         reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution
     )
@@ -216,16 +246,16 @@ def diagnose_recording(
         result.observations,
         baseline_options(options),
         proposed,
+        transferable,
     )
 
 
-def _with_proposals(source, table, options, result, diagnosis, provenance, reader):
+def _with_proposals(source, table, options, result, diagnosis, provenance, reader, *, effects):
     """
-    Return the calibration of the extended model with the proposed formulas.
+    Return the calibration of the extended model with the proposed formulas `effects`.
 
     Or None without a formula.
     """
-    effects = _proposed_effects(diagnosis)
     if not effects:
         return None
     model = result.calibration.model
