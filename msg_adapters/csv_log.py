@@ -7,6 +7,7 @@ import shutil
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
@@ -89,6 +90,10 @@ COLUMN_PATTERNS = (
 Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force
 and rate.
 """
+LONGEST_NUMBER = 100
+"""Characters of a cell that is tested for a number; a double has 24."""
+LONGEST_NAME = 200
+"""Characters of the name of a column; names are matched with expressions that may backtrack."""
 PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns', 1.2e5, 1.1e8))
 """
 Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within
@@ -355,6 +360,13 @@ class _Table:
                 f'{name} ({unit})' if unit else name
                 for name, unit in zip(self.names, units, strict=True)
             ]
+        longest = max(map(len, self.names))
+        if longest > LONGEST_NAME:
+            raise InputError(
+                f'a column name of {path} must have at most {LONGEST_NAME} characters, got'
+                f' {longest}; shorten the header',
+                code='csv_header',
+            )
         counts = Counter(self.names)
         self.names = [
             name if counts[name] == 1 else f'{name} [{k + 1}]' for k, name in enumerate(self.names)
@@ -370,18 +382,24 @@ class _Table:
 
     def _cells(self, line):
         line = line.lstrip('# ')
-        return (
-            line.split()
-            if self.delimiter is None
-            else next(csv.reader([line], delimiter=self.delimiter, skipinitialspace=True), [])
-        )
+        if self.delimiter is None:
+            return line.split()
+        reader = csv.reader([line], delimiter=self.delimiter, skipinitialspace=True)
+        try:
+            return next(reader, [])
+        except csv.Error as error:
+            raise InputError(
+                f'a cell of {self.path} must have at most {csv.field_size_limit()} characters, got'
+                f' a line of {len(line)} characters ({error}); remove this line',
+                code='csv_cell',
+            ) from error
 
     def column(self, name):
         """Return the index of a column by name or number."""
         name = name if name in self.names else name.removeprefix('-')
         if name in self.names:
             return self.names.index(name)
-        if name.isdigit() and 1 <= int(name) <= len(self.names):
+        if name.isdecimal() and len(name) < 9 and 1 <= int(name) <= len(self.names):
             return int(name) - 1
         raise InputError(
             f'a column must be in {self.path}, got {name!r}; it has'
@@ -417,15 +435,7 @@ class _Table:
             self._values[k] = _times_of_day([self._cells(line)[k] for line in lines])
         for k in set(wanted) & self.dates:
             cells = [self._cells(line) for line in lines if line.strip()]
-            dates = [
-                (
-                    re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', row[k].strip()).replace(' ', 'T')
-                    if k < len(row)
-                    else 'NaT'
-                )
-                for row in cells
-            ]
-            self._values[k] = np.array(dates, 'datetime64[ns]')
+            self._values[k] = _dates([row[k] if k < len(row) else '' for row in cells])
         if min(map(len, self._values.values())) < 2:
             raise InputError(
                 f'{self.path} must have at least two rows of numbers, got fewer; check the file'
@@ -517,6 +527,21 @@ class _Table:
         return values.astype(np.int64) if values.dtype.kind == 'M' else stamps_of(values, unit)
 
 
+def _dates(cells):
+    """Return dates with time as datetime64[ns], shape (n,); NaT where a cell is none."""
+    texts = [re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', cell.strip()).replace(' ', 'T') for cell in cells]
+    try:
+        return np.array(texts, 'datetime64[ns]')
+    except ValueError:
+        pass
+    # One of them is no date: find which.
+    dates = np.full(len(texts), np.datetime64('NaT'), 'datetime64[ns]')
+    for k, text in enumerate(texts):
+        with suppress(ValueError):
+            dates[k] = np.datetime64(text, 'ns')
+    return dates
+
+
 def _times_of_day(cells):
     """
     Return times of day as datetime64[ns] from the midnight before the first one, shape (n,).
@@ -553,7 +578,9 @@ def _delimiter(lines):
 
 
 def _numeric(cell):
-    return re.fullmatch(r'\s*[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?\s*', cell) is not None
+    if len(cell) > LONGEST_NUMBER:
+        return False
+    return re.fullmatch(r'\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*', cell) is not None
 
 
 def _guess(table):

@@ -413,3 +413,38 @@ def test_the_guess_is_printed_when_a_log_is_read_directly(tmp_path, imu, capsys)
     printed = capsys.readouterr().err.replace('\n', ' ')
     for columns in read_csv(path).columns:
         assert str(columns) in printed
+
+
+def dated(tmp_path, imu, *, bad=(), day='2024-05-06'):
+    """Write a log with dates; the rows `bad` have a date that no calendar has."""
+    lines = [PLAIN]
+    for k, (force, rate) in enumerate(zip(imu.force_s[:400], imu.rate_s[:400])):
+        date = f'{day}T10:{k // 3000:02d}:{(k / 50) % 60:09.6f}'
+        if k in bad:
+            date = date.replace('-05-', '-13-')
+        lines.append(','.join([date, *force.astype(str), *rate.astype(str)]))
+    path = tmp_path / 'dated.csv'
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
+def test_a_bad_date_is_refused_in_one_line(tmp_path, imu):
+    units = ['force=ax,ay,az:m/s^2', 'rate=gx,gy,gz:rad/s']
+    assert len(read_csv(dated(tmp_path, imu), units).imu) == 400
+    with refused(InputError, 'csv_time', 'got 2 '):
+        read_csv(dated(tmp_path, imu, bad=(7, 9)), units)
+
+
+def test_a_cell_beyond_the_limit_of_csv_is_refused_in_one_line(tmp_path, imu):
+    path = dated(tmp_path, imu)
+    path.write_text(path.read_text() + '"' + 'x' * 140_000 + '",1,2,3,4,5,6\n')
+    with refused(InputError, 'csv_cell', '131072'):
+        read_csv(path, ['force=ax,ay,az:m/s^2', 'rate=gx,gy,gz:rad/s'])
+
+
+def test_a_long_name_of_a_column_is_refused(tmp_path, imu):
+    path = write(tmp_path / 'x.csv', f'{PLAIN},{"(" * 300}', seconds(imu), imu.force_s, imu.rate_s)
+    path.write_text(path.read_text().replace('\n', ',0\n')[: 1 << 15])
+    path.write_text(path.read_text().replace(f'{"(" * 300},0\n', f'{"(" * 300}\n'))
+    with refused(InputError, 'csv_header', '300'):
+        read_csv(path)

@@ -248,6 +248,15 @@ def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_pat
 # Definitions
 
 
+@pytest.mark.parametrize('text', ['9' * 60_000 + 'x', 'a' + '(' * 25_000])
+def test_long_cells_and_headers_of_a_log_take_linear_time(tmp_path, text):
+    """Regular expressions that backtrack needed 195 s for a cell of 60,000 digits."""
+    (tmp_path / 'x.csv').write_text(
+        f'time,ax,ay,az,gx,gy,{text}\n' + ''.join(f'{k},1,2,9,0,0,1\n' for k in range(9))
+    )
+    refused('inspect', tmp_path / 'x.csv')
+
+
 def doubling(n_levels, last):
     """A definition with 2^n fields."""
     levels = [f'MSG: sensor_msgs/T{k}\nT{k + 1} a\nT{k + 1} b\n' for k in range(1, n_levels)] + [
