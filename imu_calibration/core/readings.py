@@ -155,6 +155,13 @@ class RawReadings:
             rate_s=self.gyroscope.convert(imu.rate_s),
         )
 
+    def convert_message(self, readings: Sequence[float]) -> tuple[float, ...]:
+        """Return rate x, y, z and force x, y, z of one message in SI."""
+        values = np.asarray(readings, float)
+        rate = self.gyroscope.convert(values[:3]).tolist()
+        force = self.accelerometer.convert(values[3:]).tolist()
+        return (*rate, *force)
+
     def to_mapping(self) -> dict:
         """Return the part `readings` of a document."""
         found = {

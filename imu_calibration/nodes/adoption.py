@@ -6,8 +6,10 @@ from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
 from imu_calibration.compensation.plausible_change import implausible_change
 from imu_calibration.compensation.stream import requested_transfer
+from imu_calibration.compensation.unit_gate import UnitGate
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files, trust
 from imu_calibration.document.calibration import Calibration
@@ -342,6 +344,8 @@ def _prepared(
         with_parameters=settings.parameter_covariance,
         correct_stamps=settings.correct_stamps,
         watch=_watch(calibration, transfer, settings, before),
+        readings=calibration.readings,
+        gate=UnitGate(calibration.readings.accelerometer),
     )
     if before is not None:
         compensation.prepare(before.compensation)
@@ -383,6 +387,12 @@ def _anchor_from_topic(
         references = [before.used.calibration, before.anchor]
     for reference in references:
         why = implausible_change(calibration, reference)
+        # Another unit changes the readings by any factor.
+        known = RawReadings()
+        if reference is not None:
+            known = reference.readings
+        if replace(calibration.readings, axes=known.axes) != known:
+            why = 'it describes readings in other units'
         if why:
             near = 'uncorrected readings' if reference is None else 'the one in use'
             raise DocumentError(

@@ -20,6 +20,7 @@ from imu_calibration.nodes.diagnostics import (
     DiagnosticsPublisher,
     make_status,
 )
+from imu_calibration.nodes.message_compensation import WITHHELD
 from imu_calibration.preprocessing.stamping import COUNTED
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')
@@ -32,6 +33,7 @@ COLD = 10.0
 """Seconds without a temperature after which diagnostics report it; drivers send one per second."""
 HEALTH_LEVELS = {WAITING: OK, HOLDS: OK, FOLLOWED: OK, MOVED: WARN, HARMS: ERROR, UNIT: ERROR}
 TEXT_OF_REASON = {
+    WITHHELD: 'messages before the unit of the readings was known are not published',
     'no temperature yet': (
         'the calibration has thermal effects and no temperature was received: no messages are'
         ' published'
@@ -191,6 +193,10 @@ class CompensatorDiagnostics:
                 node.problem
                 + (f'; calibration {node.adopted.version} remains in use' if node.adopted else '')
             )
+        if compensation is not None and compensation.gate is not None:
+            error = compensation.gate.error
+            if error is not None:
+                serious.append(f'nothing is published: {error}')
         if compensation is None:
             what = (
                 'messages pass unchanged' if node.settings.passthrough else 'nothing is published'

@@ -10,10 +10,14 @@ from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import is_known
 from imu_calibration.compensation.health import StopWatch
 from imu_calibration.compensation.stream import SampleCompensation, late_ns
+from imu_calibration.compensation.unit_gate import UnitGate
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.preprocessing.recording_evidence import ABSENT_MARK
 from msg_adapters.imu_stream import ImuStream
 from msg_adapters.layout import MessageError
 
+WITHHELD = 'unit of the readings'
+"""Reason of messages before the unit is known."""
 MAX_COUNTED_REASONS = 30
 """Largest number of reasons with separate counts: it bounds the memory."""
 
@@ -35,6 +39,10 @@ class LiveCompensation(SampleCompensation):
         Whether the stamps are moved back by the calibration's time_offset.
     watch : StopWatch, optional
         Evaluates the stops, and may subtract the bias that they show.
+    readings : RawReadings
+        Units of the readings; they are converted to SI before the correction.
+    gate : UnitGate, optional
+        Withholds the output until the readings are known to be in their unit.
 
     """
 
@@ -47,9 +55,12 @@ class LiveCompensation(SampleCompensation):
         with_parameters: bool = True,
         correct_stamps: bool = False,
         watch: StopWatch | None = None,
+        readings: RawReadings = RawReadings(),
+        gate: UnitGate | None = None,
     ):
         super().__init__(calibration, transfer, with_parameters)
-        self.watch = watch
+        self.watch, self.gate = watch, gate
+        self.readings, self._convert = readings, not readings.is_si
         self.frame_id, self.received = calibration.frame_id if check_frame else '', 0
         self._message = ImuStream(
             None if transfer is None else transfer.frame_id, late_ns(calibration, correct_stamps)
@@ -64,6 +75,8 @@ class LiveCompensation(SampleCompensation):
         """Continue from the state of another compensation."""
         super().follow(before)
         self.received = before.received
+        if before.gate is not None and before.readings == self.readings:
+            self.gate = before.gate
 
     def __call__(self, data: bytes, sent_ns: int = 0) -> bytes | None:
         """
@@ -87,6 +100,13 @@ class LiveCompensation(SampleCompensation):
             self._take_covariances(data)
             taken = message.read(data)
         stamp_ns, readings = taken
+        if self._convert:
+            readings = self.readings.convert_message(readings)
+        if self.gate is not None and not (
+            self._no_force or self.gate.passes(stamp_ns or sent_ns, readings[3:])
+        ):
+            self.counts[WITHHELD] += 1
+            return None
         if self._absent:
             readings = self._mixed(
                 self.at_zero['gyroscope'] + self.at_zero['accelerometer'], readings
@@ -138,11 +158,18 @@ class LiveCompensation(SampleCompensation):
         """Propagate covariances that differ from the previous message's."""
         self._taken = self.revision
         given = self._message.covariances(data)
+        received = given
         self._no_force, self._no_rate = absent = [bool(cov[0, 0] == ABSENT_MARK) for cov in given]
         self._absent = any(absent)
         self._odd = any(
             np.any(cov) and not missing and not is_known(cov) for cov, missing in zip(given, absent)
         )
+        if self._convert:
+            # Rows without a measurement (first element -1) are unchanged below.
+            given = (
+                self.readings.accelerometer.convert_covariance(given[0]),
+                self.readings.gyroscope.convert_covariance(given[1]),
+            )
         found = list(
             self.covariances(*(None if missing else cov for cov, missing in zip(given, absent)))
         )
@@ -150,7 +177,7 @@ class LiveCompensation(SampleCompensation):
             found[1] = found[1] + self.watch.rate_cov
         self._force_cov, self._rate_cov = (
             self._message.packed(cov if missing else new)
-            for cov, new, missing in zip(given, found, absent)
+            for cov, new, missing in zip(received, found, absent)
         )
 
     def _mixed(self, of_absent, of_present):

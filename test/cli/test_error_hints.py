@@ -118,6 +118,8 @@ UNREACHABLE = {
     },
     'simulator_node': {'up': 'of transforms in a bag'},
     'compensator_node': {
+        'accelerometer_unit': 'the calibration states the unit',
+        'gyroscope_unit': 'the calibration states the unit',
         'allow_xacro': 'no robot description is read',
         'imu_link': 'no robot description is read',
         'up': 'of transforms in a bag',

@@ -1,0 +1,82 @@
+"""The unit of live readings, checked before the first output."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.readings import SensorUnit
+from imu_calibration.preprocessing.value_checks import force_error
+
+WINDOW_S = 1.0
+"""s; readings are collected over it before they are judged."""
+LEAST_READINGS = 10
+"""Number of readings in a window, at least."""
+REST_SPREAD = 0.05
+"""Largest standard deviation of the length at rest, relative to its median."""
+
+
+class UnitGate:
+    """
+    Withholds the output while the specific force is not in the stated unit.
+
+    The gate opens with the first reading or window of readings that can be gravity, and then stays
+    open: a later motion or another publisher does not stop the output.
+
+    Parameters
+    ----------
+    stated : SensorUnit
+        Unit of the accelerometer's readings.
+
+    """
+
+    def __init__(self, stated: SensorUnit):
+        self._stated = stated
+        self._start_ns: int | None = None
+        self._lengths: list[float] = []
+        self._judged = False
+        self.is_open = False
+        self.error: InputError | None = None
+        """Why the readings at rest are not in the stated unit; None: not known to be wrong."""
+
+    def passes(self, stamp_ns: int, force: Sequence[float]) -> bool:
+        """
+        Return whether a reading may be corrected and published.
+
+        Parameters
+        ----------
+        stamp_ns : int
+        force : three floats
+            Specific force after the conversion from the stated unit, m/s^2.
+
+        """
+        if self.is_open:
+            return True
+        length = float(np.linalg.norm(force))
+        # A driver without an accelerometer fills zeros, which are no measurement of gravity.
+        if length == 0.0 or not np.isfinite(length):
+            return True
+        if self._start_ns is None or stamp_ns < self._start_ns:
+            self._start_ns, self._lengths = stamp_ns, []
+            # Only the very first reading opens alone: a shaken IMU in g reaches any length.
+            if not self._judged and force_error(length) is None:
+                self._open()
+                return True
+        self._lengths.append(length)
+        if stamp_ns - self._start_ns < WINDOW_S * 1e9 or len(self._lengths) < LEAST_READINGS:
+            return False
+        self._judge()
+        return self.is_open
+
+    def _judge(self):
+        """Open, or set the error of a window at rest; begin the next window."""
+        median = float(np.median(self._lengths))
+        error = force_error(median, 'at rest', self._stated)
+        if error is None:
+            self._open()
+        elif np.std(self._lengths) <= REST_SPREAD * median or error.code == 'without_gravity':
+            self.error = error
+        self._start_ns, self._lengths, self._judged = None, [], True
+
+    def _open(self):
+        self.is_open, self.error = True, None
