@@ -378,13 +378,16 @@ class RestReader:
             np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2)
             for parts in self.parts
         ]
-        for cleaned in BlockCleaner(nominal=self.nominal).all_of(self.source()):
+        for cleaned in self._cleaner().all_of(self.source()):
             for epoch, imu in cleaned.imu:
                 for number, (first, last) in enumerate(
                     np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()
                 ):
                     if last > first:
                         yield epoch, number, imu.select(slice(first, last))
+
+    def _cleaner(self):
+        return BlockCleaner(nominal=self.nominal, one_sensor=True)
 
     def curve(self) -> AllanCurve:
         """Return the Allan variances of the parts."""

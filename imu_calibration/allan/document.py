@@ -70,13 +70,14 @@ def to_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
         'sampling_rate': float(f'{figures.rate:.9g}'),
         'recording': figures.recording,
     }
-    for sensor in SENSORS:
+    for sensor in figures.sensors:
         document[sensor] = _sensor_section(sensor, figures.sensor(sensor))
     document['for_filters'] = {'horizon': horizon} | {
-        sensor: _for_filters(figures, sensor, horizon) for sensor in SENSORS
+        sensor: _for_filters(figures, sensor, horizon) for sensor in figures.sensors
     }
     document['allan_deviation'] = {'tau': list(figures.tau)} | {
-        sensor: [list(axis.deviation) for axis in figures.sensor(sensor)] for sensor in SENSORS
+        sensor: [list(axis.deviation) for axis in figures.sensor(sensor)]
+        for sensor in figures.sensors
     }
     document['provenance'] = figures.provenance
     return document
@@ -197,7 +198,14 @@ def _parse(document):
             _axis(document[sensor], k, (curve.get(sensor) or [[]] * 3)[k]) for k in range(len(AXES))
         )
         for sensor in SENSORS
+        if sensor in document
     }
+    if not sensors:
+        raise DocumentError(
+            'a noise document must have figures of a sensor, it has none; write the noise document'
+            ' again',
+            code='part_missing',
+        )
     rate = float(document['sampling_rate'])
     if not (math.isfinite(rate) and rate > 0):
         raise DocumentError(
@@ -205,7 +213,8 @@ def _parse(document):
             code='rate_not_positive',
         )
     return NoiseFigures(
-        **sensors,
+        sensors.get('accelerometer', ()),
+        sensors.get('gyroscope', ()),
         rate=rate,
         frame_id=str(document.get('frame_id', '')),
         recording=dict(document.get('recording') or {}),
@@ -308,7 +317,7 @@ def position_budget(figures: NoiseFigures) -> list[tuple[float, dict[str, float]
             seconds,
             {
                 sensor: max(_of_axis(axis, sensor, seconds) for axis in figures.sensor(sensor))
-                for sensor in SENSORS
+                for sensor in figures.sensors
             },
         )
         for seconds in RUNS
@@ -418,7 +427,7 @@ class FigureRow:
 def rows(figures: NoiseFigures) -> list[FigureRow]:
     """Return the figures of all axes, sensor by sensor, figure by figure."""
     found = []
-    for sensor in SENSORS:
+    for sensor in figures.sensors:
         for name in TERMS:
             for letter, axis in zip(AXES, figures.sensor(sensor)):
                 if name in axis.terms:
@@ -492,7 +501,7 @@ def counts(figures: NoiseFigures) -> dict[str, int]:
     """Return how many of the figures that count are determined, weak and held."""
     statuses = [
         term.status
-        for sensor in SENSORS
+        for sensor in figures.sensors
         for axis in figures.sensor(sensor)
         for term in requested(axis)
     ]
@@ -509,6 +518,8 @@ def shortcomings(figures: NoiseFigures) -> list[str]:
     found, lines = counts(figures), []
     if lacking := found[WEAK] + found[HELD]:
         lines.append(f'{lacking} of {sum(found.values())} noise figures are not determined')
+    for sensor, why in (figures.recording.get('unusable') or {}).items():
+        lines.append(f'the noise of the {sensor} is not identified: {why}')
     kept = round(figures.recording.get('seconds_at_rest', 0.0) * figures.rate)
     if dropped := dropped_text(figures.recording.get('dropped') or {}, kept):
         lines.append(dropped)
@@ -523,11 +534,15 @@ def lines(figures: NoiseFigures) -> list[str]:
     """
     found = [_rest_line(figures.recording)]
     for sensor in SENSORS:
+        if sensor not in figures.sensors:
+            why = (figures.recording.get('unusable') or {}).get(sensor, 'it has no readings')
+            found.append(f'no figures of the {sensor}: {why}')
+    for sensor in figures.sensors:
         for letter, axis in zip(AXES, figures.sensor(sensor)):
             found += _axis_lines(f'{sensor} {letter}', sensor, axis)
     if any(
         name in SLOW_PROCESSES
-        for sensor in SENSORS
+        for sensor in figures.sensors
         for axis in figures.sensor(sensor)
         for name in axis.form
     ):
@@ -617,7 +632,7 @@ def _longest(figures):
     """Return the recording time that determines all required figures, or ''."""
     needed = [
         axis.record_for[term.name]
-        for sensor in SENSORS
+        for sensor in figures.sensors
         for axis in figures.sensor(sensor)
         for term in requested(axis)
         if term.name in axis.record_for
@@ -635,7 +650,7 @@ def _longest(figures):
 def filter_lines(figures: NoiseFigures, rates: list[float], horizon: float = HORIZON) -> list[str]:
     """Return the parameters of filters, continuous and at each rate."""
     found = []
-    for sensor in SENSORS:
+    for sensor in figures.sensors:
         densities = figures.densities(sensor, horizon)
         units = NOISE_UNITS[sensor]
         found.append(

@@ -111,9 +111,9 @@ class NoiseFigures:
     """The noise of an IMU."""
 
     accelerometer: tuple[AxisFigures, ...]
-    """x, y, z."""
+    """x, y, z; empty where the sensor was absent or could not be used."""
     gyroscope: tuple[AxisFigures, ...]
-    """x, y, z."""
+    """The same."""
     rate: float
     """Sampling rate of the recording, Hz."""
     frame_id: str = ''
@@ -124,6 +124,11 @@ class NoiseFigures:
     """Averaging times of the Allan deviations, s."""
     provenance: dict = field(default_factory=dict)
     """Software version, recording, options."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors with figures."""
+        return tuple(sensor for sensor in SENSORS if self.sensor(sensor))
 
     def sensor(self, name: str) -> tuple[AxisFigures, ...]:
         """Return the axes of 'accelerometer' or 'gyroscope'."""
@@ -185,7 +190,7 @@ def bias_processes(figures: NoiseFigures) -> dict[str, tuple[BiasProcess, ...]]:
         sensor: _processes(
             [{p.name: (p, c) for p, c in axis.processes()} for axis in figures.sensor(sensor)]
         )
-        for sensor in SENSORS
+        for sensor in figures.sensors
     }
 
 

@@ -1,7 +1,7 @@
 """Identification of the noise figures from a recording at rest: the public functions."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import DETERMINED
+from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 CYCLES = 64
 """
@@ -230,8 +231,11 @@ class RestingRecord:
 
     curve: AllanCurve
     """Allan variances of the six axes."""
-    moments: tuple[Moments, ...]
-    """Variances with their covariance, one for each axis: force x, y, z, then rate x, y, z."""
+    moments: tuple[Moments | None, ...]
+    """
+    Variances with their covariance, one for each axis: force x, y, z, then rate x, y, z; None for
+    the axes of a sensor that is absent or unusable.
+    """
     trends: tuple[tuple[AxisTrend, ...], ...]
     """Trends subtracted from each axis."""
     parts: tuple[StillPart, ...]
@@ -244,6 +248,8 @@ class RestingRecord:
     """The first reading."""
     reader: RestReader
     """Reads the parts at rest again."""
+    unusable: dict[str, str] = field(default_factory=dict)
+    """Sensor with readings whose noise cannot be identified -> why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,8 +258,15 @@ class NoiseIdentification:
 
     record: RestingRecord
     """The recording."""
-    axes: tuple[AxisNoise, ...]
-    """Force x, y, z, then rate x, y, z."""
+    axes: tuple[AxisNoise | None, ...]
+    """Force x, y, z, then rate x, y, z; None for a sensor that is absent or unusable."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors whose noise is identified."""
+        return tuple(
+            sensor for sensor, part in SENSOR_COLUMNS.items() if self.axes[part.start] is not None
+        )
 
 
 def identify_noise(
@@ -278,24 +291,22 @@ def identify_noise(
     """
     record = read_rest(source, nominal)
     axes = [
-        identify_axis(moments)
+        None if moments is None else identify_axis(moments)
         for moments in reported('identifying the noise', record.moments, len(record.moments))
     ]
     longest = max(part.seconds for part in record.parts)
     searches = {
         k: ToneSearch(axis.oscillation[0], record.curve.period, k, longest=longest)
         for k, axis in enumerate(axes)
-        if axis.oscillation
+        if axis is not None and axis.oscillation
     }
     if searches:
         record.reader.read(*searches.values())
-    return NoiseIdentification(
-        record,
-        tuple(
-            replace(axis, oscillation=searches[k].line() if k in searches else None)
-            for k, axis in enumerate(axes)
-        ),
-    )
+    with_lines: list[AxisNoise | None] = []
+    for k, axis in enumerate(axes):
+        line = searches[k].line() if k in searches else None
+        with_lines.append(None if axis is None else replace(axis, oscillation=line))
+    return NoiseIdentification(record, tuple(with_lines))
 
 
 def read_rest(
@@ -322,36 +333,67 @@ def read_rest(
         )
     clock = _Clock(found.epochs)
     search = TrendSearch(_blocks(found, parts, clock))
-    trends = tuple(search.find(axis) for axis in range(6))
+    skipped = _axes_of({*found.absent, *found.unusable})
+    trends = tuple(() if axis in skipped else search.find(axis) for axis in range(6))
     detrending = Detrending(trends, search.reference, clock.temperature(found))
     reader = RestReader(source, parts, found.period, detrending, clock.time, nominal)
     curve = reader.curve()
-    _require_scatter(curve)
+    unusable = found.unusable | _without_scatter(curve, {*found.absent, *found.unusable})
+    skipped = _axes_of({*found.absent, *unusable})
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
-    moments = tuple(
-        Moments(scales, variance, variance > 0, search.kept(axis, trends[axis]), curve.parts[axis])
-        for axis, variance in enumerate(curve.variance.T)
-    )
+    moments: list[Moments | None] = []
+    for axis, variance in enumerate(curve.variance.T):
+        if axis in skipped:
+            moments.append(None)
+            continue
+        kept = search.kept(axis, trends[axis])
+        moments.append(Moments(scales, variance, variance > 0, kept, curve.parts[axis]))
     flat = tuple(part for of_epoch in parts for part in of_epoch)
     return RestingRecord(
-        curve, moments, trends, flat, left_out, _sample_sd(found, parts), found, reader
+        curve,
+        tuple(moments),
+        trends,
+        flat,
+        left_out,
+        _sample_sd(found, parts),
+        found,
+        reader,
+        unusable,
     )
 
 
-def _require_scatter(curve):
-    """Refuse an axis with constant readings: its quantisation hides the noise."""
-    names = [f'{sensor} {letter}' for sensor in SENSORS for letter in AXES]
-    frozen = [
-        name
-        for name, variance in zip(names, curve.variance.T)
-        if np.sum(variance > 0) < LEAST_SCALES
-    ]
-    if frozen:
-        raise InputError(
-            f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of its'
-            ' readings; record with a finer resolution',
-            code='coarse_steps',
-        )
+def _axes_of(sensors):
+    """Return the axes of some sensors, 0 to 5."""
+    axes = set()
+    for sensor in sensors:
+        part = SENSOR_COLUMNS[sensor]
+        axes |= set(range(part.start, part.stop))
+    return axes
+
+
+def _without_scatter(curve, skipped):
+    """
+    Return the sensor with an axis of constant readings -> why its noise cannot be identified.
+
+    The quantisation of these readings hides the noise. Refused where no other sensor remains;
+    `skipped` are the sensors that are absent or unusable.
+    """
+    found = {}
+    for sensor, part in SENSOR_COLUMNS.items():
+        scales = np.sum(curve.variance[:, part] > 0, axis=0)
+        frozen = [
+            f'{sensor} {letter}'
+            for letter, count in zip(AXES, scales, strict=True)
+            if count < LEAST_SCALES
+        ]
+        if frozen and sensor not in skipped:
+            found[sensor] = (
+                f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of'
+                ' its readings; record with a finer resolution'
+            )
+    if found and {*found, *skipped} == set(SENSORS):
+        raise InputError(next(iter(found.values())), code='coarse_steps')
+    return found
 
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
@@ -368,7 +410,11 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
         for axis, trends, sample_sd, variance in zip(
             result.axes, record.trends, record.sample_sd, record.curve.variance.T
         )
+        if axis is not None
     ]
+    of_sensor = {sensor: () for sensor in SENSORS}
+    for number, sensor in enumerate(result.sensors):
+        of_sensor[sensor] = tuple(axes[3 * number : 3 * number + 3])
     recording = {
         'seconds_at_rest': float(record.curve.seconds),
         'parts': len(record.parts),
@@ -377,9 +423,11 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
         'dropped': dict(record.survey.dropped),
         'intervals_hold_for': 'this recording; the slow noise of another one can be outside',
     }
+    if record.unusable:
+        recording['unusable'] = dict(record.unusable)
     return NoiseFigures(
-        tuple(axes[:3]),
-        tuple(axes[3:]),
+        of_sensor['accelerometer'],
+        of_sensor['gyroscope'],
         1.0 / record.curve.period,
         record.survey.frame_id,
         recording,

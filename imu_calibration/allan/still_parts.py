@@ -199,6 +199,10 @@ class Survey:
     """Reason -> messages that could not be used."""
     frame_id: str = ''
     """Frame of the messages."""
+    absent: tuple[str, ...] = ()
+    """Sensors without readings."""
+    unusable: dict[str, str] = field(default_factory=dict)
+    """Sensor with readings that cannot be used -> why, where the other one can be used."""
 
 
 def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) -> Survey:
@@ -211,8 +215,8 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
         When something makes the result wrong, such as other units.
 
     """
-    preflight = Preflight()
-    cleaner = BlockCleaner(nominal=nominal, watchers=[preflight])
+    preflight = Preflight(one_sensor=True)
+    cleaner = BlockCleaner(nominal=nominal, watchers=[preflight], one_sensor=True)
     series: dict[int, ChunkSeries] = {}
     temperature, frame_id = _Thinned(), ''
     for cleaned in cleaner.all_of(blocks):
@@ -234,7 +238,14 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
     )
     epochs = [item.chunks() for _, item in sorted(series.items())]
     return Survey(
-        epochs, _period(epochs), temperature.result(), preflight.findings, dropped, frame_id
+        epochs,
+        _period(epochs),
+        temperature.result(),
+        preflight.findings,
+        dropped,
+        frame_id,
+        absent=preflight.streams['imu'].absent,
+        unusable=preflight.unusable,
     )
 
 

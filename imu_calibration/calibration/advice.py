@@ -328,6 +328,11 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     ):
         if status in LACKING and name.split('.')[0] not in hand.hand_model.absent:
             lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
+    if 'accelerometer' in hand.hand_model.absent:
+        return tuple(
+            {'parameters': names, 'needs': 'record the accelerometer of the same board as well'}
+            for names in lacking.values()
+        )
     parts = {
         sensor: [hand.param_names.index(name) for name in lacking[sensor]]
         for sensor in SENSORS

@@ -5,7 +5,7 @@ With the effects that it supports, and with the document and result of a calibra
 """
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -38,6 +38,7 @@ from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.solution import REJECTED, with_term, with_weak_replaced
 from imu_calibration.kinematics.rotations import unit_rows
+from imu_calibration.preprocessing.absent_sensor import without_sensor
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
@@ -278,6 +279,8 @@ class HandRecording:
     """Reason -> number of unusable samples."""
     findings: tuple[CheckFinding, ...] = ()
     """Findings of the checks of the recording."""
+    unusable: dict[str, str] = field(default_factory=dict)
+    """Sensor with readings that cannot be used -> why; `imu` marks it as absent."""
 
     @property
     def gathered(self) -> SessionData:
@@ -322,6 +325,9 @@ def read_by_hand(
             'the recording must hold Imu messages that can be used, it holds none; check the topic'
         )
     imu, warm = joined.samples(), None
+    unusable = {} if preflight is None else preflight.unusable
+    for sensor in unusable:
+        imu = without_sensor(imu, sensor)
     if temperatures:
         known = TemperatureSamples.concatenate(temperatures)
         start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
@@ -338,6 +344,7 @@ def read_by_hand(
         warm,
         {reason: count for reason, count in counts.items() if count},
         () if preflight is None else tuple(preflight.findings),
+        unusable,
     )
 
 
@@ -369,7 +376,9 @@ def calibrate_without_table(
             ' separately and compare the results'
         )
     return evident_result(
-        read_by_hand(sources[0](), options.nominal, Preflight(options.gravity)), options, provenance
+        read_by_hand(sources[0](), options.nominal, Preflight(options.gravity, one_sensor=True)),
+        options,
+        provenance,
     )[0]
 
 
@@ -417,6 +426,7 @@ def hand_result(
         *notes(hand.statistics['bias_moved'], gathered.duration),
     )
     advice = missing_motion(hand)
+    unusable = {'unusable_sensors': dict(recording.unusable)} if recording.unusable else {}
     calibration = document(
         hand,
         hand.tolerances,
@@ -424,7 +434,7 @@ def hand_result(
         gravity=hand.gravity,
         gauge=dict(GAUGE),
         undetermined=advice,
-        statistics=_statistics(hand, gathered.counts, len(recording.imu)),
+        statistics=_statistics(hand, gathered.counts, len(recording.imu)) | unusable,
         provenance=provenance,
         proof=prove_by_hand(hand, hand.used_turns if turns else ()),
         changes=evident.changes,
@@ -503,7 +513,8 @@ def check_by_hand(
         When the recording cannot be used.
 
     """
-    recording = read_by_hand(source(), options.nominal, Preflight(options.gravity))
+    preflight = Preflight(options.gravity, one_sensor=True)
+    recording = read_by_hand(source(), options.nominal, preflight)
     try:
         data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
     except NotObservableError as error:

@@ -75,6 +75,8 @@ def shortcomings(calibration: Calibration) -> list[str]:
         if word is not HELPS:
             why = never_applied(calibration, sensor) or calibration.decision_reasons.get(sensor)
             lines.append(f'{sensor} {word}: {why or reason_of(calibration.proof.get(sensor))}')
+    for sensor, why in (calibration.statistics.get('unusable_sensors') or {}).items():
+        lines.append(f'{sensor} not calibrated: {why}')
     for line in (missing(calibration), dropped_text(*dropped_of(calibration))):
         if line:
             lines.append(line)

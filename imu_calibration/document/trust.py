@@ -365,7 +365,7 @@ def with_measured_noise(calibration: Calibration, figures: 'NoiseFigures') -> Ca
     read both through `Calibration.noise`.
     """
     statistics = dict(calibration.statistics)
-    for sensor in SENSORS:
+    for sensor in figures.sensors:
         density = np.array([axis.white for axis in figures.sensor(sensor)])
         statistics[sensor] = dict(statistics.get(sensor, {})) | {
             'noise_sd': (density * np.sqrt(figures.rate)).tolist(),

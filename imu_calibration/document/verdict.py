@@ -433,16 +433,19 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
 
 
 def _absent(calibration):
-    return [
-        Reason(
-            NOTE,
-            f'the recording has no readings of the {sensor}: it is not calibrated, and its readings'
-            ' are not corrected',
-            '',
-            sensors=(sensor,),
-        )
-        for sensor in calibration.absent
-    ]
+    unusable = calibration.statistics.get('unusable_sensors') or {}
+    reasons = []
+    for sensor in calibration.absent:
+        if sensor in unusable:
+            text = f'the {sensor} is not calibrated: {unusable[sensor]}'
+            reasons.append(Reason(WARNING, text, '', sensors=(sensor,)))
+        else:
+            text = (
+                f'the recording has no readings of the {sensor}: it is not calibrated, and its'
+                ' readings are not corrected'
+            )
+            reasons.append(Reason(NOTE, text, '', sensors=(sensor,)))
+    return reasons
 
 
 def _decided(calibration, sensor, word):

@@ -66,10 +66,15 @@ class SensorPresence:
         sensor = self.absent[0]
         own = samples.force_s if sensor == 'accelerometer' else samples.rate_s
         self.n_late += int(np.count_nonzero(np.isfinite(own).all(axis=1)))
-        constant = np.tile(PLACEHOLDERS[sensor], (len(samples), 1))
-        if sensor == 'accelerometer':
-            return replace(samples, force_s=constant, absent=self.absent)
-        return replace(samples, rate_s=constant, absent=self.absent)
+        return without_sensor(samples, sensor)
+
+
+def without_sensor(samples: ImuSamples, sensor: str) -> ImuSamples:
+    """Return samples with constant readings of a sensor, which is marked as absent."""
+    constant = np.tile(PLACEHOLDERS[sensor], (len(samples), 1))
+    if sensor == 'accelerometer':
+        return replace(samples, force_s=constant, absent=(sensor,))
+    return replace(samples, rate_s=constant, absent=(sensor,))
 
 
 def _missing(samples):

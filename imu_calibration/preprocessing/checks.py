@@ -76,6 +76,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 REFUSE,
                 f'the {sensor} must measure something, its outputs never change in'
                 f' {evidence.n_samples} samples; check the sensor and its driver',
+                sensor=sensor,
             )
             continue
         for axis in np.flatnonzero(constant):
@@ -85,6 +86,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                     REFUSE,
                     f'every axis must measure something, {sensor} {"xyz"[axis]} never changes while'
                     ' the remaining axes do; check the sensor and its driver',
+                    sensor=sensor,
                 )
         for axis in np.flatnonzero(~constant):
             moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(
@@ -346,12 +348,18 @@ class Preflight(EvidenceGatherer):
         Local gravity, m/s^2; default standard gravity.
     strict : bool
         Whether `finish` raises when a finding implies a wrong result.
+    one_sensor : bool
+        Whether one sensor that cannot be used is a warning: the other one is processed.
 
     """
 
-    def __init__(self, gravity: float | None = None, *, strict: bool = True):
+    def __init__(
+        self, gravity: float | None = None, *, strict: bool = True, one_sensor: bool = False
+    ):
         super().__init__(STANDARD_GRAVITY if gravity is None else gravity)
-        self._strict = strict
+        self._strict, self._one_sensor = strict, one_sensor
+        self.unusable: dict[str, str] = {}
+        """Sensor that cannot be used, one at most -> why; for `one_sensor`."""
         self.findings: tuple[CheckFinding, ...] = ()
         self.streams: dict[str, StreamStatistics] = {}
         self.lost: dict[str, int] = {}
@@ -377,8 +385,27 @@ class Preflight(EvidenceGatherer):
             if 'imu' in evidence.streams
             else ()
         )
+        if self._one_sensor:
+            self.unusable = unusable_sensor(self.findings, evidence.absent)
+            self.findings = tuple(
+                replace(finding, severity=WARNING) if finding.sensor in self.unusable else finding
+                for finding in self.findings
+            )
         if self._strict:
             refuse(self.findings)
+
+
+def unusable_sensor(findings: Sequence[CheckFinding], absent: Sequence[str] = ()) -> dict[str, str]:
+    """
+    Return the sensor that cannot be used -> why, where the other one can be used.
+
+    Empty where both can be used, or none; `absent` are sensors without readings.
+    """
+    found: dict[str, str] = {}
+    for finding in findings:
+        if finding.severity == REFUSE and finding.sensor:
+            found.setdefault(finding.sensor, finding.text)
+    return found if len({*found, *absent}) == 1 else {}
 
 
 def refuse(findings: tuple[CheckFinding, ...]) -> None:

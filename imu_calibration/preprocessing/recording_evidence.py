@@ -199,6 +199,8 @@ class CheckFinding:
     """The missing input, a key of `errors.ERROR_KEYS`."""
     value: str = ''
     """Proposed value of the missing input."""
+    sensor: str = ''
+    """The sensor that cannot be used, where the other one is not concerned."""
 
     def named(self, name: str) -> 'CheckFinding':
         """Return the finding with the name of its recording before the text."""

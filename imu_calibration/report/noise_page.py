@@ -111,7 +111,7 @@ def noise_report(
 ) -> str:
     """Return the report as one self-contained HTML page; the same input gives the same bytes."""
     found = document.counts(figures)
-    tables = {sensor: {} for sensor in SENSORS}
+    tables = {sensor: {} for sensor in figures.sensors}
     for row in document.rows(figures):
         tables[row.sensor].setdefault((row.title, row.unit), []).append(row)
     return render(
@@ -122,16 +122,16 @@ def noise_report(
         lines=document.lines(figures),
         figures=figures,
         tables=tables,
-        curves={sensor: draw_curve(result, sensor) for sensor in SENSORS},
+        curves={sensor: draw_curve(result, sensor) for sensor in figures.sensors},
         horizon=horizon,
-        densities={sensor: figures.densities(sensor, horizon) for sensor in SENSORS},
+        densities={sensor: figures.densities(sensor, horizon) for sensor in figures.sensors},
         basis=document.BASIS,
         rates=sorted({*RATES, round(figures.rate, 3)}),
         runs=document.position_budget(figures),
         duration=document.duration,
         left_out=[
             (f'{sensor} {letter}', axis.shortest)
-            for sensor in SENSORS
+            for sensor in figures.sensors
             for letter, axis in zip(AXES, figures.sensor(sensor))
             if axis.shortest * figures.rate > 1.5
         ],

@@ -143,7 +143,7 @@ def _look(bag, topics, table, options):
         except ImuCalibrationError as error:
             calibrated = error
     if not preflight.streams:  # not read to its end: no data to calibrate from
-        preflight = Preflight(table and table.gravity_value, strict=False)
+        preflight = Preflight(table and table.gravity_value, strict=False, one_sensor=table is None)
         by_hand = _by_hand(
             source_of(bag, topics, want_joints='optional', want_temperature='optional'),
             options,

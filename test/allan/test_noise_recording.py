@@ -381,15 +381,20 @@ def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys
     assert error.count('\n') == 1 and not (tmp_path / 'none').exists()
 
 
-def test_an_axis_whose_steps_hide_its_noise_is_refused_by_its_name():
+def test_an_axis_whose_steps_hide_its_noise_is_named_and_refused_without_another_sensor():
     """It changes while the sensor is knocked, and stays at one step of a coarse converter else."""
     imu = resting(120.0, 11)
     knock = np.random.default_rng(11).normal(0, 1, (40, 6)) * np.array([0.5] * 3 + [0.03] * 3)
     frozen = ImuSamples(
         imu.stamp_ns, np.where([False, True, False], 0.5, imu.force_s), imu.rate_s, imu.frame_id
     )
+    coarse = changed(frozen, slice(0, 6), 3000, knock)
+    record = read_rest(source(coarse))
+    assert list(record.unusable) == ['accelerometer']
+    assert 'accelerometer y' in record.unusable['accelerometer']
+    assert [moments is None for moments in record.moments] == [True] * 3 + [False] * 3
     with refused(InputError, 'coarse_steps', 'accelerometer y'):
-        read_rest(source(changed(frozen, slice(0, 6), 3000, knock)))
+        read_rest(source(replace(coarse, rate_s=np.full_like(coarse.rate_s, np.nan))))
 
 
 def hummed(extra, seed, period=0.05, n=24_000):

@@ -127,3 +127,18 @@ def test_a_sensor_that_starts_soon_is_present():
         part = slice(start, start + 300)
         presence.push(ImuSamples(stamps[part], np.ones((len(stamps[part]), 3)), rate[part]))
     assert (presence.absent, presence.n_late) == ((), 0)
+
+
+def test_a_gyroscope_that_measures_nothing_does_not_refuse_the_accelerometer():
+    time, force, rate = readings(35)
+    result = calibrate([block(time, force, np.zeros_like(rate))], gravity=GRAVITY)
+    assert list(result.calibration.decisions) == ['accelerometer']
+    assert result.calibration.decisions['accelerometer'] == 'helps'
+    assert list(result.calibration.statistics['unusable_sensors']) == ['gyroscope']
+    assert result.exit_code == 3  # it is there, and not corrected
+
+
+def test_an_accelerometer_that_reads_zero_is_no_traceback():
+    time, force, rate = readings(36)
+    with refused(InputError, 'frozen'):
+        calibrate([block(time, np.zeros_like(force), np.zeros_like(rate))], gravity=GRAVITY)

@@ -189,6 +189,13 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
 
 def _noise_of(calibration, figures, rate) -> Noise | None:
     if figures is not None:
+        if lacking := [sensor for sensor in SENSORS if sensor not in figures.sensors]:
+            raise InputError(
+                'the noise document must have figures of both sensors, it has none of the'
+                f' {lacking[0]}; record both sensors, or export without it',
+                key='noise',
+                code='absent',
+            )
         accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
         unbounded = [
             sensor
