@@ -26,6 +26,12 @@ from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSa
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.full_scale import relate_turns
 from imu_calibration.preprocessing.scan import ChunkSeries
+from imu_calibration.preprocessing.sensor_join import (
+    JoinedSensors,
+    SensorStream,
+    finite_stream,
+    join_sensors,
+)
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.write import write_session
@@ -106,6 +112,11 @@ NO_TIME = np.iinfo(np.int64).min
 """The value of NaT."""
 MAX_TIME_SECONDS = 4e9
 """s; stamps in ns and their differences fit into 64 bits."""
+MIN_COMMON_ROWS = 0.5
+"""
+Share of the rows of the rarer sensor that hold both sensors, below which each sensor has rows of
+its own.
+"""
 GRAVITY_BAND = 1.15
 """The median of the specific force may differ from gravity by this factor."""
 RATE_BAND = 1.6
@@ -152,6 +163,8 @@ class CsvLog:
     """Other columns."""
     n_dropped: int = 0
     """Lines that were left out, because they have too few columns."""
+    joined: JoinedSensors | None = None
+    """How accelerometer and gyroscope were joined, where they have stamps of their own."""
 
 
 @np.errstate(
@@ -200,37 +213,26 @@ def read_csv(
         for each in found
     ]
     by_quantity = {each.quantity: each for each in found}
-    for quantity in ('time', 'force', 'rate'):
-        if quantity not in by_quantity:
-            raise InputError(
-                f'{path} must have a column of'
-                f' {quantity}{"" if quantity == "time" else " per axis"}, got the columns'
-                f' {shortened(", ".join(table.names), 300)}; {REMEDY}',
-                key='columns',
-            )
+    if lacking := _lacking(table, by_quantity, stated=bool(columns)):
+        raise InputError(
+            f'{path} must have a column of'
+            f' {lacking}{"" if lacking == "time" else " per axis"}, got the columns'
+            f' {shortened(", ".join(table.names), 300)}; {REMEDY}',
+            key='columns',
+        )
     table.load([name for each in found for name in each.names], where)
     time = _with_unit(
         by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path
     )
     stamp_ns = table.stamps(time)
-    force = _with_unit(
-        by_quantity['force'], lambda: _force_unit(table.values(by_quantity['force'].names)), path
-    )
-    force_s = table.values(force.names) * _size_of(force)
-    _require_one_imu(stamp_ns, force_s, table.values(by_quantity['rate'].names))
-    rate = _with_unit(
-        by_quantity['rate'],
-        lambda: _rate_unit(stamp_ns, force_s, table.values(by_quantity['rate'].names)),
-        path,
-    )
-    used, temperature, joints = [time, force, rate], None, []
+    readings = _sensors(table, by_quantity, stamp_ns)
+    used, temperature, joints = [time, *readings.columns], None, []
     for each in found:
         if each.quantity == 'temperature':
             used.append(_with_unit(each, lambda: 'C', path))
             temperature = TemperatureSamples(stamp_ns, table.values(each.names)[:, 0])
         elif each.quantity == 'joint':
             joints.append(_with_unit(each, lambda: None, path))
-    imu = ImuSamples(stamp_ns, force_s, table.values(rate.names) * _size_of(rate), 'imu_link')
     used += joints
     taken = {name.removeprefix('-') for each in used for name in each.names}
     angles = {
@@ -239,11 +241,173 @@ def read_csv(
     }
     return CsvLog(
         tuple(used),
-        imu,
+        readings.imu,
         JointSamples.of_angles(stamp_ns, angles) if angles else None,
         temperature,
         tuple(name for name in table.names if name and name not in taken),
         table.n_dropped,
+        joined=readings.joined,
+    )
+
+
+def _lacking(table, by_quantity, *, stated):
+    """
+    Return the quantity that a log needs and lacks, or ''.
+
+    One sensor is enough; three further columns without a known name may be those of the other one,
+    unless the columns are `stated`.
+    """
+    if 'time' not in by_quantity:
+        return 'time'
+    missing = [quantity for quantity in ('force', 'rate') if quantity not in by_quantity]
+    if not missing:
+        return ''
+    taken = {name.removeprefix('-') for each in by_quantity.values() for name in each.names}
+    unknown = [name for name in table.names if name and name not in taken]
+    if len(missing) == 2 or (len(unknown) >= 3 and not stated):
+        return missing[0]
+    return ''
+
+
+@dataclass(frozen=True, eq=False)
+class _Readings:
+    """Readings of the sensors of a log in SI."""
+
+    columns: tuple[Columns, ...]
+    """Columns of force and rate, with units."""
+    imu: ImuSamples
+    """NaN for a sensor without columns."""
+    joined: JoinedSensors | None = None
+    """Where the sensors have rows of their own."""
+
+
+def _sensors(table, by_quantity, stamp_ns):
+    """Return the `_Readings` of a table."""
+    nothing = np.full((len(stamp_ns), 3), np.nan)
+    if 'force' not in by_quantity:
+        rate = _with_unit(by_quantity['rate'], lambda: None, table.path)
+        rate_s = table.values(rate.names) * _size_of(rate)
+        return _Readings((rate,), ImuSamples(stamp_ns, nothing, rate_s, 'imu_link'))
+    raw_force = table.values(by_quantity['force'].names)
+    force = _with_unit(by_quantity['force'], lambda: _force_unit(raw_force), table.path)
+    force_s = raw_force * _size_of(force)
+    if 'rate' not in by_quantity:
+        return _Readings((force,), ImuSamples(stamp_ns, force_s, nothing, 'imu_link'))
+    raw_rate = table.values(by_quantity['rate'].names)
+    accelerometer, gyroscope = (finite_stream(stamp_ns, values) for values in (force_s, raw_rate))
+    common = np.isfinite(force_s).all(axis=1) & np.isfinite(raw_rate).all(axis=1)
+    fewest = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
+    if np.count_nonzero(common) >= MIN_COMMON_ROWS * fewest:
+        _require_one_imu(stamp_ns, force_s, raw_rate)
+        rate = _with_unit(
+            by_quantity['rate'], lambda: _rate_unit(stamp_ns, force_s, raw_rate), table.path
+        )
+        rate_s = raw_rate * _size_of(rate)
+        return _Readings((force, rate), ImuSamples(stamp_ns, force_s, rate_s, 'imu_link'))
+    return _joined(force, by_quantity['rate'], accelerometer, gyroscope, path=table.path)
+
+
+def _joined(force, rate, accelerometer, gyroscope, *, path):
+    """Return the `_Readings` of sensors with stamps of their own; the rates as in the log."""
+    joined = join_sensors(accelerometer, gyroscope, 'imu_link')
+    imu = joined.imu
+    _require_one_imu(imu.stamp_ns, imu.force_s, imu.rate_s)
+    rate = _with_unit(rate, lambda: _rate_unit(imu.stamp_ns, imu.force_s, imu.rate_s), path)
+    imu = replace(imu, rate_s=imu.rate_s * _size_of(rate))
+    return _Readings((force, rate), imu, joined)
+
+
+def read_logs(
+    paths: Sequence[str | PathLike[str]], columns: Sequence[str] = (), where: Sequence[str] = ()
+) -> CsvLog:
+    """
+    Read one log, or two logs with a sensor each, or a folder with one log per sensor.
+
+    Parameters
+    ----------
+    paths : sequence of path-like
+        A text log; two text logs, of an accelerometer and of a gyroscope; or a folder of them, as
+        phones export it.
+    columns, where
+        As for `read_csv`, for one log.
+
+    Raises
+    ------
+    InputError
+        As `read_csv`; when the logs are not one of each sensor.
+
+    """
+    files = [Path(path) for path in paths]
+    if len(files) == 1 and not files[0].is_dir():
+        return read_csv(files[0], columns, where)
+    if columns:
+        raise InputError(
+            f'columns are stated for one log, got {len(files)} paths; convert one log with the'
+            ' columns of both sensors',
+            key='columns',
+            code='several_logs',
+        )
+    in_folder = len(files) == 1
+    if in_folder:
+        files = sorted(path for path in files[0].iterdir() if path.suffix.lower() in SUFFIXES)
+    found: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
+    for path in files:
+        try:
+            log = _sensor_log(path, where)
+        except InputError:
+            if not in_folder:
+                raise
+            continue  # a folder has logs of other sensors too
+        if log is not None:
+            found[log.columns.quantity].append(log)
+    for quantity, logs in found.items():
+        if len(logs) != 1:
+            names = ', '.join(log.path.name for log in logs)
+            if not logs:
+                names = f'none among {shortened(", ".join(path.name for path in files), 200)}'
+            raise InputError(
+                f'one log of {quantity} is needed, got {names}; name the two logs, accelerometer'
+                ' and gyroscope, or one that has both',
+                code='several_logs',
+            )
+    force, rate = found['force'][0], found['rate'][0]
+    readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.path)
+    used = (force.time, readings.columns[0], rate.time, readings.columns[1])
+    n_dropped = force.n_dropped + rate.n_dropped
+    return CsvLog(used, readings.imu, None, None, (), n_dropped, joined=readings.joined)
+
+
+@dataclass(frozen=True, eq=False)
+class _SensorLog:
+    """A log of one sensor."""
+
+    path: Path
+    time: Columns
+    columns: Columns
+    """Of force, with its unit, or of rate."""
+    stream: SensorStream
+    """Force in SI; rates as in the log."""
+    n_dropped: int
+
+
+def _sensor_log(path, where):
+    """Return the `_SensorLog` of a path; None where it has neither sensor."""
+    if not path.is_file():
+        raise InputError(f'a text log must be a regular file, got {path}; check the path')
+    table = _Table(path)
+    found = {each.quantity: each for each in _guess(table)}
+    sensors = [quantity for quantity in ('force', 'rate') if quantity in found]
+    if 'time' not in found or len(sensors) != 1:
+        return None
+    columns = found[sensors[0]]
+    table.load([*found['time'].names, *columns.names], where)
+    time = _with_unit(found['time'], lambda: _time_unit(table.raw(found['time'].names[0])), path)
+    values = table.values(columns.names)
+    if columns.quantity == 'force':
+        columns = _with_unit(columns, lambda: _force_unit(values), path)
+        values = values * _size_of(columns)
+    return _SensorLog(
+        path, time, columns, finite_stream(table.stamps(time), values), table.n_dropped
     )
 
 
@@ -586,8 +750,11 @@ def _numeric(cell):
 def _guess(table):
     """Return the Columns that the header names."""
     axes, found = {'force': {}, 'rate': {}}, []
+    sensor_of_file = _words(table.path.stem)[0]
     for name in table.names:
         words, unit_text = _words(name)
+        if words in ('x', 'y', 'z'):  # a file of one sensor, which has the name of it
+            words = f'{sensor_of_file} {words}'
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
         axis = re.fullmatch(r'(.*?) ?([xyz])', re.sub(r'^([xyz]) (.*)$', r'\2 \1', words))
         for quantity, pattern in COLUMN_PATTERNS:
@@ -726,6 +893,8 @@ class ConvertedLog:
     def __init__(self, path: Path, raw: tuple[str, ...] = ()):
         log, folder = read_csv(path, raw=raw), mkdtemp(prefix='imu_calibration_')
         remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
+        if log.joined is not None:
+            remark(f'{path.name}: {log.joined.text}')
         if log.n_dropped:
             remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)

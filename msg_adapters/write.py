@@ -50,6 +50,10 @@ def encode_imu(
     }
     for name, value in columns.items():
         doubles[:, FIELDS[name]] = value
+    for quantity, values in (('rate', imu.rate_s), ('force', imu.force_s)):
+        if len(values) and np.isnan(values).all():  # absent by the definition of the message
+            doubles[:, FIELDS[f'{quantity}_s']] = 0.0
+            doubles[:, FIELDS[f'{quantity}_cov']] = ABSENT_COVARIANCE
     return _table(imu.stamp_ns, frame_head(imu.frame_id), [doubles])
 
 

@@ -3,10 +3,13 @@
 from dataclasses import asdict
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
+from imu_calibration.core.documents import finite
+from imu_calibration.preprocessing.sensor_join import JoinedSensors
 from msg_adapters.storages import identifiers
 
 EXAMPLES = (
     'log.csv --output session',
+    'Accelerometer.csv Gyroscope.csv --output session',
     'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session',
 )
 
@@ -16,7 +19,12 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_argument(
         'log',
         metavar='FILE',
-        help='text with a header and columns separated by comma, semicolon, tab or spaces',
+        nargs='+',
+        help=(
+            'text with a header and columns separated by comma, semicolon, tab or spaces; two'
+            ' files, of accelerometer and gyroscope; or a folder with a file per sensor, as'
+            ' phones export'
+        ),
     )
     parser.common('--output', metavar='BAG', required=True, help='rosbag2 folder to make')
     parser.common(
@@ -41,16 +49,23 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 
+def joined_document(joined: JoinedSensors) -> dict:
+    """Return how two sensors were joined as data."""
+    return {'slower': joined.slower, 'delay': joined.delay, 'delay_sd': finite(joined.delay_sd)}
+
+
 def run(options: Options) -> VerbResult:
     """Read the log, print the columns used, write the bag."""
-    from msg_adapters.csv_log import read_csv
+    from msg_adapters.csv_log import read_logs
     from msg_adapters.write import write_session
 
-    log = read_csv(options.log, options.columns, options.where)
+    log = read_logs(options.log, options.columns, options.where)
     for columns in log.columns:
         print(columns)
     if log.unused:
         print_line(f'unused: {", ".join(log.unused)}')
+    if log.joined is not None:
+        print_line(f'joined: {log.joined.text}')
     if log.n_dropped:
         print_line(f'dropped: {log.n_dropped} lines with too few columns')
     write_session(
@@ -65,5 +80,6 @@ def run(options: Options) -> VerbResult:
             'columns': list(map(asdict, log.columns)),
             'unused': log.unused,
             'dropped': log.n_dropped,
+            'joined': None if log.joined is None else joined_document(log.joined),
         },
     )

@@ -1,0 +1,220 @@
+"""Accelerometer and gyroscope with stamps of their own, joined to one stream."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.kinematics.rotations import skew, unit_rows
+
+MAX_GAP_PERIODS = 5.0
+"""Between readings farther apart than this many periods nothing is interpolated."""
+MIN_OVERLAP_SAMPLES = 100
+"""Joined samples, at least."""
+MAX_DELAY = 0.25
+"""s; larger delays are not searched."""
+DELAY_STEP = 0.01
+"""s; distance of the delays among which the search begins: short against turns by hand."""
+DELAY_WINDOW = 0.1
+"""s; rotation of gravity and integral of the rates are compared over this time."""
+DELAY_PARTS = 8
+"""Parts of the recording that are left out in turn, for the standard deviation of the delay."""
+MOST_WINDOWS = 4000
+"""Windows that are compared, at most."""
+MIN_DELAY_ROTATION = 0.5
+"""Sum of the rotation of gravity that a delay needs, rad."""
+MIN_EXPLAINED = 0.5
+"""Share of the rotation of gravity that the rates explain, at least."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorStream:
+    """Readings of one sensor."""
+
+    stamp_ns: np.ndarray
+    """Increasing, int64, shape (n,)."""
+    values: np.ndarray
+    """SI, shape (n, 3)."""
+
+    @property
+    def period_ns(self) -> float:
+        """Median step between stamps, ns."""
+        return float(np.median(np.diff(self.stamp_ns)))
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedSensors:
+    """One stream of two sensors."""
+
+    imu: ImuSamples
+    """At the stamps of the slower sensor."""
+    slower: str
+    """Sensor whose stamps are kept."""
+    delay: float | None
+    """
+    By how much the stamps of the gyroscope are late relative to those of the accelerometer, s; None
+    where the motion does not determine it. It is not corrected.
+    """
+    delay_sd: float
+    """Its standard deviation, s."""
+
+    @property
+    def text(self) -> str:
+        """The method and the delay in one line."""
+        faster = 'gyroscope'
+        if self.slower == faster:
+            faster = 'accelerometer'
+        line = f'the {faster} is interpolated linearly to the stamps of the {self.slower}'
+        if self.delay is None:
+            return f'{line}; their delay is not determined by the motion'
+        milliseconds = f'{1e3 * self.delay:.1f} ± {1e3 * self.delay_sd:.1f} ms'
+        return f'{line}; the gyroscope is {milliseconds} late (not corrected)'
+
+
+def finite_stream(stamp_ns: np.ndarray, values: np.ndarray) -> SensorStream:
+    """Return the finite readings with increasing stamps of one sensor."""
+    known = np.isfinite(values).all(axis=1)
+    stamp_ns, values = stamp_ns[known], values[known]
+    newest = np.maximum.accumulate(stamp_ns)
+    advances = np.append(True, stamp_ns[1:] > newest[:-1])[: len(stamp_ns)]
+    return SensorStream(stamp_ns[advances], values[advances])
+
+
+def join_sensors(
+    accelerometer: SensorStream, gyroscope: SensorStream, frame_id: str = ''
+) -> JoinedSensors:
+    """
+    Return both sensors at the stamps of the slower one.
+
+    Parameters
+    ----------
+    accelerometer, gyroscope : SensorStream
+    frame_id : str
+
+    Raises
+    ------
+    InputError
+        When the two hardly overlap in time.
+
+    """
+    n_least = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
+    slower, stamp_ns = 'gyroscope', gyroscope.stamp_ns
+    if n_least >= 2 and accelerometer.period_ns >= gyroscope.period_ns:
+        slower, stamp_ns = 'accelerometer', accelerometer.stamp_ns
+    force, has_force = interpolated(accelerometer, stamp_ns)
+    rate, has_rate = interpolated(gyroscope, stamp_ns)
+    kept = has_force & has_rate
+    if np.count_nonzero(kept) < MIN_OVERLAP_SAMPLES:
+        raise InputError(
+            'accelerometer and gyroscope must be recorded at the same time, by one clock, for at'
+            f' least {MIN_OVERLAP_SAMPLES} samples, {np.count_nonzero(kept)} are common; give two'
+            ' recordings of one session',
+            code='no_overlap',
+        )
+    imu = ImuSamples(stamp_ns[kept], force[kept], rate[kept], frame_id)
+    delay, sd = gyroscope_delay(accelerometer, gyroscope)
+    return JoinedSensors(imu, slower, delay, sd)
+
+
+def interpolated(stream: SensorStream, stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return (values at stamps, shape (n, 3); whether they are known, shape (n,)).
+
+    Linear between neighbours; unknown outside of the stream and in its gaps.
+    """
+    n = len(stream.stamp_ns)
+    if n < 2:
+        return np.zeros((len(stamp_ns), 3)), np.zeros(len(stamp_ns), bool)
+    after = np.searchsorted(stream.stamp_ns, stamp_ns)
+    inside = (stamp_ns >= stream.stamp_ns[0]) & (stamp_ns <= stream.stamp_ns[-1])
+    after = np.clip(after, 1, n - 1)
+    first, last = stream.stamp_ns[after - 1], stream.stamp_ns[after]
+    step = last - first
+    share = ((stamp_ns - first) / step)[:, None]
+    values = (1.0 - share) * stream.values[after - 1] + share * stream.values[after]
+    known = inside & ((step <= MAX_GAP_PERIODS * stream.period_ns) | (stamp_ns == last))
+    return values, known
+
+
+def gyroscope_delay(
+    accelerometer: SensorStream, gyroscope: SensorStream
+) -> tuple[float | None, float]:
+    """
+    Return (delay of the gyroscope's stamps, its standard deviation), s; (None, inf) if unknown.
+
+    With the direction u of the specific force and the integral theta of the rates over a window,
+    shifted by the delay d::
+
+        u(t + w) - u(t) = u(t + w / 2) x (A (theta(t + w + d) - theta(t + d)) + b w)
+
+    A (3 x 3) and b are fitted for each d, so that neither units nor axes nor biases matter; d has
+    the least squared residual.
+    """
+    from scipy.optimize import minimize_scalar  # here, because its import is slow
+
+    windows = _windows(accelerometer)
+    if windows is None:
+        return None, np.inf
+    start, stop, middle, change = windows
+    if np.linalg.norm(change, axis=1).sum() < MIN_DELAY_ROTATION:
+        return None, np.inf
+    time = (gyroscope.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
+    steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
+    theta = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    inside = (start > time[0] + MAX_DELAY) & (stop < time[-1] - MAX_DELAY)
+    if np.count_nonzero(inside) < 20 * DELAY_PARTS:
+        return None, np.inf
+    # Windows in which gravity rotates most determine the delay.
+    rotation = np.where(inside, np.linalg.norm(change, axis=1), 0.0)
+    most = np.sort(np.argsort(rotation)[-MOST_WINDOWS:])
+    used_windows = most[rotation[most] > 0.0]
+    start, stop = start[used_windows], stop[used_windows]
+    lever, change = skew(middle[used_windows]), change[used_windows]
+
+    def residual(delay, used):
+        turned = np.empty((len(start), 4))
+        for axis in range(3):
+            turned[:, axis] = np.interp(stop + delay, time, theta[:, axis])
+            turned[:, axis] -= np.interp(start + delay, time, theta[:, axis])
+        turned[:, 3] = stop - start
+        design = (lever[:, :, :, None] * turned[:, None, None, :]).reshape(-1, 12)
+        rows = np.repeat(used, 3)
+        left = np.linalg.lstsq(design[rows], change.reshape(-1)[rows], rcond=None)[0]
+        return float(np.sum((change.reshape(-1)[rows] - design[rows] @ left) ** 2))
+
+    def best(used, near):
+        around = (near - DELAY_STEP, near + DELAY_STEP)
+        return float(minimize_scalar(residual, bounds=around, args=(used,), method='bounded').x)
+
+    every = np.ones(len(start), bool)
+    candidates = np.arange(-MAX_DELAY, MAX_DELAY + DELAY_STEP / 2, DELAY_STEP)
+    costs = [residual(candidate, every) for candidate in candidates]
+    delay = best(every, candidates[int(np.argmin(costs))])
+    if residual(delay, every) > (1.0 - MIN_EXPLAINED) * float(np.sum(change**2)):
+        return None, np.inf
+    # Jackknife over parts of the recording, because the residuals are correlated in time.
+    part = np.arange(len(start)) * DELAY_PARTS // len(start)
+    without = np.array([best(part != number, delay) for number in range(DELAY_PARTS)])
+    variance = (DELAY_PARTS - 1) / DELAY_PARTS * np.sum((without - without.mean()) ** 2)
+    if abs(delay) > MAX_DELAY - DELAY_STEP:
+        return None, np.inf
+    return delay, float(np.sqrt(variance))
+
+
+def _windows(accelerometer):
+    """Return (start, end, direction in the middle, change of the direction) of windows, or None."""
+    if len(accelerometer.stamp_ns) < 20:
+        return None
+    time = (accelerometer.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
+    half = max(int(round(0.5 * DELAY_WINDOW / (accelerometer.period_ns * 1e-9))), 1)
+    length = np.linalg.norm(accelerometer.values, axis=1)
+    usual = np.median(length)
+    if not usual > 0.0 or len(time) < 4 * half:
+        return None
+    direction = unit_rows(np.where((length > 0.1 * usual)[:, None], accelerometer.values, 1.0))
+    start, middle = np.arange(0, len(time) - 2 * half, half), half
+    begin, centre, end = start, start + middle, start + 2 * half
+    whole = time[end] - time[begin] < 2.0 * DELAY_WINDOW + 4e-9 * accelerometer.period_ns
+    begin, centre, end = begin[whole], centre[whole], end[whole]
+    return time[begin], time[end], direction[centre], direction[end] - direction[begin]

@@ -1,0 +1,161 @@
+"""Accelerometer and gyroscope in logs of their own, or in rows of their own, and one alone."""
+
+import numpy as np
+import pytest
+from refusal import refused
+
+from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
+from imu_calibration.preprocessing.sensor_join import (
+    SensorStream,
+    finite_stream,
+    gyroscope_delay,
+    interpolated,
+    join_sensors,
+)
+from msg_adapters.bag import open_recording
+from msg_adapters.csv_log import read_csv, read_logs
+
+from worlds.small_hand import ACCELEROMETER, GYROSCOPE, hand_motion
+
+LATE = 0.021
+"""s; stamps of the gyroscope minus the time of its readings."""
+START_NS = 1_730_000_000_123_000_000
+
+
+@pytest.fixture(scope='module')
+def streams():
+    """Accelerometer at 80 Hz and gyroscope at 128 Hz of one motion, with stamps that are late."""
+    motion, generator = hand_motion(hz=640.0, n_poses=14, seed=51), np.random.default_rng(51)
+    slow, fast = slice(None, None, 8), slice(None, None, 5)
+    force = ACCELEROMETER.read(motion.force[slow], generator)
+    rate = GYROSCOPE.read(motion.rate[fast], generator)
+    stamps = START_NS + np.round(motion.time * 1e9).astype(np.int64)
+    late = round(LATE * 1e9)
+    return SensorStream(stamps[slow], force), SensorStream(stamps[fast] + late, rate)
+
+
+def test_the_slower_stamps_are_kept_and_the_delay_is_estimated(streams):
+    joined = join_sensors(*streams)
+    assert joined.slower == 'accelerometer'
+    assert set(joined.imu.stamp_ns) <= set(streams[0].stamp_ns)
+    assert 0 < joined.delay_sd < 5e-3
+    assert abs(joined.delay - LATE) < 4 * joined.delay_sd
+    # Exchanged names of the axes and another unit do not change a delay.
+    turned = SensorStream(streams[1].stamp_ns, -57.3 * streams[1].values[:, [1, 0, 2]])
+    assert gyroscope_delay(streams[0], turned)[0] == pytest.approx(joined.delay, abs=1e-4)
+
+
+def test_without_rotation_there_is_no_delay():
+    generator, n = np.random.default_rng(52), 4000
+    stamps = START_NS + np.arange(n) * 10_000_000
+    force = np.array([0, 0, 9.8]) + 0.01 * generator.standard_normal((n, 3))
+    rate = 0.001 * generator.standard_normal((n, 3))
+    assert gyroscope_delay(SensorStream(stamps, force), SensorStream(stamps, rate))[0] is None
+
+
+def test_nothing_is_interpolated_across_gaps_and_ends():
+    stamps = np.array([0, 10, 20, 30, 130, 140, 150]) * 1_000_000
+    values = np.outer(stamps * 1e-6, [1.0, 2.0, -1.0])
+    wanted = np.array([-5, 5, 30, 80, 135, 151]) * 1_000_000
+    found, known = interpolated(SensorStream(stamps, values), wanted)
+    assert known.tolist() == [False, True, True, False, True, False]
+    assert np.allclose(found[known], np.outer([5.0, 30.0, 135.0], [1.0, 2.0, -1.0]))
+
+
+def test_streams_of_different_times_are_refused(streams):
+    later = SensorStream(streams[1].stamp_ns + 10**12, streams[1].values)
+    with refused(InputError, 'no_overlap', 0):
+        join_sensors(streams[0], later)
+
+
+def write(path, stream, header='time,z,y,x', scale=1.0):
+    rows = [
+        f'{stamp},' + ','.join(f'{value:.9f}' for value in scale * values[::-1])
+        for stamp, values in zip(stream.stamp_ns, stream.values, strict=True)
+    ]
+    path.write_text('\n'.join([header, *rows]) + '\n')
+
+
+@pytest.fixture(scope='module')
+def folder(streams, tmp_path_factory):
+    """The export of a phone: a file per sensor, with columns z, y, x."""
+    path = tmp_path_factory.mktemp('phone')
+    force, rate = streams
+    write(path / 'TotalAcceleration.csv', force)
+    write(path / 'Gyroscope.csv', rate)
+    write(path / 'Magnetometer.csv', SensorStream(force.stamp_ns, 30 + 0 * force.values))
+    linear = SensorStream(force.stamp_ns, force.values - [0.31, -0.12, 9.98] + 0 * force.values)
+    write(path / 'Gravity.csv', SensorStream(force.stamp_ns, force.values - linear.values))
+    return path
+
+
+def test_two_logs_and_a_folder_are_one_recording(folder, streams):
+    pair = read_logs([folder / 'Gyroscope.csv', folder / 'TotalAcceleration.csv'])
+    whole = read_logs([folder])
+    assert np.array_equal(pair.imu.force_s, whole.imu.force_s)
+    assert [each.quantity for each in pair.columns] == ['time', 'force', 'time', 'rate']
+    # x, y, z by name, although the columns are z, y, x; stamps of 19 digits lose 256 ns
+    at = np.searchsorted(streams[0].stamp_ns, pair.imu.stamp_ns[0] - 1000)
+    assert np.allclose(pair.imu.force_s[0], streams[0].values[at], atol=1e-8)
+    assert abs(pair.joined.delay - LATE) < 4 * pair.joined.delay_sd
+
+
+def test_convert_writes_them(folder, tmp_path, capsys):
+    assert main(['convert', str(folder), '--output', str(tmp_path / 'bag')]) == 0
+    assert f'{1e3 * read_logs([folder]).joined.delay:.1f}' in capsys.readouterr().out
+    with open_recording(tmp_path / 'bag', want_joints=False) as recording:
+        samples = next(recording.blocks()).imu
+    assert np.isfinite(samples.force_s).all() and np.isfinite(samples.rate_s).all()
+
+
+def test_two_logs_of_one_sensor_are_refused(folder):
+    with refused(InputError, 'several_logs', 'Gyroscope.csv'):
+        read_logs([folder / 'Gyroscope.csv', folder / 'Gyroscope.csv'])
+
+
+def test_a_table_with_empty_cells_is_read_as_two_streams(streams, tmp_path):
+    rows = []
+    for stream, empty in zip(streams, (('', ',,,'), (',,,', '')), strict=True):
+        for stamp, values in zip(stream.stamp_ns, stream.values, strict=True):
+            text = ','.join(f'{value:.9f}' for value in values)
+            seconds = (stamp - START_NS) * 1e-9
+            rows.append((seconds, f'{seconds:.6f},{empty[0]}{text}{empty[1]}'))
+    path = tmp_path / 'joined.csv'
+    lines = [text for _, text in sorted(rows)]
+    path.write_text('\n'.join(['time (s),ax,ay,az,gx,gy,gz', *lines]) + '\n')
+    log = read_csv(path)
+    assert log.joined.slower == 'accelerometer'
+    assert abs(log.joined.delay - LATE) < 4 * log.joined.delay_sd
+    assert np.isfinite(log.imu.rate_s).all()
+    assert len(log.imu) > 0.95 * len(streams[0].stamp_ns)
+
+
+def test_a_log_of_an_accelerometer_is_read_with_an_absent_gyroscope(streams, tmp_path):
+    path = tmp_path / 'log.csv'
+    seconds = SensorStream((streams[0].stamp_ns - START_NS) // 1000, streams[0].values / 9.80665)
+    write(path, seconds, 'time (us),acc_z (g),acc_y (g),acc_x (g)')
+    log = read_csv(path)
+    assert np.isnan(log.imu.rate_s).all()
+    assert np.allclose(log.imu.force_s, streams[0].values, atol=1e-7)
+    with open_recording(path, want_joints=False) as recording:
+        samples = next(recording.blocks()).imu
+    assert np.isnan(samples.rate_s).all() and np.isfinite(samples.force_s).all()
+    result = tmp_path / 'result'
+    given = ['--gravity', '9.80665', '--output', str(result), '--no-report']
+    assert main(['calibrate', str(path), *given]) == 0
+    # Three further columns may be those of the gyroscope: they are not ignored without a word.
+    wide = tmp_path / 'wide.csv'
+    lines = path.read_text().splitlines()
+    head = lines[0] + ',p,q,r'
+    wide.write_text('\n'.join([head, *[line + ',1,2,3' for line in lines[1:]]]) + '\n')
+    with pytest.raises(InputError, match='rate'):
+        read_csv(wide)
+
+
+def test_finite_streams_advance():
+    stamps = np.array([3, 1, 2, 4, 4, 5])
+    values = np.ones((6, 3))
+    values[3] = np.nan
+    found = finite_stream(stamps, values)
+    assert found.stamp_ns.tolist() == [3, 4, 5]
