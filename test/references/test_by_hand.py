@@ -233,14 +233,14 @@ def test_noise_free_recording_gives_the_truth():
     assert np.max(np.abs(error[9:])) < 1e-6  # the integration's error at 5 ms
 
 
-@pytest.mark.long
-@pytest.mark.parametrize('seeds, sensitivity', [(24, 0.0), (12, 5e-4)])
+@pytest.mark.parametrize('seeds, sensitivity', [(8, 0.0), (6, 5e-4)])
 def test_reported_sd_are_honest(seeds, sensitivity):
     """
     Random sensors and sessions: normalised squared error near 1, 95 % intervals hold.
 
-    With 21 (30) parameters of which about a third is independent, the mean over 24 seeds scatters
-    by 0.08, over 12 by 0.11; the scatter of poses comes from some 10 degrees of freedom, which the
+    With 21 (30) parameters of which about a third is independent, the mean over 8 seeds scatters
+    by 0.13; the same seeds with sds wrong by a fifth are outside the bounds. The scatter of poses
+    comes from some 10 degrees of freedom, which the
     report makes up for.
     """
     normalised, inside = [], []
@@ -273,7 +273,6 @@ def normalised_errors(seeds, **session):
     return np.array(found)
 
 
-@pytest.mark.long
 def test_nine_poses_are_widened_by_student_s_t():
     """
     Nine poses leave no degree of freedom for their scatter.
@@ -283,7 +282,7 @@ def test_nine_poses_are_widened_by_student_s_t():
     With a constant scatter of 2 mm/s^2 for so few poses, a third of these errors exceeded three sd,
     the rms was 4.3.
     """
-    errors = normalised_errors(range(24), n_poses=9)[:, :9]
+    errors = normalised_errors(range(10), n_poses=9)[:, :9]
     assert np.sqrt(np.mean(errors**2)) < 1.6 and np.mean(np.abs(errors) > 3) < 0.05
 
 
