@@ -22,7 +22,7 @@ from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.layout import Packed, clean_name
 from msg_adapters.rosbag2 import Rosbag2
-from msg_adapters.storage import RawMessages
+from msg_adapters.storage import LARGEST_STRETCH, RawMessages
 from msg_adapters.storages import suffixes
 
 DESCRIPTION_TOPIC = '/robot_description'
@@ -480,6 +480,7 @@ class Ros1File:
         self.reader.open()
         self.reader.chunks = {place: _bounded(chunk) for place, chunk in self.reader.chunks.items()}
         self.lost = {}
+        self._drop_repeated_entries()
         self.counts = {}
         self.types = {}
         self.definitions = {}
@@ -490,6 +491,19 @@ class Ros1File:
             self.types[topic] = message_type = clean_name(connection.msgtype)
             self.counts[topic] = self.counts.get(topic, 0) + connection.msgcount
             self.definitions[message_type] = ('ros2msg', connection.msgdef.data)
+
+    def _drop_repeated_entries(self):
+        """Keep one index entry for each place of a message, so that none is read twice."""
+        indexes, n_repeated = {}, 0
+        for connection, entries in self.reader.indexes.items():
+            by_place = {}
+            for entry in entries:
+                by_place.setdefault((entry.chunk_pos, entry.offset), entry)
+            indexes[connection] = list(by_place.values())
+            n_repeated += len(entries) - len(by_place)
+        self.reader.indexes = indexes
+        if n_repeated:
+            self.lost['index entries that repeat a message'] = n_repeated
 
     @property
     def duration_ns(self) -> int:
@@ -507,7 +521,7 @@ class Ros1File:
         Lost messages of the file are counted in `lost`.
         """
         connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
-        pending, n_read = [], 0
+        pending, n_pending, n_read = [], 0, 0
         expected = sum(c.msgcount for c in connections)
         try:
             for connection, received_ns, data in (
@@ -515,9 +529,10 @@ class Ros1File:
             ):
                 pending.append((topics.index(self.topics[connection.id]), received_ns, bytes(data)))
                 n_read += 1
-                if len(pending) == STRETCH_MESSAGES:
+                n_pending += len(data)
+                if len(pending) == STRETCH_MESSAGES or n_pending >= LARGEST_STRETCH:
                     yield _raw(pending)
-                    pending = []
+                    pending, n_pending = [], 0
         except Exception as error:  # rosbags raises various errors on damaged files
             extent = '' if expected > n_read else f' {UNKNOWN_EXTENT}'
             lost = max(expected - n_read, 1)

@@ -134,16 +134,16 @@ class FrameChoice:
 
     def __init__(self, topic: str, frame_id: str | None = None):
         self.topic, self.frame_id, self.counts = topic, frame_id, Counter()
+        self._n_frequent = 0
 
     def wants(self, frame_id: str, n_messages: int = 1) -> bool:
         """
         Return whether messages of a frame are used; raises InputError if the choice is ambiguous.
         """
-        self.counts[frame_id] += n_messages
-        if (
-            self.frame_id is None
-            and sum(count >= OTHER_FRAME for count in self.counts.values()) > 1
-        ):
+        before = self.counts[frame_id]
+        self.counts[frame_id] = before + n_messages
+        self._n_frequent += before < OTHER_FRAME <= before + n_messages
+        if self.frame_id is None and self._n_frequent > 1:
             raise InputError(
                 f'{self.topic} must have messages of one frame_id, got {self._listed()};'
                 ' choose one',

@@ -20,7 +20,7 @@ from imu_calibration.allan.processes import (
 from imu_calibration.allan.terms import GAUSS_MARKOV, TIME_KEY, Term
 from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.core.documents import finite, from_text, to_text
-from imu_calibration.core.errors import DocumentError
+from imu_calibration.core.errors import DocumentError, shortened
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.units import NOISE_QUANTITY, STANDARD_GRAVITY, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
@@ -53,6 +53,8 @@ NOISE_UNITS = {
 }
 """Unit of every figure."""
 TERMS = (QUANTISATION.name, WHITE.name, FLICKER.name, GAUSS_MARKOV, TIME_KEY, RANDOM_WALK.name)
+LARGEST = 1e30
+"""Figures of a document at most; their squares are finite."""
 STATUSES = (DETERMINED, WEAK, HELD)
 """Statuses of a figure."""
 
@@ -206,7 +208,7 @@ def _parse(document):
             ' again',
             code='part_missing',
         )
-    rate = float(document['sampling_rate'])
+    rate = _number(document['sampling_rate'])
     if not (math.isfinite(rate) and rate > 0):
         raise DocumentError(
             f'the sampling rate must be above zero, got {rate:g}; write the noise document again',
@@ -218,9 +220,43 @@ def _parse(document):
         rate=rate,
         frame_id=str(document.get('frame_id', '')),
         recording=dict(document.get('recording') or {}),
-        tau=tuple(float(t) for t in curve.get('tau') or ()),
+        tau=tuple(_number(t) for t in curve.get('tau') or ()),
         provenance=dict(document.get('provenance') or {}),
     )
+
+
+def _number(value):
+    """
+    Return a number of the document.
+
+    Raises
+    ------
+    DocumentError
+        When it is text, a truth value, or not finite.
+
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST:
+        raise DocumentError(
+            f'a figure of a noise document must be a number below {LARGEST:g}, got'
+            f' {shortened(repr(value), 60)}; write the noise document again',
+            code='figure_not_a_number',
+        )
+    return float(value)
+
+
+def _number_or_none(value):
+    return None if value is None else _number(value)
+
+
+def _texts(values):
+    """Return names of the document; raises DocumentError where one is no text."""
+    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+        raise DocumentError(
+            f'names in a noise document must be a list of texts, got {shortened(repr(values), 60)};'
+            ' write the noise document again',
+            code='not_a_text',
+        )
+    return tuple(values)
 
 
 def _axis(section, k, deviation):
@@ -243,49 +279,49 @@ def _axis(section, k, deviation):
     trends = tuple(
         AxisTrend(
             name,
-            float(entry['value'][k]),
-            float(entry['sd'][k]),
-            float(entry.get('time_constant', [0, 0, 0])[k]),
+            _number(entry['value'][k]),
+            _number(entry['sd'][k]),
+            _number(entry.get('time_constant', [0, 0, 0])[k]),
         )
         for name, entry in (section.get('taken_out') or {}).items()
         if entry['value'][k] is not None
     )
     record_for = {
-        name: values[k]
+        name: _number_or_none(values[k])
         for name, values in (section.get('record_for') or {}).items()
         if terms[name].status != DETERMINED
     }
-    others = tuple(tuple(form) for form in section['also_possible'][k])
+    others = tuple(_texts(form) for form in section['also_possible'][k])
     return AxisFigures(
         terms,
-        tuple(section['slow_part'][k]),
+        _texts(section['slow_part'][k]),
         others,
         alternatives,
-        float(section['shortest_averaging_time'][k]),
-        float(section['excess'][k]),
+        _number(section['shortest_averaging_time'][k]),
+        _number(section['excess'][k]),
         _pair((section.get('oscillation') or [None] * 3)[k]),
-        float((section.get('scatter_between_rests') or [0.0] * 3)[k]),
+        _number((section.get('scatter_between_rests') or [0.0] * 3)[k]),
         trends=trends,
         record_for=record_for,
-        sample_sd=float(section['sample_sd'][k]),
-        deviation=tuple(float(v) for v in deviation),
+        sample_sd=_number(section['sample_sd'][k]),
+        deviation=tuple(_number(v) for v in deviation),
     )
 
 
 def _pair(values):
-    return None if values is None else (float(values[0]), float(values[1]))
+    return None if values is None else (_number(values[0]), _number(values[1]))
 
 
 def _term(name, entry, k):
     value, status = entry['value'][k], entry['status'][k]
-    interval = tuple(math.inf if end is None else float(end) for end in entry['interval95'][k])
+    interval = tuple(math.inf if end is None else _number(end) for end in entry['interval95'][k])
     if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
         raise DocumentError(
             f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in"
             f' rising order, got {status!r} and {list(interval)}; write the noise document again',
             code='status_or_interval',
         )
-    if (value is None) != (status == HELD) or (value is not None and not np.isfinite(float(value))):
+    if (value is None) != (status == HELD):
         raise DocumentError(
             f"'{name}' must have a finite value unless it is held, got {value!r} and '{status}'; "
             'write the noise document again',
@@ -293,7 +329,7 @@ def _term(name, entry, k):
         )
     return Term(
         name,
-        None if value is None else float(value),
+        None if value is None else _number(value),
         interval,
         status,
         str((entry.get('reason') or [''] * 3)[k]),

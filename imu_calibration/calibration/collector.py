@@ -80,8 +80,10 @@ SAVED_TYPES: dict[str, Any] = {
     )
 }
 """Types that an archive may contain, in addition to arrays and plain values."""
-MOST_SAVED = 10**7
-"""Values of a column at most: a damaged header may state any number of empty ones."""
+MOST_EMPTY = 10**4
+"""Values of an archive at most that need no byte of it: a damaged header may state any number."""
+SAVED_DEPTH = 16
+"""Containers around one number of an archive at most: each counts its values once more."""
 
 
 def to_bytes(
@@ -174,6 +176,22 @@ def _kind(value):
     return None if isinstance(value, SAVED_PLAIN) else type(value)
 
 
+class _SavedNumbers(io.BytesIO):
+    """The numbers of an archive, and how many more values its columns may have together."""
+
+    def __init__(self, data, most_values):
+        super().__init__(data)
+        self._most_values = self._remaining = most_values
+
+    def count(self, n_values):
+        """Count the values of a column; raises ValueError above the limit."""
+        self._remaining -= n_values
+        if n_values < 0 or self._remaining < 0:
+            raise ValueError(
+                f'an archive of its size must have at most {self._most_values} values, got more'
+            )
+
+
 def _unpacked(column, numbers):
     """
     Return the values that `_packed` wrote.
@@ -183,13 +201,14 @@ def _unpacked(column, numbers):
     name, size, *parts = column
     if name == 'plain':
         return size
-    if name not in ('list', 'mixed') and (size[0] if name == 'array' else size) > MOST_SAVED:
-        raise ValueError(f'a column must have at most {MOST_SAVED} values, got {size}')
     if name == 'array':
+        numbers.count(size[0])
         return list(np.frombuffer(numbers.read(8 * math.prod(size))).reshape(size))
     if name == 'list':
         items = iter(_unpacked(parts[0], numbers))
         return [list(islice(items, length)) for length in size]
+    if name != 'mixed':
+        numbers.count(size)
     columns = [_unpacked(part, numbers) for part in parts[0]]
     if name == 'mixed':
         each = [iter(values) for values in columns]
@@ -226,7 +245,11 @@ def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
                     f'{shortened(repr(header.get("format")))}; remove the file'
                 )
             ((parts, of_model, definitions, extension),) = _unpacked(
-                header['content'], io.BytesIO(arrays['numbers'].tobytes())
+                header['content'],
+                _SavedNumbers(
+                    arrays['numbers'].tobytes(),
+                    MOST_EMPTY + SAVED_DEPTH * (arrays['header'].nbytes + arrays['numbers'].nbytes),
+                ),
             )
             return (
                 SessionData(**parts),

@@ -263,7 +263,9 @@ def csv_text(rows: Sequence[dict[str, Any]]) -> str:
 
 def _cell(value):
     if isinstance(value, str):
-        return f"'{value}" if value[:1] in tuple('=+-@\t\r') else value
+        # Spreadsheets skip blanks in front of a formula.
+        calculated = value.strip()[:1] in tuple('=+-@') or value[:1] in tuple('\t\r')
+        return f"'{value}" if calculated else value
     return '' if isinstance(value, float) and math.isnan(value) else value
 
 

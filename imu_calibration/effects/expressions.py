@@ -352,7 +352,21 @@ def _multiplied(left, right):
 
 
 def as_text(terms: dict[tuple[str, ...], float]) -> str:
-    """Return a sum of products as a Python expression, coefficients of one left out."""
+    """
+    Return a sum of products as a Python expression, coefficients of one left out.
+
+    Raises
+    ------
+    InputError
+        When a coefficient is not finite: `inf` and `nan` are no numbers in an expression.
+
+    """
+    if not all(math.isfinite(coefficient) for coefficient in terms.values()):
+        raise InputError(
+            'the coefficients of effects must be finite when they are multiplied out, got one that'
+            ' overflows; correct the values of the calibration',
+            code='column_overflows',
+        )
     texts = [
         ' * '.join(
             [*([repr(float(coefficient))] if coefficient != 1.0 or not factors else []), *factors]

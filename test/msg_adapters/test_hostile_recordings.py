@@ -18,10 +18,10 @@ from test_adapters_mcap import chunk, message, record, text, write_file
 
 from imu_calibration.core.documents import parsed
 from imu_calibration.core.errors import InputError
-from msg_adapters.bag import list_topics
+from msg_adapters.bag import Ros1File, list_topics
 from msg_adapters.compression import LARGEST_CHUNK, decompress_message, zstd
 from msg_adapters.decode import Decoder, JointDecoder
-from msg_adapters.definitions import deserializer, is_standard
+from msg_adapters.definitions import deserializer, is_standard, standard_definition
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
 from msg_adapters.rosbag2 import spelled_out
@@ -422,3 +422,65 @@ def test_a_name_cannot_pose_as_markup_or_as_a_line(tmp_path):
     ended = survived('inspect', bag)
     assert ended.code != 1 and '\x1b[2J' not in ended.out and '/[/nope]' in ended.out
     refused('inspect', tmp_path / 'x\x1b[2J\n')
+
+
+def test_index_entries_of_one_message_read_it_once(tmp_path):
+    """A ROS 1 bag of 8 MB with 1,000 index entries for one message needed 7.9 GB."""
+    path = tmp_path / 'x.bag'
+    path.write_bytes(ros1_with_entries(1000, 4 << 20))
+    source = Ros1File(path)
+    sizes = [len(raw.packed) for raw in source.stretches(['/imu/data_raw'])]
+    assert sum(sizes) == 1 and source.lost == {'index entries that repeat a message': 999}
+    source.close()
+    survived('inspect', path)
+
+
+def ros1_with_entries(n_entries, n_bytes):
+    """Return a ROS 1 bag with one Imu message of so many bytes, listed again and again."""
+
+    def header(**fields):
+        parts = [name.encode() + b'=' + value for name, value in fields.items()]
+        packed = b''.join(struct.pack('<I', len(part)) + part for part in parts)
+        return struct.pack('<I', len(packed)) + packed
+
+    def entry(data, **fields):
+        return header(**fields) + struct.pack('<I', len(data)) + data
+
+    def number(value, kind='<I'):
+        return struct.pack(kind, value)
+
+    definition = standard_definition(IMU_TYPE).text.encode()
+    names = header(
+        topic=b'/imu/data_raw',
+        type=b'sensor_msgs/Imu',
+        md5sum=b'6a62c6daae103f4ff57a132d6f95cec2',
+        message_definition=definition,
+    )[4:]
+    connection = entry(names, op=b'\x07', conn=number(0), topic=b'/imu/data_raw')
+    time = struct.pack('<II', 1, 0)
+    content = connection + entry(bytes(n_bytes), op=b'\x02', conn=number(0), time=time)
+    chunk_record = entry(content, op=b'\x05', compression=b'none', size=number(len(content)))
+    index = entry(
+        (time + number(len(connection))) * n_entries,
+        op=b'\x04',
+        ver=number(1),
+        conn=number(0),
+        count=number(n_entries),
+    )
+    magic, size = b'#ROSBAG V2.0\n', 4096
+    start = len(magic) + size
+    place = start + len(chunk_record) + len(index)
+    fields = {'op': b'\x03', 'conn_count': number(1), 'chunk_count': number(1)}
+    plain = header(**fields, index_pos=number(place, '<Q'))
+    fill = size - len(plain) - 4
+    info = entry(
+        number(0) + number(n_entries),
+        op=b'\x06',
+        ver=number(1),
+        chunk_pos=number(start, '<Q'),
+        start_time=time,
+        end_time=time,
+        count=number(1),
+    )
+    bag_header = plain + number(fill) + b' ' * fill
+    return magic + bag_header + chunk_record + index + connection + info

@@ -226,6 +226,10 @@ def numbers_px4(imu: AffineImu) -> dict:
     return found
 
 
+PX4_REFERENCE_C, PX4_RANGE_C = 25.0, (0.0, 100.0)
+"""Defaults of TC_*_TREF, TC_*_TMIN and TC_*_TMAX, degrees Celsius."""
+
+
 def imu_px4(found: dict) -> AffineImu:
     """
     Return the IMU of such parameters.
@@ -244,7 +248,12 @@ def imu_px4(found: dict) -> AffineImu:
             bias[sensor] = bias[sensor] + [
                 found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)
             ]
-            ref, limits = found[f'{short}_TREF'], (found[f'{short}_TMIN'], found[f'{short}_TMAX'])
+            # Parameter files omit parameters that have the autopilot's default.
+            ref = found.get(f'{short}_TREF', PX4_REFERENCE_C)
+            limits = (
+                found.get(f'{short}_TMIN', PX4_RANGE_C[0]),
+                found.get(f'{short}_TMAX', PX4_RANGE_C[1]),
+            )
     return AffineImu(
         bias=bias,
         matrix=_matrix(found, CAL_SCALE),

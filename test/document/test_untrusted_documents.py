@@ -1,0 +1,118 @@
+"""Documents with parts that are missing, of another kind, or not finite: used or refused."""
+
+import csv
+import io
+from collections import Counter
+
+import numpy as np
+import pytest
+import yaml
+from fuzz import readers
+from refusal import refused
+
+from imu_calibration.allan.document import noise_from_text
+from imu_calibration.calibration.collector import _SavedNumbers, _unpacked
+from imu_calibration.cli.fleet_run import csv_text
+from imu_calibration.core.errors import DocumentError, InputError
+from imu_calibration.document.exports.export import find_target
+from imu_calibration.document.exports.loss import import_file
+from imu_calibration.effects.expressions import as_text
+from imu_calibration.report.page import render
+from msg_adapters.decode import OTHER_FRAME, FrameChoice
+
+
+@pytest.fixture(scope='module')
+def noise():
+    """The text of a noise document."""
+    return readers.noise_seeds(None)[0].decode()
+
+
+@pytest.mark.parametrize(
+    'value', [float('inf'), float('nan'), 10**40, True, 'text', '1.5', [1.0], {'a': 1.0}]
+)
+@pytest.mark.parametrize('part', ['excess', 'sample_sd', 'shortest_averaging_time', 'value'])
+def test_a_figure_of_another_kind_is_refused(noise, part, value):
+    document = yaml.safe_load(noise)
+    section = document['gyroscope']
+    place = section['white_noise']['value'] if part == 'value' else section[part]
+    place[1] = value
+    with pytest.raises(DocumentError) as error:
+        noise_from_text(yaml.safe_dump(document))
+    assert error.value.code == 'figure_not_a_number'
+    assert noise_from_text(noise).rate > 0
+
+
+def test_names_that_are_no_texts_are_refused(noise):
+    document = yaml.safe_load(noise)
+    document['gyroscope']['slow_part'][0] = [{'a': 1}]
+    with pytest.raises(DocumentError) as error:
+        noise_from_text(yaml.safe_dump(document))
+    assert error.value.code == 'not_a_text'
+
+
+def test_a_saved_session_has_no_more_values_than_its_size_allows():
+    """465 bytes with 10^7 empty arrays in each column needed 1.4 GB."""
+    with pytest.raises(ValueError, match='at most 1000 values'):
+        _unpacked(
+            ['tuple', 1, [['array', [10**7, 0]], ['array', [10**7, 0]]], ['plain', []]],
+            _SavedNumbers(b'', 1000),
+        )
+    with pytest.raises(ValueError, match='at most 1000 values'):
+        _unpacked(['tuple', 600, [['array', [600, 0]]], ['plain', []]], _SavedNumbers(b'', 1000))
+    (rows,) = _unpacked(['array', [1, 2]], _SavedNumbers(np.arange(2.0).tobytes(), 1000))
+    np.testing.assert_array_equal(rows, [0.0, 1.0])
+
+
+def test_a_px4_file_without_the_default_parameters_is_imported(tmp_path):
+    """Parameter files omit parameters at their defaults."""
+    lines = ['1\t1\tTC_A_ENABLE\t1\t6', '1\t1\tTC_G_ENABLE\t1\t6']
+    lines += ['1\t1\tCAL_ACC0_XOFF\t0.25\t9', '1\t1\tCAL_GYRO0_XOFF\t0.01\t9']
+    lines += ['1\t1\tTC_A0_X1_0\t0.01\t9']
+    found = import_file(
+        find_target('px4'),
+        ('\n'.join(lines) + '\n').encode(),
+        tmp_path / 'absent',
+        frame_id='imu_link',
+    )
+    assert found.model.temperature_ref_c == 25.0
+
+
+@pytest.mark.parametrize('value', [float('inf'), float('nan'), -float('inf')])
+def test_a_coefficient_that_overflows_is_refused_before_it_becomes_a_name(value):
+    with refused(InputError, 'column_overflows', 'finite'):
+        as_text({('ux',): 1.0, (): value})
+
+
+@pytest.mark.parametrize('formula', ['=1+1', ' =1+1', '\t@x', '  +1'])
+def test_text_that_a_spreadsheet_calculates_begins_with_a_quote(formula):
+    (_, (cell,)) = csv.reader(io.StringIO(csv_text([{'name': formula}]), newline=''))
+    assert cell == f"'{formula}"
+
+
+def test_pages_forbid_everything_from_outside():
+    page = render('base.html', title='t', headline='h')
+    policy = page.partition('http-equiv="Content-Security-Policy" content="')[2].partition('"')[0]
+    assert "default-src 'none'" in policy and 'http' not in policy
+    assert 'unsafe-eval' not in policy
+
+
+class CountedFrames(Counter):
+    """Counts of frames that record each look at all of them."""
+
+    n_walks = 0
+
+    def values(self):
+        """All counts."""
+        self.n_walks += 1
+        return super().values()
+
+
+def test_frames_of_a_topic_are_counted_without_a_walk_for_each_message():
+    choice = FrameChoice('/imu')
+    choice.counts = CountedFrames()
+    for k in range(300):
+        assert choice.wants(f'frame{k}')
+    assert choice.counts.n_walks == 0
+    choice.wants('frame0', OTHER_FRAME)
+    with refused(InputError, 'frame_ambiguous', '/imu'):
+        choice.wants('frame1', OTHER_FRAME)
