@@ -25,6 +25,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_page('check.html')
     parser.add_gravity()
     parser.add_recording('without it: by hand')
+    parser.add_gyroscope_topic()
     parser.add_readings()
 
 

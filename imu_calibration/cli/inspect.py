@@ -19,6 +19,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_recording(
         'with it, axes and units are compared with the joints and the motions are listed'
     )
+    parser.add_gyroscope_topic()
     parser.add_model(searched=False)
 
 

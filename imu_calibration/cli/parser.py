@@ -196,6 +196,14 @@ class OneLineParser(argparse.ArgumentParser):
         self.add_stand(without)
         self.add_topics()
 
+    def add_gyroscope_topic(self) -> None:
+        """Add the option of a topic with the rates only."""
+        self.common(
+            '--gyroscope-topic',
+            metavar='TOPIC',
+            help='Imu topic of the rates, where accelerometer and gyroscope have one each',
+        )
+
     def add_page(self, name: str) -> None:
         """Add the options of a page that shows the answer."""
         self.common('--output', metavar='DIR', help=f'folder for {name}, the answer as one page')
@@ -223,6 +231,7 @@ class OneLineParser(argparse.ArgumentParser):
         """
         self.add_gravity()
         self.add_recording('without it: by hand, gravity is the reference')
+        self.add_gyroscope_topic()
         self.common(
             '--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml'
         )

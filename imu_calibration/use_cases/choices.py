@@ -43,6 +43,8 @@ class Choices(TypedDict, total=False):
 
     imu_topic: str | None
     """sensor_msgs/Imu; default /imu/data_raw, otherwise the only one."""
+    gyroscope_topic: str | None
+    """sensor_msgs/Imu with the rates, where they have a topic of their own."""
     joint_topic: str | None
     """sensor_msgs/JointState; default /joint_states, otherwise the only one."""
     temperature_topic: str | None
@@ -170,6 +172,7 @@ def topics_of(choices: Mapping[str, Any]) -> Topics:
         choices.get('temperature_topic'),
         choices.get('frame_id'),
         raw_columns(readings_of(choices), choices),
+        choices.get('gyroscope_topic'),
     )
 
 

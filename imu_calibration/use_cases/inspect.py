@@ -101,7 +101,7 @@ def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     """
     names = (
         [topics.imu]
-        if topics.imu is not None
+        if topics.imu is not None or topics.gyroscope is not None
         else [topic.name for topic in list_topics(bag) if topic.type == IMU_TYPE]
     )
     found = [topics._replace(imu=name) for name in names]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
@@ -17,11 +18,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.progress import counter
-from imu_calibration.core.samples import SampleBlock, TemperatureSamples
+from imu_calibration.core.progress import counter, remark
+from imu_calibration.core.samples import (
+    ImuSamples,
+    JointSamples,
+    SampleBlock,
+    TemperatureSamples,
+)
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import root_of, table_from_urdf, up_of
+from imu_calibration.preprocessing.sensor_join import finite_stream, join_sensors
 from msg_adapters.bag import Recording, description_in, frame_of, open_recording, static_transforms
 from msg_adapters.storage import read_ahead
 
@@ -42,6 +49,8 @@ class Topics(NamedTuple):
     """frame_id of the Imu messages; None: that of all."""
     raw: tuple[str, ...] = ()
     """Quantities of a text log that are read without conversion to SI: 'force', 'rate'."""
+    gyroscope: str | None = None
+    """sensor_msgs/Imu topic of the rates, where they have one of their own; None: as `imu`."""
 
     def chosen(self) -> dict[str, Any]:
         """Return them as arguments of `msg_adapters.bag.open_recording`."""
@@ -97,6 +106,17 @@ def read_blocks(
 
     A plain function, so that another process can run it.
     """
+    if topics.gyroscope is not None:
+        plain = partial(
+            read_blocks,
+            path,
+            joint_names=joint_names,
+            want_joints=want_joints,
+            want_temperature=want_temperature,
+            quiet=True,
+        )
+        yield _with_gyroscope(list(plain(topics._replace(gyroscope=None))), path, topics.gyroscope)
+        return
     recording = open_recording(
         path, **topics.chosen(), want_joints=want_joints, want_temperature=want_temperature
     )
@@ -114,6 +134,45 @@ def read_blocks(
                 yield block
         if recording.lost:
             yield SampleBlock(dropped=recording.lost)
+
+
+def _with_gyroscope(blocks, path, topic):
+    """Return one block: those of a recording, with the rates of another Imu topic."""
+    of_rates = Topics(imu=topic)
+    rates = []
+    with open_bag(path, of_rates, want_joints=False, want_temperature=False) as recording:
+        for block in recording.blocks():
+            if block.imu is not None:
+                rates.append(block.imu)
+    parts: dict[str, list] = {'imu': [], 'joints': [], 'temperature': []}
+    dropped: Counter[str] = Counter(recording.lost)
+    notes: Counter[str] = Counter()
+    for block in blocks:
+        for name, samples in parts.items():
+            if getattr(block, name) is not None:
+                samples.append(getattr(block, name))
+        dropped.update(block.dropped or {})
+        notes.update(block.notes or {})
+    if not rates or not parts['imu']:
+        raise InputError(
+            f'both topics must hold Imu messages, {topic} or the other one holds none; check the'
+            ' topics',
+            key='imu_topic',
+            code='no_samples',
+        )
+    imu, gyroscope = ImuSamples.concatenate(parts['imu']), ImuSamples.concatenate(rates)
+    joined = join_sensors(
+        finite_stream(imu.stamp_ns, imu.force_s),
+        finite_stream(gyroscope.stamp_ns, gyroscope.rate_s),
+        imu.frame_id,
+    )
+    remark(joined.text)
+    joints, temperature = None, None
+    if parts['joints']:
+        joints = JointSamples.concatenate(parts['joints'])
+    if parts['temperature']:
+        temperature = TemperatureSamples.concatenate(parts['temperature'])
+    return SampleBlock(joined.imu, joints, temperature, dict(dropped), dict(notes))
 
 
 def source_of(

@@ -1,0 +1,58 @@
+"""Accelerometer and gyroscope on two Imu topics, each with zeros for the other sensor."""
+
+import numpy as np
+import pytest
+from refusal import refused
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.use_cases.calibrate import calibrate
+from msg_adapters.bag_writer import BagWriter
+from msg_adapters.definitions import standard_definition
+from msg_adapters.imu import IMU_TYPE
+from msg_adapters.layout import Packed
+from msg_adapters.write import encode_imu
+
+from worlds.small_hand import ACCELEROMETER, GRAVITY, GYROSCOPE, hand_motion
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """The force at 80 Hz on /accel, the rate at 160 Hz on /gyro."""
+    motion, generator = hand_motion(hz=160.0, n_poses=14, seed=81), np.random.default_rng(81)
+    stamps = 10**18 + np.round(motion.time * 1e9).astype(np.int64)
+    nothing = np.zeros_like(motion.force)
+    accel = ImuSamples(stamps, ACCELEROMETER.read(motion.force, generator), nothing, 'accel')
+    accel = accel.select(slice(None, None, 2))
+    gyro = ImuSamples(stamps, nothing, GYROSCOPE.read(motion.rate, generator), 'gyro')
+    path = tmp_path_factory.mktemp('split') / 'bag'
+    with BagWriter(path, 'mcap') as writer:
+        for name, imu in (('/accel', accel), ('/gyro', gyro)):
+            topic = writer.add_topic(name, standard_definition(IMU_TYPE))
+            packed = Packed.of_rows(encode_imu(imu))
+            writer.write(np.full(len(imu), topic), imu.stamp_ns, packed)
+    return path
+
+
+def test_both_sensors_are_calibrated(bag):
+    result = calibrate(bag, imu_topic='/accel', gyroscope_topic='/gyro', gravity=GRAVITY)
+    found = result.calibration
+    assert found.decisions == {'accelerometer': 'helps', 'gyroscope': 'helps'}
+    # x of the body is the x axis of the accelerometer in both matrices
+    matrix = GYROSCOPE.matrix
+    for name, true in (('bias', GYROSCOPE.bias), ('matrix', matrix)):
+        error = found.value('gyroscope', name) - true
+        part = found.model.slices['gyroscope', name]
+        assert np.sqrt(np.mean((error.ravel() / found.sd[part]) ** 2)) < 2.0
+    assert found.provenance['options']['gyroscope_topic'] == '/gyro'
+
+
+def test_a_topic_that_is_missing_is_named(bag):
+    with refused(InputError, 'topic_unknown', '/gyr'):
+        calibrate(bag, imu_topic='/accel', gyroscope_topic='/gyr', gravity=GRAVITY)
+
+
+def test_one_topic_alone_is_one_sensor(bag):
+    found = calibrate(bag, imu_topic='/accel', gravity=GRAVITY)
+    assert list(found.calibration.decisions) == ['accelerometer']
+    assert found.exit_code == 3
