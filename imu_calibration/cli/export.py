@@ -34,6 +34,11 @@ def add_arguments(parser: OneLineParser) -> None:
         action='store_true',
         help='also write a sensor with the decision harms; without it nominal values',
     )
+    parser.common(
+        '--axes',
+        metavar='AXES',
+        help='of the readings, where calibration.yaml states none: flu, frd or --axes=-x,y,-z',
+    )
     parser.add_recording('motion of --bag; without it: from its readings')
 
 

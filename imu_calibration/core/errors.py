@@ -13,6 +13,7 @@ ERROR_KEYS = (
     'accelerometer_unit',
     'allow_xacro',
     'anyway',
+    'axes',
     'calibration',
     'columns',
     'diagnose',

@@ -1,8 +1,10 @@
 """From calibration.yaml to the files of other programs, and back."""
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
+from imu_calibration.core.readings import combined
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
@@ -38,6 +40,7 @@ def export_calibration(
     stand: Stand | None = None,
     topics: Topics = Topics(),
     anyway: bool = False,
+    axes: str | None = None,
 ) -> Export:
     """
     Write a calibration in the format of another program.
@@ -61,6 +64,8 @@ def export_calibration(
         Of the bag.
     anyway : bool
         Also the numbers of a sensor whose decision is `harms`; without it they are nominal.
+    axes : str, optional
+        Axes of the readings of the calibration where it states none, or others, see `Choices`.
 
     Raises
     ------
@@ -71,6 +76,8 @@ def export_calibration(
     """
     target = find_target(to)
     known = files.given_calibration(calibration)
+    if axes is not None:
+        known = replace(known, readings=combined(known.readings, axes=axes))
     figures = None if noise is None else files.read_noise(noise)
     motion = None
     if bag is not None:

@@ -6,6 +6,7 @@ Every effect that can be inverted, at sizes that still converge.
 
 import numpy as np
 
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -74,6 +75,7 @@ def random_calibration(
         'statistics': statistics,
         'conditions': conditions,
         'decision': {'accelerometer': 'helps', 'gyroscope': 'helps'},
+        'readings': RawReadings(axes='flu'),
         **fields,
     }
     return Calibration(model, values, spread @ spread.T, ('determined',) * len(values), **fields)

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.effects import base
 from imu_calibration.effects.base import SENSORS, Effect, Role
@@ -302,6 +303,27 @@ def as_mounted(_imu: AffineImu) -> Placement:
     return Placement()
 
 
-def forward_right_down(_imu: AffineImu) -> Placement:
-    """Return the placement of an autopilot: readings and frame forward-right-down."""
-    return Placement(mat_ts=FRD, mat_readings=FRD)
+def forward_right_down(readings: RawReadings) -> Placement:
+    """
+    Return the placement of an autopilot: readings and frame forward-right-down.
+
+    With the matrix A of the source (forward-left-up = A source): ``diag(1, -1, -1) @ A``, the
+    identity for readings that are forward-right-down already.
+
+    Raises
+    ------
+    InputError
+        When the axes of the readings are not stated.
+
+    """
+    mat_flu_source = readings.mat_flu_source()
+    if mat_flu_source is None:
+        raise InputError(
+            'an export with forward-right-down axes needs the axes of the readings, the calibration'
+            ' states none; state flu (forward-left-up, the convention of ROS) or frd'
+            ' (forward-right-down, most autopilots)',
+            key='axes',
+            code='axes_missing',
+        )
+    mat_frd_source = FRD @ mat_flu_source
+    return Placement(mat_ts=mat_frd_source, mat_readings=mat_frd_source)

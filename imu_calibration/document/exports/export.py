@@ -19,10 +19,12 @@ from imu_calibration.document.calibration_text import to_mapping
 from imu_calibration.document.exports import targets
 from imu_calibration.document.exports.affine import (
     ARMS,
+    FRD,
     MATRICES,
     UNNAMED,
     Placement,
     affine_of,
+    forward_right_down,
     moved,
     pose_line,
 )
@@ -152,9 +154,12 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
         return Placement(), to_mapping(calibration)
     held = affine_of(calibration, target.holds)
     # a target with diagonals only chooses its axes by the full matrices too
-    placement = target.placement(
-        affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES)
-    )
+    if target.forward_right_down:
+        placement = forward_right_down(calibration.readings)
+    else:
+        placement = target.placement(
+            affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES)
+        )
     return placement, target.numbers(moved(held, placement))
 
 
@@ -229,9 +234,14 @@ def _placement_lines(calibration, target, placement) -> list[str]:
         and np.array_equal(placement.mat_ts, np.eye(3))
         and not np.any(placement.origin_s)
     ):
+        if target.forward_right_down:
+            return [f'frame: {name}, forward-right-down as its readings']
         return [f'frame: {name}, axes as in the calibration']
     if not np.array_equal(placement.mat_readings, np.eye(3)):
-        return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
+        if np.array_equal(placement.mat_readings, FRD):
+            return [f'frame: forward-right-down, x as in {name}, y and z reversed, readings too']
+        rows = ', '.join(_axis(row) for row in placement.mat_readings)
+        return [f'frame: forward-right-down, the axes {rows} of {name}, readings too']
     child = f'{name}_{target.name}'
     return [
         (
@@ -240,6 +250,14 @@ def _placement_lines(calibration, target, placement) -> list[str]:
         ),
         f'  {pose_line(placement, name, child)}',
     ]
+
+
+def _axis(row):
+    """Return the axis of the source, with its sign, that a row of a signed permutation selects."""
+    index = int(np.argmax(np.abs(row)))
+    if row[index] < 0:
+        return f'-{"xyz"[index]}'
+    return 'xyz'[index]
 
 
 def _worked_sample(target, numbers, placement, calibration) -> list[str]:

@@ -10,6 +10,7 @@ from imu_calibration.compensation.angular_acceleration import StampedDerivative,
 from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.compensation.stream import CompensationStream, derivative_for
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import UNKNOWN_SD, Calibration
@@ -293,9 +294,10 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     assert target.imu is not None
     read, own = target.imu(found.numbers), affine.find_pose(content)
     if own is None:
-        return _document(
-            target, found, affine.moved(read, target.back(read)), target.axes, path, frame_id
-        )
+        back = target.back(read)
+        if target.forward_right_down:
+            back = affine.forward_right_down(RawReadings(axes='flu'))
+        return _document(target, found, affine.moved(read, back), target.axes, path, frame_id)
     placement, parent = own
     return _document(
         target, found, affine.moved(read, placement.inverse()), 'mount', path, frame_id or parent
@@ -340,6 +342,10 @@ def _document(
         'imported': {'from': target.name, 'file': name},
         'uncertainty': UNKNOWN_SD,
     }
+    # Numbers of autopilots are brought into the axes of ROS.
+    readings = RawReadings()
+    if target.forward_right_down:
+        readings = RawReadings(axes='flu')
     return check_numbers(
         Calibration(
             model,
@@ -353,6 +359,7 @@ def _document(
             provenance=provenance,
             decision=dict.fromkeys(SENSORS, str(UNPROVEN)),
             decision_reasons=dict.fromkeys(SENSORS, reason),
+            readings=readings,
             notes=("next: measure its error on a recording: 'imu_calibration check'",),
         )
     )

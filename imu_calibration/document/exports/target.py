@@ -288,6 +288,8 @@ class Target:
     """The IMU of numbers, in the program's placement: the other way of `numbers`."""
     back: Callable[[AffineImu], Placement] = as_mounted
     """The placement of our calibration against an IMU that was read."""
+    forward_right_down: bool = False
+    """Whether its readings are forward-right-down: the axes of the calibration must be stated."""
     axes: str = 'mount'
     """The axes of an imported calibration, named as its gauge."""
     ignored: Callable[[Numbers], list[str]] = lambda _numbers: []

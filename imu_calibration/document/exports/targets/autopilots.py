@@ -15,7 +15,6 @@ from imu_calibration.document.exports.affine import (
     SCALES,
     THERMAL_OFFSETS,
     AffineImu,
-    forward_right_down,
     of,
 )
 from imu_calibration.document.exports.target import (
@@ -179,12 +178,11 @@ ARDUPILOT = (
             ' AP_InertialSensor_tempcal.cpp'
         ),
         holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS,
-        placement=forward_right_down,
+        forward_right_down=True,
         numbers=numbers_ardupilot,
         write=write_ardupilot,
         read=read_ardupilot,
         imu=imu_ardupilot,
-        back=forward_right_down,
         ignored=ignored_ardupilot,
         hint='of the first IMU; the readings must be uncalibrated, in the axes of the vehicle',
     ),
@@ -330,12 +328,11 @@ PX4 = (
             ' temperature_compensation'
         ),
         holds=OFFSETS + of('accelerometer', SCALES) + THERMAL_OFFSETS,
-        placement=forward_right_down,
+        forward_right_down=True,
         numbers=numbers_px4,
         write=write_px4,
         read=read_px4,
         imu=imu_px4,
-        back=forward_right_down,
         ignored=ignored_px4,
         hint=(
             'set CAL_ACC0_ID and CAL_GYRO0_ID (TC_A0_ID, TC_G0_ID) to the device ids of these'
