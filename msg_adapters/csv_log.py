@@ -411,6 +411,25 @@ def _sensor_log(path, where):
     )
 
 
+AUTOPILOT_COLUMNS = {
+    'ArduPilot': ('GyrX', 'AccX'),
+    'PX4': ('gyro_rad[0]', 'accelerometer_m_s2[0]'),
+}
+"""Autopilot with forward-right-down readings -> columns of its logs."""
+
+
+def autopilot_of(path: str | PathLike[str]) -> str:
+    """Return the autopilot whose columns a text log has; '' for none, or another file."""
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+        return ''
+    names = _Table(path).names
+    for autopilot, columns in AUTOPILOT_COLUMNS.items():
+        if set(columns) <= set(names):
+            return autopilot
+    return ''
+
+
 def _require_one_imu(stamp_ns, force_s, rate):
     """Raise where the rows are those of two IMUs; units of force and rate do not matter."""
     sources = TwoSourceSearch()

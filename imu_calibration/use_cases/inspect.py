@@ -22,7 +22,7 @@ from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.document.outcome import shortcomings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
-from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
+from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import hand_options
@@ -30,6 +30,7 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of
 from msg_adapters.bag import Recording, list_topics
+from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
 
 
@@ -149,10 +150,30 @@ def _look(bag, topics, table, options):
             options,
             preflight,
         )
+    findings = (*preflight.findings, *_axes_question(bag, options))
     look = RecordingSummary(
-        recording, preflight.streams, preflight.findings, preflight.lost, calibrated, by_hand
+        recording, preflight.streams, findings, preflight.lost, calibrated, by_hand
     )
     return look if table is None and not look.refused else replace(look, by_hand=None)
+
+
+def _axes_question(bag, options):
+    """Return a note where the log of an autopilot is read without a statement of its axes."""
+    if options.nominal is not None and options.nominal.axes:
+        return []
+    autopilot = autopilot_of(bag)
+    if not autopilot:
+        return []
+    return [
+        CheckFinding(
+            'axes',
+            NOTE,
+            f'the columns are those of {autopilot}, whose readings are forward-right-down: state'
+            ' the axes, so that exports have the right signs',
+            key='axes',
+            value='frd',
+        )
+    ]
 
 
 def _by_hand(source, options, preflight):

@@ -12,6 +12,7 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.exports.export import export, find_target
 from imu_calibration.use_cases.exporting import import_calibration
+from msg_adapters.csv_log import autopilot_of
 
 from worlds.compensation_cases import random_calibration
 
@@ -71,3 +72,17 @@ def test_an_export_without_stated_axes_is_refused(tmp_path, name, capsys):
 
 def test_other_programs_need_no_axes():
     assert export(calibration_in(''), find_target('imu-calib')).content
+
+
+@pytest.mark.parametrize(
+    ('header', 'autopilot'),
+    [
+        ('TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ', 'ArduPilot'),
+        ('timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],accelerometer_m_s2[0],b,c', 'PX4'),
+        ('time,gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0],accSmooth[1],accSmooth[2]', ''),
+    ],
+)
+def test_the_header_of_an_autopilot_is_recognised(tmp_path, header, autopilot):
+    row = ','.join(['1'] * (header.count(',') + 1))
+    (tmp_path / 'log.csv').write_text('\n'.join([header, row, row]) + '\n')
+    assert autopilot_of(tmp_path / 'log.csv') == autopilot
