@@ -8,7 +8,6 @@ from imu_calibration.preprocessing.sensor_join import JoinedSensors
 from msg_adapters.storages import identifiers
 
 EXAMPLES = (
-    'log.csv --output session',
     'Accelerometer.csv Gyroscope.csv --output session',
     'log.csv --columns time=t:ms force=ax,ay,az:g rate=gx,gy,gz:deg/s --output session',
 )

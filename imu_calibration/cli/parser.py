@@ -198,10 +198,10 @@ class OneLineParser(argparse.ArgumentParser):
 
     def add_gyroscope_topic(self) -> None:
         """Add the option of a topic with the rates only."""
-        self.common(
+        self.expert(
             '--gyroscope-topic',
-            metavar='TOPIC',
-            help='Imu topic of the rates, where accelerometer and gyroscope have one each',
+            metavar='T',  # short: the help of a verb fits a screen
+            help='Imu topic with the rates, if it is another one',
         )
 
     def add_page(self, name: str) -> None:
