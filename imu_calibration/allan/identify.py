@@ -318,7 +318,7 @@ def read_rest(
     Arguments as for `identify_noise`.
     """
     found = survey(source(), nominal)
-    pieces = [still_parts(chunks, found.period) for chunks in found.epochs]
+    pieces = [still_parts(chunks, found.period, found.resolution) for chunks in found.epochs]
     parts, left_out = (
         [part for part, _ in pieces],
         {reason: sum(left[reason] for _, left in pieces) for reason in LEFT_OUT},
@@ -415,12 +415,15 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
     of_sensor = {sensor: () for sensor in SENSORS}
     for number, sensor in enumerate(result.sensors):
         of_sensor[sensor] = tuple(axes[3 * number : 3 * number + 3])
+    dropped = dict(record.survey.dropped)
+    if frozen := record.left_out['frozen_output']:
+        dropped['imu frozen output'] = round(frozen / record.curve.period)
     recording = {
         'seconds_at_rest': float(record.curve.seconds),
         'parts': len(record.parts),
         'longest_part': float(max(part.seconds for part in record.parts)),
         'left_out': record.left_out,
-        'dropped': dict(record.survey.dropped),
+        'dropped': dropped,
         'intervals_hold_for': 'this recording; the slow noise of another one can be outside',
     }
     if record.unusable:

@@ -15,7 +15,13 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock, runs_of
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.rest_detection import shrunk
-from imu_calibration.preprocessing.scan import CHUNK_SECONDS, Chunks, ChunkSeries, still_chunks
+from imu_calibration.preprocessing.scan import (
+    CHUNK_SECONDS,
+    Chunks,
+    ChunkSeries,
+    frozen_chunks,
+    still_chunks,
+)
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 
 OUTLIER = 8.0
@@ -57,14 +63,16 @@ class StillPart:
         return (self.end_ns - self.first_ns) * 1e-9
 
 
-LEFT_OUT = ('motion', 'short_rests', 'other_sampling_rate')
+LEFT_OUT = ('motion', 'short_rests', 'other_sampling_rate', 'frozen_output')
 """
 Reasons for which seconds are not used: motion and the time around it, pieces too short, another
-sampling rate.
+sampling rate, one reading again and again.
 """
 
 
-def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], dict[str, float]]:
+def still_parts(
+    chunks: Chunks, period: float, resolution: np.ndarray | None = None
+) -> tuple[list[StillPart], dict[str, float]]:
     """
     Return the parts at rest, and the seconds that were left out for each reason of `LEFT_OUT`.
 
@@ -74,11 +82,21 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], dict[st
         Of one epoch of the clock.
     period : float
         Usual time between samples, s.
+    resolution : array, shape (6,), optional
+        Smallest step between readings of each column; without it no output counts as frozen.
 
     """
+    if resolution is None:
+        frozen = np.zeros(len(chunks), bool)
+    else:
+        frozen = np.logical_or(*frozen_chunks(chunks, resolution).values())
     seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0
     same = _at_the_usual_rate(chunks, period)
-    still = _usual(chunks, still_chunks(chunks) & same)
+    # frozen chunks have no scatter: with them nothing else would be as quiet as the quietest tenth
+    still = np.zeros(len(chunks), bool)
+    still[~frozen] = _usual(
+        chunks.select(~frozen), still_chunks(chunks.select(~frozen)) & same[~frozen]
+    )
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
     inner = shrunk(still, margin)
     parts, short = [], 0.0
@@ -88,8 +106,13 @@ def still_parts(chunks: Chunks, period: float) -> tuple[list[StillPart], dict[st
             parts.append(part)
         else:
             short += part.seconds
-    moved = float(np.sum(~inner & same)) * seconds
-    return parts, dict(zip(LEFT_OUT, (moved, short, float(np.sum(~same)) * seconds)))
+    lost = {
+        'motion': float(np.sum(~inner & same & ~frozen)) * seconds,
+        'short_rests': short,
+        'other_sampling_rate': float(np.sum(~same & ~frozen)) * seconds,
+        'frozen_output': float(np.sum(frozen)) * seconds,
+    }
+    return parts, lost
 
 
 def _at_the_usual_rate(chunks, period):
@@ -195,6 +218,8 @@ class Survey:
     """Stamps (ns) and degrees Celsius, thinned; None without."""
     findings: tuple
     """Faults of the recording."""
+    resolution: np.ndarray
+    """Smallest step between readings of each column, shape (6,); 0 when unknown."""
     dropped: Counter = field(default_factory=Counter)
     """Reason -> messages that could not be used."""
     frame_id: str = ''
@@ -242,6 +267,7 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
         _period(epochs),
         temperature.result(),
         preflight.findings,
+        preflight.resolution,
         dropped,
         frame_id,
         absent=preflight.streams['imu'].absent,

@@ -29,7 +29,7 @@ from imu_calibration.estimation.window_statistics import (
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.stream_cleaning import Watcher
+from imu_calibration.preprocessing.stream_cleaning import NO_RANGES, Watcher
 from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions
@@ -306,6 +306,7 @@ class Collector:
         windows: list | StoredWindows | None = None,
         spread: bool = False,
         judged_from: float = 0.0,
+        without: np.ndarray = NO_RANGES,
     ):
         self.table, self.model, self.session, self.windows, self.spread = (
             table,
@@ -315,7 +316,12 @@ class Collector:
             spread,
         )
         self.gatherer = MotionGatherer(
-            table, settings, windows is not None, nominal=nominal, watchers=watchers
+            table,
+            settings,
+            windows is not None,
+            nominal=nominal,
+            watchers=watchers,
+            without=without,
         )
         self.gathered = SessionData(judged_from=judged_from)
 
@@ -416,23 +422,22 @@ class GatherStep:
         """
         session, source = numbered
         return naming(self.names, session)(
-            self.read, source(), session, Preflight(self.table.gravity_value)
+            self.read, source, session, Preflight(self.table.gravity_value)
         )
 
     def read(
         self,
-        blocks: Iterable[SampleBlock],
+        source: Callable[[], Iterable[SampleBlock]],
         session: int,
         preflight: Preflight,
         *,
         windows: list | StoredWindows | None = None,
     ) -> SessionData:
         """
-        Return the SessionData of a recording, which is read once.
+        Return the SessionData of a recording, which is read once for its windows and the checks.
 
-        For its windows and for the checks.
-
-        All windows, unused ones too, are appended to `windows`.
+        Where the checks find parts without readings, it is read again without them. All windows,
+        unused ones too, are appended to `windows`, which is empty before.
 
         Raises
         ------
@@ -440,22 +445,32 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
+        gathered = self._gather(source(), session, (preflight,), windows=windows)
+        if len(preflight.without_readings):
+            if windows is not None:
+                windows.clear()
+            gathered = self._gather(
+                source(), session, (), windows=windows, without=preflight.without_readings
+            )
+        gathered.findings = preflight.findings
+        return gathered
+
+    def _gather(self, blocks, session, watchers, *, windows, without=NO_RANGES):
         collector = Collector(
             self.table,
             self.model,
             self.windows,
             nominal=self.nominal,
             session=session,
-            watchers=(preflight,),
+            watchers=watchers,
             windows=windows,
             spread=self.spread,
             judged_from=self.judged_from,
+            without=without,
         )
         for block in blocks:
             collector.push(block)
-        gathered = collector.finish()
-        gathered.findings = preflight.findings
-        return gathered
+        return collector.finish()
 
 
 class LiveCollector(Collector):

@@ -30,6 +30,7 @@ from imu_calibration.calibration.result import (
 from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_samples
 from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, JoinedParts, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
@@ -39,7 +40,7 @@ from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.solution import REJECTED, with_term, with_weak_replaced
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.absent_sensor import without_sensor
-from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
@@ -325,8 +326,10 @@ def read_by_hand(
             'the recording must hold Imu messages that can be used, it holds none; check the topic'
         )
     imu, warm = joined.samples(), None
-    unusable = {} if preflight is None else preflight.unusable
-    for sensor in unusable:
+    if preflight is not None:
+        imu = _readings_only(imu, preflight.without_readings)
+    unusable_sensors = {} if preflight is None else preflight.unusable
+    for sensor in unusable_sensors:
         imu = without_sensor(imu, sensor)
     if temperatures:
         known = TemperatureSamples.concatenate(temperatures)
@@ -344,8 +347,22 @@ def read_by_hand(
         warm,
         {reason: count for reason, count in counts.items() if count},
         () if preflight is None else tuple(preflight.findings),
-        unusable,
+        unusable_sensors,
     )
+
+
+def _readings_only(imu, ranges):
+    """Return the samples that are in none of the ranges of `Preflight.without_readings`."""
+    kept = np.ones(len(imu), bool)
+    for start, stop in ranges:
+        kept[start:stop] = False
+    if not kept.any():
+        raise InputError(
+            f'the recording must hold readings, in all of its {len(imu)} samples an output is'
+            ' frozen; check the sensor and its driver',
+            code='frozen',
+        )
+    return imu if kept.all() else imu.select(kept)
 
 
 def calibrate_without_table(
@@ -519,6 +536,7 @@ def check_by_hand(
         data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
     except NotObservableError as error:
         return CheckResult({}, recording.findings, str(error))
+    lost = {**recording.counts, 'unusable': unusable(recording.findings)}
     check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
     warm = (
         None
@@ -539,6 +557,7 @@ def check_by_hand(
     return CheckResult(
         prove_readings(data, recording.imu, corrected, gravity=gravity, absent=absent),
         recording.findings,
+        dropped=dropped_text(lost, len(recording.imu)),
     )
 
 

@@ -27,7 +27,7 @@ from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.compensation.compensate import invertible
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
-from imu_calibration.core.exit_codes import exit_code_of
+from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import TemperatureSamples
@@ -50,9 +50,10 @@ from imu_calibration.estimation.solution import Solution, shrunk, tolerances_of,
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.references.turntable.session_data import HeldOut, SessionData, join, naming
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
@@ -355,6 +356,8 @@ class CheckResult:
     """Error now against the held-out error in the file of the calibration, by regime."""
     change_limit: float = CHANGE
     """Factor of the error from which a significant change counts."""
+    dropped: str = ''
+    """Why dropped samples make the result incomplete; '' where they do not."""
 
     @property
     def changed(self) -> tuple[RegimeChange, ...]:
@@ -368,7 +371,7 @@ class CheckResult:
 
     @property
     def exit_code(self) -> int:
-        """0 where the decision on each sensor is `helps` and no error has changed, otherwise 3."""
+        """0 where each sensor `helps`, no error changed and few samples were dropped, else 3."""
         return exit_code_of(self.reasons)
 
     @property
@@ -382,7 +385,10 @@ class CheckResult:
             if sensor not in self.helped
         ]
         changed = {each.sensor for each in self.changed}
-        return lines + [line for sensor, line in self._since().items() if sensor in changed]
+        lines += [line for sensor, line in self._since().items() if sensor in changed]
+        if self.dropped:
+            lines.append(self.dropped)
+        return lines
 
     def _since(self):
         """Return sensor -> how its error compares with that on the day of the calibration."""
@@ -441,7 +447,10 @@ class CheckResult:
             if self.helps
             else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
         )
-        return '\n'.join([answer, *(f'  {line}' for line in (*self.lines, *self.notes))])
+        below = [*self.lines, *self.notes]
+        if self.dropped:
+            below.append(self.dropped)
+        return '\n'.join([answer, *(f'  {line}' for line in below)])
 
     __repr__ = __str__
 
@@ -485,7 +494,7 @@ def check_on_table(
         parts.append(
             naming(names, session)(
                 step.read,
-                _with_corrected(source, calibration, options),
+                partial(_with_corrected, source, calibration, options),
                 session,
                 Preflight(table.gravity_value),
                 windows=windows,
@@ -496,9 +505,12 @@ def check_on_table(
                 if len(window) > 1:
                     held_out.add(reduce_window(window, model, table, session=session))
     gathered = join(parts, names, lambda part: check_units(part, model, table))
+    lost = dropped(gathered.counts)
+    kept = sum(count for reason, count in gathered.counts.items() if reason not in lost)
     return CheckResult(
         prove_readings(before, after, model, reference=reference_values(model, calibration)),
         gathered.findings,
+        dropped=dropped_text({**lost, 'unusable': unusable(gathered.findings)}, kept),
     )
 
 

@@ -27,6 +27,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_recording('without it: by hand')
     parser.add_gyroscope_topic()
     parser.add_readings()
+    parser.add_exclusion()
 
 
 def run(options: Options) -> VerbResult:

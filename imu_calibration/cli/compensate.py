@@ -70,6 +70,9 @@ def run(options: Options) -> VerbResult:
     found = compensate(options.bag, **options.arguments_for(compensate))
     for line in found.warnings:
         print_line(f'note: {line}')
+    for line in found.reasons:
+        if line not in found.warnings:
+            print_line(f'warning: {line}')
     print_line(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')
     if found.lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in found.lost.items()))

@@ -20,6 +20,7 @@ def add_arguments(parser: OneLineParser) -> None:
         'with it, axes and units are compared with the joints and the motions are listed'
     )
     parser.add_gyroscope_topic()
+    parser.add_exclusion()
     parser.add_model(searched=False)
 
 
@@ -48,7 +49,9 @@ def run(options: Options) -> VerbResult:
         if stand is None
         else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
     )
-    looks = inspect(bag, topics, table, options=calibration_options(choices))
+    looks = inspect(
+        bag, topics, table, options=calibration_options(choices), exclude=options.exclude
+    )
     out = Terminal.of()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints)

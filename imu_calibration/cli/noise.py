@@ -34,6 +34,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.common('--no-report', action='store_true', help='write noise.yaml only')
     parser.add_topics(joints=False)
     parser.add_readings()
+    parser.add_exclusion()
 
 
 def run(options: Options) -> VerbResult:

@@ -154,6 +154,17 @@ class OneLineParser(argparse.ArgumentParser):
             help='default /imu/temperature, else the only one',
         )
 
+    def add_exclusion(self) -> None:
+        """Add the option of times that are not used."""
+        self.common(
+            '--exclude',
+            metavar='A:B,...',
+            help=(
+                'times that are not used, s since the first stamp of the IMU; with several bags'
+                ' NAME=A:B'
+            ),
+        )
+
     def add_stand(self, without: str) -> None:
         """
         Add the options of the table or arm that moves the IMU.
@@ -232,6 +243,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.add_gravity()
         self.add_recording('without it: by hand, gravity is the reference')
         self.add_gyroscope_topic()
+        self.add_exclusion()
         self.common(
             '--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml'
         )

@@ -17,6 +17,7 @@ ERROR_KEYS = (
     'calibration',
     'columns',
     'diagnose',
+    'exclude',
     'force',
     'frame_id',
     'gravity',

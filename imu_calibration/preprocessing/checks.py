@@ -11,8 +11,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import two_sources, value_checks
 from imu_calibration.preprocessing.recording_evidence import (
@@ -62,7 +64,7 @@ def both_sensors(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """No output is constant while other axes move."""
-    chunks, range_ = evidence.chunks, evidence.chunks.range
+    chunks = evidence.chunks
     if not len(chunks):
         return
     for sensor, part in SENSOR_COLUMNS.items():
@@ -89,22 +91,51 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                     sensor=sensor,
                 )
         for axis in np.flatnonzero(~constant):
-            moving = np.delete(range_[:, part], axis, axis=1) > MIN_MOVING_STEPS * np.delete(
-                evidence.resolution[part], axis
-            )
-            same = (range_[:, part][:, axis] == 0) & ~_at_end(
-                chunks.mean[:, part][:, axis], evidence.ends[part][axis]
-            )
-            stuck = in_long_runs(same & moving.any(axis=1)) if noisy[axis] else np.zeros(1, bool)
+            stuck = _stuck(evidence, part, axis)
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
                 yield CheckFinding(
                     'frozen',
                     WARNING,
                     f'{sensor} {"xyz"[axis]} is constant for {seconds:.1f} s while different axes'
-                    ' move; check its connection, and exclude that time',
+                    ' move: that time is left out; check its connection',
                     samples=int(stuck.sum() * chunks.size),
                 )
+
+
+def _stuck(evidence, part, axis):
+    """Return the chunks in which one axis of a sensor is constant while another one moves."""
+    chunks = evidence.chunks
+    if evidence.quiet_range[part][axis] == 0:
+        return np.zeros(len(chunks), bool)
+    steps = np.delete(evidence.resolution[part], axis)
+    moving = np.delete(chunks.range[:, part], axis, axis=1) > MIN_MOVING_STEPS * steps
+    same = (chunks.range[:, part][:, axis] == 0) & ~_at_end(
+        chunks.mean[:, part][:, axis], evidence.ends[part][axis]
+    )
+    return in_long_runs(same & moving.any(axis=1))
+
+
+def without_readings(evidence: RecordingEvidence) -> np.ndarray:
+    """
+    Return the ranges of samples that are no readings, half open, shape (n, 2).
+
+    A sensor or an axis is frozen there, or the joints are while the IMU turns. The places are among
+    the cleaned samples; one chunk on both sides is included, because its readings may be mixed.
+    """
+    chunks = evidence.chunks
+    flags = np.logical_or(*evidence.frozen.values())
+    for part in SENSOR_COLUMNS.values():
+        for axis in np.flatnonzero(evidence.n_changed[part]):
+            flags |= _stuck(evidence, part, axis)
+    for part in evidence.frozen_parts:
+        half = 0.5 * chunks.duration
+        flags |= (chunks.time - half >= part.start) & (chunks.time + half <= part.stop)
+    runs = runs_of(maximum_filter1d(flags, 3)) if len(flags) else np.zeros((0, 2), int)
+    ranges = runs * chunks.size
+    # samples after the last full chunk belong to no chunk
+    ranges[runs[:, 1] == len(chunks), 1] = evidence.n_samples
+    return ranges
 
 
 def _at_end(values, ends):
@@ -120,17 +151,13 @@ def _at_end(values, ends):
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sensor and every joint measures until the end."""
     joints = [part for part in evidence.frozen_parts if part.who == 'joints']
-    sensors: dict[tuple[float, float], list[FrozenPart]] = {}
-    for part in evidence.frozen_parts:
-        if part.who != 'joints':
-            sensors.setdefault((part.start, part.stop), []).append(part)
-    for span, parts in sensors.items():
+    for span, parts in _by_span(evidence.frozen_parts).items():
         yield CheckFinding(
             'frozen',
             WARNING,
             f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats'
             f' one reading {span_words([span])}, which its noise does not allow; check the sensor'
-            ' and its driver, and exclude that time',
+            ' and its driver; that time is left out',
             samples=parts[0].samples,
         )
     if joints:
@@ -139,9 +166,27 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             WARNING,
             'joint states must follow the table, they are constant while the IMU turns,'
             f' {span_words([(part.start, part.stop) for part in joints])}; check the driver of the'
-            ' table, or exclude the time in which the IMU was carried',
+            ' table, or whether the IMU was carried; that time is left out',
             samples=sum(part.samples for part in joints),
         )
+
+
+def _by_span(parts):
+    """Return (start, stop) -> the `FrozenPart` of each sensor that is frozen there."""
+    spans: dict[tuple[float, float], list[FrozenPart]] = {}
+    for part in parts:
+        if part.who != 'joints':
+            spans.setdefault((part.start, part.stop), []).append(part)
+    return spans
+
+
+def frozen_lines(parts: Sequence[FrozenPart], consequence: str) -> list[str]:
+    """Return a line for each time in which a sensor is frozen, with the consequence."""
+    lines = []
+    for span, of_span in _by_span(parts).items():
+        who = 'IMU' if len(of_span) > 1 else of_span[0].who
+        lines.append(f'the {who} repeats one reading {span_words([span])}: {consequence}')
+    return lines
 
 
 def span_words(spans: Sequence[tuple[float, float]]) -> str:
@@ -363,9 +408,12 @@ class Preflight(EvidenceGatherer):
         self.findings: tuple[CheckFinding, ...] = ()
         self.streams: dict[str, StreamStatistics] = {}
         self.lost: dict[str, int] = {}
+        self.without_readings = np.zeros((0, 2), int)
+        self.resolution = np.zeros(6)
         """
-        Findings; name -> StreamStatistics; reason -> number of unreadable messages: complete after
-        `finish`.
+        Findings; name -> StreamStatistics; reason -> number of unreadable messages; ranges of
+        cleaned samples that are no readings; smallest step between readings of each column:
+        complete after `finish`.
         """
 
     def finish(self, cleaner: BlockCleaner) -> None:
@@ -385,6 +433,9 @@ class Preflight(EvidenceGatherer):
             if 'imu' in evidence.streams
             else ()
         )
+        if 'imu' in evidence.streams:
+            self.without_readings = without_readings(evidence)
+            self.resolution = evidence.resolution
         if self._one_sensor:
             self.unusable = unusable_sensor(self.findings, evidence.absent)
             self.findings = tuple(

@@ -23,9 +23,6 @@ from imu_calibration.preprocessing.full_scale import (
 )
 from imu_calibration.preprocessing.stream_cleaning import CleanedBlock, StreamStatistics
 
-RESOLUTION_SAMPLES = 20_000
-"""First samples, from which the smallest step between readings is estimated."""
-
 
 @dataclass(frozen=True, eq=False)
 class RecordingEvidence:
@@ -157,9 +154,9 @@ class EvidenceGatherer:
 
     def _take_imu(self, imu):
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
-        if self._chunks.n_samples < RESOLUTION_SAMPLES:
+        if self._chunks.n_samples < scan.RESOLUTION_SAMPLES:
             self._resolution = np.minimum(
-                self._resolution, smallest_step(columns[:, :RESOLUTION_SAMPLES].T)
+                self._resolution, smallest_step(columns[:, : scan.RESOLUTION_SAMPLES].T)
             )
         self._chunks.push(imu.stamp_ns, columns)
         for column, (upwards, downwards) in zip(columns, self._ends):

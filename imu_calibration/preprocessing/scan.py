@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.core.samples import AlignedArrays, runs_of
+from imu_calibration.core.samples import AlignedArrays, runs_of, smallest_step
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.sphere import Sphere, fit_sphere
 
@@ -19,6 +19,10 @@ FIRST = 200
 """Samples from which the period is estimated."""
 MAX_SCAN_CHUNKS = 40_000
 """Chunks kept, nearly three hours; later samples are counted but not checked."""
+
+
+RESOLUTION_SAMPLES = 20_000
+"""First samples, from which the smallest step between readings is estimated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,6 +365,31 @@ def frozen_parts(chunks: Chunks, frozen: dict[str, np.ndarray]) -> list[FrozenPa
     return sorted(parts, key=lambda part: part.start)
 
 
+class FrozenSearch:
+    """Searches raw readings for parts with frozen output, in bounded memory."""
+
+    def __init__(self) -> None:
+        self._series = ChunkSeries()
+        self._step = np.full(6, np.inf)
+
+    def push(self, stamp_ns: np.ndarray, force: np.ndarray, rate: np.ndarray) -> None:
+        """Process readings in order of arrival: stamps, shape (n,), and two arrays (n, 3)."""
+        readings = np.concatenate([force, rate], axis=1)
+        finite = np.isfinite(readings).all(axis=1)
+        if not finite.any():
+            return
+        readings = readings[finite]
+        if self._series.n_samples < RESOLUTION_SAMPLES:
+            self._step = np.minimum(self._step, smallest_step(readings))
+        self._series.push(stamp_ns[finite], readings.T)
+
+    def parts(self) -> list[FrozenPart]:
+        """Return the parts with frozen output until now, in order of time."""
+        chunks = self._series.chunks()
+        resolution = np.where(np.isfinite(self._step), self._step, 0.0)
+        return frozen_parts(chunks, frozen_chunks(chunks, resolution))
+
+
 def frozen_joints(
     chunks: Chunks, still_ns: np.ndarray, rate_at_rest: np.ndarray
 ) -> list[FrozenPart]:
@@ -399,7 +428,7 @@ def frozen_joints(
 def _part(chunks, who, start, stop):
     return FrozenPart(
         who,
-        float(chunks.time[start] - chunks.duration[start] / 2),
+        max(float(chunks.time[start] - chunks.duration[start] / 2), 0.0),
         float(chunks.time[stop - 1] + chunks.duration[stop - 1] / 2),
         int((stop - start) * chunks.size),
     )

@@ -365,6 +365,8 @@ class StepHistogram:
 STREAMS = ('imu', 'joints', 'temperature')
 MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 """Stream -> message type; names of reasons for lost messages begin with it."""
+NO_RANGES = np.zeros((0, 2), np.int64)
+"""Nothing to leave out."""
 CLEANING_BATCH = 200
 """Samples that are cleaned together: cleaning has a fixed cost per call."""
 _SAMPLE_TYPES: dict[str, Any] = {
@@ -417,6 +419,9 @@ class BlockCleaner:
         Receivers of each cleaned block.
     one_sensor : bool
         Whether an IMU with one sensor is accepted, as for `StreamCheck`.
+    without : array, shape (n, 2)
+        Ranges of cleaned samples of the IMU to leave out, from an earlier pass
+        (`checks.without_readings`).
 
     """
 
@@ -427,7 +432,9 @@ class BlockCleaner:
         watchers: Sequence[Watcher] = (),
         *,
         one_sensor: bool = False,
+        without: np.ndarray = NO_RANGES,
     ):
+        self._without, self._n_imu = without, 0
         self._names, self._nominal, self._watchers = tuple(joint_names), nominal, watchers
         self._checks = {name: StreamCheck(one_sensor=one_sensor) for name in STREAMS}
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
@@ -543,9 +550,23 @@ class BlockCleaner:
             }
         )
         self._ready = {name: [] for name in STREAMS}
+        if len(self._without):
+            cleaned = replace(cleaned, imu=self._readings_only(cleaned.imu))
         for watcher in self._watchers:
             watcher.push(cleaned)
         return cleaned
+
+    def _readings_only(self, parts):
+        """Return the (epoch, samples) without the ranges to leave out."""
+        kept_parts = []
+        for epoch, imu in parts:
+            place = np.arange(self._n_imu, self._n_imu + len(imu))
+            self._n_imu += len(imu)
+            # an odd number of bounds lies at or below a place within a range
+            kept = np.searchsorted(self._without.ravel(), place, side='right') % 2 == 0
+            if kept.any():
+                kept_parts.append((epoch, imu if kept.all() else imu.select(kept)))
+        return kept_parts
 
     def _in_order(self, joints):
         if not self._names or not joints.names or tuple(joints.names) == self._names:

@@ -184,6 +184,11 @@ class StoredWindows:
         self._file.seek(self._starts[number])
         return pickle.load(self._file)
 
+    def clear(self) -> None:
+        """Remove all windows."""
+        self._file.truncate(0)
+        self._starts = []
+
     def extend(self, windows: Iterable[Window]) -> None:
         """Append windows."""
         for window in windows:

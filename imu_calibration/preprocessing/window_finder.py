@@ -18,7 +18,7 @@ from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import QuietFloor
 from imu_calibration.preprocessing.stream_alignment import JOINT_WAIT, MotionChunks
-from imu_calibration.preprocessing.stream_cleaning import STREAMS, BlockCleaner, Watcher
+from imu_calibration.preprocessing.stream_cleaning import NO_RANGES, STREAMS, BlockCleaner, Watcher
 from imu_calibration.preprocessing.window import (
     UnusedReason,
     Window,
@@ -48,7 +48,7 @@ class MotionGatherer:
     keep_unused : bool
         Also return windows of kind 'unused', so that every accepted sample is in exactly one
         window, in order.
-    nominal, watchers
+    nominal, watchers, without
         As for the `BlockCleaner`.
 
     """
@@ -61,8 +61,11 @@ class MotionGatherer:
         *,
         nominal: RawReadings | None = None,
         watchers: Sequence[Watcher] = (),
+        without: np.ndarray = NO_RANGES,
     ):
-        self.cleaner = BlockCleaner(() if table is None else table.joint_names, nominal, watchers)
+        self.cleaner = BlockCleaner(
+            () if table is None else table.joint_names, nominal, watchers, without=without
+        )
         self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
         self._queue = {name: [] for name in STREAMS}
         self._epoch_shift = dict.fromkeys(STREAMS, 0)

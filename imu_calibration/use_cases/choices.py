@@ -33,6 +33,7 @@ from imu_calibration.use_cases.recordings import (
     open_bag,
     provenance_of,
     source_of,
+    sources_without,
     table_of,
 )
 from imu_calibration.use_cases.resources import config_file
@@ -51,6 +52,11 @@ class Choices(TypedDict, total=False):
     """sensor_msgs/Temperature; default /imu/temperature, otherwise the only one."""
     frame_id: str | None
     """frame_id of the Imu messages; required if a topic has messages of several."""
+    exclude: str | None
+    """
+    Times that are not used, 'A:B,...' in s since the first stamp of the IMU; with several
+    recordings 'NAME=A:B,...'.
+    """
     accelerometer_model: str | None
     """
     A named model or effect names joined by +; default bias+matrix, and accel_size_effect when the
@@ -154,14 +160,9 @@ def inputs_of(
     for path in recordings:
         if not isinstance(path, SampleBlock):
             open_bag(path, topics, want_joints=table is not None).close()
-    return Inputs(
-        options,
-        table,
-        [
-            source_of(item, topics, None if table is None else table.joint_names)
-            for item in recordings
-        ],
-    )
+    joint_names = None if table is None else table.joint_names
+    sources = [source_of(item, topics, joint_names) for item in recordings]
+    return Inputs(options, table, sources_without(sources, recordings, choices.get('exclude')))
 
 
 def topics_of(choices: Mapping[str, Any]) -> Topics:

@@ -22,6 +22,8 @@ from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import ABSENT, Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
+from imu_calibration.preprocessing.checks import frozen_lines
+from imu_calibration.preprocessing.scan import FrozenSearch
 from imu_calibration.preprocessing.value_checks import refuse_force_unit
 from imu_calibration.use_cases.choices import noise_of, raw_columns, readings_for
 from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
@@ -53,14 +55,16 @@ class Compensated:
     """Sensor that was not corrected -> why."""
     cautions: tuple[str, ...] = ()
     """A line for each sensor that was corrected although the decision on it is not `helps`."""
+    frozen: int = 0
+    """Samples in which a sensor repeats one reading that its noise does not allow."""
 
     @property
     def exit_code(self) -> int:
         """
         0 when all is corrected, otherwise 3.
 
-        The code is 3 when more than 1 % could not be read, or when the decision on a sensor is not
-        `helps`.
+        The code is 3 when more than 1 % of the samples could not be read or are no readings, or
+        when the decision on a sensor is not `helps`.
         """
         return exit_code_of(self.reasons)
 
@@ -69,7 +73,10 @@ class Compensated:
         """Why the exit code is 3, a line each."""
         lines = [f'the {sensor} is not corrected: {why}' for sensor, why in self.refused.items()]
         lines += self.cautions
-        if lost := dropped_text(self.lost, self.count):
+        dropped = dict(self.lost)
+        if self.frozen:
+            dropped['frozen output'] = self.frozen
+        if lost := dropped_text(dropped, self.count - self.frozen):
             lines.append(lost)
         return lines
 
@@ -163,9 +170,11 @@ def compensate(
         stream = CompensationStream(
             calibration, temperature=temperatures(recording, topics), transfer=transfer
         )
+        search = FrozenSearch()
 
         def correct(imu):
             advance(len(imu))
+            search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
             return stream.correct(readings.apply(imu))
 
         def propagate(force_cov, rate_cov):
@@ -183,7 +192,11 @@ def compensate(
                 if block.imu is not None
             ]
             return _outcome(
-                ImuSamples.concatenate(parts) if parts else None, stream, bag.lost, used
+                ImuSamples.concatenate(parts) if parts else None,
+                stream,
+                bag.lost,
+                used=used,
+                search=search,
             )
         from msg_adapters.copying import copy_with_corrected
 
@@ -200,7 +213,7 @@ def compensate(
             source_frame_id=frame_id,
             raw=raw,
         )
-        return _outcome(None, stream, lost, used)
+        return _outcome(None, stream, lost, used=used, search=search)
 
 
 def _refuse_bag_unit(recording, topics, readings):
@@ -224,22 +237,37 @@ def _in_memory(recording, calibration, transfer, *, late, used, readings):
     assert block.imu is not None
     refuse_force_unit(block.imu.force_s, readings)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
+    search = FrozenSearch()
+    search.push(block.imu.stamp_ns, block.imu.force_s, block.imu.rate_s)
     return _outcome(
         _corrected(block.imu, stream.correct(readings.apply(block.imu)), transfer, late),
         stream,
         {},
-        used,
+        used=used,
+        search=search,
     )
 
 
-def _outcome(imu, stream, lost, used):
+def _outcome(imu, stream, lost, *, used, search):
     against = [*used.lines, *caveats(stream.calibration)]
     refused = dict(used.refused)
     for sensor in stream.calibration.absent:
         if stream.measured[sensor]:  # readings that nothing is known about pass unchanged
             refused[sensor] = ABSENT
             against.append(f'the {sensor} is not corrected: {ABSENT}')
-    return Compensated(imu, stream.count, against + stream.warnings(), lost, refused, used.cautions)
+    frozen = search.parts()
+    against += frozen_lines(frozen, 'the corrected topic has no measurements there')
+    # both sensors are frozen in one part where the IMU is
+    samples = {(part.start, part.stop): part.samples for part in frozen}
+    return Compensated(
+        imu,
+        stream.count,
+        against + stream.warnings(),
+        lost,
+        refused,
+        used.cautions,
+        sum(samples.values()),
+    )
 
 
 def _corrected(imu, corrected, transfer, late):

@@ -28,7 +28,13 @@ from imu_calibration.references.gravity.hand_calibration import gather_by_hand, 
 from imu_calibration.references.gravity.hand_parameters import hand_options
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
-from imu_calibration.use_cases.recordings import Source, Topics, open_bag, source_of
+from imu_calibration.use_cases.recordings import (
+    Source,
+    Topics,
+    open_bag,
+    source_of,
+    sources_without,
+)
 from msg_adapters.bag import Recording, list_topics
 from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
@@ -123,12 +129,17 @@ def inspect(
     table: Table | None,
     *,
     options: CalibrationOptions,
+    exclude: str | None = None,
 ) -> list[RecordingSummary]:
-    """Inspect each Imu topic of a recording, with the joints and temperatures used with it."""
-    return [_look(bag, each, table, options) for each in topics]
+    """
+    Inspect each Imu topic of a recording, with the joints and temperatures used with it.
+
+    `exclude`: times that are not used, as in `Choices`.
+    """
+    return [_look(bag, each, table, options=options, exclude=exclude) for each in topics]
 
 
-def _look(bag, topics, table, options):
+def _look(bag, topics, table, *, options, exclude):
     recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
     recording.close()
     preflight, calibrated = Preflight(table and table.gravity_value, strict=table is not None), None
@@ -136,7 +147,7 @@ def _look(bag, topics, table, options):
     if table is not None:
         try:
             calibrated = calibrate(
-                [source_of(bag, topics, table.joint_names)],
+                sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude),
                 table,
                 options,
                 mapper=_watched_by(preflight),
@@ -145,11 +156,9 @@ def _look(bag, topics, table, options):
             calibrated = error
     if not preflight.streams:  # not read to its end: no data to calibrate from
         preflight = Preflight(table and table.gravity_value, strict=False, one_sensor=table is None)
-        by_hand = _by_hand(
-            source_of(bag, topics, want_joints='optional', want_temperature='optional'),
-            options,
-            preflight,
-        )
+        source = source_of(bag, topics, want_joints='optional', want_temperature='optional')
+        (source,) = sources_without([source], [bag], exclude)
+        by_hand = _by_hand(source, options, preflight)
     findings = (*preflight.findings, *_axes_question(bag, options))
     look = RecordingSummary(
         recording, preflight.streams, findings, preflight.lost, calibrated, by_hand
@@ -201,6 +210,6 @@ def _watched_by(
     def mapper(step, numbered):
         if preflight.streams:
             return map(step, numbered)
-        return [step.read(source(), session, preflight) for session, source in numbered]
+        return [step.read(source, session, preflight) for session, source in numbered]
 
     return mapper

@@ -14,7 +14,7 @@ from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import warnings
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import raw_columns, readings_of
-from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of
+from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of, sources_without
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +83,7 @@ def noise(
     accelerometer_unit: str | None = None,
     gyroscope_unit: str | None = None,
     horizon: float = HORIZON,
+    exclude: str | None = None,
 ) -> IdentifiedNoise:
     """
     Identify the noise of an IMU from a recording that holds rest.
@@ -99,6 +100,8 @@ def noise(
         Units of the readings, see `Choices`.
     horizon : float
         Averaging time at which a random walk approximates the slow noise, s.
+    exclude : str, optional
+        Times that are not used, 'A:B,...' in s since the first stamp of the IMU.
 
     Raises
     ------
@@ -113,8 +116,10 @@ def noise(
     }
     readings = readings_of(units)
     topics = Topics(imu_topic, None, temperature_topic, frame_id, raw_columns(readings, units))
-    result = identify_noise(source_of(recording, topics), readings)
-    options = {name: value for name, value in topics.chosen().items() if value}
+    (source,) = sources_without([source_of(recording, topics)], [recording], exclude)
+    result = identify_noise(source, readings)
+    chosen = topics.chosen() | {'exclude': exclude}
+    options = {name: value for name, value in chosen.items() if value}
     if readings is not None:
         options['readings'] = readings.to_mapping()
     return IdentifiedNoise(result, figures_of(result, provenance_of([recording], options)), horizon)

@@ -28,6 +28,11 @@ from imu_calibration.core.samples import (
 from imu_calibration.document import files
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import root_of, table_from_urdf, up_of
+from imu_calibration.preprocessing.exclusion import (
+    exclusions_by_recording,
+    parse_exclusions,
+    without_excluded,
+)
 from imu_calibration.preprocessing.sensor_join import finite_stream, join_sensors
 from msg_adapters.bag import Recording, description_in, frame_of, open_recording, static_transforms
 from msg_adapters.storage import read_ahead
@@ -213,6 +218,31 @@ def source_of(
         want_temperature=want_temperature,
         quiet=quiet,
     )
+
+
+def sources_without(
+    sources: Sequence[Source],
+    recordings: Sequence[str | PathLike | SampleBlock],
+    exclude: str | None,
+) -> list[Source]:
+    """
+    Return the sources without the times that the user excludes (`exclusion.parse_exclusions`).
+
+    Raises
+    ------
+    InputError
+        When the text has another form, or names no recording.
+
+    """
+    if not exclude:
+        return list(sources)
+    names = [name_of(recording) for recording in recordings]
+    found = []
+    for source, exclusions in zip(
+        sources, exclusions_by_recording(parse_exclusions(exclude), names), strict=True
+    ):
+        found.append(partial(without_excluded, source, exclusions) if exclusions else source)
+    return found
 
 
 def provenance_of(recordings: Iterable[str | PathLike | SampleBlock], options: dict) -> dict:

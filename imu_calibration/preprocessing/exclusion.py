@@ -1,0 +1,129 @@
+"""Times of a recording that its user excludes."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
+
+EXCLUDED = 'imu excluded'
+"""Reason under which the samples are counted."""
+
+
+@dataclass(frozen=True)
+class Exclusion:
+    """A time that is not used."""
+
+    start: float
+    """s since the first stamp of the IMU."""
+    stop: float
+    """The same, of its end, which is not included."""
+    recording: str = ''
+    """Name of the recording; '' for the only one."""
+
+    def __str__(self):
+        span = f'{self.start:g}:{self.stop:g}'
+        return f'{self.recording}={span}' if self.recording else span
+
+
+def parse_exclusions(text: str) -> tuple[Exclusion, ...]:
+    """
+    Return the times in a text ``A:B,...`` or ``NAME=A:B,...``, s since the first stamp of the IMU.
+
+    Raises
+    ------
+    InputError
+        When a part has another form, or does not end after its start.
+
+    """
+    exclusions = []
+    for part in text.split(','):
+        name, _, span = part.strip().rpartition('=')
+        start, _, stop = span.partition(':')
+        try:
+            exclusion = Exclusion(float(start), float(stop), name)
+        except ValueError:
+            exclusion = Exclusion(np.nan, np.nan)
+        if not 0.0 <= exclusion.start < exclusion.stop:
+            raise InputError(
+                'an excluded time must be A:B or NAME=A:B in seconds since the first stamp of the'
+                f" IMU, with B after A, got '{part}'; write for example 40:55",
+                key='exclude',
+                code='exclude_form',
+            )
+        exclusions.append(exclusion)
+    return tuple(exclusions)
+
+
+def exclusions_by_recording(
+    exclusions: Sequence[Exclusion], names: Sequence[str]
+) -> list[list[Exclusion]]:
+    """
+    Return the excluded times of each recording.
+
+    Raises
+    ------
+    InputError
+        When a time names no recording, or none although there are several.
+
+    """
+    for exclusion in exclusions:
+        known = exclusion.recording in names if exclusion.recording else len(names) == 1
+        if not known:
+            raise InputError(
+                f'an excluded time must name one of the recordings {", ".join(names)}, got'
+                f" '{exclusion}'; write NAME=A:B",
+                key='exclude',
+                code='exclude_recording',
+            )
+    return [
+        [exclusion for exclusion in exclusions if exclusion.recording in ('', name)]
+        for name in names
+    ]
+
+
+def without_excluded(
+    source: Callable[[], Iterable[SampleBlock]], exclusions: Sequence[Exclusion]
+) -> Iterator[SampleBlock]:
+    """
+    Yield the blocks of a recording without the excluded samples of the IMU, which are counted.
+
+    Raises
+    ------
+    InputError
+        At the end, when no sample lies in an excluded time.
+
+    """
+    first_ns = None
+    used = np.zeros(len(exclusions), bool)
+    last = 0.0
+    for block in source():
+        if block.imu is None or not len(block.imu):
+            yield block
+            continue
+        if first_ns is None:
+            first_ns = int(block.imu.stamp_ns[0])
+        time = (block.imu.stamp_ns - first_ns) * 1e-9
+        last = max(last, float(time.max()))
+        kept = np.ones(len(time), bool)
+        for number, exclusion in enumerate(exclusions):
+            inside = (time >= exclusion.start) & (time < exclusion.stop)
+            used[number] |= inside.any()
+            kept &= ~inside
+        if kept.all():
+            yield block
+            continue
+        dropped = dict(block.dropped or {})
+        dropped[EXCLUDED] = dropped.get(EXCLUDED, 0) + int(np.count_nonzero(~kept))
+        imu = block.imu.select(kept) if kept.any() else None
+        yield replace(block, imu=imu, dropped=dropped)
+    for exclusion, found in zip(exclusions, used, strict=True):
+        if not found:
+            raise InputError(
+                f'an excluded time must lie in the recording, which has {last:.1f} s, got'
+                f" '{exclusion}'; correct it",
+                key='exclude',
+                code='exclude_outside',
+            )
