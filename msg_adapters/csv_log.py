@@ -24,6 +24,7 @@ from imu_calibration.core.readings import SPELLINGS as READING_SPELLINGS
 from imu_calibration.core.readings import UNIT_SIZES, unit_of
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.preprocessing.counter_overflow import without_overflows
 from imu_calibration.preprocessing.full_scale import relate_turns
 from imu_calibration.preprocessing.scan import ChunkSeries
 from imu_calibration.preprocessing.sensor_join import (
@@ -163,6 +164,8 @@ class CsvLog:
     """Other columns."""
     n_dropped: int = 0
     """Lines that were left out, because they have too few columns."""
+    n_overflows: int = 0
+    """Overflows of the counter in the column of time, which are undone."""
     joined: JoinedSensors | None = None
     """How accelerometer and gyroscope were joined, where they have stamps of their own."""
 
@@ -224,7 +227,7 @@ def read_csv(
     time = _with_unit(
         by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path
     )
-    stamp_ns = table.stamps(time)
+    stamp_ns, n_overflows = without_overflows(table.stamps(time))
     readings = _sensors(table, by_quantity, stamp_ns)
     used, temperature, joints = [time, *readings.columns], None, []
     for each in found:
@@ -246,6 +249,7 @@ def read_csv(
         temperature,
         tuple(name for name in table.names if name and name not in taken),
         table.n_dropped,
+        n_overflows,
         joined=readings.joined,
     )
 
@@ -916,6 +920,8 @@ class ConvertedLog:
             remark(f'{path.name}: {log.joined.text}')
         if log.n_dropped:
             remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
+        if log.n_overflows:
+            remark(f'{path.name}: the counter of time overflows {log.n_overflows} times: undone')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.bag = Path(folder, path.stem)
         write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')

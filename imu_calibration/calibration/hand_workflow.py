@@ -43,7 +43,7 @@ from imu_calibration.preprocessing.absent_sensor import without_sensor
 from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
-from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, ContinuedStamps
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.equations import TurnData
@@ -317,10 +317,13 @@ def read_by_hand(
     watchers = [] if preflight is None else [preflight]
     cleaner = BlockCleaner(nominal=nominal, watchers=watchers, one_sensor=True)
     joined, temperatures = JoinedParts(), []
+    # each epoch of the clock is a part of its own: no turn is used across a reset
+    stamps, shifts = ContinuedStamps(), {}
     for cleaned in cleaner.all_of(blocks):
-        for _, imu in cleaned.imu:
-            joined.add(imu)
-        temperatures += [temperature for _, temperature in cleaned.temperature]
+        for epoch, imu in cleaned.imu:
+            joined.add(stamps.moved(epoch, imu))
+            shifts[epoch] = stamps.shift_ns
+        temperatures += cleaned.temperature
     if not len(joined):
         raise InputError(
             'the recording must hold Imu messages that can be used, it holds none; check the topic'
@@ -332,7 +335,11 @@ def read_by_hand(
     for sensor in unusable_sensors:
         imu = without_sensor(imu, sensor)
     if temperatures:
-        known = TemperatureSamples.concatenate(temperatures)
+        moved = [
+            replace(part, stamp_ns=part.stamp_ns + shifts.get(epoch, stamps.shift_ns))
+            for epoch, part in temperatures
+        ]
+        known = TemperatureSamples.concatenate(moved)
         start = imu.stamp_ns[0]  # epochs in nanoseconds do not fit a float
         warm = np.interp(
             (imu.stamp_ns - start).astype(float),

@@ -245,6 +245,13 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 f'{MESSAGES[name]}: {found.unstamped} of {total} stamps are zero: the time of'
                 ' arrival is used; the driver should stamp each sample at its measurement',
             )
+        if found.overflows:
+            yield CheckFinding(
+                'stamps',
+                NOTE,
+                f'{MESSAGES[name]}: the counter of the stamps overflows'
+                f' {"once" if found.overflows == 1 else f"{found.overflows} times"}: undone',
+            )
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING
             text = (

@@ -11,6 +11,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.preprocessing.absent_sensor import SensorPresence
+from imu_calibration.preprocessing.counter_overflow import OverflowSearch
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
@@ -38,8 +39,9 @@ class StreamCheck:
     Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is
     kept), 'backward stamp' (a late sample), 'stray stamp' (one sample far from both neighbours), of
     an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps, each of which starts a new
-    epoch. Where the stamps of an IMU follow a clock only loosely (packets, times of arrival,
-    milliseconds, jitter), the times of its samples are computed first (see `sample_times`).
+    epoch; an overflow of the counter from which stamps are made is undone. Where the stamps of an
+    IMU follow a clock only loosely (packets, times of arrival, milliseconds, jitter), the times of
+    its samples are computed first (see `sample_times`).
 
     Parameters
     ----------
@@ -56,6 +58,7 @@ class StreamCheck:
         self.sources = TwoSourceSearch()
         """Whether an IMU stream holds the readings of two sensors."""
         self.epoch = 0
+        self._overflows = OverflowSearch()
         self._steps = StepHistogram()
         self._n_accepted = 0
         self._span_ns = 0
@@ -93,6 +96,8 @@ class StreamCheck:
         if not len(samples):
             return []
         samples = self._finite(samples)
+        if len(samples):
+            samples = replace(samples, stamp_ns=self._overflows.undone(samples.stamp_ns))
         if isinstance(samples, ImuSamples):
             self.sources.push(samples)
         return self._without_spikes(self._accept(self._without_strays(samples)))
@@ -126,6 +131,7 @@ class StreamCheck:
             two_sources=self.sources.requirement if self.sources.found else '',
             absent=() if self.presence is None else self.presence.absent,
             n_late=0 if self.presence is None else self.presence.n_late,
+            overflows=self._overflows.count,
         )
 
     def _without_spikes(self, accepted, ended=False):
@@ -290,6 +296,8 @@ class StreamStatistics:
     """Sensors without readings."""
     n_late: int = 0
     """Samples with readings of a sensor that had none at first; they are not used."""
+    overflows: int = 0
+    """Overflows of the counter from which the stamps are made; they are undone."""
 
     @property
     def rate(self) -> float:
@@ -363,6 +371,8 @@ class StepHistogram:
 
 
 STREAMS = ('imu', 'joints', 'temperature')
+RESET_PAUSE_NS = 10 * _SECOND
+"""Pause inserted at a clock reset: the true one is unknown; no turn is used across it."""
 MESSAGES = {'imu': 'Imu', 'joints': 'JointState', 'temperature': 'Temperature'}
 """Stream -> message type; names of reasons for lost messages begin with it."""
 NO_RANGES = np.zeros((0, 2), np.int64)
@@ -391,6 +401,39 @@ class CleanedBlock:
 
     def __bool__(self) -> bool:
         return bool(self.imu or self.joints or self.temperature)
+
+
+class ContinuedStamps:
+    """
+    Moves the samples of each epoch of the clock behind those of the one before.
+
+    Parameters
+    ----------
+    pause_ns : int
+        Time between the last sample of an epoch and the first of the next, ns.
+
+    """
+
+    def __init__(self, pause_ns: int = RESET_PAUSE_NS):
+        self._pause_ns = pause_ns
+        self._epoch = 0
+        self._last_ns: int | None = None
+        self.shift_ns = 0
+        """Shift of the present epoch, ns."""
+
+    def continue_after(self, last_ns: int) -> None:
+        """Continue after samples of an earlier run: the next epoch is a new one."""
+        self._epoch, self._last_ns = -1, last_ns
+
+    def moved(self, epoch: int, samples: Any) -> Any:
+        """Return samples of an epoch, in order, with stamps that continue to increase."""
+        if epoch != self._epoch and self._last_ns is not None:
+            self.shift_ns = self._last_ns + self._pause_ns - int(samples.stamp_ns[0])
+        self._epoch = epoch
+        if self.shift_ns:
+            samples = replace(samples, stamp_ns=samples.stamp_ns + self.shift_ns)
+        self._last_ns = int(samples.stamp_ns[-1])
+        return samples
 
 
 class Watcher(Protocol):

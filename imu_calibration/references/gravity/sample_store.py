@@ -6,12 +6,14 @@ All samples up to a limit, then the least informative are discarded first.
 
 import io
 from collections.abc import Iterable, Sequence
+from copy import copy
 
 import numpy as np
 
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.samples import ImuSamples
+from imu_calibration.preprocessing.stream_cleaning import ContinuedStamps
 
 SAMPLES_FORMAT = 'imu_calibration/hand_samples/1'
 RESET_PAUSE_NS = 3600 * 10**9
@@ -36,8 +38,8 @@ class HandStore:
     """
 
     def __init__(self, most: int):
-        self.most, self._parts, self._epoch = most, [], 0
-        self._shift, self.forgotten = 0, 0
+        self.most, self._parts = most, []
+        self._stamps, self.forgotten = ContinuedStamps(RESET_PAUSE_NS), 0
 
     def __len__(self):
         return sum(len(part) for part in self._parts)
@@ -45,7 +47,10 @@ class HandStore:
     def copy(self) -> 'HandStore':
         """Return a copy that shares the samples."""
         twin = HandStore(self.most)
-        twin.__dict__ |= self.__dict__ | {'_parts': list(self._parts)}
+        twin.__dict__ |= self.__dict__ | {
+            '_parts': list(self._parts),
+            '_stamps': copy(self._stamps),
+        }
         return twin
 
     def add(self, accepted: Iterable[tuple[int, ImuSamples]]) -> None:
@@ -57,18 +62,9 @@ class HandStore:
         for epoch, samples in accepted:
             if not len(samples):
                 continue
-            if epoch != self._epoch and self._parts:
-                self._shift = (
-                    int(self._parts[-1].stamp_ns[-1]) + RESET_PAUSE_NS - int(samples.stamp_ns[0])
-                )
-            self._epoch = epoch
+            moved = self._stamps.moved(epoch, samples)
             self._parts.append(
-                ImuSamples(
-                    samples.stamp_ns + self._shift,
-                    samples.force_s,
-                    samples.rate_s,
-                    samples.frame_id,
-                )
+                ImuSamples(moved.stamp_ns, moved.force_s, moved.rate_s, moved.frame_id)
             )
 
     def samples(self) -> ImuSamples | None:
@@ -80,7 +76,7 @@ class HandStore:
 
     def true_stamps(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return the header stamps of samples of the present epoch."""
-        return stamp_ns - self._shift
+        return stamp_ns - self._stamps.shift_ns
 
     def forget(self, rests: Sequence[slice], most_rests: int) -> bool:
         """
@@ -179,7 +175,8 @@ class HandStore:
                 code='samples_damaged',
             ) from error
         if len(imu):
-            self._parts, self._epoch = [imu], -1
+            self._parts = [imu]
+            self._stamps.continue_after(int(imu.stamp_ns[-1]))
 
 
 def _across_holes(stamp_ns, rests):

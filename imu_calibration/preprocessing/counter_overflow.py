@@ -1,0 +1,95 @@
+"""Stamps from a counter that overflows: the steps back are undone."""
+
+import numpy as np
+
+COUNTER_BITS = (16, 24, 31, 32)
+"""Widths of counters of time."""
+TICKS_NS = (1, 1_000, 1_000_000)
+"""Usual ticks: ns, us, ms."""
+LEAST_STEP_NS = 1_000_000_000
+"""A smaller step back is a late sample."""
+SIZES_NS = tuple(
+    sorted(
+        2**bits * tick
+        for bits in COUNTER_BITS
+        for tick in TICKS_NS
+        if 2**bits * tick > LEAST_STEP_NS
+    )
+)
+"""Sizes of the steps back at an overflow, ns: from 4.3 s to 50 days."""
+LOST_PERIODS = 5
+"""An overflow may coincide with the loss of so many samples."""
+LEAST_EQUAL_STEPS = 2
+"""Steps back of one size from which on it is the size of a counter, whatever its width and tick."""
+
+
+def overflow_size(step_ns: int, period_ns: float) -> int:
+    """
+    Return the size of the counter whose overflow explains a step between stamps, ns; 0 for none.
+
+    The step forward that remains without the overflow is at most `LOST_PERIODS` periods.
+    """
+    for size in SIZES_NS:
+        if 0 < step_ns + size <= LOST_PERIODS * period_ns:
+            return size
+    return 0
+
+
+class OverflowSearch:
+    """
+    Undoes overflows in the stamps of one stream; the division into pieces has no influence.
+
+    The period is that of the first piece with three stamps or more.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Overflows until now."""
+        self._shift_ns = 0
+        self._last: int | None = None
+        self._period_ns = 0.0
+
+    def undone(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return the next stamps without overflows, ns, shape (n,)."""
+        stamps = stamp_ns + self._shift_ns
+        if not self._period_ns and len(stamps) >= 3:
+            forward = np.diff(stamps)
+            forward = forward[forward > 0]
+            self._period_ns = float(np.median(forward)) if len(forward) else 0.0
+        first = stamps[0] if self._last is None else self._last
+        steps = np.diff(stamps, prepend=first)
+        for place in np.flatnonzero(steps < -LEAST_STEP_NS):
+            size = overflow_size(int(steps[place]), self._period_ns)
+            if size:
+                stamps[place:] += size
+                self._shift_ns += size
+                self.count += 1
+        self._last = int(stamps[-1])
+        return stamps
+
+
+def without_overflows(stamp_ns: np.ndarray) -> tuple[np.ndarray, int]:
+    """
+    Return all stamps of a recording without overflows, and the number of overflows.
+
+    In addition to the known widths, any step back that recurs with one size, to a few periods, is
+    the overflow of a counter.
+    """
+    search = OverflowSearch()
+    stamps = search.undone(stamp_ns)
+    steps = np.diff(stamps)
+    forward = steps[steps > 0]
+    back = np.flatnonzero(steps < -LEAST_STEP_NS)
+    if not len(forward) or len(back) < LEAST_EQUAL_STEPS:
+        return stamps, search.count
+    period = np.median(forward)
+    sizes = period - steps[back]
+    size = np.median(sizes)
+    equal = np.abs(sizes - size) < LOST_PERIODS * period
+    # a counter always steps back from its end
+    whole = np.abs(np.diff(stamps[back])) < LOST_PERIODS * period
+    if not equal.all() or not whole.all():
+        return stamps, search.count
+    shift = np.zeros(len(stamps), np.int64)
+    shift[back + 1] = np.round(sizes).astype(np.int64)
+    return stamps + np.cumsum(shift), search.count + len(back)

@@ -1,0 +1,125 @@
+"""Clocks that step back: overflows of counters are undone, other parts are processed separately."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.hand_workflow import calibrate_without_table, read_by_hand
+from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
+from imu_calibration.document.outcome import exit_code
+from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.counter_overflow import OverflowSearch, without_overflows
+from imu_calibration.references.options import CalibrationOptions
+from msg_adapters.csv_log import read_csv
+
+from worlds.hand_sessions import GRAVITY
+from worlds.physics_hand import hold_and_turn
+
+OPTIONS = CalibrationOptions(gravity=GRAVITY, as_asked=True)
+
+
+@pytest.fixture(scope='module')
+def session():
+    """Readings of sixteen poses by hand at 70 Hz."""
+    return hold_and_turn(21, n_poses=16, rate_hz=70.0, pose_sd=0.0, drift_sd=0.0)[0]
+
+
+@pytest.fixture(scope='module')
+def usual(session):
+    return calibrated(session)
+
+
+def calibrated(imu):
+    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], OPTIONS)
+
+
+def counted(stamp_ns, bits, tick_ns, before):
+    """Return the stamps of a counter that overflows `before` ns after the first one."""
+    ticks = (stamp_ns - stamp_ns[0]) // tick_ns
+    return (ticks + 2**bits - before // tick_ns) % 2**bits * tick_ns
+
+
+def regular(n=5000, rate=70.0):
+    return np.round(np.arange(n) * 1e9 / rate).astype(np.int64)
+
+
+@pytest.mark.parametrize(('bits', 'tick_ns'), [(32, 1), (32, 1_000), (16, 1_000_000), (24, 1_000)])
+def test_an_overflow_is_undone_whatever_the_pieces(bits, tick_ns):
+    true = regular() // tick_ns * tick_ns
+    stamps = counted(true, bits, tick_ns, 2_000_000_000)
+    assert (np.diff(stamps) < 0).any()
+    for cut in (len(stamps), 211):
+        search = OverflowSearch()
+        parts = [search.undone(stamps[a : a + cut]) for a in range(0, len(stamps), cut)]
+        assert np.array_equal(np.diff(np.concatenate(parts)), np.diff(true))
+        assert search.count == np.count_nonzero(np.diff(stamps) < 0)
+
+
+def test_other_steps_back_remain():
+    stamps = regular()
+    stamps[3000:] -= 17_300_000_000
+    assert np.array_equal(OverflowSearch().undone(stamps), stamps)
+    assert np.array_equal(without_overflows(stamps)[0], stamps)
+
+
+def test_a_size_that_recurs_is_that_of_a_counter():
+    """A counter of seconds that begins again at each minute."""
+    true = regular(10_000)
+    stamps = (true + 41_000_000_000) % 60_000_000_000
+    found, count = without_overflows(stamps)
+    assert count == 3 and np.diff(found) == pytest.approx(np.diff(true), abs=20_000_000)
+
+
+def test_stamps_of_a_bag_that_overflow_give_the_usual_result(session, usual):
+    stamps = counted(session.stamp_ns, 32, 1_000, 33_000_000_000)
+    found = calibrated(replace(session, stamp_ns=stamps))
+    away = found.calibration.values - usual.calibration.values
+    assert (np.abs(away) <= 0.5 * found.calibration.sd).all()
+    assert exit_code(found.calibration) == 0
+    notes = read_by_hand(
+        [SampleBlock(replace(session, stamp_ns=stamps))], preflight=Preflight(GRAVITY)
+    ).findings
+    assert ('stamps', 'note') in [(f.check, f.severity) for f in notes]
+
+
+def test_by_hand_the_parts_of_a_clock_that_was_set_are_used_separately(session, usual):
+    """Inspect promised it, and the calibration refused stamps that go backwards."""
+    stamps = session.stamp_ns.copy()
+    at = len(stamps) // 2
+    stamps[at:] -= 222_000_000_000
+    found = calibrated(replace(session, stamp_ns=stamps))
+    away = found.calibration.values - usual.calibration.values
+    assert (np.abs(away) <= 3 * found.calibration.sd).all()
+    poses = usual.calibration.statistics['windows']['static']
+    assert found.calibration.statistics['windows']['static'] in (poses, poses + 1)
+    assert 'held' not in set(found.calibration.status)
+    assert exit_code(found.calibration) == 0
+
+
+def test_temperatures_follow_the_parts():
+    imu = ImuSamples(regular(400), np.tile([0.0, 0, 9.8], (400, 1)), np.zeros((400, 3)), 'imu')
+    stamps = imu.stamp_ns + 400_000_000_000
+    stamps[200:] -= 300_000_000_000
+    warm = TemperatureSamples(stamps.copy(), np.where(np.arange(400) < 200, 20.0, 30.0))
+    found = read_by_hand([SampleBlock(replace(imu, stamp_ns=stamps), temperature=warm)])
+    assert (np.diff(found.imu.stamp_ns) > 0).all()
+    assert found.temperature_c[:200] == pytest.approx(20.0)
+    assert found.temperature_c[200:] == pytest.approx(30.0)
+
+
+def test_a_text_log_with_a_counter_that_overflows(tmp_path, session):
+    path = tmp_path / 'log.csv'
+    ticks = counted(session.stamp_ns, 32, 1_000, 9_000_000_000) // 1_000
+    columns = [ticks, *session.force_s.T, *session.rate_s.T]
+    header = 'time (us),ax (m/s^2),ay (m/s^2),az (m/s^2),gx (rad/s),gy (rad/s),gz (rad/s)'
+    np.savetxt(path, np.column_stack(columns), '%.8g', ',', header=header, comments='')
+    rows = path.read_text().splitlines()
+    lines = [rows[0]]
+    for tick, row in zip(ticks, rows[1:], strict=True):
+        lines.append(','.join([str(tick), *row.split(',')[1:]]))
+    path.write_text('\n'.join(lines) + '\n')
+    log = read_csv(path)
+    assert log.n_overflows == 1
+    steps = np.diff(log.imu.stamp_ns)
+    assert steps == pytest.approx(np.diff(session.stamp_ns), abs=2_000)
