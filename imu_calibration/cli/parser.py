@@ -159,10 +159,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--exclude',
             metavar='A:B,...',
-            help=(
-                'times that are not used, s since the first stamp of the IMU; with several bags'
-                ' NAME=A:B'
-            ),
+            help='times not used, s from the first Imu stamp, or NAME=A:B',
         )
 
     def add_stand(self, without: str) -> None:
