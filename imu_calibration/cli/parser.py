@@ -222,7 +222,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--gravity',
             type=float,
-            help='local gravity, m/s^2, by hand or with --urdf; default 9.80665',
+            help='m/s^2, by hand or with --urdf; default 9.80665',
         )
         self.common(
             '--latitude', metavar='DEG', type=float, help='gravity from the latitude (WGS 84)'
@@ -277,7 +277,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.expert(
             '--noise',
             metavar='FILE',
-            help='noise.yaml of this IMU: model of its biases (table only)',
+            help='noise.yaml of this IMU, for its biases (table only)',
         )
         self.expert(
             '--setting',
