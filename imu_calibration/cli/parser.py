@@ -159,7 +159,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--exclude',
             metavar='A:B,...',
-            help='times not used, s from the first Imu stamp, or NAME=A:B',
+            help='unused times, s from the first stamp; or NAME=A:B',
         )
 
     def add_stand(self, without: str) -> None:
@@ -185,7 +185,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.expert(
             '--allow-xacro',
             action='store_true',
-            help='expand a .xacro file; it is a program: only from authors you trust',
+            help='expand .xacro, a program: only from trusted authors',
         )
         self.expert(
             '--up',
@@ -261,13 +261,13 @@ class OneLineParser(argparse.ArgumentParser):
         self.expert(
             '--accelerometer-model',
             metavar='MODEL',
-            help='effects joined by +; default bias+matrix, and accel_size_effect if observable',
+            help='joined by +; default bias+matrix, and arms if seen',
         )
         self.expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
         self.expert(
             '--reference-model',
             metavar='MODEL',
-            help="effects of table and clock, or 'none'; default table_tilt",
+            help="of table and clock, or 'none'; default table_tilt",
         )
         self.add_effects(self.expert)
         self.expert(
