@@ -172,7 +172,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--urdf',
             metavar='FILE',
-            help='robot description in place of a table; --table adds up, gravity, mount, limits',
+            help='robot description; --table adds up, gravity, mount',
         )
         self.common(
             '--imu-link',
