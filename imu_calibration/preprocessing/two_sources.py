@@ -12,8 +12,8 @@ LEAST_CLUSTER = 5
 MIN_SEPARATION = 8.0
 """
 Distance of the two clusters in standard deviations within them. Normal noise of `RUN_SAMPLES` that
-is cut at its widest gap has 2.9 in the median, 5.0 in one of 1,000 runs and at most 7.7 in a million
-(simulated).
+is cut at its widest gap has 2.9 in the median, 5.0 in one of 1,000 runs, and at most 7.7 in a
+million runs (simulated).
 """
 MIN_AXES = 2
 """Outputs that must change together: noise of one converter step changes each output apart."""
