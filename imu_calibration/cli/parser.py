@@ -177,10 +177,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.common(
             '--imu-link',
             metavar='LINK',
-            help=(
-                'link with the IMU, default its frame_id; without --urdf: of /robot_description in'
-                ' the bag'
-            ),
+            help='link with the IMU, default its frame_id',
         )
         self.expert(
             '--allow-xacro',
