@@ -40,8 +40,9 @@ In a notebook
     import imu_calibration as imu
     found = imu.calibrate('session.bag', 'table.yaml')      # without a table: by hand
 
-`load`, `calibrate`, `check`, `compensate`, `diagnose` and `simulate` suffice; their results print,
-draw and saves itself.
+`load`, `calibrate`, `check`, `compensate`, `diagnose`, `inspect`, `noise` and `simulate` suffice;
+their results print, draw and save themselves. Arrays take the place of a recording:
+``imu.check(calibration=found.calibration, time=t, force=f, rate=w)``.
 
 Contents
 --------
@@ -83,11 +84,22 @@ if TYPE_CHECKING:
         check,
         compensate,
         diagnose,
+        inspect,
         load,
+        noise,
         simulate,
     )
 
-__all__ = ['calibrate', 'check', 'compensate', 'diagnose', 'load', 'simulate']
+__all__ = [
+    'calibrate',
+    'check',
+    'compensate',
+    'diagnose',
+    'inspect',
+    'load',
+    'noise',
+    'simulate',
+]
 __version__ = '0.1.0'
 
 

@@ -36,6 +36,6 @@ def run(options: Options) -> VerbResult:
             options.bags, options.stand(), jobs=options.jobs, earlier=options.earlier, **choices
         )
         warn(found.calibration.statistics['preflight'])
-        found.save(folder, report=not options.no_report)
+        found.save(folder, report=not options.no_report, force=True)  # `require_place`
         show_calibration(found, folder, options.hints(), report=not options.no_report)
         return VerbResult(found.exit_code, to_mapping(found.calibration), found.reasons)

@@ -39,7 +39,7 @@ def run(options: Options) -> VerbResult:
     with files.output_folder(options.output) as folder:
         found = diagnose(options.bag, options.stand(), **options.choices())
         warn(found.calibration.statistics['preflight'])
-        found.save(folder)
+        found.save(folder, force=True)  # `require_place` has looked
         if options.mcap:
             found.save_overlay(options.mcap)
         also = (

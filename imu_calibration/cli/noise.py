@@ -32,6 +32,7 @@ def add_arguments(parser: OneLineParser) -> None:
         help='averaging time at which a random walk replaces other slow noise, default 100 s',
     )
     parser.common('--no-report', action='store_true', help='write noise.yaml only')
+    parser.common('--force', action='store_true', help='overwrite the noise of other inputs')
     parser.add_topics(joints=False)
     parser.add_readings()
     parser.add_exclusion()
@@ -41,20 +42,19 @@ def run(options: Options) -> VerbResult:
     """Identify into a folder that can be written, print the figures, return the exit code."""
     from imu_calibration.allan.document import to_mapping
     from imu_calibration.document import files
-    from imu_calibration.use_cases.noise import noise
+    from imu_calibration.use_cases.choices import require_same_inputs
+    from imu_calibration.use_cases.noise import noise, noise_provenance
 
+    choices = {
+        name: value for name, value in options.arguments_for(noise).items() if value is not None
+    }
+    if not options.force:
+        require_same_inputs(options.output, noise_provenance(options.bag), 'noise.yaml')
     with files.output_folder(options.output) as folder:
-        found = noise(
-            options.bag,
-            **{
-                name: value
-                for name, value in options.arguments_for(noise).items()
-                if value is not None
-            },
-        )
+        found = noise(options.bag, **choices)
         for warning in found.warnings:
             complain(f'warning: {warning}')
-        found.save(folder, report=not options.no_report)
+        found.save(folder, report=not options.no_report, force=True)
         _show(
             found,
             [found.figures.rate, *options.rate],

@@ -18,6 +18,17 @@ EPOCH = 1e8
 """s; larger times count from 1970."""
 
 
+LEAST_NS_STEP = 1000
+"""Integer times with this median step or more are nanoseconds: no IMU is read every 1000 s."""
+
+
+def _are_nanoseconds(time: np.ndarray) -> bool:
+    """Return whether times are integers with the steps of nanoseconds."""
+    if time.ndim != 1 or not np.issubdtype(time.dtype, np.integer) or len(time) < 2:
+        return False
+    return bool(np.median(np.abs(np.diff(time.astype(np.int64)))) >= LEAST_NS_STEP)
+
+
 def stamps_of(time: np.ndarray, unit: float = 1.0) -> np.ndarray:
     """
     Return stamps of times in multiples of `unit` seconds, ns, int64, shape (n,).
@@ -208,7 +219,8 @@ class SampleBlock:
         Parameters
         ----------
         time : array_like
-            Seconds, from an epoch or relative, shape (n,).
+            Seconds, from an epoch or relative, shape (n,); integers with steps of at least
+            `LEAST_NS_STEP` are nanoseconds.
         force : array_like
             Specific force in the sensor frame, m/s^2; at rest, z up, +g about z; shape (n, 3).
         rate : array_like
@@ -224,6 +236,8 @@ class SampleBlock:
             When shapes differ or a time is not finite.
 
         """
+        given_ns = np.asarray(time)
+        in_ns = _are_nanoseconds(given_ns)
         time, force, rate = (np.asarray(values, float) for values in (time, force, rate))
         angles = {name: np.asarray(values, float) for name, values in (joints or {}).items()}
         heat = None if temperature_c is None else np.asarray(temperature_c, float)
@@ -248,7 +262,12 @@ class SampleBlock:
                 f'every time must be finite, got {np.count_nonzero(~np.isfinite(time))} that are'
                 ' not; remove these rows'
             )
-        stamp_ns = stamps_of(time)
+        if in_ns:
+            whole_ns = given_ns.astype(np.int64)
+            start_ns = int(whole_ns[0]) if whole_ns[0] > EPOCH * 10**9 else FIRST_NS
+            stamp_ns = start_ns + (whole_ns - whole_ns[0])
+        else:
+            stamp_ns = stamps_of(time)
         return cls(
             ImuSamples(stamp_ns, force, rate, 'imu_link'),
             JointSamples.of_angles(stamp_ns, angles) if angles else None,

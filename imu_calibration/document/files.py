@@ -153,7 +153,9 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
 
 
 def read_calibration(path: str | PathLike[str]) -> Calibration:
-    """Return the calibration in a file."""
+    """Return the calibration in a file, or in calibration.yaml of a folder."""
+    if Path(path).is_dir():
+        path = Path(path) / 'calibration.yaml'
     return calibration_from_text(read_text(path, 'calibration'))
 
 

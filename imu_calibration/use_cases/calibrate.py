@@ -38,6 +38,7 @@ from imu_calibration.use_cases.choices import (
     made_from,
     provenance_with,
     readings_for,
+    require_same_inputs,
 )
 from imu_calibration.use_cases.recordings import (
     Stand,
@@ -102,8 +103,14 @@ class Calibrated:
 
         return calibration_report(self.result)
 
-    def save(self, folder: str | PathLike, *, report: bool = True) -> None:
-        """Write calibration.yaml and, when wanted, report.html into a folder."""
+    def save(self, folder: str | PathLike, *, report: bool = True, force: bool = False) -> None:
+        """
+        Write calibration.yaml and, when wanted, report.html into a folder.
+
+        The result of other inputs there is replaced only with `force`.
+        """
+        if not force:
+            require_same_inputs(folder, self.calibration.provenance)
         files.write_texts(
             folder,
             ({'report.html': self.report} if report else {})

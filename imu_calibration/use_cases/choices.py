@@ -425,9 +425,11 @@ def made_from(found: Mapping[str, Any]) -> set[str]:
     }
 
 
-def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> None:
+def require_same_inputs(
+    folder: str | PathLike, found: Mapping[str, Any], name: str = 'calibration.yaml'
+) -> None:
     """
-    Refuse to overwrite the calibration of another verb or of other inputs.
+    Refuse to overwrite the result of another verb or of other inputs.
 
     Parameters
     ----------
@@ -435,24 +437,26 @@ def require_same_inputs(folder: str | PathLike, found: Mapping[str, Any]) -> Non
         Output folder.
     found : mapping
         Provenance of the new result.
+    name : str
+        File of the result.
 
     Raises
     ------
     InputError
-        If calibration.yaml in the folder differs in verb, recordings, table or robot description,
-        or is none.
+        If the file in the folder differs in verb, recordings, table or robot description, or is no
+        such document.
 
     """
-    path = Path(folder) / 'calibration.yaml'
+    path = Path(folder) / name
     if not path.exists():
         return
     try:
-        before = files.read_mapping(path, 'calibration document').get('provenance')
+        before = files.read_mapping(path, 'document').get('provenance')
     except ImuCalibrationError:
         before = None
     before = before if isinstance(before, Mapping) else {}
     parts = {
-        'verb': before.get('verb', found['verb']) == found['verb'],
+        'verb': before.get('verb', found.get('verb')) == found.get('verb'),
         'recordings': made_from(before) == made_from(found),
         'reference': _stands(before) == _stands(found),
     }

@@ -18,7 +18,12 @@ from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import Choices, inputs_of, provenance_with
+from imu_calibration.use_cases.choices import (
+    Choices,
+    inputs_of,
+    provenance_with,
+    require_same_inputs,
+)
 from imu_calibration.use_cases.recordings import Stand
 
 
@@ -97,12 +102,15 @@ class Diagnosed:
 
         return diagnosis_report(self.result)
 
-    def save(self, folder: str | PathLike) -> None:
+    def save(self, folder: str | PathLike, *, force: bool = False) -> None:
         """
         Write diagnosis.json, report.html and the extended calibration.yaml into a folder.
 
-        With proposed formulas that compensation undoes also extended.yaml.
+        With proposed formulas that compensation undoes also extended.yaml. The result of other
+        inputs there is replaced only with `force`.
         """
+        if not force:
+            require_same_inputs(folder, self.calibration.provenance)
         files.write_texts(
             folder,
             {

@@ -41,6 +41,7 @@ def export_calibration(
     topics: Topics = Topics(),
     anyway: bool = False,
     axes: str | None = None,
+    force: bool = False,
 ) -> Export:
     """
     Write a calibration in the format of another program.
@@ -66,6 +67,8 @@ def export_calibration(
         Also the numbers of a sensor whose decision is `harms`; without it they are nominal.
     axes : str, optional
         Axes of the readings of the calibration where it states none, or others, see `Choices`.
+    force : bool
+        Whether an existing file is replaced.
 
     Raises
     ------
@@ -85,6 +88,7 @@ def export_calibration(
         motion = _motion(known, bag, stand, topics)
     found = export(known, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
     if output is not None:
+        files.require_new(output, force=force)
         files.write_whole(output, found.content)
     return found
 

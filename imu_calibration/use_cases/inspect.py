@@ -19,6 +19,7 @@ from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.outcome import shortcomings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
@@ -44,8 +45,8 @@ from msg_adapters.imu import IMU_TYPE
 class RecordingSummary:
     """Properties of one Imu topic of a recording, with the joints and temperatures used with it."""
 
-    recording: Recording
-    """The recording, closed again."""
+    recording: Recording | None
+    """The recording, closed again; None for samples in memory."""
     streams: dict[str, StreamStatistics]
     """'imu', 'joints' or 'temperature' -> statistics of its stamps."""
     findings: tuple[CheckFinding, ...]
@@ -124,7 +125,7 @@ def _by_frame(bag, topics):
 
 
 def inspect(
-    bag: str | PathLike,
+    bag: str | PathLike | SampleBlock,
     topics: Iterable[Topics],
     table: Table | None,
     *,
@@ -140,8 +141,10 @@ def inspect(
 
 
 def _look(bag, topics, table, *, options, exclude):
-    recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
-    recording.close()
+    recording = None
+    if not isinstance(bag, SampleBlock):
+        recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
+        recording.close()
     preflight, calibrated = Preflight(table and table.gravity_value, strict=table is not None), None
     by_hand = None
     if table is not None:

@@ -13,7 +13,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.preprocessing.checks import warnings
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import raw_columns, readings_of
+from imu_calibration.use_cases.choices import raw_columns, readings_of, require_same_inputs
 from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of, sources_without
 
 
@@ -61,8 +61,14 @@ class IdentifiedNoise:
         report('drawing the report')
         return noise_report(self.result, self.figures, self.horizon)
 
-    def save(self, folder: str | PathLike, *, report: bool = True) -> None:
-        """Write noise.yaml and, when wanted, report.html into a folder."""
+    def save(self, folder: str | PathLike, *, report: bool = True, force: bool = False) -> None:
+        """
+        Write noise.yaml and, when wanted, report.html into a folder.
+
+        The noise of other inputs there is replaced only with `force`.
+        """
+        if not force:
+            require_same_inputs(folder, self.figures.provenance, 'noise.yaml')
         files.write_texts(
             folder,
             ({'report.html': self.report} if report else {})
@@ -71,6 +77,11 @@ class IdentifiedNoise:
 
     def __str__(self):
         return '\n'.join(lines(self.figures))
+
+
+def noise_provenance(recording: str | PathLike | SampleBlock) -> dict:
+    """Return the provenance of the noise of a recording, without options."""
+    return provenance_of([recording], {})
 
 
 def noise(

@@ -5,6 +5,7 @@ The names that a notebook needs, with errors in terms of their arguments.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import wraps
 from inspect import signature
 from os import PathLike
@@ -12,17 +13,23 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 from numpy.typing import ArrayLike
 
+from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
-from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.use_cases.calibrate import Calibrated
 from imu_calibration.use_cases.calibrate import calibrate as _calibrate
 from imu_calibration.use_cases.calibrate import check as _check
-from imu_calibration.use_cases.choices import Choices
+from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
+from imu_calibration.use_cases.compensate import Compensated
 from imu_calibration.use_cases.compensate import compensate as _compensate
 from imu_calibration.use_cases.diagnose import diagnose as _diagnose
-from imu_calibration.use_cases.recordings import Stand
+from imu_calibration.use_cases.inspect import RecordingSummary, imu_topics_of
+from imu_calibration.use_cases.inspect import inspect as _inspect
+from imu_calibration.use_cases.noise import IdentifiedNoise
+from imu_calibration.use_cases.noise import noise as _noise
+from imu_calibration.use_cases.recordings import Stand, table_of
 from imu_calibration.use_cases.simulate import simulate as _simulate
 
 Arguments = ParamSpec('Arguments')
@@ -46,6 +53,58 @@ def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments,
             raise type(error)(error.with_hint(hints), code=error.code) from None
 
     return with_hints
+
+
+@dataclass(frozen=True, eq=False)
+class Arrays:
+    """A recording as arrays; see `SampleBlock.from_arrays`."""
+
+    time: ArrayLike | None
+    """Seconds, or integer nanoseconds, shape (n,)."""
+    force: ArrayLike | None
+    """m/s^2, shape (n, 3)."""
+    rate: ArrayLike | None
+    """rad/s, shape (n, 3)."""
+    joints: dict[str, ArrayLike] | None
+    """Joint name -> rad, shape (n,)."""
+    temperature_c: ArrayLike | None
+    """Degrees Celsius, shape (n,)."""
+
+    def or_given(self, verb: str, recording: Any) -> Any:
+        """Return the recording, or these arrays as one; exactly one of both must be there."""
+        given = {
+            'recordings': recording,
+            'time': self.time,
+            'force': self.force,
+            'rate': self.rate,
+        }
+        names = [name for name, values in given.items() if values is not None]
+        if names == ['recordings']:
+            return recording
+        if names != ['time', 'force', 'rate']:
+            raise InputError(
+                f'{verb} must have either recordings, or the arrays time, force and rate, got'
+                f' {", ".join(names) or "none"}; give one or the other',
+                code='recording_or_arrays',
+            )
+        return SampleBlock.from_arrays(
+            cast(ArrayLike, self.time),
+            cast(ArrayLike, self.force),
+            cast(ArrayLike, self.rate),
+            joints=self.joints,
+            temperature_c=self.temperature_c,
+        )
+
+
+def _needed(verb: str, calibration: Any) -> Any:
+    """Return the calibration, which must be given."""
+    if calibration is None:
+        raise InputError(
+            f'{verb} must have a calibration, none was given; give it, or the path of its file',
+            key='calibration',
+            code='calibration_missing',
+        )
+    return calibration
 
 
 @_for_notebooks
@@ -89,29 +148,99 @@ def calibrate(
         As for `use_cases.calibrate.calibrate`.
 
     """
-    given = [values is not None for values in (recordings, time, force, rate)]
-    if given not in ([True, False, False, False], [False, True, True, True]):
-        names = [
-            name
-            for name, there in zip(('recordings', 'time', 'force', 'rate'), given, strict=True)
-            if there
-        ]
-        raise InputError(
-            'calibrate must have either recordings, or the arrays time, force and rate, got'
-            f' {", ".join(names) or "none"}; give one or the other'
-        )
-    if recordings is None:
-        recordings = SampleBlock.from_arrays(
-            cast(ArrayLike, time),
-            cast(ArrayLike, force),
-            cast(ArrayLike, rate),
-            joints=joints,
-            temperature_c=temperature_c,
-        )
-    return _calibrate(recordings, table, **choices)
+    arrays = Arrays(time, force, rate, joints, temperature_c)
+    return _calibrate(arrays.or_given('calibrate', recordings), table, **choices)
 
 
-check = _for_notebooks(_check)
-compensate = _for_notebooks(_compensate)
+@_for_notebooks
+def check(
+    recording: str | PathLike | SampleBlock | None = None,
+    calibration: Calibration | str | PathLike | None = None,
+    table: Stand | None = None,
+    *,
+    time: ArrayLike | None = None,
+    force: ArrayLike | None = None,
+    rate: ArrayLike | None = None,
+    joints: dict[str, ArrayLike] | None = None,
+    temperature_c: ArrayLike | None = None,
+    **choices: Any,
+) -> CheckResult:
+    """
+    Test a calibration on a recording, or on arrays.
+
+    ``check(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
+    `use_cases.calibrate.check`.
+    """
+    arrays = Arrays(time, force, rate, joints, temperature_c)
+    block = arrays.or_given('check', recording)
+    return _check(block, _needed('check', calibration), table, **choices)
+
+
+@_for_notebooks
+def compensate(
+    recording: str | PathLike | ImuSamples | SampleBlock | None = None,
+    calibration: Calibration | str | PathLike | None = None,
+    *,
+    time: ArrayLike | None = None,
+    force: ArrayLike | None = None,
+    rate: ArrayLike | None = None,
+    temperature_c: ArrayLike | None = None,
+    **options: Any,
+) -> Compensated:
+    """
+    Correct the calibrated errors in a recording, or in arrays.
+
+    ``compensate(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
+    `use_cases.compensate.compensate`.
+    """
+    arrays = Arrays(time, force, rate, None, temperature_c)
+    block = arrays.or_given('compensate', recording)
+    return _compensate(block, _needed('compensate', calibration), **options)
+
+
+@_for_notebooks
+def inspect(
+    recording: str | PathLike | SampleBlock | None = None,
+    table: Stand | None = None,
+    *,
+    time: ArrayLike | None = None,
+    force: ArrayLike | None = None,
+    rate: ArrayLike | None = None,
+    joints: dict[str, ArrayLike] | None = None,
+    temperature_c: ArrayLike | None = None,
+    **choices: Any,
+) -> list[RecordingSummary]:
+    """
+    Return the RecordingSummary of each Imu topic of a recording, or of arrays.
+
+    Arguments as for `calibrate`.
+    """
+    arrays = Arrays(time, force, rate, joints, temperature_c)
+    block = arrays.or_given('inspect', recording)
+    topics = topics_of(choices)
+    chosen = [topics] if isinstance(block, SampleBlock) else imu_topics_of(block, topics)
+    stand = None if table is None else table_of(table, [block], chosen[0])
+    return _inspect(block, chosen, stand, options=calibration_options(choices))
+
+
+@_for_notebooks
+def noise(
+    recording: str | PathLike | SampleBlock | None = None,
+    *,
+    time: ArrayLike | None = None,
+    force: ArrayLike | None = None,
+    rate: ArrayLike | None = None,
+    temperature_c: ArrayLike | None = None,
+    **options: Any,
+) -> IdentifiedNoise:
+    """
+    Identify the noise of an IMU from a recording at rest, or from arrays.
+
+    Arguments as for `calibrate` and `use_cases.noise.noise`.
+    """
+    arrays = Arrays(time, force, rate, None, temperature_c)
+    return _noise(arrays.or_given('noise', recording), **options)
+
+
 diagnose = _for_notebooks(_diagnose)
 simulate = _for_notebooks(_simulate)

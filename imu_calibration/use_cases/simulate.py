@@ -153,8 +153,11 @@ def simulate(
         seed=seed if imu_seed is None else imu_seed,
         catalogue=catalogue_of(catalogue),
     )
+    of_imu = seed if imu_seed is None else imu_seed
     for name in effects:
-        sensor, hidden = hidden_effect(model, name, seed, share=size, moment=0.6 * motion.duration)
+        sensor, hidden = hidden_effect(
+            model, name, of_imu, share=size, moment=0.6 * motion.duration
+        )
         model, values = replace(model, point={}).with_sized_effect(
             values, sensor, name, size=hidden
         )

@@ -1,0 +1,114 @@
+"""Arrays in place of recordings, integer nanoseconds, and files that are not replaced silently."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from refusal import refused
+
+import imu_calibration as imu
+from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document import files
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.use_cases.calibrate import Calibrated
+from imu_calibration.use_cases.simulate import simulate
+
+from worlds.compensation_cases import random_calibration
+
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
+PERIOD_NS, COUNT = 10_000_000, 12_000
+
+
+def at_rest(seed=0):
+    """Return arrays of two minutes at rest: time in ns from 1970, force, rate."""
+    rng = np.random.default_rng(seed)
+    time_ns = 1_700_000_000 * 10**9 + PERIOD_NS * np.arange(COUNT)
+    force = np.array([0.0, 0.0, 9.81]) + 0.01 * rng.normal(size=(COUNT, 3))
+    return {'time': time_ns, 'force': force, 'rate': 1e-3 * rng.normal(size=(COUNT, 3))}
+
+
+@pytest.mark.parametrize('start', (0, 5, 1_700_000_000 * 10**9 + 123))
+def test_integer_nanoseconds_are_exact(start):
+    time_ns = start + PERIOD_NS * np.arange(5) + np.array([0, 1, 2, 3, 4])
+    zeros = np.zeros((5, 3))
+    stamps = SampleBlock.from_arrays(time_ns, zeros, zeros).imu.stamp_ns
+    np.testing.assert_array_equal(stamps - stamps[0], time_ns - start)
+    assert stamps[0] == start or start < 10
+    seconds = SampleBlock.from_arrays(np.arange(5), zeros, zeros).imu.stamp_ns
+    np.testing.assert_array_equal(np.diff(seconds), 10**9)
+
+
+def test_noise_and_inspect_take_arrays():
+    arrays = at_rest()
+    found = imu.noise(**arrays)
+    white = found.figures.densities('accelerometer').white
+    assert white == pytest.approx(0.01 * np.sqrt(PERIOD_NS * 1e-9), rel=0.1)
+    (summary,) = imu.inspect(**arrays)
+    assert summary.streams['imu'].count == COUNT and not summary.refused
+    with refused(InputError, 'recording_or_arrays', 'noise', 'time'):
+        imu.noise(time=arrays['time'])
+
+
+def test_compensate_and_check_take_arrays():
+    calibration = random_calibration(2, ())
+    arrays = at_rest()
+    block = SampleBlock.from_arrays(**arrays)
+    expected = imu.compensate(block, calibration).imu.force_s
+    found = imu.compensate(calibration=calibration, **arrays).imu.force_s
+    np.testing.assert_array_equal(found, expected)
+    assert imu.check(calibration=calibration, **arrays).exit_code == 3  # one attitude
+    with refused(InputError, 'calibration_missing', 'check'):
+        imu.check(**arrays)
+
+
+def test_a_folder_is_the_calibration_in_it(tmp_path):
+    calibration = random_calibration(2, ())
+    (tmp_path / 'calibration.yaml').write_text(calibration_to_text(calibration))
+    np.testing.assert_array_equal(files.read_calibration(tmp_path).values, calibration.values)
+    with refused(InputError, 'file_unreadable', 'calibration.yaml'):
+        files.read_calibration(tmp_path.parent)
+
+
+def test_results_of_other_inputs_are_replaced_only_by_force(tmp_path):
+    first, second = (imu.noise(**at_rest(seed)) for seed in (0, 1))
+    first.save(tmp_path, report=False)
+    before = (tmp_path / 'noise.yaml').read_bytes()
+    first.save(tmp_path, report=False)
+    with refused(InputError, 'other_result', 'noise.yaml'):
+        second.save(tmp_path, report=False)
+    assert (tmp_path / 'noise.yaml').read_bytes() == before
+    second.save(tmp_path, report=False, force=True)
+    assert (tmp_path / 'noise.yaml').read_bytes() != before
+    one, other = (
+        Calibrated(SimpleNamespace(calibration=random_calibration(2, (), provenance=provenance)))
+        for provenance in (
+            {'verb': 'calibrate', 'bags': [{'name': name, 'sha256': 16 * name}]} for name in 'ab'
+        )
+    )
+    one.save(tmp_path, report=False)
+    with refused(InputError, 'other_result', 'calibration.yaml'):
+        other.save(tmp_path, report=False)
+    other.save(tmp_path, report=False, force=True)
+
+
+def test_an_existing_export_needs_force(tmp_path, capsys):
+    document, out = tmp_path / 'calibration.yaml', tmp_path / 'calibration.json'
+    document.write_text(calibration_to_text(random_calibration(2, ())))
+    out.write_text('mine')
+    arguments = ['export', str(document), '--to', 'json', '--output', str(out)]
+    assert main(arguments) == 1 and '--force' in capsys.readouterr().err
+    assert out.read_text() == 'mine'
+    assert main([*arguments, '--force']) == 0 and out.read_text() != 'mine'
+
+
+def test_the_seed_of_the_imu_fixes_its_added_effects():
+    first, second, other = (
+        simulate(profile='quick', seed=seed, imu_seed=of_imu, effects=['gyro_quadratic']).truth
+        for seed, of_imu in ((1, 7), (2, 7), (1, 8))
+    )
+    np.testing.assert_array_equal(first.values, second.values)
+    part = first.model.slices['gyroscope', 'gyro_quadratic']
+    assert not np.array_equal(first.values[part], other.values[part])
