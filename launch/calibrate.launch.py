@@ -83,6 +83,9 @@ def generate_launch_description():
                 description='topic of sensor_msgs/Temperature',
             ),
             DeclareLaunchArgument(
+                'respawn', default_value='false', description='start the node again when it ends'
+            ),
+            DeclareLaunchArgument(
                 'use_sim_time', default_value='false', description='use the time of /clock'
             ),
             Node(
@@ -90,6 +93,7 @@ def generate_launch_description():
                 executable='calibration_node',
                 namespace=LaunchConfiguration('namespace'),
                 output='screen',
+                respawn=LaunchConfiguration('respawn'),
                 parameters=[
                     LaunchConfiguration('params'),
                     {

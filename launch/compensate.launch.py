@@ -52,6 +52,9 @@ def generate_launch_description():
                 ),
             ),
             DeclareLaunchArgument(
+                'respawn', default_value='false', description='start the node again when it ends'
+            ),
+            DeclareLaunchArgument(
                 'params',
                 default_value=PathJoinSubstitution([CONFIG, 'compensator_node.yaml']),
                 description='parameters of the node, YAML',
@@ -85,6 +88,7 @@ def generate_launch_description():
                 executable='compensator_node',
                 namespace=LaunchConfiguration('namespace'),
                 output='screen',
+                respawn=LaunchConfiguration('respawn'),
                 parameters=[
                     LaunchConfiguration('params'),
                     {

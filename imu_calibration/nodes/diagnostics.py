@@ -158,7 +158,7 @@ class Complaints:
         for kind in [
             kind for kind in self._open if kind.startswith(source + ':') and kind not in present
         ]:
-            say(self._logger, LOG_INFO, f'over: {self._open.pop(kind)}')
+            say(self._logger, LOG_INFO, f'no longer: {self._open.pop(kind)}')
         for kind, (level, line) in present.items():
             if self._due(kind, REMINDER if kind in self._open else patience):
                 say(self._logger, level, line)

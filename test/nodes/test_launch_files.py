@@ -97,11 +97,11 @@ def test_the_filter_of_robot_localization_takes_what_the_compensator_publishes()
     [(node, found)] = yaml.safe_load(
         (ROOT / 'config/robot_localization_ekf.yaml').read_text()
     ).items()
-    parameters = found['ros__parameters']
+    parameters, name = found['ros__parameters'], node.removeprefix('/**/')
     assert (
-        node == 'ekf_filter_node'
+        node == '/**/ekf_filter_node'  # in any namespace
         and parameters['imu0'] == 'imu/data'
-        and f"name='{node}'" in (ROOT / 'launch/compensate.launch.py').read_text()
+        and f"name='{name}'" in (ROOT / 'launch/compensate.launch.py').read_text()
     )
     assert len(parameters['imu0_config']) == len(parameters['odom0_config']) == 15
     yaw_rate, forward = 11, 12  # of x y z, roll pitch yaw, velocities, rates, accelerations
