@@ -1,6 +1,7 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
 from itertools import groupby
+from pathlib import Path
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, complain, print_line
 
@@ -44,12 +45,14 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.use_cases.choices import require_same_inputs
     from imu_calibration.use_cases.noise import noise, noise_provenance
+    from imu_calibration.use_cases.recordings import existing
 
     choices = {
         name: value for name, value in options.arguments_for(noise).items() if value is not None
     }
-    if not options.force:
-        require_same_inputs(options.output, noise_provenance(options.bag), 'noise.yaml')
+    if not options.force and (Path(options.output) / 'noise.yaml').exists():
+        found = noise_provenance(existing(options.bag))
+        require_same_inputs(options.output, found, 'noise.yaml')
     with files.output_folder(options.output) as folder:
         found = noise(options.bag, **choices)
         for warning in found.warnings:
