@@ -173,6 +173,8 @@ def _axes_question(bag, options):
     """Return a note where the log of an autopilot is read without a statement of its axes."""
     if options.nominal is not None and options.nominal.axes:
         return []
+    if isinstance(bag, SampleBlock):  # arrays have no header
+        return []
     autopilot = autopilot_of(bag)
     if not autopilot:
         return []
