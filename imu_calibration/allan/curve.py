@@ -1,6 +1,6 @@
 """Allan deviation of samples, and the curve of a recording."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
@@ -8,6 +8,13 @@ from typing import Protocol
 
 import numpy as np
 
+from imu_calibration.allan.outliers import (
+    NO_FAULTS,
+    FaultSearch,
+    ReadingFaults,
+    RestOutliers,
+    without_outliers,
+)
 from imu_calibration.allan.still_parts import StillPart
 from imu_calibration.allan.trends import AxisTrend, Parts, TrendReference
 from imu_calibration.core.readings import RawReadings
@@ -288,6 +295,8 @@ class AllanCurve:
     """Samples of each part."""
     parts: tuple[Parts, ...]
     """The variances of each part, one for each axis."""
+    faults: ReadingFaults = NO_FAULTS
+    """What makes the white noise of the readings appear larger than that of the sensor."""
 
     @property
     def tau(self) -> np.ndarray:
@@ -350,7 +359,7 @@ class RestReader:
     nominal: RawReadings | None = None
     """For recordings in volts or counts."""
 
-    def read(self, *bare: Sink, raw: Sink | None = None) -> None:
+    def read(self, *bare: Sink, raw: Sequence[Sink] = ()) -> None:
         """
         Push the samples of each part into the sinks `bare` and `raw`.
 
@@ -367,9 +376,9 @@ class RestReader:
                 flat = spread(values if trend is None else values - trend, steps)
                 for sink in bare:
                     sink.push(*flat)
-                if raw is not None:
-                    raw.push(*spread(values, steps))
-            for sink in filter(None, (*bare, raw)):
+                for sink in raw:
+                    sink.push(*spread(values, steps))
+            for sink in (*bare, *raw):
                 sink.end_stretch()
 
     def _pieces(self):
@@ -378,7 +387,7 @@ class RestReader:
             np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2)
             for parts in self.parts
         ]
-        for cleaned in self._cleaner().all_of(self.source()):
+        for cleaned in without_outliers(self._cleaner().all_of(self.source()), RestOutliers()):
             for epoch, imu in cleaned.imu:
                 for number, (first, last) in enumerate(
                     np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()
@@ -394,11 +403,9 @@ class RestReader:
         factors = averaging_factors(
             max(round(part.seconds / self.period) for of_epoch in self.parts for part in of_epoch)
         )
-        bare, raw = (
-            AllanSums(factors, 6),
-            AllanSums(factors, 6) if any(self.detrending.trends) else None,
-        )
-        self.read(bare, raw=raw)
+        bare, faults = AllanSums(factors, 6), FaultSearch()
+        raw = AllanSums(factors, 6) if any(self.detrending.trends) else None
+        self.read(bare, raw=(faults,) if raw is None else (raw, faults))
         usable = bare.terms > 0
         variance, terms = (values[:, usable] for values in bare.by_stretch())
         parts = tuple(Parts(variance[:, :, axis], terms) for axis in range(variance.shape[2]))
@@ -409,4 +416,5 @@ class RestReader:
             (raw or bare).variance()[usable],
             tuple(bare.lengths),
             parts,
+            faults.result(),
         )

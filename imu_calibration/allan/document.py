@@ -568,7 +568,7 @@ def lines(figures: NoiseFigures) -> list[str]:
 
     Excluded parts, subtracted trends, other forms that fit, required recording time.
     """
-    found = [_rest_line(figures.recording)]
+    found = [_rest_line(figures.recording), *_fault_lines(figures.recording)]
     for sensor in SENSORS:
         if sensor not in figures.sensors:
             why = (figures.recording.get('unusable') or {}).get(sensor, 'it has no readings')
@@ -614,6 +614,21 @@ def _rest_line(recording):
     return f'at rest: {duration(recording["seconds_at_rest"])}{parts}' + (
         f'; left out: {said}' if said else ''
     )
+
+
+def _fault_lines(recording):
+    """Return a line for each sensor or axis with readings that are not noise of the sensor."""
+    found = []
+    for name, entry in (recording.get('faults') or {}).items():
+        share = entry['white_noise_too_high_by'] - 1.0
+        cause = 'outliers (heavy tails)'
+        if 'repeated' in entry:
+            cause = f'{entry["repeated"]:.0%} repeated readings'
+        found.append(
+            f'{name}: white noise may be up to {share:.1%} too high because of {cause}; its'
+            ' interval is wider by that'
+        )
+    return found
 
 
 def _axis_lines(name, sensor, axis):

@@ -27,6 +27,10 @@ HORIZON = 100.0
 s; for a filter with white noise and a random walk only: the walk has the same Allan variance at
 this averaging time.
 """
+MIN_WALK_REST = 3.0 * HORIZON
+"""
+Rest from which a random walk is exported, s: it holds two differences of means over the horizon.
+"""
 SLOW_PROCESSES = (FLICKER.name, RANDOM_WALK.name, GAUSS_MARKOV)
 
 

@@ -11,7 +11,13 @@ from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.moment_fit import Moments, Whitener
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, ScaleCovariance
 from imu_calibration.allan.still_parts import LEFT_OUT, StillPart, Survey, still_parts, survey
-from imu_calibration.allan.terms import LEAST_SCALES, PROCESSES, AxisNoise, identify_axis
+from imu_calibration.allan.terms import (
+    LEAST_SCALES,
+    PROCESSES,
+    AxisNoise,
+    identify_axis,
+    with_wider_white_noise,
+)
 from imu_calibration.allan.trends import MAX_TREND_BLOCKS, AxisTrend, Blocks, TrendSearch
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.errors import InputError
@@ -305,7 +311,10 @@ def identify_noise(
     with_lines: list[AxisNoise | None] = []
     for k, axis in enumerate(axes):
         line = searches[k].line() if k in searches else None
-        with_lines.append(None if axis is None else replace(axis, oscillation=line))
+        if axis is not None:
+            axis = with_wider_white_noise(axis, record.curve.faults.factor(k))
+            axis = replace(axis, oscillation=line)
+        with_lines.append(axis)
     return NoiseIdentification(record, tuple(with_lines))
 
 
@@ -424,6 +433,7 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
         'longest_part': float(max(part.seconds for part in record.parts)),
         'left_out': record.left_out,
         'dropped': dropped,
+        'faults': _fault_entries(record.curve.faults),
         'intervals_hold_for': 'this recording; the slow noise of another one can be outside',
     }
     if record.unusable:
@@ -437,6 +447,21 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
         tuple(float(tau) for tau in record.curve.tau),
         {'software': f'imu_calibration {__version__}'} | (provenance or {}),
     )
+
+
+def _fault_entries(faults):
+    """Return the doubtful readings for noise.yaml: name of a sensor or axis -> figures."""
+    entries = {}
+    for k, sensor in enumerate(SENSORS):
+        if faults.repeated[k] > 0:
+            entries[sensor] = {
+                'repeated': float(faults.repeated[k]),
+                'white_noise_too_high_by': float(faults.repetition[k]),
+            }
+        for letter, ratio in zip(AXES, faults.tails[3 * k : 3 * k + 3]):
+            if ratio > 1.0:
+                entries[f'{sensor} {letter}'] = {'white_noise_too_high_by': float(ratio)}
+    return entries
 
 
 def _record_for(axis, times):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 
+from imu_calibration.allan.outliers import RestOutliers, without_outliers
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock, runs_of
 from imu_calibration.preprocessing.checks import Preflight
@@ -42,6 +43,10 @@ PERIOD_MEDIAN_CHUNKS = 41
 """Chunks among which a period is the usual one."""
 SAME_PERIOD = 0.02
 """Relative change of the sampling period that ends a part."""
+MOST_MISSING = 0.2
+"""Share of the samples of a chunk that may be dropped where the median step is the usual one."""
+USUAL_STEP_SHARE = 0.05
+"""Least share of chunks without dropped samples that determines the period."""
 BRIDGE = 60.0
 """Longest hole within a part, s."""
 
@@ -119,18 +124,17 @@ def _at_the_usual_rate(chunks, period):
     """
     Return the chunks around which most have the usual period.
 
-    A chunk with a lost sample is longer, its neighbours are not.
+    A chunk with a lost sample is longer, its neighbours are not. Where outliers were dropped from
+    most chunks, the median step between stamps is still the period.
     """
     if not len(chunks):
         return np.zeros(0, bool)
-    return (
-        np.abs(
-            median_filter(chunks.duration / chunks.size, PERIOD_MEDIAN_CHUNKS, mode='nearest')
-            / period
-            - 1.0
-        )
-        <= SAME_PERIOD
-    )
+    mean_step = median_filter(chunks.duration / chunks.size, PERIOD_MEDIAN_CHUNKS, mode='nearest')
+    excess = mean_step / period - 1.0
+    usual_mean = np.abs(excess) <= SAME_PERIOD
+    median_step = median_filter(chunks.step, PERIOD_MEDIAN_CHUNKS, mode='nearest')
+    usual_step = np.abs(median_step / period - 1.0) <= SAME_PERIOD
+    return usual_mean | (usual_step & (np.abs(excess) <= MOST_MISSING))
 
 
 def _usual(chunks, still):
@@ -244,7 +248,8 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
     cleaner = BlockCleaner(nominal=nominal, watchers=[preflight], one_sensor=True)
     series: dict[int, ChunkSeries] = {}
     temperature, frame_id = _Thinned(), ''
-    for cleaned in cleaner.all_of(blocks):
+    outliers = RestOutliers()
+    for cleaned in without_outliers(cleaner.all_of(blocks), outliers):
         for epoch, imu in cleaned.imu:
             frame_id = frame_id or imu.frame_id
             columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
@@ -261,6 +266,8 @@ def survey(blocks: Iterable[SampleBlock], nominal: RawReadings | None = None) ->
             if reason != 'clock reset'
         }
     )
+    if outliers.dropped:
+        dropped['outlier'] = outliers.dropped
     epochs = [item.chunks() for _, item in sorted(series.items())]
     return Survey(
         epochs,
@@ -279,7 +286,8 @@ def _period(epochs):
     """
     Return the period of most chunks.
 
-    The mean of those near the median, since stamps may be rounded to milliseconds.
+    The mean of those near the median, since stamps may be rounded to milliseconds. Near the median
+    step between stamps, where such chunks exist: dropped outliers lengthen the others.
     """
     steps = (
         np.concatenate([chunks.duration / chunks.size for chunks in epochs])
@@ -289,6 +297,9 @@ def _period(epochs):
     if not len(steps):
         return 0.0
     middle = np.median(steps)
+    usual_step = np.median(np.concatenate([chunks.step for chunks in epochs]))
+    if np.mean(np.abs(steps / usual_step - 1.0) < SAME_PERIOD) > USUAL_STEP_SHARE:
+        middle = usual_step
     return float(
         f'{np.mean(steps[np.abs(steps / middle - 1.0) < 0.02]):.9g}'
     )  # without rounding errors in the file

@@ -319,6 +319,22 @@ def identify_axis(moments: Moments) -> AxisNoise:
     )
 
 
+def with_wider_white_noise(axis: AxisNoise, factor: float) -> AxisNoise:
+    """
+    Return the noise of an axis whose white noise may be too high by a factor, at least 1.
+
+    The lower end of its interval is divided by the factor, because outliers or repeated readings
+    raise the variances at every averaging time alike.
+    """
+    white = axis.terms[WHITE.name]
+    if factor <= 1.0 or white.value is None:
+        return axis
+    wider = replace(white, interval=(white.interval[0] / factor, white.interval[1]))
+    if wider.status == DETERMINED and wider.interval[1] > DETERMINED_RATIO * wider.interval[0]:
+        wider = replace(wider, status=WEAK, reason='readings at fault')
+    return replace(axis, terms=axis.terms | {WHITE.name: wider})
+
+
 def scatter_of(moments: Moments) -> float:
     """
     Return the excess variation of the level of the variances between parts.

@@ -39,6 +39,8 @@ class Chunks(AlignedArrays):
     """Shape (n, 6)."""
     range: np.ndarray
     """Largest minus smallest, shape (n, 6)."""
+    step: np.ndarray
+    """Median step between the stamps, s, shape (n,); a dropped sample does not change it."""
     size: int
     """Samples per chunk."""
     first_ns: int = 0
@@ -93,8 +95,10 @@ class ChunkSeries:
         if self.size is None and self._rest is not None and len(self._rest[0]) > MIN_CHUNK_SAMPLES:
             self.size = _size(self._rest[0], self._chunk_time)
             self._cut()
-        parts = self._parts or [(np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)))]
-        time, duration, mean, sd, extent = (
+        parts = self._parts or [
+            (np.zeros(0), np.zeros(0), *(np.zeros((0, 6)) for _ in range(3)), np.zeros(0))
+        ]
+        time, duration, mean, sd, extent, step = (
             np.concatenate(column) for column in zip(*parts, strict=True)
         )
         return Chunks(
@@ -103,6 +107,7 @@ class ChunkSeries:
             mean,
             sd,
             extent,
+            step,
             self.size or MIN_CHUNK_SAMPLES,
             int(self._first_ns or 0),
         )
@@ -155,6 +160,7 @@ def _describe(time, values):
         (mean + start[:, :, 0]).T,
         sd.T,
         spread.T,
+        np.median(np.diff(time, axis=1), axis=1),
     )
 
 

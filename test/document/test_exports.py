@@ -404,6 +404,18 @@ def test_a_random_walk_is_never_invented():
     )
 
 
+def test_a_random_walk_of_a_short_rest_is_not_exported():
+    """From half a minute of rest no walk is measured; covariances of samples need none."""
+    calibration = random_calibration(1, ())
+    short = replace(noise_figures(), recording={'seconds_at_rest': 31.0})
+    for name in ('vins', 'orb-slam3', 'openvins'):
+        with refused(InputError, 'rest_too_short_for_walk', 31):
+            export(calibration, find_target(name), noise=short, rate=RATE)
+    assert export(calibration, find_target('robot-localization'), noise=short).content
+    long = replace(noise_figures(), recording={'seconds_at_rest': 301.0})
+    assert export(calibration, find_target('vins'), noise=long).content
+
+
 def test_who_takes_no_calibration_is_to_be_fed_compensated_readings():
     found = export(random_calibration(1), find_target('vins'), noise=noise_figures())
     assert all(

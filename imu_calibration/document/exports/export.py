@@ -10,7 +10,7 @@ import numpy as np
 
 import imu_calibration
 from imu_calibration.allan.document import BASIS
-from imu_calibration.allan.figures import Densities, NoiseFigures
+from imu_calibration.allan.figures import MIN_WALK_REST, Densities, NoiseFigures
 from imu_calibration.core.errors import InputError, did_you_mean
 from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.units import error_text
@@ -184,12 +184,28 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
         return None, [
             f'the noise figures are left out: there must be {lacks} from a noise document'
         ]
+    if target.needs_walk and figures is not None:
+        _require_rest_for_walk(figures)
     bases = {sensor: getattr(found, sensor).basis for sensor in SENSORS if target.needs_walk}
     return target.noise(found), [
         f'random walk of the {sensor}: {BASIS[basis]}'
         for sensor, basis in bases.items()
         if basis != 'walk'
     ]
+
+
+def _require_rest_for_walk(figures):
+    """Refuse the random walk of a rest in which none can be seen; imported figures have no rest."""
+    seconds = figures.recording.get('seconds_at_rest')
+    if seconds is None or seconds >= MIN_WALK_REST:
+        return
+    raise InputError(
+        f'a random walk must be measured in at least {MIN_WALK_REST:.0f} s of rest, that of the'
+        f' noise document is from {seconds:.0f} s; record a longer rest, or export without a noise'
+        ' document',
+        key='noise',
+        code='rest_too_short_for_walk',
+    )
 
 
 def _noise_of(calibration, figures, rate) -> Noise | None:

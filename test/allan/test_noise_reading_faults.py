@@ -1,0 +1,119 @@
+"""Noise of readings with torn register reads, heavy tails and repeated readings."""
+
+import numpy as np
+import pytest
+
+from imu_calibration.allan.document import lines, noise_from_text, noise_to_text
+from imu_calibration.allan.identify import figures_of, identify_noise
+from imu_calibration.allan.outliers import FaultSearch, outliers
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.effects.base import SENSORS
+
+RATE = 125.0
+DENSITY = {'accelerometer': 1.9e-3, 'gyroscope': 1.5e-4}
+"""White noise, m/s^2/sqrt(Hz) and rad/s/sqrt(Hz)."""
+SCALE = {'accelerometer': 8192 / 9.80665, 'gyroscope': 65.5 * 180 / np.pi}
+"""Counts per m/s^2 and per rad/s."""
+
+
+def recording(values, rate):
+    """Readings, shape (n, 6), as one block."""
+    stamps = 10**18 + np.round(np.arange(len(values)) / rate * 1e9).astype(np.int64)
+    return lambda: iter([SampleBlock(ImuSamples(stamps, values[:, :3], values[:, 3:], 'imu'))])
+
+
+def torn_readings(seconds, share, level):
+    """Counts near a change of the high byte, a share of them with the high byte of the last one."""
+    rng = np.random.default_rng(4)
+    n = int(seconds * RATE)
+    columns = []
+    for sensor in SENSORS:
+        for axis in range(3):
+            spread = DENSITY[sensor] * RATE**0.5 * SCALE[sensor]
+            centre = level[axis] if sensor == 'accelerometer' else 128.0
+            count = np.round(rng.normal(centre, spread, n + 1)).astype(np.int64) & 0xFFFF
+            torn = (count[:-1] & 0xFF00) | (count[1:] & 0xFF)
+            read = np.where(rng.random(n) < share, torn, count[1:])
+            columns.append(np.where(read > 0x7FFF, read - 0x10000, read) / SCALE[sensor])
+    return np.column_stack(columns)
+
+
+def white_interval(result, column):
+    return result.axes[column].terms['white_noise'].interval
+
+
+def test_torn_reads_change_neither_the_noise_nor_the_rest():
+    values = torn_readings(500.0, 0.04, (513.0, -766.0, 8188.0))
+    result = identify_noise(recording(values, RATE))
+    for column in range(6):
+        low, high = white_interval(result, column)
+        # 95 % intervals of six axes: the truth is at most half a width outside
+        margin = 0.5 * (high - low)
+        assert low - margin < DENSITY[SENSORS[column // 3]] < high + margin
+        assert high / low < 1.25
+    assert result.record.left_out == {'motion': 0.0, 'short_rests': 0.0, 'other_sampling_rate': 0.0}
+    assert len(result.record.parts) == 1
+
+
+def test_heavy_tails_widen_the_interval():
+    """Three readings in a hundred have four times the noise: none of them is a sure outlier."""
+    rng = np.random.default_rng(12)
+    n = int(400 * RATE)
+    sd = np.repeat([0.02, 1e-3], 3)
+    values = rng.normal(0, 1, (n, 6)) * sd + [0.0, 0.0, 9.8, 0.0, 0.0, 0.0]
+    doubtful = rng.random(n) < 0.03
+    values[doubtful, :2] += rng.normal(0, 4, (doubtful.sum(), 2)) * sd[:2]
+    result = identify_noise(recording(values, RATE))
+    for column in range(6):
+        low, high = white_interval(result, column)
+        margin = 0.5 * (high - low)
+        assert low - margin < sd[column] / RATE**0.5 < high + margin
+    assert low > 0.95 * sd[5] / RATE**0.5
+    figures = figures_of(result)
+    assert set(figures.recording['faults']) == {'accelerometer x', 'accelerometer y'}
+    again = noise_from_text(noise_to_text(figures))
+    assert any(line.startswith('accelerometer x: white noise') for line in lines(again))
+
+
+def test_repeated_readings_of_one_sensor_are_named_with_their_effect():
+    """Runs of one and two: the noise is sqrt(mean square) / mean of their lengths too high."""
+    rng = np.random.default_rng(8)
+    n_new = 30_000
+    lengths = rng.integers(1, 3, n_new)
+    values = rng.normal(0, 1, (lengths.sum(), 6)) * ([0.02] * 3 + [1e-3] * 3) + [0, 0, 9.8, 0, 0, 0]
+    values[:, 3:] = np.repeat(values[:n_new, 3:], lengths, axis=0)
+    search = FaultSearch()
+    for part in np.array_split(values, 7):
+        search.push(part, np.ones(len(part), bool))
+    faults = search.result()
+    assert faults.repeated == pytest.approx([0.0, 1 / 3], abs=0.01)
+    assert faults.repetition == pytest.approx([1.0, np.sqrt(2.5) / 1.5], abs=0.005)
+    assert faults.tails == pytest.approx(np.ones(6))
+    # The interval of a recording of five minutes holds the density of the sensor.
+    part = values[: int(300 * RATE)]
+    result = identify_noise(recording(part, RATE))
+    new_rate = RATE / 1.5
+    for column in (3, 4, 5):
+        low, high = white_interval(result, column)
+        assert low < 1e-3 / np.sqrt(new_rate) < high
+    assert 'gyroscope' in figures_of(result).recording['faults']
+
+
+def test_gaussian_readings_are_without_faults():
+    rng = np.random.default_rng(3)
+    values = rng.normal(0, 1, (30_000, 6))
+    search = FaultSearch()
+    search.push(values, np.ones(len(values), bool))
+    faults = search.result()
+    assert np.all(faults.tails == 1.0)
+    assert not faults.repeated.any()
+    assert not outliers(values).any()
+
+
+def test_a_knock_is_no_outlier():
+    """Twelve readings in a row deviate: the search for rest must see them."""
+    rng = np.random.default_rng(3)
+    values = rng.normal(0, 1, (1000, 6))
+    values[500:512, 0] += 40 * (-1.0) ** np.arange(12)
+    values[700, 1] += 12.0
+    assert np.flatnonzero(outliers(values)).tolist() == [700]
