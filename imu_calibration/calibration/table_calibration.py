@@ -17,6 +17,7 @@ from imu_calibration.calibration.from_solution import (
     weak_on_table,
     with_gravity_uncertainty,
 )
+from imu_calibration.calibration.latitude_check import with_latitude_findings
 from imu_calibration.calibration.proof import (
     prove_readings,
     prove_solution,
@@ -268,6 +269,7 @@ def conclude(
     The solution is of data gathered with `model`.
     """
     tolerances = tolerances_of(solution.model, options.tolerances)
+    gathered.findings = with_latitude_findings(gathered.findings, solution, table)
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)
     uncorrected = uncorrected_on_table(

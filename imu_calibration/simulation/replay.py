@@ -15,7 +15,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, WindowKind, all_samples, chunks
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.sensor_noise import gauss_markov
-from imu_calibration.simulation.session import unit_hum
+from imu_calibration.simulation.session import turning_world, unit_hum
 
 BIAS_TIME = 100.0
 """Correlation time of the bias process where it is not identified, s."""
@@ -112,6 +112,7 @@ def replay(
 
     """
     blocks = list(blocks)
+    table = turning_world(table, model)
     windows = MotionGatherer(table, keep_unused=True).all_of(blocks)
     if not windows:
         raise InputError(

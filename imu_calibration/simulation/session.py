@@ -143,6 +143,20 @@ def true_imu(
     return known
 
 
+def turning_world(table: Table, model: SensorModel) -> Table:
+    """
+    Return the table of a simulated world: it turns with the Earth wherever a latitude is given.
+
+    Without an azimuth in the description north is along base x; calibration estimates it. An
+    Earth's rate that the model states is that of the world already.
+    """
+    if table.latitude is None or table.azimuth_deg is not None:
+        return table
+    if ('reference', 'earth_rate') in model.slices:
+        return table
+    return replace(table, azimuth_deg=0.0)
+
+
 def require_joints(model: SensorModel, table: Table) -> None:
     """
     Refuse a model with effects of the reference for joints that differ from those of the table.
@@ -243,7 +257,7 @@ class LiveSimulation:
         self.model, self.values, self.table, self.motion, self.options = (
             model,
             values,
-            table,
+            turning_world(table, model),
             motion,
             options,
         )

@@ -1,0 +1,138 @@
+"""The latitude of the table against the Earth's rate that the gyroscopes measured."""
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.units import significant
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.rotations import EARTH_RATE
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+
+CHECK = 'latitude'
+CONTRADICTING_SDS = 5.0
+"""Standard deviations beyond which the estimate contradicts the latitude."""
+LEAST_SHARE = 0.1
+"""The same as a share of the Earth's rate: below, small errors of the model explain it."""
+AGREEING_SDS = 4.0
+"""Standard deviations within which an estimate agrees with a cause."""
+AGREEING_SHARE = 0.15
+"""The same as a share of the effect of the cause."""
+FARTHEST_SHARE = 0.5
+"""An estimate farther than this share from an effect does not agree with it, however uncertain."""
+DEG_PER_HOUR = np.degrees(1.0) * 3600.0
+
+
+def latitude_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]:
+    """
+    Return the contradictions between the latitude and the estimates.
+
+    ``omega_up = Omega sin(latitude)`` and ``|omega| = Omega`` do not depend on the azimuth. Where
+    the table gives the azimuth, the reference contains the Earth's rate, and a latitude with the
+    wrong sign leaves ``-2 Omega sin(latitude)`` about the vertical: at rest that is a g-sensitivity
+    ``k f`` with the same k for each axis.
+
+    Parameters
+    ----------
+    solution : Solution
+        With all allowances in its covariance.
+    table : Table
+
+    Raises
+    ------
+    InputError
+        When the latitude with the other sign explains the estimate.
+
+    """
+    if table.latitude is None:
+        return ()
+    if ('reference', 'earth_rate') in solution.model.slices:
+        return _of_free_rate(solution, table)
+    if ('gyroscope', 'gyro_g_sensitivity') in solution.model.slices:
+        _refuse_vertical_rate(solution, table)
+    return ()
+
+
+def _of_free_rate(solution, table):
+    """Compare the vertical component and the length of the estimated Earth's rate."""
+    part = solution.model.slices['reference', 'earth_rate']
+    if solution.held[part].any():
+        return ()
+    rate = solution.values[part]
+    covariance = solution.covariance[part, part]
+    expected_up = EARTH_RATE * float(np.sin(np.radians(table.latitude)))
+    up_sd = float(np.sqrt(covariance[2, 2]))
+    if _contradicts(rate[2] - expected_up, up_sd):
+        if _agrees(rate[2] + expected_up, up_sd, expected_up):
+            raise _wrong_sign(table, rate[2], expected_up)
+        return (_finding('vertical component', rate[2], up_sd, expected=expected_up),)
+    length = float(np.linalg.norm(rate))
+    direction = rate / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    length_sd = float(np.sqrt(direction @ covariance @ direction))
+    if _contradicts(length - EARTH_RATE, length_sd):
+        return (_finding('magnitude', length, length_sd, expected=EARTH_RATE),)
+    return ()
+
+
+def _refuse_vertical_rate(solution, table):
+    """Refuse a g-sensitivity that is the vertical rate of a latitude with the wrong sign."""
+    part = solution.model.slices['gyroscope', 'gyro_g_sensitivity']
+    values, sd = solution.values[part], np.sqrt(np.diag(solution.covariance[part, part]))
+    if len(values) != 9 or solution.held[part].any():
+        return
+    matrix, matrix_sd = values.reshape(3, 3), sd.reshape(3, 3)
+    common = float(np.trace(matrix)) / 3.0
+    # The sds of the three diagonal entries as if they were fully correlated.
+    common_sd = float(matrix_sd.diagonal().mean())
+    left = -2.0 * EARTH_RATE * float(np.sin(np.radians(table.latitude))) / table.gravity_value
+    if abs(common) < CONTRADICTING_SDS * common_sd or not _agrees(common - left, common_sd, left):
+        return
+    rest = np.abs(matrix - common * np.eye(3))
+    if np.any(rest > np.maximum(AGREEING_SDS * matrix_sd, AGREEING_SHARE * abs(left))):
+        return
+    expected_up = EARTH_RATE * float(np.sin(np.radians(table.latitude)))
+    raise _wrong_sign(table, expected_up + common * table.gravity_value, expected_up)
+
+
+def _contradicts(difference, sd):
+    return abs(difference) > max(CONTRADICTING_SDS * sd, LEAST_SHARE * EARTH_RATE)
+
+
+def _agrees(difference, sd, size):
+    return abs(difference) < min(
+        max(AGREEING_SDS * sd, AGREEING_SHARE * abs(size)), FARTHEST_SHARE * abs(size)
+    )
+
+
+def _wrong_sign(table, measured, expected):
+    return InputError(
+        f"the latitude must give the vertical component of the Earth's rate, {table.latitude:g} deg"
+        f' gives {_hourly(expected)} deg/h and the gyroscopes measured {_hourly(measured)} deg/h:'
+        ' its sign is wrong; correct the latitude in the table (south is negative), and look at the'
+        ' g-sensitivity of the gyroscopes afterwards',
+        key='latitude',
+        code='latitude_sign',
+    )
+
+
+def _finding(name, measured, sd, *, expected):
+    return CheckFinding(
+        CHECK,
+        WARNING,
+        f"the latitude must give the {name} of the Earth's rate: {_hourly(expected)} deg/h, the"
+        f' gyroscopes measured {_hourly(measured)} ± {_hourly(sd)} deg/h; correct the latitude in'
+        ' the table; if it is right, gyro_g_sensitivity or a drift can be the cause',
+        key='latitude',
+    )
+
+
+def _hourly(rate):
+    return significant(rate * DEG_PER_HOUR, 3)
+
+
+def with_latitude_findings(
+    findings: tuple[CheckFinding, ...], solution: Solution, table: Table
+) -> tuple[CheckFinding, ...]:
+    """Return the findings of a recording, those on the latitude first."""
+    earlier = tuple(finding for finding in findings if finding.check != CHECK)
+    return (*latitude_findings(solution, table), *earlier)
