@@ -224,6 +224,7 @@ def read_csv(
             key='columns',
         )
     table.load([name for each in found for name in each.names], where)
+    _require_distinct_times(table.raw(by_quantity['time'].names[0]), path)
     time = _with_unit(
         by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path
     )
@@ -847,6 +848,29 @@ def _unit(quantity, text):
     text = text.strip().replace(' ', '')
     known = {unit.lower(): unit for unit in COLUMN_UNITS[quantity]} | SPELLINGS[quantity]
     return known.get(text)
+
+
+MIN_DISTINCT_TIMES = 0.1
+"""Least share of different times: below, they were written with too few digits, or never set."""
+MIN_ROWS_OF_TIMES = 20
+"""Rows from which the share is tested."""
+
+
+def _require_distinct_times(values, path):
+    """Refuse times that are equal in nearly all rows."""
+    # Cells that are no time are refused with their own cause.
+    values = values[~np.isnan(values)] if values.dtype.kind == 'f' else values[~np.isnat(values)]
+    n_distinct = len(np.unique(values))
+    if len(values) < MIN_ROWS_OF_TIMES or n_distinct >= MIN_DISTINCT_TIMES * len(values):
+        return
+    what = 'all stamps are equal' if n_distinct == 1 else f'only {n_distinct} stamps differ'
+    raise InputError(
+        f'the time in {path} must differ from row to row, {what} in {len(values)} rows, the first'
+        f' is {values[0]}: written with too few digits?; export the time with nine digits after'
+        ' the second, or name another column with time=NAME:UNIT',
+        key='columns',
+        code='stamps_equal',
+    )
 
 
 def _time_unit(values):
