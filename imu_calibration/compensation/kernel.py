@@ -7,6 +7,7 @@ With bias, matrix and lever arms it is one straight line of products; every furt
 fixed-point steps.
 """
 
+import ast
 import re
 from collections.abc import Callable
 
@@ -30,6 +31,12 @@ Sum of the changes in one fixed-point step (m/s^2, rad/s) below which the iterat
 """
 MAX_KERNEL_CHARACTERS = 200_000
 """Largest number of characters of a kernel; compiling it needs about a second and 100 MB."""
+MAX_OPERATIONS = 50_000
+"""
+Largest number of operations for one sample, in all fixed-point steps; they need about 1 ms.
+"""
+OPERATIONS_OF_A_CALL = 8
+"""Operations of arithmetic that need as much time as the call of one function."""
 BEFOREHAND = {'temperature', 'thermal branch', 'vibration', 'reference temperature'}
 """Quantities of a sample that are available before the correction of either sensor."""
 
@@ -55,17 +62,50 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     Raises
     ------
     InputError
-        If an effect to be inverted has columns that a single sample does not determine.
+        If an effect to be inverted has columns that a single sample does not determine, or if the
+        effects need more than `MAX_OPERATIONS`.
 
     """
     namespace, text = dict(SCALAR_FUNCTIONS), kernel_text(calibration, transfer)
     if len(text) > MAX_KERNEL_CHARACTERS:
         raise InputError(
             f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS}'
-            f' characters of arithmetic, got {len(text)}; use fewer or shorter effects'
+            f' characters of arithmetic, got {len(text)}; use fewer or shorter effects',
+            code='effects_too_long',
         )
-    exec(compile(text, '<compensation kernel>', 'exec'), namespace)
+    try:
+        n_operations = count_operations(ast.parse(text))
+        if n_operations <= MAX_OPERATIONS:
+            exec(compile(text, '<compensation kernel>', 'exec'), namespace)
+    except (RecursionError, MemoryError):  # the compiler steps into each term of a sum
+        n_operations = 'a sum that Python cannot compile'
+    if 'kernel' not in namespace:
+        raise InputError(
+            f'the effects of a calibration must need at most {MAX_OPERATIONS} operations for one'
+            f' sample, got {n_operations}; use fewer or shorter effects',
+            code='effects_cost',
+        )
     return namespace['kernel']
+
+
+def count_operations(tree: ast.Module) -> int:
+    """Return the operations of a kernel for a sample that needs every fixed-point step."""
+    n_operations = _operations_in(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.For):
+            n_operations += (MAX_INVERSION_STEPS - 1) * _operations_in(node)
+    return n_operations
+
+
+def _operations_in(tree):
+    """Return the operations of a tree that is executed once."""
+    n_operations = 0
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            n_operations += OPERATIONS_OF_A_CALL
+        elif isinstance(node, (ast.BinOp, ast.UnaryOp, ast.Compare)):
+            n_operations += 1
+    return n_operations
 
 
 def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> str:

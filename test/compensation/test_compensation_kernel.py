@@ -1,12 +1,25 @@
 """The function made for one calibration equals the catalogue's own compensation."""
 
+import ast
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal import refused
 
+from imu_calibration.compensation import kernel
 from imu_calibration.compensation.compensate import Transfer, compensate
-from imu_calibration.compensation.kernel import kernel_text, make_kernel
+from imu_calibration.compensation.kernel import (
+    MAX_OPERATIONS,
+    count_operations,
+    kernel_text,
+    make_kernel,
+)
+from imu_calibration.core.errors import InputError
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.sensor_model import SensorModel
 
 from worlds.compensation_cases import FURTHER, random_calibration, random_motion
 
@@ -35,11 +48,11 @@ def both(calibration, transfer, seed=0, n=12):
         vibration=vibration,
         transfer=transfer,
     )
-    kernel = make_kernel(calibration, transfer)
+    corrected = make_kernel(calibration, transfer)
     dt = temperature - calibration.model.temperature_ref_c
     got = np.array(
         [
-            kernel(*row)
+            corrected(*row)
             for row in np.column_stack([force, rate, slope, dt, branch, vibration]).tolist()
         ]
     )
@@ -64,10 +77,68 @@ def test_the_usual_model_is_one_straight_line(accelerometer):
 
 def test_zero_input_does_not_trip_the_asymmetry():
     calibration = random_calibration(2, ('accel_scale_asymmetry',), ('gyro_scale_asymmetry',))
-    kernel = make_kernel(calibration)
+    corrected = make_kernel(calibration)
     force, rate = (
         calibration.value(sensor, 'bias')[None] for sensor in ('accelerometer', 'gyroscope')
     )
     expected = compensate(calibration, force, rate, alpha_s=np.zeros((1, 3)))
-    got = kernel(*force[0].tolist(), *rate[0].tolist(), 0.0, 0.0, 0.0, 0.0)
+    got = corrected(*force[0].tolist(), *rate[0].tolist(), 0.0, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(got, np.column_stack([expected.force, expected.rate])[0], atol=1e-15)
+
+
+def with_own_effects(n_effects, n_functions):
+    """Return a calibration with own effects, each a sum of functions of the force."""
+    definitions = {}
+    for k in range(n_effects):
+        column = '+'.join(f'cos({k}.{j + 10}*f_y)' for j in range(n_functions))
+        definitions[f'own_{k}'] = {
+            'sensor': 'accelerometer',
+            'column': column,
+            'unit': 'm/s^2',
+            'tolerance': 1e-3,
+            'text': 'a sum of waves',
+        }
+    model = SensorModel(catalogue=CATALOGUE.with_definitions(definitions))
+    for name in definitions:
+        model = model.with_effect('accelerometer', name)
+    values = model.start()
+    for name in definitions:
+        values[model.slices['accelerometer', name]] = 1e-3
+    n_values = len(values)
+    plain = random_calibration(0, ())
+    return replace(
+        plain,
+        model=model,
+        values=values,
+        covariance=np.zeros((n_values, n_values)),
+        status=('determined',) * n_values,
+    )
+
+
+def test_own_effects_have_a_limit_of_operations():
+    """50 own effects of many functions needed 12.7 ms for one sample."""
+    with refused(InputError, 'effects_cost', str(MAX_OPERATIONS)):
+        make_kernel(with_own_effects(50, 22))
+    few = with_own_effects(10, 22)
+    assert MAX_OPERATIONS / 10 < count_operations(ast.parse(kernel_text(few))) < MAX_OPERATIONS
+    assert np.all(np.isfinite(make_kernel(few)(*[1.0] * 10)))
+
+
+def test_a_sum_that_cannot_be_compiled_is_refused(monkeypatch):
+    """The compiler of Python ends with an error of recursion at some thousand terms."""
+    long = 'def kernel(*x):\n    return ' + ' + '.join(['1.5'] * 9000)
+    monkeypatch.setattr(kernel, 'kernel_text', lambda *_: long)
+    with refused(InputError, 'effects_cost', str(MAX_OPERATIONS)):
+        make_kernel(None)
+
+
+def test_every_effect_of_the_catalogue_together_is_far_from_the_limit():
+    every = random_calibration(0, FURTHER['accelerometer'], FURTHER['gyroscope'])
+    assert count_operations(ast.parse(kernel_text(every))) < MAX_OPERATIONS / 4
+
+
+def test_each_step_of_a_loop_counts():
+    once = 'x = a * b + cos(c)\n'
+    assert count_operations(ast.parse(once)) == 10
+    loop = 'for _ in range(12):\n    x = a * b\n'
+    assert count_operations(ast.parse(loop)) == 8 + 12 + 11 * 8
