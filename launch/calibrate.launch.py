@@ -9,10 +9,11 @@ Calibrate an IMU on a table, live.
     ros2 launch imu_calibration calibrate.launch.py table:=none imu:=/imu/data_raw      # by hand,
     without a table
 
-Several IMUs: one launch each with its own `namespace` and `save_file`.
+Several IMUs: one launch each with its own `namespace` and `save_file`. An empty argument has no
+effect on `params`.
 """
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -21,6 +22,16 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
+OPTIONAL_PARAMETERS = {
+    'urdf': ('urdf_file', str),
+    'imu_link': ('imu_link', str),
+    'save_file': ('save_file', str),
+    'resume': ('resume', bool),
+    'gravity': ('gravity', float),
+    'latitude': ('latitude', float),
+    'noise_file': ('noise_file', str),
+}
+"""Launch argument, empty by default -> parameter that it sets, and the type of its value."""
 
 
 def generate_launch_description():
@@ -63,8 +74,23 @@ def generate_launch_description():
             ),
             DeclareLaunchArgument(
                 'resume',
-                default_value='false',
-                description='continue with the accumulator in the folder of save_file',
+                default_value='',
+                description='true: continue with the accumulator in the folder of save_file',
+            ),
+            DeclareLaunchArgument(
+                'gravity',
+                default_value='',
+                description='local gravity without a table, m/s^2; empty: by latitude or params',
+            ),
+            DeclareLaunchArgument(
+                'latitude',
+                default_value='',
+                description='latitude without a table, deg, for the gravity there',
+            ),
+            DeclareLaunchArgument(
+                'noise_file',
+                default_value='',
+                description='noise.yaml of this IMU, from the verb noise; with a table',
             ),
             DeclareLaunchArgument(
                 'namespace', default_value='', description='one per IMU when there are several'
@@ -88,32 +114,32 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'use_sim_time', default_value='false', description='use the time of /clock'
             ),
-            Node(
-                package='imu_calibration',
-                executable='calibration_node',
-                namespace=LaunchConfiguration('namespace'),
-                output='screen',
-                respawn=LaunchConfiguration('respawn'),
-                parameters=[
-                    LaunchConfiguration('params'),
-                    {
-                        'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
-                        'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
-                        'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
-                        'save_file': ParameterValue(
-                            LaunchConfiguration('save_file'), value_type=str
-                        ),
-                        'resume': ParameterValue(LaunchConfiguration('resume'), value_type=bool),
-                        'use_sim_time': ParameterValue(
-                            LaunchConfiguration('use_sim_time'), value_type=bool
-                        ),
-                    },
-                ],
-                remappings=[
-                    ('imu/data_raw', LaunchConfiguration('imu')),
-                    ('joint_states', LaunchConfiguration('joint_states')),
-                    ('imu/temperature', LaunchConfiguration('temperature')),
-                ],
-            ),
+            OpaqueFunction(function=_nodes),
         ]
     )
+
+
+def _nodes(context):
+    """Return the node; a parameter without an argument keeps its value in `params`."""
+    parameters = {
+        'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
+        'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
+    }
+    for argument, (name, kind) in OPTIONAL_PARAMETERS.items():
+        if LaunchConfiguration(argument).perform(context):
+            parameters[name] = ParameterValue(LaunchConfiguration(argument), value_type=kind)
+    return [
+        Node(
+            package='imu_calibration',
+            executable='calibration_node',
+            namespace=LaunchConfiguration('namespace'),
+            output='screen',
+            respawn=LaunchConfiguration('respawn'),
+            parameters=[LaunchConfiguration('params'), parameters],
+            remappings=[
+                ('imu/data_raw', LaunchConfiguration('imu')),
+                ('joint_states', LaunchConfiguration('joint_states')),
+                ('imu/temperature', LaunchConfiguration('temperature')),
+            ],
+        )
+    ]

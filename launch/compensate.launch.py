@@ -8,19 +8,28 @@ Optionally feed robot_localization with the corrected messages.
     calibration:=/path/to/calibration.yaml corrected:=imu/data ekf:=true
 
 Subscribers of imu/data, the usual topic, receive corrected readings with corrected:=imu/data and a
-driver on imu/data_raw.
+driver on imu/data_raw. An empty argument has no effect on `params`.
 """
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
+OPTIONAL_PARAMETERS = {
+    'calibration': ('calibration_file', str),
+    'adopt': ('adopt', str),
+    'target_frame': ('target_frame', str),
+    'anyway': ('anyway', bool),
+    'gravity': ('gravity', float),
+    'noise_file': ('noise_file', str),
+}
+"""Launch argument, empty by default -> parameter that it sets, and the type of its value."""
 
 
 def generate_launch_description():
@@ -37,10 +46,10 @@ def generate_launch_description():
             ),
             DeclareLaunchArgument(
                 'adopt',
-                default_value='file_then_topic',
+                default_value='',
                 description=(
                     'source of calibrations: file (in the field), topic (replaces the file),'
-                    ' file_then_topic'
+                    ' file_then_topic (the default of the node)'
                 ),
             ),
             DeclareLaunchArgument(
@@ -50,6 +59,21 @@ def generate_launch_description():
                     'frame to move the readings to, by the transforms on /tf_static; empty: that of'
                     ' the sensor'
                 ),
+            ),
+            DeclareLaunchArgument(
+                'anyway',
+                default_value='',
+                description='true: also correct a sensor whose decision is unproven',
+            ),
+            DeclareLaunchArgument(
+                'gravity',
+                default_value='',
+                description='gravity at the site of the robot, m/s^2, for the test at stops',
+            ),
+            DeclareLaunchArgument(
+                'noise_file',
+                default_value='',
+                description='noise.yaml of this IMU, from the verb noise, for the covariances',
             ),
             DeclareLaunchArgument(
                 'respawn', default_value='false', description='start the node again when it ends'
@@ -81,32 +105,16 @@ def generate_launch_description():
                 description='its parameters, YAML',
             ),
             DeclareLaunchArgument(
+                'frame_prefix',
+                default_value=PythonExpression(
+                    ["'", LaunchConfiguration('namespace'), "/'.lstrip('/')"]
+                ),
+                description='prefix of the frames in ekf_params; default: the namespace and /',
+            ),
+            DeclareLaunchArgument(
                 'use_sim_time', default_value='false', description='use the time of /clock'
             ),
-            Node(
-                package='imu_calibration',
-                executable='compensator_node',
-                namespace=LaunchConfiguration('namespace'),
-                output='screen',
-                respawn=LaunchConfiguration('respawn'),
-                parameters=[
-                    LaunchConfiguration('params'),
-                    {
-                        'calibration_file': ParameterValue(
-                            LaunchConfiguration('calibration'), value_type=str
-                        ),
-                        'adopt': LaunchConfiguration('adopt'),
-                        'target_frame': ParameterValue(
-                            LaunchConfiguration('target_frame'), value_type=str
-                        ),
-                        **use_sim_time,
-                    },
-                ],
-                remappings=[
-                    ('imu/data_raw', LaunchConfiguration('imu')),
-                    ('imu/data_corrected', LaunchConfiguration('corrected')),
-                ],
-            ),
+            OpaqueFunction(function=_nodes),
             Node(
                 package='robot_localization',
                 executable='ekf_node',
@@ -114,8 +122,36 @@ def generate_launch_description():
                 namespace=LaunchConfiguration('namespace'),
                 output='screen',
                 condition=IfCondition(LaunchConfiguration('ekf')),
-                parameters=[LaunchConfiguration('ekf_params'), use_sim_time],
+                parameters=[
+                    # the file contains $(var frame_prefix)
+                    ParameterFile(LaunchConfiguration('ekf_params'), allow_substs=True),
+                    use_sim_time,
+                ],
                 remappings=[('imu/data', LaunchConfiguration('corrected'))],
             ),
         ]
     )
+
+
+def _nodes(context):
+    """Return the node; a parameter without an argument keeps its value in `params`."""
+    parameters = {
+        'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
+    }
+    for argument, (name, kind) in OPTIONAL_PARAMETERS.items():
+        if LaunchConfiguration(argument).perform(context):
+            parameters[name] = ParameterValue(LaunchConfiguration(argument), value_type=kind)
+    return [
+        Node(
+            package='imu_calibration',
+            executable='compensator_node',
+            namespace=LaunchConfiguration('namespace'),
+            output='screen',
+            respawn=LaunchConfiguration('respawn'),
+            parameters=[LaunchConfiguration('params'), parameters],
+            remappings=[
+                ('imu/data_raw', LaunchConfiguration('imu')),
+                ('imu/data_corrected', LaunchConfiguration('corrected')),
+            ],
+        )
+    ]

@@ -27,6 +27,10 @@ class Recorded:
         self.args, self.kwargs = args, kwargs
         Recorded.made.append(self)
 
+    def perform(self, context):
+        """Return the value of a LaunchConfiguration, '' without one."""
+        return context.get(self.args[0], '')
+
 
 def stand_in(name):
     """A class of its own for each name."""
@@ -38,12 +42,16 @@ def launch(monkeypatch):
     """Stand-ins for the modules of launch."""
     names = {
         'launch': ['LaunchDescription'],
-        'launch.actions': ['DeclareLaunchArgument'],
+        'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
         'launch.conditions': ['IfCondition'],
-        'launch.substitutions': ['LaunchConfiguration', 'PathJoinSubstitution'],
+        'launch.substitutions': [
+            'LaunchConfiguration',
+            'PathJoinSubstitution',
+            'PythonExpression',
+        ],
         'launch_ros': [],
         'launch_ros.actions': ['Node'],
-        'launch_ros.parameter_descriptions': ['ParameterValue'],
+        'launch_ros.parameter_descriptions': ['ParameterFile', 'ParameterValue'],
         'launch_ros.substitutions': ['FindPackageShare'],
     }
     for module, classes in names.items():
@@ -54,29 +62,43 @@ def launch(monkeypatch):
     Recorded.made = []
 
 
-@pytest.mark.parametrize(
-    'path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name
-)
-def test_arguments_are_declared_and_parameters_exist(path, launch):
+def described(path, context):
+    """Record the classes made by a launch file with the launch arguments of `context`."""
     spec = importlib.util.spec_from_file_location('launch_file', path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.generate_launch_description()
+    for made in [r for r in Recorded.made if type(r).__name__ == 'OpaqueFunction']:
+        made.kwargs['function'](context)
+    return module
+
+
+@pytest.mark.parametrize(
+    'path', sorted((ROOT / 'launch').glob('*.launch.py')), ids=lambda path: path.name
+)
+def test_arguments_are_declared_and_parameters_exist(path, launch):
+    module = described(path, {})
+    # a second pass with a value for each optional argument
+    Recorded.made = []
+    described(path, dict.fromkeys(getattr(module, 'OPTIONAL_PARAMETERS', {}), '1'))
     of_kind = {
         kind: [r for r in Recorded.made if type(r).__name__ == kind]
         for kind in ('DeclareLaunchArgument', 'LaunchConfiguration', 'Node')
     }
     declared = [r.args[0] for r in of_kind['DeclareLaunchArgument']]
-    assert sorted(declared) == sorted({r.args[0] for r in of_kind['LaunchConfiguration']})
+    used = {r.args[0] for r in of_kind['LaunchConfiguration']}
+    if path.name == 'compensate.launch.py':
+        used |= {'frame_prefix'}  # in config/robot_localization_ekf.yaml
+    assert sorted(declared) == sorted(used)
     tables = [
         r.kwargs['default_value'].args[0][1]
         for r in of_kind['DeclareLaunchArgument']
         if r.args[0] == 'table'
     ]
-    assert tables in (
-        [],
-        ['table_simulated.yaml' if path.name == 'demo.launch.py' else 'table_template.yaml'],
-    )  # the template is refused
+    expected = 'table_template.yaml'  # the template is refused
+    if path.name == 'demo.launch.py':
+        expected = 'table_simulated.yaml'
+    assert set(tables) <= {expected}
     for node in of_kind['Node']:
         name = node.kwargs['executable']
         if node.kwargs['package'] != 'imu_calibration':
@@ -86,6 +108,45 @@ def test_arguments_are_declared_and_parameters_exist(path, launch):
             key for group in node.kwargs['parameters'] if isinstance(group, dict) for key in group
         }
         assert given <= known | {'use_sim_time'}, name
+
+
+@pytest.mark.parametrize('verb', ['calibrate', 'compensate'])
+def test_an_argument_that_is_not_given_keeps_the_parameter_of_the_file(verb, launch):
+    given = {'gravity': '9.81', 'noise_file': 'noise.yaml', 'latitude': '48', 'anyway': 'true'}
+    expected = {'gravity', 'noise_file', {'calibrate': 'latitude', 'compensate': 'anyway'}[verb]}
+    parameters = []
+    for context in ({}, given):
+        Recorded.made = []
+        described(ROOT / f'launch/{verb}.launch.py', context)
+        (node,) = [
+            r
+            for r in Recorded.made
+            if type(r).__name__ == 'Node' and r.kwargs['package'] == 'imu_calibration'
+        ]
+        (group,) = [each for each in node.kwargs['parameters'] if isinstance(each, dict)]
+        parameters.append(set(group))
+    assert parameters[0] <= {'table_file', 'use_sim_time'}
+    assert parameters[1] - parameters[0] == expected
+
+
+def test_the_frames_of_the_filter_have_the_prefix_of_the_namespace(launch):
+    text = (ROOT / 'config/robot_localization_ekf.yaml').read_text()
+    [found] = yaml.safe_load(text.replace('$(var frame_prefix)', 'left/')).values()
+    parameters = found['ros__parameters']
+    frames = {parameters[name] for name in ('odom_frame', 'base_link_frame', 'world_frame')}
+    assert frames == {'left/odom', 'left/base_link'}
+    described(ROOT / 'launch/compensate.launch.py', {})
+    (file,) = [r for r in Recorded.made if type(r).__name__ == 'ParameterFile']
+    assert file.kwargs == {'allow_substs': True}
+    (prefix,) = [
+        r.kwargs['default_value']
+        for r in Recorded.made
+        if type(r).__name__ == 'DeclareLaunchArgument' and r.args[0] == 'frame_prefix'
+    ]
+    before, namespace, after = prefix.args[0]
+    assert namespace.args == ('namespace',)
+    prefixes = [eval(before + name + after) for name in ('', 'left', '/left')]
+    assert prefixes == ['', 'left/', 'left/']
 
 
 def test_the_filter_of_robot_localization_takes_what_the_compensator_publishes():
