@@ -15,7 +15,7 @@ from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.compression import LARGEST_CHUNK, decompress
-from msg_adapters.csv_log import SUFFIXES, CsvBag
+from msg_adapters.csv_log import SUFFIXES, CsvBag, is_text_log
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
@@ -388,7 +388,7 @@ def _open_source(path, raw=()):
             ' device; give a file'
         )
     try:
-        if path.suffix.lower() in SUFFIXES:
+        if is_text_log(path):
             return CsvBag(path, raw)
         return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
     except InputError:

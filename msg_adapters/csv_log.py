@@ -149,6 +149,25 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
+class LogText:
+    """The text of a log from which the readings were made."""
+
+    path: Path
+    names: tuple[str, ...]
+    """Names of all columns, from the header."""
+    places: dict[str, tuple[int, ...]]
+    """Quantity -> indexes of its columns."""
+    lines: tuple[str, ...]
+    """Rows that were read, as text."""
+    row_of_sample: np.ndarray
+    """Index into `lines` for each sample, int64, shape (n,)."""
+    delimiter: str | None
+    """None for white space."""
+    decimal_comma: bool
+    """Whether numbers have a decimal comma."""
+
+
+@dataclass(frozen=True, eq=False)
 class CsvLog:
     """Content of a log."""
 
@@ -168,6 +187,8 @@ class CsvLog:
     """Overflows of the counter in the column of time, which are undone."""
     joined: JoinedSensors | None = None
     """How accelerometer and gyroscope were joined, where they have stamps of their own."""
+    text: LogText | None = None
+    """The rows, of a log in one file."""
 
 
 @np.errstate(
@@ -252,6 +273,33 @@ def read_csv(
         table.n_dropped,
         n_overflows,
         joined=readings.joined,
+        text=_text_of(table, used, stamp_ns, readings.joined),
+    )
+
+
+def _text_of(table, used, stamp_ns, joined):
+    """Return the `LogText` of a table; each sample is one of its rows."""
+    places = {
+        each.quantity: tuple(table.column(name) for name in each.names)
+        for each in used
+        if each.quantity != 'joint'
+    }
+    rows = np.arange(len(stamp_ns))
+    if joined is not None:
+        # Samples have the stamps of the slower sensor: find its first row with each stamp.
+        quantity = next(key for key, sensor in SENSOR_OF.items() if sensor == joined.slower)
+        names = next(each.names for each in used if each.quantity == quantity)
+        known = np.flatnonzero(np.isfinite(table.values(names)).all(axis=1))
+        stamps, first = np.unique(stamp_ns[known], return_index=True)
+        rows = known[first[np.searchsorted(stamps, joined.imu.stamp_ns)]]
+    return LogText(
+        table.path,
+        tuple(table.names),
+        places,
+        tuple(table.lines),
+        rows,
+        table.delimiter,
+        decimal_comma=table.decimal_comma,
     )
 
 
@@ -426,7 +474,7 @@ AUTOPILOT_COLUMNS = {
 def autopilot_of(path: str | PathLike[str]) -> str:
     """Return the autopilot whose columns a text log has; '' for none, or another file."""
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+    if not is_text_log(path) or not path.is_file():
         return ''
     names = _Table(path).names
     for autopilot, columns in AUTOPILOT_COLUMNS.items():
@@ -502,6 +550,22 @@ def _opened(path):
     return io.TextIOWrapper(open_regular(path), encoding='utf-8-sig', errors='replace')
 
 
+def cells_of(line: str, delimiter: str | None, path: Path) -> list[str]:
+    """Return the cells of a line; `delimiter` None: white space; `path` is named in errors."""
+    line = line.lstrip('# ')
+    if delimiter is None:
+        return line.split()
+    reader = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
+    try:
+        return next(reader, [])
+    except csv.Error as error:
+        raise InputError(
+            f'a cell of {path} must have at most {csv.field_size_limit()} characters, got'
+            f' a line of {len(line)} characters ({error}); remove this line',
+            code='csv_cell',
+        ) from error
+
+
 class _Table:
     """Header and columns of a text log."""
 
@@ -566,21 +630,11 @@ class _Table:
         }
         self.clocks = {k for k, cell in enumerate(rows[first]) if CLOCK.fullmatch(cell)}
         self.n_dropped = 0
+        self.lines = []
         self._values = {}
 
     def _cells(self, line):
-        line = line.lstrip('# ')
-        if self.delimiter is None:
-            return line.split()
-        reader = csv.reader([line], delimiter=self.delimiter, skipinitialspace=True)
-        try:
-            return next(reader, [])
-        except csv.Error as error:
-            raise InputError(
-                f'a cell of {self.path} must have at most {csv.field_size_limit()} characters, got'
-                f' a line of {len(line)} characters ({error}); remove this line',
-                code='csv_cell',
-            ) from error
+        return cells_of(line, self.delimiter, self.path)
 
     def column(self, name):
         """Return the index of a column by name or number."""
@@ -605,9 +659,9 @@ class _Table:
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
         with _opened(self.path) as file:
             lines = self._selected(file.read().splitlines()[self.first :], where)
+        lines = self.lines = self._complete(lines, wanted[-1] + 1)
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]
-        lines = self._complete(lines, wanted[-1] + 1)
         with warnings.catch_warnings():
             warnings.simplefilter(
                 'ignore', UserWarning
@@ -818,13 +872,36 @@ def _guess(table):
     return found
 
 
+ELEMENT = re.compile(r'(.*\S)\[([012])\]')
+"""
+Elements of an array are axes: gyro[0] is x. A space before the bracket marks a repeated name.
+"""
+
+
 def _words(name):
     """Return (name in lower case with spaces, without unit; text of the unit)."""
-    # Elements of an array are axes: gyro[0] is x. A space before the bracket marks a repeated name.
-    element = re.fullmatch(r'(.*\S)\[([012])\]', name)
+    element = ELEMENT.fullmatch(name)
     if element:
         words, unit = _words(element.group(1))
         return f'{words} {"xyz"[int(element.group(2))]}', unit
+    text, unit = _without_unit(name)
+    text = re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', text)
+    unit = unit.lower().replace('m_s2', 'm/s2').replace('m_s_2', 'm/s2').replace('_s', '/s')
+    return re.sub(r'[\s_./-]+', ' ', text).strip().lower(), unit
+
+
+def name_with_unit(name: str, quantity: str, unit: str) -> str:
+    """Return the name of a column that states this unit; unchanged where it does already."""
+    if _unit(quantity, _words(name)[1]) == unit:
+        return name
+    element = ELEMENT.fullmatch(name)
+    if element:
+        return f'{name_with_unit(element[1], quantity, unit)}[{element[2]}]'
+    return f'{_without_unit(name)[0].strip()} ({unit})'
+
+
+def _without_unit(name):
+    """Return (name without its unit, text of the unit)."""
     bracket = re.search(r'[(\[](.*?)[)\]]\s*(?:\[\d+\])?$', name)
     unit = bracket.group(1) if bracket else ''
     text = name[: bracket.start()] if bracket else name
@@ -838,9 +915,7 @@ def _words(name):
             unit, text = suffix.group(1), text[: suffix.start()]
     if not unit and text.lower() in ('millis', 'micros', 'nanos'):
         unit = text
-    text = re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', text)
-    unit = unit.lower().replace('m_s2', 'm/s2').replace('m_s_2', 'm/s2').replace('_s', '/s')
-    return re.sub(r'[\s_./-]+', ' ', text).strip().lower(), unit
+    return text, unit
 
 
 def _unit(quantity, text):
@@ -913,6 +988,24 @@ def _rate_unit(stamp_ns, force_s, rate):
     )
 
 
+def is_text_log(path: str | PathLike[str]) -> bool:
+    """Return whether a path has the name of a text log."""
+    return Path(path).suffix.lower() in SUFFIXES
+
+
+def read_directly(path: Path, raw: Sequence[str] = ()) -> CsvLog:
+    """Read a text log without `convert`, and report how it is read; see `read_csv`."""
+    log = read_csv(path, raw=raw)
+    remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
+    if log.joined is not None:
+        remark(f'{path.name}: {log.joined.text}')
+    if log.n_dropped:
+        remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
+    if log.n_overflows:
+        remark(f'{path.name}: the counter of time overflows {log.n_overflows} times: undone')
+    return log
+
+
 class CsvBag(Rosbag2):
     """
     A text log, converted into a temporary bag.
@@ -938,14 +1031,7 @@ class ConvertedLog:
     """
 
     def __init__(self, path: Path, raw: tuple[str, ...] = ()):
-        log, folder = read_csv(path, raw=raw), mkdtemp(prefix='imu_calibration_')
-        remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
-        if log.joined is not None:
-            remark(f'{path.name}: {log.joined.text}')
-        if log.n_dropped:
-            remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
-        if log.n_overflows:
-            remark(f'{path.name}: the counter of time overflows {log.n_overflows} times: undone')
+        log, folder = read_directly(path, raw), mkdtemp(prefix='imu_calibration_')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.bag = Path(folder, path.stem)
         write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')

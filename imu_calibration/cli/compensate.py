@@ -1,11 +1,14 @@
 """
 ``imu_calibration compensate``: a bag with the corrected topic in addition to the original ones.
+
+Or a text log with corrected readings.
 """
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, print_line
 
 EXAMPLES = (
     'drive --calibration result/calibration.yaml --output drive_corrected',
+    'log.csv --calibration calibration.yaml --output corrected.csv',
     (
         'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2'
         ' --output drive_corrected'
@@ -17,7 +20,12 @@ def add_arguments(parser: OneLineParser) -> None:
     """Declare the arguments."""
     parser.add_argument('bag', metavar='BAG', help=BAG)
     parser.common('--calibration', metavar='FILE', required=True, help='calibration.yaml')
-    parser.common('--output', metavar='BAG2', required=True, help='rosbag2 folder to make')
+    parser.common(
+        '--output',
+        metavar='BAG2',
+        required=True,
+        help='rosbag2 folder to make; from a text log also a text log (.csv)',
+    )
     parser.common(
         '--corrected-topic',
         metavar='TOPIC',
@@ -66,6 +74,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Options) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
     from imu_calibration.use_cases.compensate import compensate
+    from msg_adapters.csv_log import is_text_log
 
     found = compensate(options.bag, **options.arguments_for(compensate))
     for line in found.warnings:
@@ -73,14 +82,16 @@ def run(options: Options) -> VerbResult:
     for line in found.reasons:
         if line not in found.warnings:
             print_line(f'warning: {line}')
-    print_line(f'written: {options.output} with {options.corrected_topic} ({found.count} samples)')
+    topic = '' if is_text_log(options.output) else options.corrected_topic
+    place = f'{options.output} with {topic}' if topic else options.output
+    print_line(f'written: {place} ({found.count} samples)')
     if found.lost:
         print('lost: ' + ', '.join(f'{count} {reason}' for reason, count in found.lost.items()))
     return VerbResult(
         found.exit_code,
         {
             'output': str(options.output),
-            'topic': options.corrected_topic,
+            'topic': topic,
             'count': found.count,
             'warnings': list(found.warnings),
             'lost': found.lost,

@@ -1,7 +1,7 @@
 """From a recording and a calibration to corrected samples, in memory or in a new bag."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 
@@ -26,7 +26,8 @@ from imu_calibration.preprocessing.checks import frozen_lines
 from imu_calibration.preprocessing.scan import FrozenSearch
 from imu_calibration.preprocessing.value_checks import refuse_force_unit
 from imu_calibration.use_cases.choices import noise_of, raw_columns, readings_for
-from imu_calibration.use_cases.recordings import Topics, open_bag, temperatures
+from imu_calibration.use_cases.recordings import Topics, existing, open_bag, temperatures
+from msg_adapters.csv_log import is_text_log, read_directly
 
 CORRECTED_TOPIC = '/imu/data_corrected'
 UNIT_READINGS = 20000
@@ -112,7 +113,8 @@ def compensate(
         A bag, or samples in memory (a block may bring temperatures).
     calibration : Calibration or path-like
     output : path-like, optional
-        A rosbag2 folder to make: all topics of the recording, and the corrected one. Without it the
+        A rosbag2 folder to make: all topics of the recording, and the corrected one. For a text log
+        also a text log to make (.csv): its columns, with corrected readings. Without it the
         corrected samples are returned.
     corrected_topic : str
         Name of the topic to add.
@@ -157,10 +159,21 @@ def compensate(
         return _in_memory(recording, calibration, transfer, late=late, used=used, readings=readings)
     if output is not None and Path(output).exists():
         raise InputError(
-            f'the output bag {output} must not exist yet; choose another name or remove it',
+            f'the output {output} must not exist yet; choose another name or remove it',
             code='exists_already',
         )
     raw = raw_columns(readings, units)
+    if output is not None and is_text_log(output):
+        return _into_text_log(
+            recording,
+            output,
+            calibration,
+            transfer=transfer,
+            late=late,
+            used=used,
+            readings=readings,
+            raw=raw,
+        )
     topics = Topics(imu_topic, None, temperature_topic, frame_id, raw)
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
@@ -214,6 +227,30 @@ def compensate(
             raw=raw,
         )
         return _outcome(None, stream, lost, used=used, search=search)
+
+
+def _into_text_log(recording, output, calibration, *, transfer, late, used, readings, raw):
+    """Correct a text log into another one with the same columns."""
+    from msg_adapters.csv_copy import write_corrected_log
+
+    if not is_text_log(recording):
+        raise InputError(
+            f'a text log is made from a text log, got the recording {recording} and the output'
+            f' {output}; name a folder for a bag',
+            code='output_kind',
+        )
+    if late:
+        raise InputError(
+            'stamps are copied as text into a text log and cannot be moved; name a folder for a'
+            ' bag, or leave the stamps as they are',
+            code='output_kind',
+        )
+    log = read_directly(existing(recording), raw)
+    block = SampleBlock(log.imu, None, log.temperature)
+    found = _in_memory(block, calibration, transfer, late=0, used=used, readings=readings)
+    with files.output_folder(str(Path(output).parent)):
+        write_corrected_log(output, log, found.imu)
+    return replace(found, imu=None)
 
 
 def _refuse_bag_unit(recording, topics, readings):

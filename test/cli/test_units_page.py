@@ -23,16 +23,20 @@ def test_the_commands_of_the_page_run_in_its_order(tmp_path, monkeypatch):
     raw = replace(imu, force_s=imu.force_s / 9.80665, rate_s=np.degrees(imu.rate_s))
     write_session(tmp_path / 'session_si', imu)
     write_session(tmp_path / 'session_g', raw)
+    seconds = (imu.stamp_ns - imu.stamp_ns[0]) * 1e-9
+    header = 't (s),ax (g),ay (g),az (g),gx (deg/s),gy (deg/s),gz (deg/s)'
+    columns = np.column_stack([seconds, raw.force_s, raw.rate_s])
+    np.savetxt(tmp_path / 'log.csv', columns, delimiter=',', header=header, comments='')
     monkeypatch.chdir(tmp_path)
     parts = re.split(r'^```\w*\n?', PAGE.read_text(), flags=re.MULTILINE)
     lines = [line for block in parts[1::2] for line in block.splitlines()]
     lines = [line for line in lines if line.startswith('imu_calibration ')]
-    assert len(lines) == 4
+    assert len(lines) == 5
     for line in lines:
         program, *arguments = shlex.split(line)
         assert program == 'imu_calibration'
         assert main(arguments) in (0, 3), line
-    for name in ('corrected', 'corrected_si', 'flu.params'):
+    for name in ('corrected', 'corrected_si', 'corrected.csv', 'flu.params'):
         assert (tmp_path / name).exists()
 
 

@@ -1,0 +1,85 @@
+"""A copy of a text log with corrected readings in place of the measured ones."""
+
+import csv
+import io
+from os import PathLike
+
+import numpy as np
+
+from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import ImuSamples
+from imu_calibration.document.files import write_whole
+from msg_adapters.csv_log import SENSOR_OF, CsvLog, cells_of, name_with_unit
+
+SI_UNITS = {'force': 'm/s^2', 'rate': 'rad/s'}
+"""Quantity -> unit of the corrected readings."""
+
+
+def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSamples) -> None:
+    """
+    Write a text log with the columns of another one and its readings corrected.
+
+    The first line is the header, which states the units; force and rate are in SI, and empty where
+    a reading could not be corrected. Time and all other columns are copied as text.
+
+    Parameters
+    ----------
+    path : path-like
+        File to make; it appears when it is complete.
+    log : CsvLog
+        The log that was corrected, in one file.
+    corrected : ImuSamples
+        One for each sample of the log, in SI.
+
+    Raises
+    ------
+    InputError
+        When rows and samples do not correspond, or the file cannot be written.
+
+    """
+    text = log.text
+    if text is None or len(corrected) != len(text.row_of_sample):
+        raise InputError(
+            f'each row of a text log must give one sample, {path} cannot be written; name a folder'
+            ' for a bag',
+            code='csv_rows',
+        )
+    # White space is no delimiter of names that contain it.
+    delimiter = '\t' if text.delimiter is None else text.delimiter
+    readings = {'force': corrected.force_s, 'rate': corrected.rate_s}
+    readings = {quantity: readings[quantity] for quantity in SENSOR_OF if quantity in text.places}
+
+    # The header states the unit of each column that was read.
+    names = list(text.names)
+    for columns in log.columns:
+        for place in text.places.get(columns.quantity, ()):
+            unit = SI_UNITS.get(columns.quantity, columns.unit)
+            if columns.quantity != 'time' or _is_number(text, place):
+                names[place] = name_with_unit(names[place], columns.quantity, unit)
+    out = io.StringIO()
+    writer = csv.writer(out, delimiter=delimiter, lineterminator='\n')
+    writer.writerow(names)
+
+    # Rows as they were read, with new cells of force and rate.
+    comma = text.decimal_comma and delimiter != ','
+    for k, row in enumerate(text.row_of_sample.tolist()):
+        cells = cells_of(text.lines[row], text.delimiter, text.path)
+        for quantity, values in readings.items():
+            for place, value in zip(text.places[quantity], values[k].tolist(), strict=True):
+                cells[place] = _number(value, comma)
+        writer.writerow(cells)
+    write_whole(path, out.getvalue().encode())
+
+
+def _is_number(text, place):
+    """Return whether the first cell of a column is a number, not a date or a time of day."""
+    cell = cells_of(text.lines[0], text.delimiter, text.path)[place]
+    return ':' not in cell
+
+
+def _number(value, comma):
+    """Return a number as text; '' for NaN."""
+    if not np.isfinite(value):
+        return ''
+    number = f'{value:.10g}'
+    return number.replace('.', ',') if comma else number

@@ -1,0 +1,175 @@
+"""``imu_calibration compensate`` from a text log to a text log."""
+
+import json
+
+import numpy as np
+import pytest
+
+from imu_calibration.cli.main import main
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.use_cases.compensate import compensate
+from msg_adapters.csv_log import read_csv
+from msg_adapters.write import write_session
+
+from worlds.compensation_cases import random_calibration
+
+N, RATE = 3000, 100.0
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    """Biases and matrices of an IMU, written as calibration.yaml."""
+    found = random_calibration(5, (), (), sd=1e-5)
+    (tmp_path / 'calibration.yaml').write_text(calibration_to_text(found))
+    return found
+
+
+def readings():
+    """Time (s), force (m/s^2) and rate (rad/s) of quarter turns with rests between."""
+    rng = np.random.default_rng(59)
+    time = np.arange(N) / RATE
+    angle = np.interp(time, np.arange(0.0, 31.0, 1.5), [0.0, *np.tile([0.0, 1.6, 1.6, 0.0], 5)])
+    force = 9.8 * np.column_stack([np.sin(angle), np.zeros(N), np.cos(angle)])
+    rate = np.zeros((N, 3))
+    rate[:, 1] = -np.gradient(angle, time)
+    return time, force + rng.normal(0, 0.01, (N, 3)), rate + rng.normal(0, 1e-3, (N, 3))
+
+
+def clock(time):
+    """Times of day, past midnight."""
+    seconds = (86_397.0 + time) % 86_400
+    return [f'{s // 3600:02.0f}:{s % 3600 // 60:02.0f}:{s % 60:06.3f}' for s in seconds.tolist()]
+
+
+def comma(text):
+    return text.replace('.', ',')
+
+
+CASES = {
+    # name -> header, delimiter, time, unit of force and of rate, header that is expected
+    'si without units': (
+        't,ax,ay,az,note,gx,gy,gz',
+        ',',
+        (1.0, 1.0),
+        't (s),ax (m/s^2),ay (m/s^2),az (m/s^2),note,gx (rad/s),gy (rad/s),gz (rad/s)',
+    ),
+    'g and deg/s': (
+        'millis;ax_g;ay_g;az_g;note;gx_dps;gy_dps;gz_dps',
+        ';',
+        (STANDARD_GRAVITY, DEG),
+        'millis;ax (m/s^2);ay (m/s^2);az (m/s^2);note;gx (rad/s);gy (rad/s);gz (rad/s)',
+    ),
+    'time of day': (
+        'Time\tAccel[0]\tAccel[1]\tAccel[2]\tnote\tGyro[0]\tGyro[1]\tGyro[2]',
+        '\t',
+        (1.0, 1.0),
+        'Time\tAccel (m/s^2)[0]\tAccel (m/s^2)[1]\tAccel (m/s^2)[2]\tnote'
+        '\tGyro (rad/s)[0]\tGyro (rad/s)[1]\tGyro (rad/s)[2]',
+    ),
+}
+
+
+def write_log(path, name):
+    """Write a log of `CASES`; return the cells of time."""
+    header, delimiter, sizes, _ = CASES[name]
+    time, force, rate = readings()
+    stamps = [f'{s:.2f}' for s in time]
+    if header.startswith('millis'):
+        stamps = [f'{1e3 * s:.0f}' for s in time]
+    elif header.startswith('Time'):
+        stamps = clock(time)
+    lines = ['device: 7', header]
+    for k in range(N):
+        numbers = [f'{v:.9f}' for v in (*force[k] / sizes[0], *rate[k] / sizes[1])]
+        if delimiter == ';':
+            numbers = [comma(number) for number in numbers]
+        lines.append(delimiter.join([stamps[k], *numbers[:3], f'n{k % 7}', *numbers[3:]]))
+    path.write_text('\n'.join(lines) + '\n')
+    return stamps
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_a_text_log_gives_a_text_log(name, calibration, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    log, out = tmp_path / 'log.csv', tmp_path / 'new/corrected.csv'
+    stamps = write_log(log, name)
+    delimiter, expected_header = CASES[name][1], CASES[name][3]
+    verb = ['compensate', 'log.csv', '--calibration', 'calibration.yaml']
+    code = main([*verb, '--output', str(out), '--json'])
+    result = json.loads(capsys.readouterr().out)
+    assert result['result']['count'] == N and result['result']['topic'] == ''
+
+    # Columns, time and other cells as they were, units in the header.
+    header, *rows = out.read_text().splitlines()
+    assert header == expected_header
+    cells = [row.split(delimiter) for row in rows]
+    assert [row[0] for row in cells] == stamps
+    assert [row[4] for row in cells] == [f'n{k % 7}' for k in range(N)]
+
+    # The readings are those that are corrected in memory, and a bag has the same exit code.
+    read = read_csv(out)
+    expected = compensate(read_csv(log).imu, calibration).imu
+    np.testing.assert_allclose(read.imu.force_s, expected.force_s, atol=1e-7)
+    np.testing.assert_allclose(read.imu.rate_s, expected.rate_s, atol=1e-8)
+    assert np.abs(read.imu.force_s - read_csv(log).imu.force_s).max() > 0.01
+    assert main([*verb, '--output', 'bag']) == code
+
+
+def test_readings_in_the_unit_of_the_calibration_become_si(tmp_path, monkeypatch):
+    """Counts that calibration.yaml describes."""
+    monkeypatch.chdir(tmp_path)
+    found = random_calibration(5, (), (), sd=1e-5)
+    text = calibration_to_text(found)
+    (tmp_path / 'calibration.yaml').write_text(text)
+    time, force, rate = readings()
+    columns = np.column_stack([time, force / STANDARD_GRAVITY * 2048, rate])
+    np.savetxt('log.csv', columns, delimiter=',', header='t,ax,ay,az,gx,gy,gz', comments='')
+    verb = ['compensate', 'log.csv', '--calibration', 'calibration.yaml', '--output', 'out.csv']
+    main([*verb, '--accelerometer-unit', 'counts:2048/g'])
+    expected = compensate(read_csv('log.csv', ['force=ax,ay,az:counts:2048/g']).imu, found).imu
+    np.testing.assert_allclose(read_csv('out.csv').imu.force_s, expected.force_s, atol=1e-6)
+
+
+def test_rows_of_one_sensor_each_are_joined(calibration, tmp_path, monkeypatch):
+    """A table with empty cells: the rows of the slower sensor get readings of both."""
+    monkeypatch.chdir(tmp_path)
+    time, force, rate = readings()
+    lines = ['t,ax,ay,az,gx,gy,gz']
+    for k in range(N):
+        if k % 2 == 0:
+            lines.append(','.join([f'{time[k]:.3f}', *(f'{v:.9f}' for v in force[k]), '', '', '']))
+        lines.append(
+            ','.join([f'{time[k] + 0.003:.3f}', '', '', '', *(f'{v:.9f}' for v in rate[k])])
+        )
+    (tmp_path / 'log.csv').write_text('\n'.join(lines))
+    verb = ['compensate', 'log.csv', '--calibration', 'calibration.yaml', '--output', 'out.csv']
+    assert main(verb) in (0, 3)
+    log, read = read_csv('log.csv'), read_csv('out.csv')
+    expected = compensate(log.imu, calibration).imu
+    assert log.joined.slower == 'accelerometer' and len(read.imu) == len(log.imu)
+    np.testing.assert_array_equal(np.diff(read.imu.stamp_ns), np.diff(log.imu.stamp_ns))
+    np.testing.assert_allclose(read.imu.rate_s, expected.rate_s, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ('case', 'code'),
+    [('bag', 'output_kind'), ('exists', 'exists_already'), ('force unit', 'force_unit')],
+)
+def test_refusals_write_nothing(case, code, calibration, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_log(tmp_path / 'log.csv', 'si without units')
+    source, options = 'log.csv', []
+    if case == 'bag':
+        write_session('bag', read_csv('log.csv').imu)
+        source = 'bag'
+    elif case == 'exists':
+        (tmp_path / 'out.csv').write_text('mine')
+    else:
+        options = ['--accelerometer-unit', 'g']
+    before = sorted(path.name for path in tmp_path.iterdir())
+    verb = ['compensate', source, '--calibration', 'calibration.yaml', '--output', 'out.csv']
+    assert main([*verb, *options, '--json']) == 1
+    assert json.loads(capsys.readouterr().out)['error']['code'] == code
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    assert case != 'exists' or (tmp_path / 'out.csv').read_text() == 'mine'
