@@ -112,6 +112,8 @@ def _messages(
                         yield read(deserialize(raw.packed.message(k)))
 
 
+LISTED_TOPICS = 20
+"""Topics that an error shows."""
 TOPIC_KEYS = {
     IMU_TYPE: 'imu_topic',
     JOINT_STATE_TYPE: 'joint_topic',
@@ -442,7 +444,7 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
     if fitting and not lenient:
         raise InputError(
             f'{path} must have one {message_type} topic or one named'
-            f' {DEFAULT_TOPICS[message_type]}, got {", ".join(fitting)}; choose one',
+            f' {DEFAULT_TOPICS[message_type]}, got {_some(fitting)}; choose one',
             key=key,
             code='topic_ambiguous',
         )
@@ -458,10 +460,18 @@ def _choose(path, topics, message_type, asked, required, lenient=False):
 
 def _listing(topics, fitting):
     if fitting:
-        return f'choose one of {", ".join(fitting)}'
+        return f'choose one of {_some(fitting)}'
     return 'it holds ' + (
-        ', '.join(f'{topic.name} ({topic.type})' for topic in topics) or 'no topics'
+        _some([f'{topic.name} ({topic.type})' for topic in topics]) or 'no topics'
     )
+
+
+def _some(names):
+    """Return the first names as a text, and how many more there are."""
+    text = ', '.join(names[:LISTED_TOPICS])
+    if len(names) > LISTED_TOPICS:
+        text += f' and {len(names) - LISTED_TOPICS} more'
+    return text
 
 
 STRETCH_MESSAGES = 8192

@@ -338,7 +338,8 @@ class McapFile(StorageFile):
         return ids
 
     def _stretches(self, topics):
-        wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
+        known = self.topic_ids
+        wanted = {number for topic in topics for number in known.get(topic, ())}
         with closing(read_ahead(self._joined_pieces(wanted))) as pieces:
             for channel, packed in pieces:
                 yield Stretch(

@@ -75,13 +75,30 @@ class StorageFile:
         Lost messages of the file are counted in `lost`.
         """
         for stretch in self._stretches(topics):
-            code = np.full(len(stretch.topic_ids), -1)
-            for number, topic in enumerate(topics):
-                code[np.isin(stretch.topic_ids, self.topic_ids.get(topic, []))] = number
+            code = self._codes(stretch.topic_ids, topics)
             mine = np.flatnonzero(code >= 0)
             if len(mine):
                 mine, packed = self._take(stretch, mine)
                 yield RawMessages(code[mine], partial(stretch.received_ns, mine), packed)
+
+    def _codes(self, topic_ids, topics):
+        """
+        Return the index into `topics` of each message, or -1.
+
+        The ids are looked up at once, because a hostile file has thousands of topics.
+        """
+        # A file without a summary declares topics between its messages.
+        known = self.topic_ids
+        number_of = {}
+        for number, topic in enumerate(topics):
+            for topic_id in known.get(topic, ()):
+                number_of[topic_id] = number
+        if not number_of:
+            return np.full(len(topic_ids), -1)
+        ids = np.array(sorted(number_of))
+        numbers = np.array([number_of[topic_id] for topic_id in ids.tolist()])
+        place = np.minimum(np.searchsorted(ids, topic_ids), len(ids) - 1)
+        return np.where(ids[place] == topic_ids, numbers[place], -1)
 
     def _take(self, stretch, mine):
         mine, packed = stretch.pack(mine)

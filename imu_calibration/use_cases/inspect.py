@@ -17,7 +17,7 @@ from imu_calibration.calibration.hand_workflow import (
 )
 from imu_calibration.calibration.table_calibration import calibrate
 from imu_calibration.calibration.table_result import TableResult
-from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.outcome import shortcomings
@@ -39,6 +39,9 @@ from imu_calibration.use_cases.recordings import (
 from msg_adapters.bag import Recording, list_topics
 from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
+
+MOST_IMUS = 64
+"""Imu topics and frames of a recording that are inspected at most; each needs a few scans."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,16 +109,36 @@ def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     Return the topics with the requested Imu topic, or with each one of the recording.
 
     Each frame_id is returned too if a topic has several.
+
+    Raises
+    ------
+    InputError
+        When there are more than `MOST_IMUS`.
+
     """
     names = (
         [topics.imu]
         if topics.imu is not None or topics.gyroscope is not None
         else [topic.name for topic in list_topics(bag) if topic.type == IMU_TYPE]
     )
-    found = [topics._replace(imu=name) for name in names]
-    if topics.frame is None:
-        found = [part for each in found for part in _by_frame(bag, each)]
+    _limit_imus(bag, len(names))
+    found = []
+    for name in names:
+        one = topics._replace(imu=name)
+        found += [one] if topics.frame is not None else _by_frame(bag, one)
+        _limit_imus(bag, len(found))
     return found or [topics]
+
+
+def _limit_imus(bag, n_imus):
+    """Refuse a recording of too many IMUs, before each of them is read."""
+    if n_imus > MOST_IMUS:
+        raise InputError(
+            f'a recording must have at most {MOST_IMUS} Imu topics and frames to be inspected'
+            f' together, {bag} has {n_imus} or more; choose one',
+            key='imu_topic',
+            code='imu_topics_many',
+        )
 
 
 def _by_frame(bag, topics):
