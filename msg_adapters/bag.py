@@ -15,7 +15,7 @@ from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.compression import LARGEST_CHUNK, decompress
-from msg_adapters.csv_log import SUFFIXES, CsvBag, is_text_log
+from msg_adapters.csv_log import SUFFIXES, CsvBag, is_text_log, require_no_rows
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
@@ -147,6 +147,7 @@ def open_recording(
     want_temperature: bool | str = True,
     frame_id: str | None = None,
     raw: Sequence[str] = (),
+    where: Sequence[str] = (),
 ) -> 'Recording':
     """
     Open a bag and choose its topics.
@@ -170,6 +171,8 @@ def open_recording(
         Frame of the Imu messages that are read; needed for a topic with messages of several frames.
     raw : sequence of str
         Quantities of a text log ('force', 'rate') that are not converted to SI.
+    where : sequence of str
+        Conditions on the rows of a text log, see `msg_adapters.csv_log.read_csv`.
 
     Returns
     -------
@@ -182,7 +185,7 @@ def open_recording(
 
     """
     path = Path(path)
-    source = _open_source(path, tuple(raw))
+    source = _open_source(path, tuple(raw), tuple(where))
     try:
         topics = _listed(source)
         imu = _choose(path, topics, IMU_TYPE, imu_topic, required=True)
@@ -378,7 +381,7 @@ def _block(parts, decoders):
     )
 
 
-def _open_source(path, raw=()):
+def _open_source(path, raw=(), where=()):
     if not path.exists():
         raise InputError(
             f'a recording must be a rosbag2 folder, a {", ".join(suffixes())}, .bag or .csv file,'
@@ -391,7 +394,8 @@ def _open_source(path, raw=()):
         )
     try:
         if is_text_log(path):
-            return CsvBag(path, raw)
+            return CsvBag(path, raw, where)
+        require_no_rows(where, path)
         return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
     except InputError:
         raise
@@ -404,9 +408,9 @@ def _open_source(path, raw=()):
         ) from error
 
 
-def list_topics(path: str | PathLike[str]) -> tuple[Topic, ...]:
-    """Return the topics of a recording in order of name; raises as `open_recording`."""
-    source = _open_source(Path(path))
+def list_topics(path: str | PathLike[str], where: Sequence[str] = ()) -> tuple[Topic, ...]:
+    """Return the topics of a recording in order of name; `where` and errors: `open_recording`."""
+    source = _open_source(Path(path), where=tuple(where))
     try:
         return _listed(source)
     finally:

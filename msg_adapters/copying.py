@@ -32,6 +32,8 @@ def copy_with_corrected(
     late_ns: int = 0,
     source_frame_id: str | None = None,
     raw: Sequence[str] = (),
+    where: Sequence[str] = (),
+    check: Callable[[], None] | None = None,
 ) -> dict[str, int]:
     """
     Write a bag with all topics of another one, and the corrected Imu messages.
@@ -62,8 +64,10 @@ def copy_with_corrected(
         Subtracted from the stamps of the corrected messages.
     source_frame_id : str, optional
         Frame of the messages that are corrected; see `msg_adapters.bag.open_recording`.
-    raw : sequence of str
+    raw, where : sequence of str
         As for `msg_adapters.bag.open_recording`.
+    check : callable, optional
+        Called after the last block; an error that it raises removes the bag.
 
     Returns
     -------
@@ -78,7 +82,7 @@ def copy_with_corrected(
 
     """
     with open_recording(
-        source, imu_topic, want_joints=False, want_temperature=False, raw=raw
+        source, imu_topic, want_joints=False, want_temperature=False, raw=raw, where=where
     ) as recording:
         bag = recording.source
         _check(recording, corrected_topic)
@@ -93,6 +97,8 @@ def copy_with_corrected(
             for raw in bag.stretches(topics):
                 measured = np.flatnonzero(raw.topic == topics.index(recording.imu_topic))
                 _write(writer, ids[raw.topic], raw, measured, corrected_id, patch)
+            if check is not None:
+                check()
         choice.check()
         return recording.lost | dict(patch.dropped)
 

@@ -488,7 +488,7 @@ def _require_one_imu(stamp_ns, force_s, rate):
     sources = TwoSourceSearch()
     good = np.isfinite(force_s).all(axis=1) & np.isfinite(rate).all(axis=1)
     sources.push(ImuSamples(stamp_ns[good], force_s[good], rate[good]))
-    sources.require_one()
+    sources.require_one(key='where')
 
 
 def _with_unit(columns, guess, path):
@@ -993,9 +993,19 @@ def is_text_log(path: str | PathLike[str]) -> bool:
     return Path(path).suffix.lower() in SUFFIXES
 
 
-def read_directly(path: Path, raw: Sequence[str] = ()) -> CsvLog:
+def require_no_rows(where: Sequence[str], path: str | PathLike[str]) -> None:
+    """Refuse conditions on rows for a recording without rows."""
+    if where:
+        raise InputError(
+            f'conditions select rows of a text log ({", ".join(SUFFIXES)}), got'
+            f' {shortened(" ".join(where), 100)} for {path}; omit them',
+            code='where',
+        )
+
+
+def read_directly(path: Path, raw: Sequence[str] = (), where: Sequence[str] = ()) -> CsvLog:
     """Read a text log without `convert`, and report how it is read; see `read_csv`."""
-    log = read_csv(path, raw=raw)
+    log = read_csv(path, where=where, raw=raw)
     remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
     if log.joined is not None:
         remark(f'{path.name}: {log.joined.text}')
@@ -1018,9 +1028,9 @@ class CsvBag(Rosbag2):
 
     """
 
-    def __init__(self, path: Path, raw: tuple[str, ...] = ()):
+    def __init__(self, path: Path, raw: tuple[str, ...] = (), where: tuple[str, ...] = ()):
         status = path.stat()
-        self.converted = _converted(path, status.st_mtime_ns, status.st_size, raw)
+        self.converted = _converted(path, status.st_mtime_ns, status.st_size, raw, where)
         super().__init__(self.converted.bag)
         self.path = path
 
@@ -1030,18 +1040,18 @@ class ConvertedLog:
     The temporary bag of a text log; its folder is removed with the last reference, or at exit.
     """
 
-    def __init__(self, path: Path, raw: tuple[str, ...] = ()):
-        log, folder = read_directly(path, raw), mkdtemp(prefix='imu_calibration_')
+    def __init__(self, path: Path, raw: tuple[str, ...] = (), where: tuple[str, ...] = ()):
+        log, folder = read_directly(path, raw, where), mkdtemp(prefix='imu_calibration_')
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self.bag = Path(folder, path.stem)
         write_session(self.bag, log.imu, log.joints, temperature=log.temperature, storage='mcap')
 
 
 @lru_cache(maxsize=1)
-def _converted(path, _modified_ns, _size, raw):
+def _converted(path, _modified_ns, _size, raw, where):
     """
     Return the ConvertedLog.
 
     A verb opens a recording several times, and converts an unchanged file once.
     """
-    return ConvertedLog(path, raw)
+    return ConvertedLog(path, raw, where)

@@ -28,6 +28,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_gyroscope_topic()
     parser.add_readings()
     parser.add_exclusion()
+    parser.add_rows()
 
 
 def run(options: Options) -> VerbResult:

@@ -8,7 +8,6 @@ from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult, 
 
 EXAMPLES = (
     'drive --calibration result/calibration.yaml --output drive_corrected',
-    'log.csv --calibration calibration.yaml --output corrected.csv',
     (
         'drive --calibration calibration.yaml --target-frame base_link --target-xyz 0.1 0 0.2'
         ' --output drive_corrected'
@@ -69,6 +68,7 @@ def add_arguments(parser: OneLineParser) -> None:
     )
     parser.add_topics(joints=False)
     parser.add_readings()
+    parser.add_rows()
 
 
 def run(options: Options) -> VerbResult:

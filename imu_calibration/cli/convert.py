@@ -38,13 +38,7 @@ def add_arguments(parser: OneLineParser) -> None:
             ' mrad/s urad/s counts:16.4/(deg/s), rad deg'
         ),
     )
-    parser.common(
-        '--where',
-        metavar='COLUMN=VALUE',
-        nargs='+',
-        default=[],
-        help='read only the rows with this value, such as one of several IMUs in a log',
-    )
+    parser.add_rows()
     parser.expert('--storage', choices=identifiers(), default='mcap', help='default mcap')
 
 

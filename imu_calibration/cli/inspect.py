@@ -21,6 +21,7 @@ def add_arguments(parser: OneLineParser) -> None:
     )
     parser.add_gyroscope_topic()
     parser.add_exclusion()
+    parser.add_rows()
     parser.add_model(searched=False)
 
 

@@ -162,6 +162,16 @@ class OneLineParser(argparse.ArgumentParser):
             help='unused times, s from the first stamp; or NAME=A:B',
         )
 
+    def add_rows(self) -> None:
+        """Add the option of the rows of a text log."""
+        self.common(
+            '--where',
+            metavar='COLUMN=VALUE',
+            action='append',
+            default=[],
+            help='only these rows of a text log; may be repeated',
+        )
+
     def add_stand(self, without: str) -> None:
         """
         Add the options of the table or arm that moves the IMU.
@@ -238,6 +248,7 @@ class OneLineParser(argparse.ArgumentParser):
         self.add_recording('without it: by hand, gravity is the reference')
         self.add_gyroscope_topic()
         self.add_exclusion()
+        self.add_rows()
         self.common(
             '--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml'
         )

@@ -35,6 +35,7 @@ ERROR_KEYS = (
     'temperature_topic',
     'up',
     'urdf',
+    'where',
 )
 """Inputs that an error may request, and programs that a remedy may need."""
 OFFERS = {

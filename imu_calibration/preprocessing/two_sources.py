@@ -78,13 +78,17 @@ class TwoSourceSearch:
             observed += f', and {100 * self.equal_stamp_share:.0f} % of the stamps are double'
         return (
             f'the readings must be those of one IMU, {observed}: two IMUs in one stream; give each'
-            ' its own topic, or select the rows of one when a text log is converted'
+            ' its own topic, or select the rows of one in a text log'
         )
 
-    def require_one(self) -> None:
-        """Raise InputError where the stream holds the readings of two sensors."""
+    def require_one(self, *, key: str = KEY) -> None:
+        """
+        Raise InputError where the stream holds the readings of two sensors.
+
+        `key`: the input that selects one, a key of `errors.ERROR_KEYS`.
+        """
         if self.found:
-            raise InputError(self.requirement, code=CHECK, key=KEY)
+            raise InputError(self.requirement, code=CHECK, key=key)
 
     def _count_stamps(self, stamp_ns):
         if self._last_stamp is not None:

@@ -57,6 +57,8 @@ class Choices(TypedDict, total=False):
     Times that are not used, 'A:B,...' in s since the first stamp of the IMU; with several
     recordings 'NAME=A:B,...'.
     """
+    where: Sequence[str]
+    """Conditions 'COLUMN=VALUE': only these rows of a text log are read."""
     accelerometer_model: str | None
     """
     A named model or effect names joined by +; default bias+matrix, and accel_size_effect when the
@@ -174,6 +176,7 @@ def topics_of(choices: Mapping[str, Any]) -> Topics:
         choices.get('frame_id'),
         raw_columns(readings_of(choices), choices),
         choices.get('gyroscope_topic'),
+        tuple(choices.get('where') or ()),
     )
 
 

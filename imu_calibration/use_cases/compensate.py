@@ -24,6 +24,7 @@ from imu_calibration.document.calibration import ABSENT, Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
 from imu_calibration.preprocessing.checks import frozen_lines
 from imu_calibration.preprocessing.scan import FrozenSearch
+from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from imu_calibration.preprocessing.value_checks import refuse_force_unit
 from imu_calibration.use_cases.choices import noise_of, raw_columns, readings_for
 from imu_calibration.use_cases.recordings import Topics, existing, open_bag, temperatures
@@ -103,6 +104,7 @@ def compensate(
     nominal: str | PathLike | RawReadings | None = None,
     accelerometer_unit: str | None = None,
     gyroscope_unit: str | None = None,
+    where: Sequence[str] = (),
 ) -> Compensated:
     """
     Correct the calibrated errors in a recording.
@@ -135,6 +137,8 @@ def compensate(
         frame_id of the Imu messages; required if the topic has messages of several.
     nominal, accelerometer_unit, gyroscope_unit : optional
         Units of these readings where they differ from those of the calibration, see `Choices`.
+    where : sequence of str
+        Conditions 'COLUMN=VALUE': only these rows of a text log are read.
 
     Raises
     ------
@@ -163,6 +167,7 @@ def compensate(
             code='exists_already',
         )
     raw = raw_columns(readings, units)
+    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw, where=tuple(where))
     if output is not None and is_text_log(output):
         return _into_text_log(
             recording,
@@ -172,9 +177,8 @@ def compensate(
             late=late,
             used=used,
             readings=readings,
-            raw=raw,
+            topics=topics,
         )
-    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw)
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
@@ -183,10 +187,11 @@ def compensate(
         stream = CompensationStream(
             calibration, temperature=temperatures(recording, topics), transfer=transfer
         )
-        search = FrozenSearch()
+        search, sources = FrozenSearch(), TwoSourceSearch()
 
         def correct(imu):
             advance(len(imu))
+            _search_sources(sources, imu)
             search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
             return stream.correct(readings.apply(imu))
 
@@ -204,6 +209,7 @@ def compensate(
                 for block in bag.blocks()
                 if block.imu is not None
             ]
+            sources.require_one()
             return _outcome(
                 ImuSamples.concatenate(parts) if parts else None,
                 stream,
@@ -225,11 +231,13 @@ def compensate(
             late_ns=late,
             source_frame_id=frame_id,
             raw=raw,
+            where=topics.where,
+            check=sources.require_one,
         )
         return _outcome(None, stream, lost, used=used, search=search)
 
 
-def _into_text_log(recording, output, calibration, *, transfer, late, used, readings, raw):
+def _into_text_log(recording, output, calibration, *, transfer, late, used, readings, topics):
     """Correct a text log into another one with the same columns."""
     from msg_adapters.csv_copy import write_corrected_log
 
@@ -245,7 +253,7 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
             ' bag, or leave the stamps as they are',
             code='output_kind',
         )
-    log = read_directly(existing(recording), raw)
+    log = read_directly(existing(recording), topics.raw, topics.where)
     block = SampleBlock(log.imu, None, log.temperature)
     found = _in_memory(block, calibration, transfer, late=0, used=used, readings=readings)
     with files.output_folder(str(Path(output).parent)):
@@ -268,6 +276,13 @@ def _refuse_bag_unit(recording, topics, readings):
         refuse_force_unit(np.concatenate(forces), readings)
 
 
+def _search_sources(sources, imu):
+    """Push the finite samples; an absent sensor has none."""
+    sources.push(
+        imu.select(np.isfinite(imu.force_s).all(axis=1) & np.isfinite(imu.rate_s).all(axis=1))
+    )
+
+
 def _in_memory(recording, calibration, transfer, *, late, used, readings):
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
     # A recording in memory has samples of an IMU.
@@ -275,6 +290,9 @@ def _in_memory(recording, calibration, transfer, *, late, used, readings):
     refuse_force_unit(block.imu.force_s, readings)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
     search = FrozenSearch()
+    sources = TwoSourceSearch()
+    _search_sources(sources, block.imu)
+    sources.require_one()
     search.push(block.imu.stamp_ns, block.imu.force_s, block.imu.rate_s)
     return _outcome(
         _corrected(block.imu, stream.correct(readings.apply(block.imu)), transfer, late),

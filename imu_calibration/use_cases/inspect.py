@@ -119,7 +119,7 @@ def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
     names = (
         [topics.imu]
         if topics.imu is not None or topics.gyroscope is not None
-        else [topic.name for topic in list_topics(bag) if topic.type == IMU_TYPE]
+        else [topic.name for topic in list_topics(bag, topics.where) if topic.type == IMU_TYPE]
     )
     _limit_imus(bag, len(names))
     found = []

@@ -1,5 +1,6 @@
 """From a recording at rest to the figures of its noise."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
@@ -95,6 +96,7 @@ def noise(
     gyroscope_unit: str | None = None,
     horizon: float = HORIZON,
     exclude: str | None = None,
+    where: Sequence[str] = (),
 ) -> IdentifiedNoise:
     """
     Identify the noise of an IMU from a recording that holds rest.
@@ -113,6 +115,8 @@ def noise(
         Averaging time at which a random walk approximates the slow noise, s.
     exclude : str, optional
         Times that are not used, 'A:B,...' in s since the first stamp of the IMU.
+    where : sequence of str
+        Conditions 'COLUMN=VALUE': only these rows of a text log are read.
 
     Raises
     ------
@@ -126,7 +130,8 @@ def noise(
         'gyroscope_unit': gyroscope_unit,
     }
     readings = readings_of(units)
-    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw_columns(readings, units))
+    raw = raw_columns(readings, units)
+    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw, where=tuple(where))
     (source,) = sources_without([source_of(recording, topics)], [recording], exclude)
     result = identify_noise(source, readings)
     chosen = topics.chosen() | {'exclude': exclude}

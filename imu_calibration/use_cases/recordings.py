@@ -56,6 +56,8 @@ class Topics(NamedTuple):
     """Quantities of a text log that are read without conversion to SI: 'force', 'rate'."""
     gyroscope: str | None = None
     """sensor_msgs/Imu topic of the rates, where they have one of their own; None: as `imu`."""
+    where: tuple[str, ...] = ()
+    """Conditions COLUMN=VALUE on the rows of a text log."""
 
     def chosen(self) -> dict[str, Any]:
         """Return them as arguments of `msg_adapters.bag.open_recording`."""
@@ -65,6 +67,7 @@ class Topics(NamedTuple):
             'temperature_topic': self.temperature,
             'frame_id': self.frame,
             'raw': self.raw,
+            'where': self.where,
         }
 
 

@@ -95,6 +95,7 @@ UNREACHABLE = {
         'gyroscope_unit': 'readings are converted in the driver, which the error names',
         'anyway': 'no calibration is applied',
         'columns': 'no text log is read',
+        'where': 'no text log is read',
         'force': 'results of verbs',
         'up': 'of transforms in a bag',
         'setting': NAMED['setting'],
