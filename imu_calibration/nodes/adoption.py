@@ -15,7 +15,7 @@ from imu_calibration.document import files, trust
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.document.comparison import moved_beyond_sd
-from imu_calibration.document.decision import decisions_text
+from imu_calibration.document.decision import HARMS, decisions_text
 from imu_calibration.document.trust import with_measured_noise
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.robot_stand import TF_STATIC, StaticFrames
@@ -188,6 +188,13 @@ class CompensatorSettings:
 
 class Awaited(ImuCalibrationError):
     """A precondition is not met yet; the text names it."""
+
+
+def may_become_ready(error: ImuCalibrationError, text: str) -> bool:
+    """Return whether a calibration is refused only because it has too few data so far."""
+    if error.code != 'no_sensor_helps':
+        return False
+    return HARMS not in calibration_from_text(text).decisions.values()
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,7 @@ from imu_calibration.nodes.diagnosis_thread import Listeners, give_arrays_own_pa
 from imu_calibration.nodes.diagnostics import (
     LOG_ERROR,
     LOG_INFO,
+    REMINDER,
     Complaints,
     DiagnosticsPublisher,
     say,
@@ -342,11 +343,10 @@ class CalibrationNode(Node):
             if not self.worker.is_alive():
                 break
         response.success, response.message = answer.result() if answer.done() else (False, '')
-        say(
-            self.get_logger(),
-            LOG_INFO if response.success else LOG_ERROR,
-            f'~/{what}: {response.message}',
-        )
+        level = LOG_INFO
+        if not response.success and not self.worker.state.is_gathering:
+            level = LOG_ERROR
+        say(self.get_logger(), level, f'~/{what}: {response.message}')
         self._diagnostics.publish_now()
         return response
 
@@ -397,7 +397,8 @@ class CalibrationNode(Node):
             else []
         )
         if time.monotonic() - self._started > MAX_SILENCE_SECONDS:
-            self._complaints.now('calibration', about_topics + silent + trouble, state.faults)
+            self._complaints.now('calibration', about_topics + silent, state.faults)
+            self._complaints.now('streams', trouble, patience=REMINDER)
         for level, line in self._guide.lines(state):
             say(self.get_logger(), level, line)
         return statuses_of(state, about_topics + silent)

@@ -27,7 +27,15 @@ from imu_calibration.calibration.coverage import (
 from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
 from imu_calibration.core.progress import LiveState
 from imu_calibration.document.decision import HARMS
-from imu_calibration.nodes.diagnostics import ERROR, LOG_INFO, LOG_WARN, OK, WARN, make_status
+from imu_calibration.nodes.diagnostics import (
+    ERROR,
+    LOG_INFO,
+    LOG_WARN,
+    OK,
+    REMINDER,
+    WARN,
+    make_status,
+)
 from imu_calibration.nodes.inputs import MatchedInput
 from imu_calibration.preprocessing.stamping import COUNTED, REGULAR
 from imu_calibration.preprocessing.stream_watch import StreamState
@@ -63,6 +71,11 @@ class WorkerState:
     """The decisions in one phrase."""
     complete: bool = False
     """Whether each sensor helps and every requested parameter is determined."""
+
+    @property
+    def is_gathering(self) -> bool:
+        """Whether there is no solution yet, without a fault."""
+        return not self.solution and not self.faults
 
 
 MIN_ADVICE_SECONDS = 5.0
@@ -102,7 +115,7 @@ class CalibrationGuide:
             clock,
         )
         self._coming: set[str] = set()
-        self._stamping = ''
+        self._stamping, self._stamping_at = '', float('-inf')
         self._gathered, self._verdict, self._advice, self._advised, self._diagnosed = (
             0,
             '',
@@ -134,10 +147,14 @@ class CalibrationGuide:
             )
         self._coming = coming
         line = None if state.streams is None else state.streams.stamping
-        if line is not None and line.word != self._stamping:
-            if line.word == COUNTED or (line.word == REGULAR and self._stamping):
-                yield LOG_INFO, f'Imu: {line}'
-            self._stamping = line.word
+        if line is None or line.word == self._stamping:
+            return
+        if line.word == COUNTED or (line.word == REGULAR and self._stamping):
+            if self._clock() - self._stamping_at < REMINDER:
+                return  # logged later if it lasts
+            self._stamping_at = self._clock()
+            yield LOG_INFO, f'Imu: {line}'
+        self._stamping = line.word
 
     def _verdicts(self, state: WorkerState) -> Iterator[tuple[str, str]]:
         known = f'{state.judged}, every parameter is determined' if state.complete else state.judged

@@ -21,7 +21,7 @@ from imu_calibration.nodes.diagnostics import (
     make_status,
 )
 from imu_calibration.nodes.message_compensation import WITHHELD
-from imu_calibration.preprocessing.stamping import COUNTED
+from imu_calibration.preprocessing.stamping import COUNTED, REGULAR
 
 SERIOUS = ('frame_id', 'not an Imu message', 'failed')
 """Prefixes of the reasons for which no message of a stream can be corrected."""
@@ -60,10 +60,10 @@ class CompensatorDiagnostics:
     def __init__(self, node: Any):
         self._node, self._counts = node, {}
         self._received, self._last_change, self._last_source = 0, monotonic(), ''
-        self._last_stamps: tuple[Any, Any] | None = None
+        self._last_stamps: tuple[Any, int] | None = None
         self._temperature: float | None = None
         self._temperature_at, self._unusable_temperatures = monotonic(), ''
-        self._stamps_at: dict = {}
+        self._stamps_at = -np.inf
         self._publisher = DiagnosticsPublisher(node, self.collect)
 
     def publish_now(self) -> None:
@@ -107,14 +107,14 @@ class CompensatorDiagnostics:
         adopted: Adopted | None = node.adopted
         notes += [] if adopted is None else adopted.caveats
         level = ERROR if serious else WARN if notes else OK
-        good = (
-            ''
-            if adopted is None
-            else (
+        good = ''
+        if adopted is not None:
+            good = (
                 f'corrected with calibration {adopted.version}'
                 f' ({decisions_text(adopted.calibration.decisions)})'
             )
-        )
+        elif node.unready:
+            good = f'{node.unready}; {self._uncorrected()}'
         frame_id = '' if adopted is None else adopted.calibration.frame_id
         return [
             *self._health(compensation, frame_id),
@@ -170,19 +170,28 @@ class CompensatorDiagnostics:
         return [node.imu.silence()] if monotonic() - self._last_change > QUIET else []
 
     def _tell_stamps(self, compensation):
-        """Log irregular stamps once, and again when their rate changes."""
+        """Log a change of the kind or of the regular rate of the stamps, at most once a minute."""
         line = None if compensation is None else compensation.slope.line
-        if (
-            line is not None
-            and (shown := (line.word, round(np.log(line.period_ns) / ANOTHER_RATE)))
-            != self._last_stamps
-        ):
-            if (
-                line.word == COUNTED or self._last_stamps is not None
-            ) and monotonic() - self._stamps_at.get(shown, -np.inf) >= REMINDER:
-                self._stamps_at[shown] = monotonic()
-                self._node.get_logger().info(str(line))
-            self._last_stamps = shown
+        if line is None:
+            return
+        rate = 0
+        if line.word == REGULAR:  # the other lines state no rate
+            rate = round(np.log(line.period_ns) / ANOTHER_RATE)
+        shown = (line.word, rate)
+        if shown == self._last_stamps:
+            return
+        if line.word == COUNTED or self._last_stamps is not None:
+            if monotonic() - self._stamps_at < REMINDER:
+                return  # logged later if it lasts
+            self._stamps_at = monotonic()
+            self._node.get_logger().info(str(line))
+        self._last_stamps = shown
+
+    def _uncorrected(self):
+        """Return what happens to messages without a calibration."""
+        if self._node.settings.passthrough:
+            return 'messages pass unchanged'
+        return 'nothing is published'
 
     def _lines(self, compensation):
         """Return (faults that prevent correction, notes), one line each."""
@@ -197,10 +206,10 @@ class CompensatorDiagnostics:
             error = compensation.gate.error
             if error is not None:
                 serious.append(f'nothing is published: {error}')
+        if compensation is None and node.unready:
+            return serious, []
         if compensation is None:
-            what = (
-                'messages pass unchanged' if node.settings.passthrough else 'nothing is published'
-            )
+            what = self._uncorrected()
             waiting = (
                 f'waiting for {node.awaited}; {what}'
                 if node.awaited

@@ -30,6 +30,7 @@ from imu_calibration.nodes.adoption import (
     adopt,
     again,
     has_moved,
+    may_become_ready,
 )
 from imu_calibration.nodes.compensator_diagnostics import CompensatorDiagnostics
 from imu_calibration.nodes.diagnostics import LOG_ERROR, Complaints
@@ -77,7 +78,7 @@ class CompensatorNode(Node):
         )
         self.adopted: Adopted | None = None
         self._previous: Adopted | None = None
-        self._harmful = ''
+        self._harmful, self.unready = '', ''
         self._current: LiveCompensation | None = None
         self._wanted: LiveCompensation | None = None
         self._reported: Adopted | None = None
@@ -267,6 +268,7 @@ class CompensatorNode(Node):
         if self.adopted is not None and self.adopted.version != adopted.version:
             self._previous = self.adopted
         self.adopted, self.problem, self.refusal, self.awaited = adopted, '', '', ''
+        self.unready = ''
         self._wanted = adopted.compensation
         if self.temperature is None and (
             adopted.compensation.needs_temperature
@@ -320,9 +322,21 @@ class CompensatorNode(Node):
         except ImuCalibrationError as error:
             why = error.with_hint(HINTS['compensator_node'])
             self.refusal = error.code
+            if self.adopted is None and source == self._topic:
+                if may_become_ready(error, self._heard):
+                    self._wait_until_ready(source, why)
+                    return why
+        self.unready = ''
         self.problem = f'the calibration from {source} was refused: {why}'
         self.diagnostics.publish_now()
         return why
+
+    def _wait_until_ready(self, source: str, why: str) -> None:
+        """Report a calibration in progress, whose next version may be applied."""
+        if not self.unready:
+            self.get_logger().info(f'the calibration from {source} is not ready yet: {why}')
+        self.unready, self.problem = f'the calibration from {source} is not ready yet: {why}', ''
+        self.diagnostics.publish_now()
 
     def _on_transforms(self) -> None:
         """Resume an adoption that waited for a transform, or apply a changed transform."""

@@ -83,19 +83,19 @@ class StampLine:
         return self.low_ns >= 0 and self.high_ns > 0
 
     def __str__(self) -> str:
-        rate = 1e9 / self.period_ns
         if self.word == REGULAR:
-            return f'stamps are regular at {rate:.4g} Hz'
+            return f'stamps are regular at {1e9 / self.period_ns:.4g} Hz'
+        # With lost samples the other periods are those of received messages, not of the driver.
         if self.word == IRREGULAR:
-            return f'the steps between stamps scatter and follow no clock near {rate:.4g} Hz'
+            return 'the steps between stamps scatter and follow no clock'
         if self.at_once >= PACKET:
             return (
                 f'stamps are times of arrival, about {self.at_once:.0f} samples at once; regular'
-                f' times at {rate:.4g} Hz are drawn through them'
+                ' times are drawn through them'
             )
         return (
             f'stamps scatter by {1e-6 * (self.high_ns - self.low_ns):.3g} ms about a clock; regular'
-            f' times at {rate:.4g} Hz are drawn through them'
+            ' times are drawn through them'
         )
 
 

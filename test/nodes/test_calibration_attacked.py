@@ -237,6 +237,16 @@ def test_motion_of_another_model_or_a_damaged_file_is_put_aside_and_the_session_
     assert not any(word in line for word in ('pickle', 'Error', 'numpy', 'without resume'))
 
 
+def test_a_calibration_without_motion_so_far_is_no_fault(bench, tmp_path):
+    start(bench, tmp_path)
+    for service in ('solve', 'save'):
+        assert not bench.call(f'/calibration_node/{service}').success
+        assert bench.heard(f'~/{service}: ', level='info') == 1
+        assert not bench.heard(f'~/{service}: ', level='error')
+    bench.until(lambda: bench.lines().get(CALIBRATION, (ERROR, ''))[0] == OK, 'no fault')
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_whatever_fails_within_is_told_and_the_session_goes_on(bench, session, tmp_path):
     node = start(bench, tmp_path)
     live = node.worker.live

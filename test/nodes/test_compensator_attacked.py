@@ -16,7 +16,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import Role
-from imu_calibration.preprocessing.stamping import COUNTED, StampLine
+from imu_calibration.preprocessing.stamping import COUNTED, REGULAR, StampLine
 from msg_adapters.write import encode_imu
 
 from worlds.compensation_cases import random_calibration
@@ -341,15 +341,37 @@ def test_a_temperature_in_kelvin_is_refused(bench, tmp_path):
     assert bench.heard('/imu/temperature', '310.0', level='warning') == 1
 
 
-def test_how_the_stamps_are_is_said_at_most_once_a_minute_for_each_state(bench, place, monkeypatch):
+def test_a_calibration_in_progress_is_no_fault(bench):
+    bench.start(CompensatorNode, {'adopt': 'topic'})
+    publisher = bench.node.create_publisher(String, 'imu/calibration', latched_qos())
+    bench.until(publisher.get_subscription_count, 'a subscription')
+    unproven = REFUSED['unproven'][0]
+    for text in (unproven, unproven + '\n'):  # two versions of the session
+        publisher.publish(String(data=text))
+        bench.until(lambda: bench.figure(STATUS, 'refused') == 'no_sensor_helps', 'the refusal')
+        bench.until(lambda: bench.shows(STATUS, 'unproven', level=OK), 'no fault')
+    assert bench.heard('/imu/calibration', 'unproven', level='info') == 1
+    assert not bench.heard('unproven', level='error')
+    bench.status.clear()
+    publisher.publish(String(data=REFUSED['harms'][0]))
+    bench.until(lambda: bench.shows(STATUS, 'refused', level=ERROR), 'a fault')
+    publisher.publish(String(data=GOOD_TEXT))
+    bench.until(lambda: bench.figure(STATUS, 'calibration') == version_of(GOOD_TEXT), 'the good')
+
+
+def test_how_the_stamps_are_is_said_at_most_once_a_minute_without_a_rate_of_losses(
+    bench, place, monkeypatch
+):
     node, now = bench.start(CompensatorNode, {'calibration_file': str(place)}), [1000.0]
     monkeypatch.setattr(compensator_diagnostics, 'monotonic', lambda: now[0])
-    states = [StampLine(COUNTED, 5_000_000.0), StampLine(COUNTED, 10_000_000.0)]
+    states = [StampLine(REGULAR, 5_000_000.0), StampLine(COUNTED, 6_000_000.0)]
     slope = SimpleNamespace(line=None)
     for second in range(121):
         now[0], slope.line = 1000.0 + second, states[second % 2]
         node.diagnostics._tell_stamps(SimpleNamespace(slope=slope))
-    assert bench.heard(states[0], level='info') == 3 and bench.heard(states[1], level='info') == 2
+    said = [bench.heard(str(state), level='info') for state in states]
+    assert sum(said) == 2  # at 1 s and 62 s
+    assert 'Hz' not in str(states[1])
 
 
 def test_with_two_publishers_nothing_is_adopted_and_later_the_last_document_of_the_remaining_one(

@@ -347,9 +347,11 @@ def test_calibrate_refuses_what_would_make_the_result_wrong(
     """One line, exit code 1, nothing written: with the table and by hand."""
     imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
     write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
-    for more in (
-        (['--table', str(table)], []) if fault is not two_clocks else (['--table', str(table)],)
-    ):
+    references = [['--table', str(table)]]
+    # By hand the joints do not matter, and without a gyroscope the accelerometer is calibrated.
+    if fault not in (two_clocks, dead_gyroscope):
+        references.append([])
+    for more in references:
         capsys.readouterr()
         assert (
             main(['calibrate', str(tmp_path / 'bag'), *more, '--output', str(tmp_path / 'out')])

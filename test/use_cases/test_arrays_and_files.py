@@ -1,5 +1,6 @@
 """Arrays in place of recordings, integer nanoseconds, and files that are not replaced silently."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,8 +15,10 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.calibrate import Calibrated
 from imu_calibration.use_cases.simulate import simulate
+from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration
+from worlds.hand_sessions import simulate as hand_session
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
@@ -92,6 +95,48 @@ def test_results_of_other_inputs_are_replaced_only_by_force(tmp_path):
     with refused(InputError, 'other_result', 'calibration.yaml'):
         other.save(tmp_path, report=False)
     other.save(tmp_path, report=False, force=True)
+
+
+def test_the_noise_of_another_recording_is_not_replaced_on_the_command_line(tmp_path, capsys):
+    for seed in (0, 1):
+        held = SampleBlock.from_arrays(**at_rest(seed)).imu
+        write_session(tmp_path / f'still_{seed}', held.select(slice(0, COUNT // 4)))
+    document = tmp_path / 'out' / 'noise.yaml'
+    first, second = (
+        ['noise', str(tmp_path / f'still_{seed}'), '--no-report', '--output', str(document.parent)]
+        for seed in (0, 1)
+    )
+    assert main(first) in (0, 3)
+    before = document.read_bytes()
+    capsys.readouterr()
+    assert main([*second, '--json']) == 1
+    assert json.loads(capsys.readouterr().out)['error']['code'] == 'other_result'
+    assert document.read_bytes() == before
+    assert main([*second, '--force']) in (0, 3) and document.read_bytes() != before
+
+
+def test_check_reads_a_folder_and_compares_with_the_given_gravity(tmp_path, capsys):
+    session, result = str(tmp_path / 'session'), str(tmp_path / 'result')
+    held = hand_session(3, n_poses=20, still=3.0, force_sd=0.004, rate_sd=4e-4)[0]
+    write_session(tmp_path / 'session', held)
+    calibrate = ['calibrate', session, '--gravity', '9.80665', '--no-report', '--output', result]
+    assert main(calibrate) == 0
+    mean_errors = []
+    for place in (['--gravity', '9.80665'], ['--gravity', '9.78033'], ['--latitude', '0']):
+        capsys.readouterr()
+        assert main(['check', session, '--calibration', result, *place, '--json']) in (0, 3)
+        found = json.loads(capsys.readouterr().out)['result']
+        mean_errors.append(found['proof']['accelerometer']['after'])
+    # WGS 84 at the equator: 9.78033 m/s^2, which is 0.02632 below the gravity of the calibration
+    right, given, of_latitude = mean_errors
+    assert right < 0.002 and given == pytest.approx(0.0263, rel=0.05)
+    assert of_latitude == pytest.approx(given, rel=0.01)
+    both = ['--gravity', '9.8', '--latitude', '0', '--json']
+    assert main(['check', session, '--calibration', result, *both]) == 1
+    assert json.loads(capsys.readouterr().out)['error']['code'] == 'gravity_twice'
+    # the folder without a calibration
+    assert main(['check', session, '--calibration', session, '--json']) == 1
+    assert json.loads(capsys.readouterr().out)['error']['code'] == 'file_unreadable'
 
 
 def test_an_existing_export_needs_force(tmp_path, capsys):
