@@ -1,11 +1,16 @@
 """``imu_calibration convert``: a text log as a bag."""
 
+from __future__ import annotations
+
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 from imu_calibration.core.documents import finite
-from imu_calibration.preprocessing.sensor_join import JoinedSensors
 from msg_adapters.storages import identifiers
+
+if TYPE_CHECKING:
+    from imu_calibration.preprocessing.sensor_join import JoinedSensors
 
 EXAMPLES = (
     'Accelerometer.csv Gyroscope.csv --output session',

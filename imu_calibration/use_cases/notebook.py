@@ -37,9 +37,15 @@ Result = TypeVar('Result')
 Recordings = str | PathLike | SampleBlock | Sequence[str | PathLike | SampleBlock]
 
 
+USE_CASES = {'compensate': _compensate, 'noise': _noise}
+"""Function with further options -> the use case that has them."""
+
+
 def _for_notebooks(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the function with errors that name its arguments."""
     names = set(signature(function).parameters)
+    if 'options' in names:  # which are those of the use case
+        names |= set(signature(USE_CASES[function.__name__]).parameters)
     hints = {
         name: f'argument {name}'
         for name in (names | set(Choices.__annotations__) if 'choices' in names else names)

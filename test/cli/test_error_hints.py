@@ -91,6 +91,7 @@ NAMED = {
 }
 UNREACHABLE = {
     'calibration_node': {
+        'exclude': 'of times in a recording',
         'accelerometer_unit': 'readings are converted in the driver, which the error names',
         'gyroscope_unit': 'readings are converted in the driver, which the error names',
         'anyway': 'no calibration is applied',
@@ -105,6 +106,8 @@ UNREACHABLE = {
         'target_frame': 'no calibration is applied',
     },
     'planner_node': {
+        'force': 'results of verbs',
+        'noise': 'no noise is compared',
         'anyway': 'no calibration is applied',
         **NAMED,
         'accelerometer_unit': 'no readings are compared',
@@ -117,15 +120,20 @@ UNREACHABLE = {
         'up': 'of transforms in a bag',
         'target_frame': 'no calibration is applied',
     },
-    'simulator_node': {'up': 'of transforms in a bag'},
+    'simulator_node': {'up': 'of transforms in a bag', 'force': 'results of verbs'},
     'compensator_node': {
+        'force': 'results of verbs',
+        'axes': 'no calibration is exported',
         'accelerometer_unit': 'the calibration states the unit',
         'gyroscope_unit': 'the calibration states the unit',
         'allow_xacro': 'no robot description is read',
         'imu_link': 'no robot description is read',
         'up': 'of transforms in a bag',
     },
-    'bag_player_node': {'allow_xacro': 'no robot description is read'},
+    'bag_player_node': {
+        'allow_xacro': 'no robot description is read',
+        'force': 'results of verbs',
+    },
 }
 """
 Node -> {key of errors in the modules that it imports: reason why the node needs no name for it}.

@@ -21,7 +21,7 @@ SESSION, TABLE, TRUTH = (
 )
 
 
-HELP_NEEDS = {'simulate': {'numpy'}, 'plan': {'numpy'}, 'convert': {'numpy'}}
+HELP_NEEDS = {verb: {'numpy'} for verb in ('simulate', 'plan', 'convert', 'check')}
 """Heavy modules that the help of a verb may import, by verb; others import none."""
 
 
@@ -169,7 +169,7 @@ def test_the_closest_model_effect_topic_profile_or_program_is_suggested(
     ('arguments', 'code', 'keys'),
     [
         (['inspect', SESSION], 0, {'topics', 'imu'}),
-        (['compare', TRUTH, TRUTH], 0, {'rows', 'lines'}),
+        (['compare', TRUTH, TRUTH], 0, {'rows', 'lines', 'agree', 'reference_agree'}),
         (['effects'], 0, {'effects'}),
         (['export', '--list'], 0, {'targets'}),
         (['compare', TRUTH, 'nowhere.yaml'], 1, 'file_unreadable'),
