@@ -208,6 +208,10 @@ STAMP_FAULTS = {
         'are spikes: readings that differ from their neighbours beyond any motion are excluded; if'
         ' they are many, check the bus and the driver'
     ),
+    'wrapped': (
+        'are in motions whose readings wrap around at the end of the range of the converter: these'
+        ' motions are left out; move less fast or choose a wider range'
+    ),
 }
 """Reason for which samples were dropped -> what they do, and the remedy."""
 SPIKE_SHARE = 5e-3
@@ -223,11 +227,11 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sample has a stamp of its own, later than the one before, and finite readings."""
     clean = []
     for name, found in evidence.streams.items():
-        # Spikes are samples with accepted stamps, and a clock reset drops no sample.
+        # Spikes and wrapped readings have accepted stamps, and a clock reset drops no sample.
         total = found.count + sum(
             count
             for reason, count in found.dropped.items()
-            if reason not in ('clock reset', 'spike')
+            if reason not in ('clock reset', 'spike', 'wrapped')
         )
         if found.count < 0.1 * total:
             reasons = ', '.join(f'{count} {reason}' for reason, count in found.dropped.items())

@@ -15,6 +15,7 @@ from imu_calibration.preprocessing.counter_overflow import OverflowSearch
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
+from imu_calibration.preprocessing.wrap_filter import WrapFilter
 
 _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
@@ -69,6 +70,7 @@ class StreamCheck:
         self._newest_raw = None
         self._times: SampleTimes | None = None
         self._spikes, self._filtered_epoch = SpikeFilter(), 0
+        self._wraps = WrapFilter()
 
     @property
     def line(self) -> StampLine | None:
@@ -144,14 +146,21 @@ class StreamCheck:
             if epoch != self._filtered_epoch:
                 passed += self._let_out()
                 self._filtered_epoch = epoch
-            passed += [(epoch, part) for part in self._spikes.push(samples)]
+            for unwrapped in self._wraps.push(samples):
+                passed += [(epoch, part) for part in self._spikes.push(unwrapped)]
         passed += self._let_out() if ended else []
         if self._spikes.dropped:
             self.counts['spike'] = self._spikes.dropped
+        if self._wraps.dropped:
+            self.counts['wrapped'] = self._wraps.dropped
         return passed
 
     def _let_out(self):
-        return [(self._filtered_epoch, part) for part in self._spikes.finish()]
+        passed = []
+        for unwrapped in self._wraps.finish():
+            passed += self._spikes.push(unwrapped)
+        passed += self._spikes.finish()
+        return [(self._filtered_epoch, part) for part in passed]
 
     def _count(self, reason, number):
         self.counts += Counter({reason: int(number)})  # without zeros

@@ -1,0 +1,189 @@
+"""Readings that wrap around at the end of the range of the converter, with the turn around them."""
+
+import numpy as np
+
+from imu_calibration.core.samples import ImuSamples
+
+LEAST_STEP = np.array([20.0] * 3 + [3.0] * 3)
+"""Smallest step, m/s^2 and rad/s: ranges of +-2 g and +-125 deg/s wrap by 39 and 4.4."""
+LEAST_SLOPE = np.array([1000.0] * 3 + [150.0] * 3)
+"""Smallest slope of the step, m/s^3 and rad/s^2: no motion with smooth neighbours is as steep."""
+SYMMETRY = 0.3
+"""Largest sum of the readings on both sides, as a share of the step: both are at an end."""
+NEIGHBOUR_SHARE = 0.1
+"""Largest step between neighbours, as a share of the step: two steps on each side."""
+END_SHARE = 1.05
+"""Largest earlier reading of the sensor, as a share of the end of the range, for scaled axes."""
+BACKWARD_SHARE = 0.02
+"""Largest movement away from the end of the range before the step, as a share of it, for noise."""
+LONGEST_NS = 3 * 10**9
+"""A reading that wraps returns within this time."""
+MARGIN_NS = 150 * 10**6
+"""Left out after the return, so that the hole is a gap: no motion is interpolated across it."""
+CONTEXT = 4
+"""Decided samples that are kept as neighbours of the next ones."""
+
+
+class WrapFilter:
+    """
+    Removes the parts of a stream in which a reading has wrapped around.
+
+    A converter of n bits continues at the other end of its range instead of clipping: a step of
+    exactly twice the range between two readings at opposite ends, with smooth neighbours that move
+    towards the end, and the opposite step when the motion slows down. Everything between both steps
+    is removed. No reading before is beyond this end, which distinguishes it from a sensor that is
+    shaken within a larger range. The result does not depend on the division into pieces.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._held: ImuSamples | None = None
+        self._begin()
+
+    def _begin(self):
+        """Begin a stream."""
+        self._held = None
+        self._n_before = 0
+        self._until_ns = -(1 << 62)
+        # Of each column, the last step that ended a wrapped part.
+        self._returned_ns = np.full(6, -(1 << 62))
+        # Of force and rate, the largest reading before the buffered ones.
+        self._largest = np.zeros(2)
+
+    def push(self, samples: ImuSamples) -> list[ImuSamples]:
+        """Return the samples with a decision; those after a step are buffered until it returns."""
+        held = samples if self._held is None else type(samples).concatenate([self._held, samples])
+        self._held = held
+        stamps = held.stamp_ns
+        spans, open_ns = self._spans(held)
+        # The steps between the last four readings lack one of the two later neighbours.
+        n_decided = max(len(held) - 3, 0)
+        if open_ns is not None:
+            n_decided = min(n_decided, int(np.searchsorted(stamps, open_ns)))
+        return self._pass_on(n_decided, spans)
+
+    def finish(self) -> list[ImuSamples]:
+        """Return the buffered samples, and begin a new stream."""
+        passed = []
+        if self._held is not None:
+            spans, _ = self._spans(self._held)
+            passed = self._pass_on(len(self._held), spans)
+        self._begin()
+        return passed
+
+    def _pass_on(self, stop, spans):
+        """Return the undecided samples before row `stop` that are outside of all spans."""
+        if stop <= self._n_before:
+            return []
+        assert self._held is not None
+        part = self._held.select(slice(self._n_before, stop))
+        wrapped = part.stamp_ns <= self._until_ns
+        for axis, first_ns, return_ns in spans:
+            # A span that begins in the undecided samples is found again with the next piece.
+            if first_ns <= part.stamp_ns[-1]:
+                until_ns = return_ns + MARGIN_NS
+                wrapped |= (part.stamp_ns >= first_ns) & (part.stamp_ns <= until_ns)
+                self._until_ns = max(self._until_ns, until_ns)
+                self._returned_ns[axis] = return_ns
+        self.dropped += int(np.count_nonzero(wrapped))
+        first = max(stop - CONTEXT, 0)
+        if first:
+            self._largest = largest_so_far(self._held, self._largest)[first - 1]
+        self._held = self._held.select(slice(first, None))
+        self._n_before = stop - first
+        if wrapped.all():
+            return []
+        return [part.select(~wrapped) if wrapped.any() else part]
+
+    def _spans(self, samples):
+        """Return [(column, first, return)] of wrapped parts in ns, and the first without return."""
+        row, column, up = wrap_steps(samples, self._largest)
+        new = samples.stamp_ns[row] > self._returned_ns[column]
+        row, column, up = row[new], column[new], up[new]
+        stamps, spans, open_ns = samples.stamp_ns, [], None
+        for axis in np.unique(column):
+            of_axis = column == axis
+            times, directions = stamps[row[of_axis]], up[of_axis]
+            k = 0
+            while k < len(times):
+                returns = k + 1 < len(times) and directions[k + 1] != directions[k]
+                if returns and times[k + 1] - times[k] < LONGEST_NS:
+                    spans.append((int(axis), int(times[k]), int(times[k + 1])))
+                    k += 2
+                    continue
+                if k + 1 == len(times) and stamps[-1] - times[k] < LONGEST_NS:
+                    open_ns = int(times[k]) if open_ns is None else min(open_ns, int(times[k]))
+                k += 1
+        return spans, open_ns
+
+
+def largest_so_far(samples: ImuSamples, before: np.ndarray) -> np.ndarray:
+    """
+    Return the largest reading of each sensor up to each sample.
+
+    Parameters
+    ----------
+    samples : ImuSamples
+    before : ndarray, shape (2,)
+        Of force and rate, before these samples.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+
+    """
+    sizes = [np.abs(values).max(axis=1) for values in (samples.force_s, samples.rate_s)]
+    return np.maximum(np.maximum.accumulate(np.column_stack(sizes), axis=0), before)
+
+
+def wrap_steps(
+    samples: ImuSamples, largest: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Return the steps that are those of a converter which wraps around.
+
+    Parameters
+    ----------
+    samples : ImuSamples
+    largest : ndarray, shape (2,)
+        Largest reading of force and rate before these samples.
+
+    Returns
+    -------
+    row : ndarray of int, shape (n,)
+        First reading after each step.
+    column : ndarray of int, shape (n,)
+        Force x, y, z, then rate x, y, z.
+    up : ndarray of bool, shape (n,)
+        Whether the reading increases.
+
+    """
+    values = np.hstack([samples.force_s, samples.rate_s])
+    none = np.zeros(0, int)
+    if len(values) < 6:
+        return none, none, none.astype(bool)
+    step = np.diff(values, axis=0)
+    row, column = np.nonzero(np.abs(step) > LEAST_STEP)
+    inside = (row >= 2) & (row + 2 < len(step))
+    row, column = row[inside], column[inside]
+    size = step[row, column]
+    before, after = values[row, column], values[row + 1, column]
+    earlier, later = step[row - 1, column], step[row + 1, column]
+    sizes = np.abs(size)
+    seconds = np.diff(samples.stamp_ns)[row] * 1e-9
+    # Both readings are at the ends of the range.
+    wraps = np.abs(before + after) < SYMMETRY * sizes
+    # A step that is too steep for motion, with smooth neighbours.
+    wraps &= sizes > LEAST_SLOPE[column] * seconds
+    neighbours = np.maximum(np.abs(earlier), np.abs(later))
+    wraps &= neighbours < NEIGHBOUR_SHARE * sizes
+    for further in (step[row - 2, column], step[row + 2, column]):
+        # The next neighbour is smooth too, or the opposite step where two readings are wrapped.
+        distance = np.minimum(np.abs(further), np.abs(further + size))
+        wraps &= distance < NEIGHBOUR_SHARE * sizes
+    # Before the step the reading moves towards the end of the range.
+    wraps &= earlier * np.sign(size) < BACKWARD_SHARE * sizes
+    # The end of the range: no reading of this sensor so far is beyond it.
+    end = np.maximum(np.abs(before), np.abs(after)) + neighbours
+    wraps &= largest_so_far(samples, largest)[row + 3, column // 3] < END_SHARE * end
+    return row[wraps] + 1, column[wraps], size[wraps] > 0
