@@ -35,7 +35,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.preprocessing.checks import refuse
     from imu_calibration.use_cases.choices import calibration_options, topics_of
-    from imu_calibration.use_cases.inspect import imu_topics_of, inspect
+    from imu_calibration.use_cases.inspect import imu_topics_of, inspect, split_topics
     from imu_calibration.use_cases.recordings import Topics, existing, table_of
 
     bag, choices, stand, hints = (
@@ -72,6 +72,13 @@ def run(options: Options) -> VerbResult:
         reasons += [*look.reasons, *([reason] if reason else [])]
         if look.by_hand is not None:
             _show_by_hand(out, look.by_hand, hints)
+    split = split_topics(looks)
+    if split is not None:
+        out.print()
+        out.print(
+            'one sensor per topic; to read both: --imu-topic'
+            f' {split.imu} --gyroscope-topic {split.gyroscope}'
+        )
     if set(codes) == {1}:  # no topic is usable: also one line on standard error, as every refusal
         refuse(looks[0].findings)
     return VerbResult(

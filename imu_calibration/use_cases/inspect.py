@@ -4,7 +4,7 @@ Inspect: content of the topics of a recording, their faults, and the parameters 
 Each is read once.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 
@@ -160,7 +160,42 @@ def inspect(
 
     `exclude`: times that are not used, as in `Choices`.
     """
-    return [_look(bag, each, table, options=options, exclude=exclude) for each in topics]
+    looks = [_look(bag, each, table, options=options, exclude=exclude) for each in topics]
+    split = split_topics(looks)
+    if split is None:
+        return looks
+    note = CheckFinding(
+        'split',
+        NOTE,
+        f'{split.imu} has the accelerometer only and {split.gyroscope} the gyroscope only: read'
+        ' both together as one IMU',
+    )
+    names = (split.imu, split.gyroscope)
+    return [
+        replace(look, findings=(*look.findings, note))
+        if look.recording is not None and look.recording.imu_topic in names
+        else look
+        for look in looks
+    ]
+
+
+def split_topics(looks: Sequence[RecordingSummary]) -> Topics | None:
+    """
+    Return the Imu topics of the two sensors where each has one of its own, as `Topics`.
+
+    None where a topic has both sensors, or several topics have the same one alone.
+    """
+    alone: dict[str, list[str]] = {'accelerometer': [], 'gyroscope': []}
+    for look in looks:
+        lacking = {each.sensor for each in look.findings if each.check == 'frozen' and each.sensor}
+        if 'imu' in look.streams:
+            lacking.update(look.streams['imu'].absent)
+        present = [sensor for sensor in alone if sensor not in lacking]
+        if len(present) == 1 and look.recording is not None:
+            alone[present[0]].append(look.recording.imu_topic)
+    if any(len(set(topics)) != 1 for topics in alone.values()):
+        return None
+    return Topics(imu=alone['accelerometer'][0], gyroscope=alone['gyroscope'][0])
 
 
 def _look(bag, topics, table, *, options, exclude):

@@ -1,9 +1,12 @@
 """Accelerometer and gyroscope on two Imu topics, each with zeros for the other sensor."""
 
+import json
+
 import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.use_cases.calibrate import calibrate
@@ -56,3 +59,51 @@ def test_one_topic_alone_is_one_sensor(bag):
     found = calibrate(bag, imu_topic='/accel', gravity=GRAVITY)
     assert list(found.calibration.decisions) == ['accelerometer']
     assert found.exit_code == 3
+
+
+def two_topics(path, of_accel, of_gyro):
+    """Write two Imu topics, /accel and /gyro, of a resting IMU."""
+    rng = np.random.default_rng(83)
+    stamps = 10**18 + 5_000_000 * np.arange(800)
+    force, rate = rng.normal([0, 0, 9.8], 0.01, (800, 3)), rng.normal(0, 1e-3, (800, 3))
+    with BagWriter(path, 'mcap') as writer:
+        for name, (has_force, has_rate), nothing in (
+            ('/accel', of_accel, np.nan),
+            ('/gyro', of_gyro, 0.0),
+        ):
+            imu = ImuSamples(
+                stamps,
+                force if has_force else np.full_like(force, nothing),
+                rate if has_rate else np.full_like(rate, nothing),
+                'imu_link',
+            )
+            topic = writer.add_topic(name, standard_definition(IMU_TYPE))
+            writer.write(np.full(len(imu), topic), imu.stamp_ns, Packed.of_rows(encode_imu(imu)))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ('of_accel', 'of_gyro', 'split'),
+    [
+        ((True, False), (False, True), True),
+        ((True, True), (False, True), False),
+        ((True, False), (True, False), False),
+        ((True, True), (True, True), False),
+    ],
+)
+def test_inspect_proposes_to_read_the_topics_of_two_sensors_together(
+    of_accel, of_gyro, split, tmp_path, capsys
+):
+    bag = two_topics(tmp_path / 'bag', of_accel, of_gyro)
+    main(['inspect', bag])
+    assert ('--imu-topic /accel --gyroscope-topic /gyro' in capsys.readouterr().out) == split
+    main(['inspect', bag, '--json'])
+    looks = json.loads(capsys.readouterr().out)['result']['imu']
+    checks = [[finding['check'] for finding in look['findings']] for look in looks]
+    assert ['split' in each for each in checks] == [split, split]
+
+
+def test_nothing_is_proposed_where_both_topics_are_read(tmp_path, capsys):
+    bag = two_topics(tmp_path / 'bag', (True, False), (False, True))
+    main(['inspect', bag, '--imu-topic', '/accel', '--gyroscope-topic', '/gyro'])
+    assert 'one sensor per topic' not in capsys.readouterr().out
