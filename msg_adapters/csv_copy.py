@@ -54,7 +54,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
     for columns in log.columns:
         for place in text.places.get(columns.quantity, ()):
             unit = SI_UNITS.get(columns.quantity, columns.unit)
-            if columns.quantity != 'time' or _is_number(text, place):
+            if unit is not None and (columns.quantity != 'time' or _is_number(text, place)):
                 names[place] = name_with_unit(names[place], columns.quantity, unit)
     out = io.StringIO()
     writer = csv.writer(out, delimiter=delimiter, lineterminator='\n')

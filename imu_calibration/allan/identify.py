@@ -421,7 +421,7 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
         )
         if axis is not None
     ]
-    of_sensor = {sensor: () for sensor in SENSORS}
+    of_sensor: dict[str, tuple[AxisFigures, ...]] = {sensor: () for sensor in SENSORS}
     for number, sensor in enumerate(result.sensors):
         of_sensor[sensor] = tuple(axes[3 * number : 3 * number + 3])
     dropped = dict(record.survey.dropped)
