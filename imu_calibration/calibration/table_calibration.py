@@ -32,8 +32,9 @@ from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import TemperatureSamples
+from imu_calibration.core.settings import CHANGE
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.change import CHANGE, RegimeChange
+from imu_calibration.document.change import RegimeChange
 from imu_calibration.document.decision import (
     HELPS,
     UNPROVEN,

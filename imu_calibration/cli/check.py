@@ -3,7 +3,7 @@
 from dataclasses import asdict
 
 from imu_calibration.cli.parser import BAG, OneLineParser, Options, VerbResult
-from imu_calibration.document.change import CHANGE
+from imu_calibration.core.settings import CHANGE
 
 EXAMPLES = (
     'later_session --calibration result/calibration.yaml --table table.yaml',

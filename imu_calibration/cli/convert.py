@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
-from imu_calibration.core.documents import finite
 from msg_adapters.storages import identifiers
 
 if TYPE_CHECKING:
@@ -49,6 +48,8 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def joined_document(joined: JoinedSensors) -> dict:
     """Return how two sensors were joined as data."""
+    from imu_calibration.core.documents import finite
+
     return {'slower': joined.slower, 'delay': joined.delay, 'delay_sd': finite(joined.delay_sd)}
 
 

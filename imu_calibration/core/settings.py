@@ -8,6 +8,12 @@ from typing import Any
 
 from imu_calibration.core.errors import InputError
 
+CHANGE = 1.5
+"""
+Factor of the error from which a significant change counts, a convention: with it the error of a
+calibration that halved an error still has three quarters of the error before.
+"""
+
 
 @dataclass(frozen=True)
 class Setting:

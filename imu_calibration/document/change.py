@@ -8,11 +8,6 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 
-CHANGE = 1.5
-"""
-Factor of the error from which a significant change counts, a convention: with it the error of a
-calibration that halved an error still has three quarters of the error before.
-"""
 QUANTILE = 1.96
 """Of the normal distribution, for 95 %."""
 SMALLEST_SHARE = 1e-3

@@ -24,10 +24,11 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.readings import UNIT_KEYS
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.settings import CHANGE
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.change import CHANGE, changes_since, checked_limit
+from imu_calibration.document.change import changes_since, checked_limit
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.document.verdict import judged
