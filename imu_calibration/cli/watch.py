@@ -5,7 +5,7 @@ import time
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from imu_calibration.cli.parser import OneLineParser, Options, VerbResult
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, complain
 from imu_calibration.cli.terminal import STYLES, Cell, Terminal
 from imu_calibration.core.errors import InputError, printable
 
@@ -13,6 +13,10 @@ EXAMPLES = ('', '--node /lab/calibration_node --once')
 GONE = 5.0
 """Seconds without a message after which the node counts as ended."""
 WATCH_PERIOD_SECONDS = 0.25
+ONCE_SECONDS = 10.0
+"""Default patience where one status is wanted, and the longest wait for the picture."""
+NOTICE_SECONDS = 3.0
+"""Seconds of waiting after which the missing node is named."""
 
 
 def add_arguments(parser: OneLineParser) -> None:
@@ -27,8 +31,7 @@ def add_arguments(parser: OneLineParser) -> None:
         '--patience',
         metavar='SECONDS',
         type=float,
-        default=10.0,
-        help='how long to wait for it, default 10',
+        help='how long to wait for it, default without an end; with --once or --json 10',
     )
     parser.common('--once', action='store_true', help='show the present status and end')
 
@@ -57,15 +60,21 @@ def run(options: Options) -> VerbResult:
 
 def _watch(watcher, options):
     """Wait for the node, then show it."""
-    end = time.monotonic() + options.patience
+    patience = options.patience
+    if patience is None:
+        patience = math.inf
+        if options.once or options.json:
+            patience = ONCE_SECONDS
+    _wait_for_status(watcher, patience)
+    if not watcher.statuses:
+        raise InputError(
+            f"'{options.node}' must run, no message on /diagnostics in {patience:g} s;"
+            f' start it, or name it with --node, as `ros2 node list` shows it{_heard(watcher)}'
+        )
+    # The picture is latched: it arrives at once from a node that publishes it.
+    end = time.monotonic() + min(patience, ONCE_SECONDS)
     while not watcher.complete and time.monotonic() < end:
         watcher.spin(WATCH_PERIOD_SECONDS)
-    if not watcher.statuses:
-        others = f' (heard: {", ".join(sorted(watcher.others))})' if watcher.others else ''
-        raise InputError(
-            f"'{options.node}' must run, no message on /diagnostics in {options.patience:g} s;"
-            f' start it, or name it with --node, as `ros2 node list` shows it{others}'
-        )
     out = Terminal.of()
     if options.once or options.json:
         out.write(watcher.screen(out))
@@ -84,6 +93,24 @@ def _watch(watcher, options):
         out.write(watcher.screen(out))
     out.print(f'{watcher.name} has ended')
     return VerbResult(0, {'node': watcher.name})
+
+
+def _wait_for_status(watcher, patience):
+    """Wait for the first status of the node; name a missing node once."""
+    start = time.monotonic()
+    named = False
+    while not watcher.statuses and time.monotonic() - start < patience:
+        watcher.spin(WATCH_PERIOD_SECONDS)
+        if not named and time.monotonic() - start > NOTICE_SECONDS and not watcher.statuses:
+            named = True
+            complain(f"waiting for '{watcher.name}' on /diagnostics{_heard(watcher)}")
+
+
+def _heard(watcher):
+    """Return the names of the received nodes in brackets, '' without any."""
+    if not watcher.others:
+        return ''
+    return f' (heard: {", ".join(sorted(watcher.others))})'
 
 
 class NodeWatcher:

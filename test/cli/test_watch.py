@@ -11,11 +11,14 @@ import pty
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
+from imu_calibration.cli import watch
 from imu_calibration.cli.terminal import Terminal
 from imu_calibration.cli.watch import BAR, NodeStatus, bar, ratio_of, screen
+from imu_calibration.core.errors import InputError
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
@@ -88,6 +91,52 @@ def test_before_anything_came_the_screen_is_short():
     ]
 
 
+class LateNode:
+    """Stands for a watcher: the node starts at a time of a clock, and ends a second later."""
+
+    name, others, picture = 'calibration_node', set(), ''
+
+    def __init__(self, start):
+        self.now, self.start, self.heard, self.statuses = 0.0, start, 0.0, {}
+
+    @property
+    def complete(self):
+        return bool(self.statuses) and bool(self.picture)
+
+    def spin(self, seconds):
+        self.now += seconds
+        if self.start <= self.now <= self.start + 1.0:
+            self.statuses, self.heard = STATUSES, self.now
+
+    def screen(self, out):
+        return screen(self.name, self.statuses, self.picture, out=out)
+
+
+def watched(monkeypatch, start, **options):
+    """Watch a LateNode; return (result or code of the error, its clock at the end)."""
+    node = LateNode(start)
+    monkeypatch.setattr(watch, 'time', SimpleNamespace(monotonic=lambda: node.now))
+    given = {'node': node.name, 'patience': None, 'once': False, 'json': False} | options
+    try:
+        return watch._watch(node, SimpleNamespace(**given)), node.now
+    except InputError:
+        return None, node.now
+
+
+def test_it_waits_for_its_node(monkeypatch, capsys):
+    found, end = watched(monkeypatch, 600.0)
+    assert found.exit_code == 0 and 600.0 < end < 620.0
+    assert capsys.readouterr().err.count('calibration_node') == 1  # the missing node, once
+    for options, limit in (
+        ({'once': True}, 10.0),
+        ({'json': True}, 10.0),
+        ({'patience': 50.0}, 50),
+    ):
+        assert watched(monkeypatch, 600.0, **options) == (None, limit)
+    found, end = watched(monkeypatch, 5.0, once=True)
+    assert found.exit_code == 0 and end <= 16.0
+
+
 @pytest.mark.long
 @pytest.mark.live
 def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
@@ -98,9 +147,9 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
 
     domain_id, lock = free_domain()
     environment = local_environment(domain_id) | {'COLUMNS': '80', 'LINES': '40', 'TERM': 'xterm'}
-    watch = [sys.executable, '-m', 'imu_calibration', 'watch']
+    command = [sys.executable, '-m', 'imu_calibration', 'watch']
     nobody = subprocess.run(
-        [*watch, '--patience', '1'], env=environment, capture_output=True, text=True, timeout=60
+        [*command, '--patience', '1'], env=environment, capture_output=True, text=True, timeout=60
     )
     assert (
         nobody.returncode == 1
@@ -121,7 +170,7 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
     ]
     try:
         once = subprocess.run(
-            [*watch, '--once', '--patience', '60'],
+            [*command, '--once', '--patience', '60'],
             env=environment,
             capture_output=True,
             text=True,
@@ -130,7 +179,7 @@ def test_it_watches_a_running_node_and_ends_with_it(tmp_path):
         assert once.returncode == 0 and 'streams' in once.stdout and '|' in once.stdout, once
         screen_end, terminal = pty.openpty()
         with subprocess.Popen(
-            watch, env=environment, stdin=subprocess.DEVNULL, stdout=terminal, stderr=terminal
+            command, env=environment, stdin=subprocess.DEVNULL, stdout=terminal, stderr=terminal
         ) as watching:
             os.close(terminal)
             time.sleep(8)
