@@ -88,8 +88,10 @@ class Packed:
         """Return the messages of all parts, one part after the other."""
         if len(parts) == 1:
             return parts[0]
-        sizes = [len(part.buffer) for part in parts]
-        start = [part.start + sum(sizes[:k]) for k, part in enumerate(parts)]
+        start, n_bytes = [], 0
+        for part in parts:
+            start.append(part.start + n_bytes)
+            n_bytes += len(part.buffer)
         return cls(
             *(
                 np.concatenate(each)

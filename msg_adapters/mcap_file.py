@@ -254,8 +254,8 @@ def _strings(content, position, count):
 
 FIRST_BYTES = 1 << 16
 """
-Bytes read at once of messages outside of chunks; doubled up to `STRETCH_BYTES` while no other
-record is between them.
+Bytes read at first of messages outside of chunks; doubled up to `STRETCH_BYTES` while no other
+record is between them, otherwise reduced, so that few bytes are read twice.
 """
 STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
@@ -428,7 +428,10 @@ class McapFile(StorageFile):
                     self._read(position, max(ahead, behind - position)), np.uint8
                 )
                 messages, others, end = walk(buffer)
-                ahead = min(2 * ahead, STRETCH_BYTES) if 2 * end > len(buffer) else FIRST_BYTES
+                if 2 * end > len(buffer):
+                    ahead = min(2 * ahead, STRETCH_BYTES)
+                else:
+                    ahead = max(2 * end, MESSAGE_PREFIX)
                 if end:
                     yield MESSAGE, position, end, (messages, others)
                 position = position + end if end else self._resume(position)

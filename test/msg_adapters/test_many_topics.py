@@ -1,5 +1,6 @@
-"""Recordings of thousands of topics: the passes over the topics and over the file are counted."""
+"""Recordings of thousands of topics and records: looks at the topics and bytes read are counted."""
 
+import struct
 from contextlib import closing
 
 import numpy as np
@@ -14,7 +15,8 @@ from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.bag import LISTED_TOPICS, open_recording
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
-from msg_adapters.mcap_file import McapFile
+from msg_adapters.mcap_file import MAGIC, McapFile
+from msg_adapters.mcap_writer import record
 from msg_adapters.storage import StorageFile, Stretch
 
 
@@ -98,3 +100,52 @@ def test_an_error_lists_the_first_topics_only(tmp_path, topic):
     with refused(InputError, code, 150 - LISTED_TOPICS) as caught:
         open_recording(path, topic)
     assert len(str(caught.value)) < 1000
+
+
+OVERLAPPING = {
+    'chunks that claim the rest of the file': struct.pack('<BQ', 0x06, 2**40) + bytes(41),
+    'chunks that claim a long part of it': struct.pack('<BQ', 0x06, 60_000) + bytes(41),
+    'messages that claim the rest': struct.pack('<BQ', 0x05, 2**40) + bytes(41),
+    'a message and damage': message(1, 0, b'x') + bytes(18),
+    'a message and a chunk': message(1, 0, b'') + record(0x06, bytes(10)),
+}
+
+
+@pytest.mark.parametrize('kind', OVERLAPPING)
+def test_the_start_of_a_chunk_reads_no_byte_again(tmp_path, monkeypatch, kind):
+    """
+    The rest of the file was read for each of 60,000 starts, and 64 KiB for each single message.
+    """
+    one, n_starts, read = OVERLAPPING[kind], 2000, []
+    data = MAGIC + one * n_starts
+    starts = b''.join(
+        record(0x08, struct.pack('<QQQ', 0, 0, len(MAGIC) + len(one) * k) + bytes(40))
+        for k in range(n_starts)
+    )
+    path = tmp_path / 'x.mcap'
+    path.write_bytes(data + starts + record(0x02, struct.pack('<QQI', len(data), 0, 0)) + MAGIC)
+    original = McapFile._read
+
+    def counted(self, position, size):
+        content = original(self, position, size)
+        read.append(len(content))
+        return content
+
+    monkeypatch.setattr(McapFile, '_read', counted)
+    with closing(McapFile(path)) as file:
+        assert sum(read) < 3 * path.stat().st_size
+        read.clear()
+        assert list(file.stretches(['/imu'])) == []
+    assert sum(read) < 3 * path.stat().st_size
+
+
+def test_many_parts_are_chained_in_order():
+    """The sizes of all earlier parts were added for each part."""
+    parts = [Packed.join([bytes([k % 251]) * (1 + k % 3), b'ab']) for k in range(3000)]
+    chained = Packed.chain(parts)
+    assert [bytes(chained.message(2 * k)) for k in (0, 1, 2999)] == [
+        b'\0',
+        b'\1\1',
+        bytes([2999 % 251]) * 3,
+    ]
+    assert len(chained) == 6000
