@@ -65,7 +65,7 @@ SPELLINGS = {
     },
     'force': READING_SPELLINGS['accelerometer'],
     'rate': READING_SPELLINGS['gyroscope'],
-    'temperature': {'c': 'C', '°c': 'C', 'degc': 'C', 'celsius': 'C'},
+    'temperature': dict.fromkeys(('c', '°c', 'degc', 'deg_c', 'celsius'), 'C'),
     'joint': {'rads': 'rad', '°': 'deg', 'degrees': 'deg', 'radians': 'rad'},
 }
 """Quantity -> spelling in headers -> unit."""
@@ -91,7 +91,11 @@ COLUMN_PATTERNS = (
         r'(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
         r'(.* )?angular velocity)',
     ),
-    ('temperature', r'temp|temperature|(imu|sensor|chip|die) temp(erature)?'),
+    (
+        'temperature',
+        r'((imu|sensor|chip|die|board|device|mpu|gyro\w*|acc\w*) )?(tmp|temp|temperature)'
+        r'( (imu|sensor|chip|die))?',
+    ),
 )
 """
 Quantity -> names of its columns, in lower case, without axis and unit; an axis follows for force
@@ -833,6 +837,8 @@ def _guess(table):
         words, unit_text = _words(name)
         if words in ('x', 'y', 'z'):  # a file of one sensor, which has the name of it
             words = f'{sensor_of_file} {words}'
+        if words in ('t', 't imu') and _unit('temperature', unit_text):
+            words = 'temperature'
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
         axis = re.fullmatch(r'(.*?) ?([xyz])', re.sub(r'^([xyz]) (.*)$', r'\2 \1', words))
         for quantity, pattern in COLUMN_PATTERNS:
@@ -843,8 +849,8 @@ def _guess(table):
                     ] = (name, _unit(quantity, unit_text))
             elif (
                 re.fullmatch(pattern, words)
-                # T (°C) is no time
-                and (not unit_text or _unit(quantity, unit_text) or quantity != 'time')
+                # T (°C) is no time, and temp (F) is not read as °C
+                and (not unit_text or _unit(quantity, unit_text))
                 and quantity not in {each.quantity for each in found}
             ):
                 found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
@@ -907,12 +913,12 @@ def _without_unit(name):
     text = name[: bracket.start()] if bracket else name
     if not unit:
         suffix = re.search(
-            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|ms|us|ns|deg|rad|c|s)$',
+            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|ms|us|ns|deg|rad|deg_?c|celsius|c|s)$',
             text,
             re.IGNORECASE,
-        )
+        ) or re.search(r'(?<=temp)((?:deg)?c)$|(?<=temperature)((?:deg)?c)$', text, re.IGNORECASE)
         if suffix:
-            unit, text = suffix.group(1), text[: suffix.start()]
+            unit, text = suffix.group().removeprefix('_'), text[: suffix.start()]
     if not unit and text.lower() in ('millis', 'micros', 'nanos'):
         unit = text
     return text, unit

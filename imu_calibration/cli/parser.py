@@ -245,7 +245,7 @@ class OneLineParser(argparse.ArgumentParser):
         Local gravity, recording, labels of the result, and model (`add_model`).
         """
         self.add_gravity()
-        self.add_recording('without it: by hand, gravity is the reference')
+        self.add_recording('without it: by hand')
         self.add_gyroscope_topic()
         self.add_exclusion()
         self.add_rows()

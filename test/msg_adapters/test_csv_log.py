@@ -450,3 +450,44 @@ def test_a_long_name_of_a_column_is_refused(tmp_path, imu):
     path.write_text(path.read_text().replace(f'{"(" * 300},0\n', f'{"(" * 300}\n'))
     with refused(InputError, 'csv_header', '300'):
         read_csv(path)
+
+
+@pytest.mark.parametrize(
+    ('name', 'unit'),
+    [
+        ('temp', 'values'),
+        ('Temperature', 'values'),
+        ('imu_temp', 'values'),
+        ('gyroTemp', 'values'),
+        ('TempC', 'header'),
+        ('tempDegC', 'header'),
+        ('T_degC', 'header'),
+        ('T (°C)', 'header'),
+        ('T [degC]', 'header'),
+        ('imu_temperature_celsius', 'header'),
+        ('temp_deg_c', 'header'),
+        ('Temp (F)', None),
+        ('temp_raw', None),
+        ('T [K]', None),
+    ],
+)
+def test_names_of_temperature_columns(name, unit, tmp_path, imu):
+    """The time remains the time; other units are not read as degrees Celsius."""
+    degrees = 20 + 0.1 * seconds(imu)
+    path = tmp_path / 'log.csv'
+    np.savetxt(
+        path,
+        np.column_stack([degrees, seconds(imu), imu.force_s, imu.rate_s]),
+        delimiter=',',
+        header=f'{name},{PLAIN}',
+        comments='',
+        encoding='utf-8',
+    )
+    log = read_csv(path)
+    assert_read(log, imu)
+    if unit is None:
+        assert log.temperature is None and log.unused == (name,)
+        return
+    np.testing.assert_allclose(log.temperature.temperature_c, degrees, atol=1e-9)
+    (column,) = [each for each in log.columns if each.quantity == 'temperature']
+    assert (column.names, column.unit, column.origin) == ((name,), 'C', unit)
