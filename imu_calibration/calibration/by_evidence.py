@@ -147,8 +147,10 @@ def solve_by_evidence(
         _examined(inquire(windows, table, baseline, bias_processes=options.bias_processes))
         for windows in parts
     )
-    found, more = _without_faint(found, solution), _named_elsewhere(found, others)
+    more = _named_elsewhere(found, others)
     added, point = (), {}
+    # An effect of the requested model is judged with the added effects in the solution: the misfit
+    # of a missing delay or encoder zero widens every standard deviation.
     while beyond := _beyond((*found.adopted, *more), first[2]):
         point = {name: value for each in (*others, found) for name, value in _point(each).items()}
         added = tuple(question.effect.key for question in beyond)
@@ -164,6 +166,7 @@ def solve_by_evidence(
             break
     else:
         added, point, (solution, gathered, model) = (), {}, first
+        found = _without_faint(found, solution)
     extension = ModelExtension(
         added, point, _changes([found, *others], added), _moves(found), _clipped(found)
     )

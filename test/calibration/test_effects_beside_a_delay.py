@@ -1,0 +1,32 @@
+"""Effects of the sensor model in a recording whose clock also needs an effect."""
+
+import numpy as np
+import pytest
+
+import imu_calibration as imu
+from imu_calibration.kinematics.table import Table
+
+from worlds.physics import make_session
+
+FEW = ('accel_size_effect', 'time_offset')
+"""Candidates of the search (`few_candidates`)."""
+DELAY = 0.014
+"""s."""
+
+
+@pytest.mark.usefixtures('few_candidates')
+def test_a_delay_does_not_cost_the_effects_that_are_in_the_model():
+    """
+    The standard deviations without the delay contain its misfit.
+
+    By these no arm of a sensor is significant; with the delay in the model it is.
+    """
+    session = make_session(6, {'time_offset': DELAY}, arms=True, imu_rate=50.0, joint_rate=50.0)
+    found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
+    assert found.statistics['added'] == ['time_offset']
+    assert not {'denied', 'unexplained', 'implausible'} & set(found.statistics)
+    bias = [found.param_names.index(f'accelerometer.bias.{axis}') for axis in 'xyz']
+    off = found.values[bias] - session.truth['accelerometer'].bias
+    # 0.05 mg; it was 0.5 to 1.2 mg.
+    assert found.sd[bias].max() < 5e-4
+    assert np.all(np.abs(off) < 4 * found.sd[bias])
