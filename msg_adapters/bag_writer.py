@@ -1,10 +1,13 @@
 """A new rosbag2 folder, written under a temporary name and renamed when it is complete."""
 
 import os
+import re
 import shutil
 import sqlite3
+import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from secrets import token_hex
@@ -13,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.document.files import is_running
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed
 from msg_adapters.storages import STORAGES, identifiers
@@ -160,6 +164,8 @@ def make_partial_folder(path: Path) -> Path:
     partial = path.with_name(f'.{path.name}.{os.getpid()}.{token_hex(8)}.partial')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(OSError):  # a folder that can be written and not be listed
+            _remove_leftovers(path)
         partial.mkdir()
     except OSError as error:
         raise InputError(
@@ -167,6 +173,24 @@ def make_partial_folder(path: Path) -> Path:
             ' output'
         ) from error
     return partial
+
+
+def _remove_leftovers(path):
+    """
+    Remove the temporary folders of processes that were killed while they wrote the same bag.
+
+    Only real folders with the name that `make_partial_folder` gives and the files that `BagWriter`
+    writes; everything else is unchanged.
+    """
+    pattern = re.compile(re.escape(f'.{path.name}.') + r'(\d{1,10})\.[0-9a-f]{16}\.partial')
+    for found in sorted(path.parent.iterdir()):
+        name = pattern.fullmatch(found.name)
+        if name is None or found.is_symlink() or not found.is_dir() or is_running(int(name[1])):
+            continue
+        content = [file.name for file in found.iterdir()]
+        if all(file == 'metadata.yaml' or file.startswith(f'{path.name}_0.') for file in content):
+            shutil.rmtree(found, ignore_errors=True)
+            print(f'removed {found}, which an ended run has not finished', file=sys.stderr)
 
 
 def dump_yaml(value: Any) -> str:

@@ -351,11 +351,12 @@ def remove_leftovers(path: Path) -> None:
     with suppress(OSError, ValueError):
         for found in path.parent.glob(f'.[0-9]*.{_ending(path)}'):
             number = found.name.split('.')[1]
-            if number.isdigit() and not _is_running(int(number)):
+            if number.isdigit() and not is_running(int(number)):
                 found.unlink(missing_ok=True)
 
 
-def _is_running(process: int) -> bool:
+def is_running(process: int) -> bool:
+    """Return whether a process of this host has the number."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
