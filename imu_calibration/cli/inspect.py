@@ -59,7 +59,7 @@ def run(options: Options) -> VerbResult:
     codes, reasons = [], []
     for look in looks:
         out.print()
-        if len(looks) > 1:
+        if len(looks) > 1 and look.recording is not None:
             frame = look.recording.frame_id
             out.print(
                 look.recording.imu_topic + ('' if frame is None else f' ({frame})'), style='bold'
@@ -81,6 +81,8 @@ def run(options: Options) -> VerbResult:
         )
     if set(codes) == {1}:  # no topic is usable: also one line on standard error, as every refusal
         refuse(looks[0].findings)
+    # A recording with a path was inspected, not samples in memory.
+    assert looks[0].recording is not None
     return VerbResult(
         3 if any(codes) else 0,
         {

@@ -37,7 +37,7 @@ Result = TypeVar('Result')
 Recordings = str | PathLike | SampleBlock | Sequence[str | PathLike | SampleBlock]
 
 
-USE_CASES = {'compensate': _compensate, 'noise': _noise}
+USE_CASES: dict[str, Callable[..., Any]] = {'compensate': _compensate, 'noise': _noise}
 """Function with further options -> the use case that has them."""
 
 
