@@ -18,7 +18,8 @@ def in_counts(found, nominal, sensor):
     Lengths of matrix rows need no choice of axes.
     """
     bias, matrix = found.accelerometer if sensor == 'accelerometer' else found.gyroscope[:2]
-    offset, scale = getattr(nominal, f'{sensor}_offset'), getattr(nominal, f'{sensor}_scale')
+    unit = getattr(nominal, sensor)
+    offset, scale = unit.offset, unit.scale
     return offset + scale * bias, scale * np.linalg.norm(matrix, axis=1)
 
 

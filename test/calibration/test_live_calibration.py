@@ -365,7 +365,7 @@ def test_residuals_are_what_the_model_leaves(quick):
 @pytest.mark.parametrize('column', [['array', [10**12, 0]], ['dict', 10**12, [], ['plain', []]]])
 def test_a_column_of_more_values_than_any_session_has_is_refused(column):
     with pytest.raises(ValueError, match='at most'):
-        collector._unpacked(column, None)
+        collector._unpacked(column, collector._SavedNumbers(b'', 10**6))
 
 
 def test_windows_of_one_kind_are_saved_in_common_columns(quick):
