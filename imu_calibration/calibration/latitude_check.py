@@ -4,6 +4,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import significant
+from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.kinematics.table import Table
@@ -46,16 +47,18 @@ def latitude_findings(solution: Solution, table: Table) -> tuple[CheckFinding, .
     """
     if table.latitude is None:
         return ()
-    if ('reference', 'earth_rate') in solution.model.slices:
-        return _of_free_rate(solution, table)
-    if ('gyroscope', 'gyro_g_sensitivity') in solution.model.slices:
-        _refuse_vertical_rate(solution, table)
+    model = solution.model
+    # The Earth's rate is the effect of which the size is known.
+    free = next((effect for effect in model.effects if effect.known_size), None)
+    if free is not None:
+        return _of_free_rate(solution, table, model.slices[free.key])
+    if model.find('gyroscope', Role.CROSS) is not None:
+        _refuse_vertical_rate(solution, table, model.part('gyroscope', Role.CROSS))
     return ()
 
 
-def _of_free_rate(solution, table):
+def _of_free_rate(solution, table, part):
     """Compare the vertical component and the length of the estimated Earth's rate."""
-    part = solution.model.slices['reference', 'earth_rate']
     if solution.held[part].any():
         return ()
     rate = solution.values[part]
@@ -74,9 +77,8 @@ def _of_free_rate(solution, table):
     return ()
 
 
-def _refuse_vertical_rate(solution, table):
+def _refuse_vertical_rate(solution, table, part):
     """Refuse a g-sensitivity that is the vertical rate of a latitude with the wrong sign."""
-    part = solution.model.slices['gyroscope', 'gyro_g_sensitivity']
     values, sd = solution.values[part], np.sqrt(np.diag(solution.covariance[part, part]))
     if len(values) != 9 or solution.held[part].any():
         return

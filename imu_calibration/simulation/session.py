@@ -152,7 +152,7 @@ def turning_world(table: Table, model: SensorModel) -> Table:
     """
     if table.latitude is None or table.azimuth_deg is not None:
         return table
-    if ('reference', 'earth_rate') in model.slices:
+    if any(effect.known_size for effect in model.effects):
         return table
     return replace(table, azimuth_deg=0.0)
 

@@ -8,6 +8,7 @@ from refusal import refused
 
 from imu_calibration.calibration.latitude_check import latitude_findings
 from imu_calibration.core.errors import InputError
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
@@ -24,9 +25,19 @@ def table(latitude=LATITUDE, azimuth_deg=None):
 
 def solution(sensor, name, values, sd):
     """Estimates of one effect, uncorrelated."""
-    values = np.asarray(values, float)
+    values, effect = np.asarray(values, float), CATALOGUE.find(sensor, name)
+    part = slice(0, len(values))
+
+    def find(of_sensor, role):
+        return effect if (of_sensor, role) == (effect.sensor, effect.role) else None
+
     return SimpleNamespace(
-        model=SimpleNamespace(slices={(sensor, name): slice(0, len(values))}),
+        model=SimpleNamespace(
+            effects=[effect],
+            slices={effect.key: part},
+            find=find,
+            part=lambda of_sensor, role: part if find(of_sensor, role) else slice(0, 0),
+        ),
         values=values,
         held=np.zeros(len(values), bool),
         covariance=np.diag(np.full(len(values), sd**2)),
