@@ -78,10 +78,13 @@ def compare(imu):
     first, second = identify_noise(lambda: iter([before])), read_rest(lambda: iter([after]))
     found = []
     for axis in range(6):
+        moments, fit = second.moments[axis], first.axes[axis]
+        if moments is None or fit is None:
+            raise ValueError('each half must have readings of both sensors, one has none')
         lower, upper = predicted_band(first, second, axis)
-        measured, tau = second.moments[axis].variance, second.curve.tau
-        fitted = tau >= 0.999 * first.axes[axis].shortest
-        found.append((((lower <= measured) & (measured <= upper))[fitted], first.axes[axis].excess))
+        measured, tau = moments.variance, second.curve.tau
+        fitted = tau >= 0.999 * fit.shortest
+        found.append((((lower <= measured) & (measured <= upper))[fitted], fit.excess))
     return found
 
 
