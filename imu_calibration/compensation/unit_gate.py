@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import SensorUnit
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing.value_checks import force_error
 
 WINDOW_S = 1.0
@@ -14,6 +15,8 @@ LEAST_READINGS = 10
 """Number of readings in a window, at least."""
 REST_SPREAD = 0.05
 """Largest standard deviation of the length at rest, relative to its median."""
+MOST_IN_MOTION = 16 * STANDARD_GRAVITY
+"""Median of the length that a motion reaches at most, m/s^2: the range of usual sensors."""
 
 
 class UnitGate:
@@ -72,9 +75,11 @@ class UnitGate:
         """Open, or set the error of a window at rest; begin the next window."""
         median = float(np.median(self._lengths))
         error = force_error(median, 'at rest', self._stated)
-        if error is None:
+        moves = np.std(self._lengths) > REST_SPREAD * median
+        # A motion may exceed gravity, as no reading in g does; a motion must not stop the output.
+        if error is None or (moves and STANDARD_GRAVITY < median < MOST_IN_MOTION):
             self._open()
-        elif np.std(self._lengths) <= REST_SPREAD * median or error.code == 'without_gravity':
+        elif not moves or error.code == 'without_gravity':
             self.error = error
         self._start_ns, self._lengths, self._judged = None, [], True
 

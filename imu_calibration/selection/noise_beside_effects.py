@@ -27,7 +27,6 @@ from imu_calibration.estimation.session_noise import (
     shaken_means,
     white_noise,
 )
-from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.selection.parameter_space import ParameterSpace, normal_matrix, within_matrix
 
 
@@ -82,10 +81,6 @@ STABLE = {'accelerometer': 1e-4, 'gyroscope': 0.0}
 Bias variation that is normal for any white noise, m/s^2 and rad/s: the best accelerometers keep
 their bias to 10 ug.
 """
-MIN_STEP_WINDOWS = 6
-"""Least number of windows before and after a step of the bias."""
-MOST_MOMENTS = 400
-"""Moments at which a step of the bias is tried."""
 MAX_DRIFT_RATIO = 100.0
 """
 Largest drift over the usual bias variation: the ratio by which the effects' priors, for consumer
@@ -226,8 +221,7 @@ def _with_bias_process(space, sensor, noise, smooth):
     """
     Return the noise of a sensor with window offsets and bias process.
 
-    It is estimated with all effects but the superfluous smooth ones, and with a step of the bias
-    where the wander does not explain it.
+    It is estimated with all effects but the superfluous smooth ones.
     """
     recording, superfluous = (
         space.recording,
@@ -244,95 +238,30 @@ def _with_bias_process(space, sensor, noise, smooth):
     white = noise[sensor].mean_variance(
         recording.kind, recording.count, recording.duration, keys=recording.keys
     )
-    information = _known_otherwise(space, sensor, noise, own)
-    natural_noise = natural_processes(noise[sensor], recording.period)
-    natural = float(np.sqrt(sum(process.sd**2 for process in natural_noise)))
-    prior_sd = drift_prior(
-        rows[:, :, len(structural) : -1], space.prior_sd[superfluous], max(natural, STABLE[sensor])
-    )
-    options = [[place[k] - len(structural) for k in parameters] for parameters in smooth]
-    # A bias that changes at one moment competes with the smooth effects and with the wander.
-    moments = _step_moments(len(rows))
-    if len(moments):
-        kept = [*range(len(structural)), -1]
-        after = _likeliest_step(
-            rows[:, :, kept],
-            information[np.ix_(kept, kept)],
-            Whitening(white, recording.time, recording.sessions, processes=natural_noise),
-            moments=moments,
-        )
-        n_own, bias_prior = len(own), MAX_DRIFT_RATIO * max(natural, STABLE[sensor])
-        rows = np.insert(rows, [n_own] * 3, after[:, None, None] * np.eye(3), axis=2)
-        information = np.insert(information, [n_own] * 3, 0.0, axis=0)
-        information = np.insert(information, [n_own] * 3, 0.0, axis=1)
-        steps = np.arange(n_own, n_own + 3)
-        information[steps, steps] = 1 / bias_prior**2
-        options.append((steps - len(structural)).tolist())
-        # One of many moments: the prior of each is one over their number.
-        prior_sd = np.append(prior_sd, np.full(3, bias_prior * len(moments) ** (1 / 3)))
     likelihood = NoiseLikelihood(
         rows,
         white,
         recording.time,
         sessions=recording.sessions,
-        information=information,
+        information=_known_otherwise(space, sensor, noise, own),
         known=noise[sensor].known,
         durations=recording.duration,
         common=len(structural),
     )
+    natural = float(
+        np.sqrt(
+            sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))
+        )
+    )
     search = BiasProcessSearch(likelihood, 0.0 if noise[sensor].known else natural, STABLE[sensor])
+    options = [[place[k] - len(structural) for k in parameters] for parameters in smooth]
+    prior_sd = drift_prior(
+        rows[:, :, len(structural) : -1], space.prior_sd[superfluous], max(natural, STABLE[sensor])
+    )
     used = _needed_smooth(search, options, prior_sd=prior_sd)
     shape = search.best(used)[0]
     middle = search.of_middle_axis(shape, used) if shape[1] > PLAUSIBLE * search.usual else 0.0
     return replace(noise[sensor], middle_wander=middle, **search.polished(shape, used))
-
-
-def _step_moments(count):
-    """Return the windows after which a bias may change, at most `MOST_MOMENTS` of them."""
-    first, last = MIN_STEP_WINDOWS - 1, count - MIN_STEP_WINDOWS - 1
-    if last < first:
-        return np.zeros(0, int)
-    return np.unique(np.linspace(first, last, min(MOST_MOMENTS, last - first + 1)).astype(int))
-
-
-def _likeliest_step(rows, information, whitening, *, moments):
-    """
-    Return 1 in each window after the moment at which a step of the bias fits best, shape (n,).
-
-    The fall of the sum of squares by a step ``s`` of one axis is ``(s' r)^2 / (s' s_free)``, with r
-    the residual and s_free the step without the part that the parameters imitate.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (n, 3, q + 1)
-        Means ``[columns | residual]`` of the windows.
-    information : ndarray, shape (q + 1, q + 1)
-        What priors and the part within windows state of the parameters.
-    whitening : Whitening
-    moments : ndarray
-        Last windows before the step.
-
-    """
-    count = len(rows)
-    steps = (np.arange(count)[:, None] > moments).astype(float)
-    white = whitening(
-        np.concatenate([rows, np.repeat(steps[:, None], rows.shape[1], axis=1)], axis=2)
-    )
-    n_columns = rows.shape[2] - 1
-    design = white[:, :, :n_columns]
-    normal = np.einsum('naq,nap->qp', design, design) + information[:-1, :-1]
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-12, hermitian=True)
-    inverse /= np.outer(scale, scale)
-    right = np.einsum('naq,na->q', design, white[:, :, n_columns]) + information[:-1, -1]
-    rest = white[:, :, n_columns] - design @ (inverse @ right)
-    gain = np.zeros(len(moments))
-    for axis in range(rows.shape[1]):
-        own = white[:, axis, n_columns + 1 :]
-        imitated = design[:, axis].T @ own
-        size = (own**2).sum(axis=0) - np.einsum('qm,qp,pm->m', imitated, inverse, imitated)
-        gain += (own.T @ rest[:, axis]) ** 2 / np.maximum(size, 1e-9 * (own**2).sum(axis=0))
-    return steps[:, int(np.argmax(gain))]
 
 
 def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.ndarray:

@@ -39,6 +39,8 @@ GRADUAL = 5
 """Degree of the polynomial in time of a gradual change."""
 COARSE = 40
 """Moments that are tried first; then all about the best of them."""
+MOST_LIMITS = 100
+"""Temperatures at which a step is tried."""
 NO_WEIGHT = 1e8
 """Factor on the variance of the mean of a window that does not count."""
 LIKELY = 16.0
@@ -138,6 +140,8 @@ def find_onset(
         own = np.union1d(base, at)
         losses = _losses_of_moments(rows, own, at, allowed)
         last = min(losses, key=losses.__getitem__)
+        if name.startswith(BIAS_OF) and _follows_temperature(rows, own, at, losses[last]):
+            continue
         likely = sorted(k for k, loss in losses.items() if loss < losses[last] + LIKELY)
         # The change lies within one of the windows about the moment, which hold both states: all
         # models are compared without them.
@@ -146,8 +150,8 @@ def find_onset(
         change = apart.changes(at, _after(last, len(time)))
         alone, step = apart.fit(base), apart.fit(own, change)
         gradual = apart.fit(own, apart.changes(at, _curves(time)))
-        single, noise = apart.significant_excess(base, alone)
-        excess = apart.significant_excess(own, step, change)[0]
+        single, _ = apart.significant_excess(base, alone)
+        excess, noise = apart.significant_excess(own, step, change)
         explains = excess < (1 - MIN_EXPLAINED_SHARE) * single
         if explains and gradual.loss - step.loss > SUDDEN * (alone.loss - step.loss):
             found.append(
@@ -230,7 +234,7 @@ class _Candidate:
     excess: float
     """Squares that remain beyond noise, without the windows about the moment."""
     noise: float
-    """Limit of an excess that is significant."""
+    """Limit of an excess that is significant, in the parts in which one remains."""
     share: float
     """Share of the excess that the second state removes."""
     fit: _Fit
@@ -406,6 +410,22 @@ class _Changes:
 def _after(last, count):
     """Return 1 in each window after the window `last`, shape (count, 1)."""
     return (np.arange(count) > last).astype(float)[:, None]
+
+
+def _follows_temperature(rows, own, at, loss):
+    """
+    Return whether a step where the temperature passes a value fits as well as one at a moment.
+
+    An offset above a temperature is a place (`selection.regimes`), not an onset.
+    """
+    warmth = rows.space.recording.describe['temperature']
+    if not np.all(np.isfinite(warmth)) or np.ptp(warmth) == 0:
+        return False
+    limits = np.sort(warmth)[MIN_ONSET_WINDOWS:-MIN_ONSET_WINDOWS]
+    for limit in limits[:: max(len(limits) // MOST_LIMITS, 1)]:
+        if rows.fit(own, rows.changes(at, (warmth > limit).astype(float)[:, None])).loss <= loss:
+            return True
+    return False
 
 
 def _losses_of_moments(rows, own, at, allowed):

@@ -66,6 +66,12 @@ def test_a_shock_at_the_start_delays_the_first_output_by_one_window():
     assert passed.index(True) == 100 and gate.error is None and all(passed[100:])
 
 
+def test_a_violent_motion_at_the_start_delays_the_output_by_one_window():
+    shaken = 40.0 + 25.0 * np.sin(np.arange(400))
+    passed = run(UnitGate(SI_ACCELEROMETER), [60.0, *shaken])
+    assert passed.index(True) == 100 and all(passed[100:])
+
+
 def test_a_shaken_imu_in_g_does_not_pass():
     gate = UnitGate(SI_ACCELEROMETER)
     assert not any(run(gate, np.tile([1.0, 1.0, 1.0, 5.0, 0.6], 100)))
