@@ -20,6 +20,8 @@ LONGEST_NS = 3 * 10**9
 """A reading that wraps returns within this time."""
 MARGIN_NS = 150 * 10**6
 """Left out after the return, so that the hole is a gap: no motion is interpolated across it."""
+WRAP_REACH = 3
+"""Last readings that wait: the steps between them lack one of the two later neighbours."""
 CONTEXT = 4
 """Decided samples that are kept as neighbours of the next ones."""
 
@@ -56,8 +58,7 @@ class WrapFilter:
         self._held = held
         stamps = held.stamp_ns
         spans, open_ns = self._spans(held)
-        # The steps between the last four readings lack one of the two later neighbours.
-        n_decided = max(len(held) - 3, 0)
+        n_decided = max(len(held) - WRAP_REACH, 0)
         if open_ns is not None:
             n_decided = min(n_decided, int(np.searchsorted(stamps, open_ns)))
         return self._pass_on(n_decided, spans)

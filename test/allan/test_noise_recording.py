@@ -288,7 +288,7 @@ def test_a_document_is_read_as_it_was_written(quiet):
     'change, code, values',
     [
         (lambda d: d.update(format='imu_calibration/1'), 'document_format', ['imu_calibration/1']),
-        (lambda d: d.pop('conditions'), 'document_parts', ['conditions']),
+        (lambda d: d.pop('sampling_rate'), 'document_parts', ['sampling_rate']),
         (lambda d: d['gyroscope'].pop('random_walk'), 'part_missing', ['random_walk']),
         (lambda d: d.update(sampling_rate=0.0), 'rate_not_positive', [0]),
         (

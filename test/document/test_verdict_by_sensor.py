@@ -150,7 +150,10 @@ def test_other_programs_get_nominal_numbers_for_the_sensor_that_is_refused(tmp_p
     ]
     assert main(command) == 3
     printed = capsys.readouterr().out
-    assert all(line in printed for line in found.lines) and main([*command, '--anyway']) == 0
+    assert (
+        all(line in printed for line in found.lines)
+        and main([*command, '--anyway', '--force']) == 0
+    )
 
 
 def test_the_loss_of_a_refused_sensor_is_its_whole_error():

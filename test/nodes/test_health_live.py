@@ -72,7 +72,7 @@ def test_a_driver_that_publishes_g_is_told_the_unit_and_nothing_is_published(ben
     assert {node.convert(row, {'source_timestamp': 1}) for row in rows} == {None}
     bench.until(
         lambda: any(
-            level == ERROR and 'm/s^2' in text and 'accelerometer_unit' in text
+            level == ERROR and 'm/s^2' in text and 'probably g' in text
             for level, text in bench.lines().values()
         ),
         'an error',

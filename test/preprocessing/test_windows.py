@@ -25,6 +25,7 @@ from imu_calibration.preprocessing.window import (
 )
 from imu_calibration.preprocessing.window_cutter import MIN_MOVING_SECONDS, WanderLimit
 from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.preprocessing.wrap_filter import WRAP_REACH
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
 START = 1_700_000_000 * 10**9
@@ -577,9 +578,8 @@ def test_memory_is_bounded_when_a_stream_is_silent(case):
     longest = JOINT_WAIT + 2 * 20 + 4 * 2 + 5  # waiting, two chunks or windows, margins, batch
     assert held < 2 * 20 * longest
     used = sum(len(window) for window in windows)
-    held_back = (
-        SPIKE_REACH if case == 'imu stops' else 0
-    )  # by the filter of spikes, and late when the joints have gone on for so long
+    # By the filters of spikes and wraps, and late when the joints have gone on for so long.
+    held_back = SPIKE_REACH + WRAP_REACH if case == 'imu stops' else 0
     assert used == {'no joints': 0, 'no imu': 0, 'both there': 12000}.get(case, 2000 - held_back)
     expected = {'no joints': 12000, 'joints stop': 10000}.get(case, 0)
     assert gatherer.counts.get('no joint state', 0) == expected
