@@ -12,6 +12,8 @@ QUANTILE = 1.96
 """Of the normal distribution, for 95 %."""
 SMALLEST_SHARE = 1e-3
 """Smallest lower end of an interval as a share of its upper end: its logarithm is finite."""
+KIND_BY_HAND = {'accelerometer': 'rest', 'gyroscope': 'turns'}
+"""Sensor -> the only kind of motion of its held-out error by hand (`hand_proof.prove_by_hand`)."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,24 @@ def checked_limit(limit: float) -> float:
     return limit
 
 
+def with_kinds_by_hand(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the proof of a file with the kind of motion of its entries by hand, which have none.
+
+    Parameters
+    ----------
+    stored : mapping
+        Sensor -> entry of the file.
+
+    """
+    found = {}
+    for sensor, entry in stored.items():
+        found[sensor] = entry
+        if entry and 'regimes' not in entry:
+            found[sensor] = {**entry, 'regimes': {KIND_BY_HAND[sensor]: entry}}
+    return found
+
+
 def changes_since(stored: Mapping[str, Any], proof: Mapping[str, Any]) -> tuple[RegimeChange, ...]:
     """
     Return the changes of the error in the regimes that both proofs have, with the same unit.
@@ -90,10 +110,10 @@ def changes_since(stored: Mapping[str, Any], proof: Mapping[str, Any]) -> tuple[
                     sensor,
                     regime,
                     unit,
-                    float(earlier['after']),
-                    float(part['after']),
-                    float(ratio / spread),
-                    float(ratio * spread),
+                    stored=float(earlier['after']),
+                    now=float(part['after']),
+                    low=float(ratio / spread),
+                    high=float(ratio * spread),
                 )
             )
     return tuple(found)

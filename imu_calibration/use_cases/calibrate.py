@@ -28,7 +28,7 @@ from imu_calibration.core.settings import CHANGE
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.change import changes_since, checked_limit
+from imu_calibration.document.change import changes_since, checked_limit, with_kinds_by_hand
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.document.verdict import judged
@@ -294,7 +294,11 @@ def check(
         if why := never_applied(calibration, sensor):
             refused[sensor] = why
     questions = scale_questions(calibration).values()
-    changes = changes_since(calibration.proof, result.proof)
+    stored = calibration.proof
+    if table is None:
+        # A table compares components, rests by hand the length: only these errors are alike.
+        stored = with_kinds_by_hand(stored)
+    changes = changes_since(stored, result.proof)
     if result.proof and not changes:
         notes = (*notes, 'the file has no held-out error of the same kinds of motion to compare')
     return replace(

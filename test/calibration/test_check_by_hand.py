@@ -86,6 +86,22 @@ def test_the_gravity_of_the_calibration_is_taken_and_said(second, calibrated):
     assert not any('9.81 m/s^2' in note for note in stated.notes)
 
 
+def test_check_gives_3_when_the_error_by_hand_has_changed(first, second, calibrated):
+    """A gravity that is wrong by 0.05 m/s^2 leaves that error at rest, and turns as they are."""
+    block = SampleBlock(first[0])
+    for recording in (block, SampleBlock(second)):
+        same = check(recording, calibrated, gravity=GRAVITY)
+        assert same.exit_code == 0 and not same.changed
+        kinds = {(each.sensor, each.regime) for each in same.changes}
+        assert kinds == {('accelerometer', 'rest'), ('gyroscope', 'turns')}
+    found = check(block, calibrated, gravity=GRAVITY + 0.05)
+    (change,) = found.changed
+    assert found.helps and found.exit_code == 3
+    assert (change.sensor, change.regime) == ('accelerometer', 'rest')
+    assert change.now == pytest.approx(0.05, rel=0.05)
+    assert change.stored == calibrated.proof['accelerometer']['after']
+
+
 def test_temperatures_reach_the_correction(first):
     imu, ranges, truth = hold_and_turn(5, rate_hz=50.0, n_poses=24)
     warm, temperature_c = warmed_up(imu, 5, rate=0.05, kelvin=10.0)
