@@ -19,6 +19,7 @@ from imu_calibration.allan.processes import (
 )
 from imu_calibration.allan.terms import GAUSS_MARKOV, PROCESSES, TIME_KEY, AxisNoise
 from imu_calibration.allan.trends import AxisTrend
+from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import BiasProcess
 
@@ -133,6 +134,17 @@ class NoiseFigures:
     def sensors(self) -> tuple[str, ...]:
         """Sensors with figures."""
         return tuple(sensor for sensor in SENSORS if self.sensor(sensor))
+
+    def require_both_sensors(self, remedy: str) -> None:
+        """Raise an InputError with the remedy where a sensor has no figures."""
+        for sensor in SENSORS:
+            if sensor not in self.sensors:
+                raise InputError(
+                    'the noise document must have figures of both sensors, it has none of the'
+                    f' {sensor}; {remedy}',
+                    key='noise',
+                    code='absent',
+                )
 
     def sensor(self, name: str) -> tuple[AxisFigures, ...]:
         """Return the axes of 'accelerometer' or 'gyroscope'."""

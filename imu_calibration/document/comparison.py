@@ -108,24 +108,16 @@ def compare(first: Calibration, second: Calibration) -> Comparison:
         )
     notes = _notes(first, second)
     axes = {first.gauge.get('axes'), second.gauge.get('axes')}
-    if len(axes) == 2 and axes == {TABLE_AXES, HAND_AXES}:
-        return _compared(
-            in_accelerometer_axes(first),
-            in_accelerometer_axes(second),
-            common,
-            [*notes, 'both are compared in the axes of the accelerometer'],
-        )
-    found = _compared(first, second, common, notes)
-    if found.agree is False and axes == {TABLE_AXES}:
-        turned = _compared(
-            in_accelerometer_axes(first),
-            in_accelerometer_axes(second),
-            common,
-            [*notes, 'the IMU is mounted differently: compared in the axes of the accelerometer'],
-        )
+    if axes == {TABLE_AXES, HAND_AXES}:
+        note = 'both are compared in the axes of the accelerometer'
+        return _compared_turned(first, second, common, [*notes, note])
+    comparison = _compared(first, second, common, notes)
+    if comparison.agree is False and axes == {TABLE_AXES}:
+        note = 'the IMU is mounted differently: compared in the axes of the accelerometer'
+        turned = _compared_turned(first, second, common, [*notes, note])
         if turned.agree:
             return turned
-    return found
+    return comparison
 
 
 def in_accelerometer_axes(calibration: Calibration) -> Calibration:
@@ -146,11 +138,11 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
         above = _turned(model, calibration.values + step)
         below = _turned(model, calibration.values - step)
         jacobian[:, k] = (above - below) / (2 * step[k])
-    status = list(calibration.status)
-    part = model.part('accelerometer', Role.LINEAR)
-    upper = np.flatnonzero(np.triu(np.ones((3, 3)), 1).ravel())
-    for index in (part.start + upper).tolist() if part.stop > part.start else ():
-        status[index] = FIXED
+    # The upper triangle of L is zero by definition.
+    status = np.array(calibration.status, object)
+    matrix_status = status[model.part('accelerometer', Role.LINEAR)]
+    if len(matrix_status):
+        matrix_status.reshape(3, 3)[np.triu_indices(3, 1)] = FIXED
     return replace(
         calibration,
         values=values,
@@ -163,18 +155,23 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
 
 def _turned(model, values):
     """Return the values in the axes of the accelerometer."""
-    found = values.copy()
+    turned = values.copy()
     matrix = model.value('accelerometer', Role.LINEAR, values)
-    rotation = lower_times_rotation(matrix)[1]
+    _, rotation = lower_times_rotation(matrix)
     for effect in model.effects:
         part = model.slices[effect.key]
-        own = values[part]
         if effect.role in (Role.LINEAR, Role.CROSS) and effect.sensor in SENSORS:
-            found[part] = (own.reshape(3, 3) @ rotation.T).ravel()
+            matrix = values[part].reshape(3, 3)
+            turned[part] = (matrix @ rotation.T).ravel()
         elif effect.role is Role.ARMS:
-            arms = own.reshape(3, 3)
-            found[part] = ((arms - arms.mean(axis=0)) @ rotation.T).ravel()
-    return found
+            arms = values[part].reshape(3, 3)
+            turned[part] = ((arms - arms.mean(axis=0)) @ rotation.T).ravel()
+    return turned
+
+
+def _compared_turned(first, second, common, notes):
+    """Compare the common parameters of two calibrations in the axes of the accelerometer."""
+    return _compared(in_accelerometer_axes(first), in_accelerometer_axes(second), common, notes)
 
 
 def _compared(first, second, common, notes):
@@ -206,14 +203,17 @@ def _compared(first, second, common, notes):
         for name, i, j, s, h, d in zip(common, a, b, sd, held, difference)
     )
     groups = _groups(common, difference, covariance, held) if len(parts) == 2 else []
-    reference = {
-        name.rpartition('.')[0]
-        for effect in first.model.effects
-        if effect.in_reference or effect.sensor == 'reference'
-        for name in effect.param_names()
-    }
-    of_imu = [group for group in groups if group[0] not in reference]
-    of_reference = [group for group in groups if group[0] in reference]
+    # Table and clock are judged apart: they are no property of the IMU.
+    keys_of_reference = set()
+    for effect in first.model.effects:
+        if effect.section == 'reference':
+            keys_of_reference |= {name.rpartition('.')[0] for name in effect.param_names()}
+    of_reference, of_imu = [], []
+    for group in groups:
+        if group[0] in keys_of_reference:
+            of_reference.append(group)
+        else:
+            of_imu.append(group)
     rejected_reference = _holm(of_reference)
     rejected = _holm(of_imu)
     lines = notes + [
@@ -222,7 +222,7 @@ def _compared(first, second, common, notes):
         if name in rejected | rejected_reference
     ]
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
-    if rejected & linear and 'mount' in (first.gauge.get('axes'), second.gauge.get('axes')):
+    if rejected & linear and TABLE_AXES in (first.gauge.get('axes'), second.gauge.get('axes')):
         lines.append(
             'off-diagonal terms of a matrix include how the IMU was mounted on the table: '
             'they differ after remounting without a change of the IMU'

@@ -434,13 +434,7 @@ def expected_noise(figures: NoiseFigures | None, grade: str, rate: float) -> dic
         )
     if figures is None:
         return noise_of_grade(GRADES[grade].noise, rate)
-    if lacking := [sensor for sensor in SENSORS if sensor not in figures.sensors]:
-        raise InputError(
-            'the noise document must have figures of both sensors, it has none of the'
-            f' {lacking[0]}; record both sensors',
-            key='noise',
-            code='absent',
-        )
+    figures.require_both_sensors('record both sensors')
     slow = bias_processes(figures)  # the slow part as Gauss-Markov processes
     return {
         sensor: NoiseModel(

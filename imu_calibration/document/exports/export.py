@@ -210,13 +210,7 @@ def _require_rest_for_walk(figures):
 
 def _noise_of(calibration, figures, rate) -> Noise | None:
     if figures is not None:
-        if lacking := [sensor for sensor in SENSORS if sensor not in figures.sensors]:
-            raise InputError(
-                'the noise document must have figures of both sensors, it has none of the'
-                f' {lacking[0]}; record both sensors, or export without it',
-                key='noise',
-                code='absent',
-            )
+        figures.require_both_sensors('record both sensors, or export without it')
         accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
         unbounded = [
             sensor

@@ -142,6 +142,8 @@ def temperature_at(
 
 ROUNDING_LOSS = 1e-9
 """m/s^2, rad/s; smaller differences are rounding."""
+IMPORTED_FROM_AUTOPILOT = RawReadings(axes='flu')
+"""Readings of an imported calibration: numbers of autopilots are brought into the axes of ROS."""
 
 
 @dataclass(frozen=True)
@@ -294,9 +296,10 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
     assert target.imu is not None
     read, own = target.imu(found.numbers), affine.find_pose(content)
     if own is None:
-        back = target.back(read)
         if target.forward_right_down:
-            back = affine.forward_right_down(RawReadings(axes='flu'))
+            back = affine.forward_right_down(IMPORTED_FROM_AUTOPILOT)
+        else:
+            back = target.back(read)
         return _document(target, found, affine.moved(read, back), target.axes, path, frame_id)
     placement, parent = own
     return _document(
@@ -342,10 +345,9 @@ def _document(
         'imported': {'from': target.name, 'file': name},
         'uncertainty': UNKNOWN_SD,
     }
-    # Numbers of autopilots are brought into the axes of ROS.
     readings = RawReadings()
     if target.forward_right_down:
-        readings = RawReadings(axes='flu')
+        readings = IMPORTED_FROM_AUTOPILOT
     return check_numbers(
         Calibration(
             model,

@@ -192,8 +192,10 @@ ARDUPILOT = (
 CAL_OFFSET = {'accelerometer': 'CAL_ACC0_*OFF', 'gyroscope': 'CAL_GYRO0_*OFF'}
 CAL_SCALE = 'CAL_ACC0_*SCALE'
 TC = {'accelerometer': 'TC_A', 'gyroscope': 'TC_G'}
+PX4_REFERENCE_C = 25.0
+"""Degrees Celsius; PX4's default of TC_*_TREF."""
 PX4_RANGE_C = (0.0, 100.0)
-"""Degrees Celsius; PX4's own range of thermal compensation."""
+"""Degrees Celsius; PX4's own range of thermal compensation: the defaults of TC_*_TMIN, TC_*_TMAX."""
 UNNOTICED = 0.01
 """
 Norm up to which PX4 ignores a change of an offset (m/s^2, rad/s) or a scale; 0.001 in older
@@ -224,17 +226,13 @@ def numbers_px4(imu: AffineImu) -> dict:
     return found
 
 
-PX4_REFERENCE_C, PX4_RANGE_C = 25.0, (0.0, 100.0)
-"""Defaults of TC_*_TREF, TC_*_TMIN and TC_*_TMAX, degrees Celsius."""
-
-
 def imu_px4(found: dict) -> AffineImu:
     """
     Return the IMU of such parameters.
 
     Thermal offsets beyond the first power are refused by `read_px4`.
     """
-    bias, thermal, ref, limits = {}, {}, 25.0, None
+    bias, thermal, ref, limits = {}, {}, PX4_REFERENCE_C, None
     for sensor in SENSORS:
         short = f'{TC[sensor]}0'
         on = bool(found.get(f'{TC[sensor]}_ENABLE'))
