@@ -195,7 +195,7 @@ TC = {'accelerometer': 'TC_A', 'gyroscope': 'TC_G'}
 PX4_REFERENCE_C = 25.0
 """Degrees Celsius; PX4's default of TC_*_TREF."""
 PX4_RANGE_C = (0.0, 100.0)
-"""Degrees Celsius; PX4's own range of thermal compensation: the defaults of TC_*_TMIN, TC_*_TMAX."""
+"""Degrees Celsius; PX4's own range of thermal compensation: defaults of TC_*_TMIN and _TMAX."""
 UNNOTICED = 0.01
 """
 Norm up to which PX4 ignores a change of an offset (m/s^2, rad/s) or a scale; 0.001 in older
