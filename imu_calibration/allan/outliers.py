@@ -9,7 +9,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
-from imu_calibration.preprocessing.stream_cleaning import CleanedBlock
+from imu_calibration.preprocessing.stream_cleaning import CleanedBlock, EpochFilters
 
 PIECE = 1024
 """Samples that are decided together, with one estimate of their scatter."""
@@ -81,16 +81,17 @@ def without_outliers(
     blocks: Iterable[CleanedBlock], search: RestOutliers
 ) -> Iterator[CleanedBlock]:
     """Yield cleaned blocks without the outliers of the IMU; each epoch of the clock is a stream."""
-    epoch = 0
+    filters = EpochFilters(search)
     for cleaned in blocks:
         imu = []
-        for next_epoch, samples in cleaned.imu:
-            if next_epoch != epoch:
-                imu += [(epoch, part) for part in search.finish()]
-                epoch = next_epoch
-            imu += [(epoch, part) for part in search.push(samples)]
-        yield replace(cleaned, imu=[(number, part) for number, part in imu if len(part)])
-    yield CleanedBlock(imu=[(epoch, part) for part in search.finish() if len(part)])
+        for epoch, samples in cleaned.imu:
+            imu += filters.push(epoch, samples)
+        yield replace(cleaned, imu=_not_empty(imu))
+    yield CleanedBlock(imu=_not_empty(filters.finish()))
+
+
+def _not_empty(parts):
+    return [(epoch, samples) for epoch, samples in parts if len(samples)]
 
 
 def outliers(values: np.ndarray) -> np.ndarray:

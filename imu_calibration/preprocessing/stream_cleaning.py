@@ -69,8 +69,9 @@ class StreamCheck:
         self._held = None
         self._newest_raw = None
         self._times: SampleTimes | None = None
-        self._spikes, self._filtered_epoch = SpikeFilter(), 0
         self._wraps = WrapFilter()
+        self._spikes = SpikeFilter()
+        self._filters = EpochFilters(self._wraps, self._spikes)
 
     @property
     def line(self) -> StampLine | None:
@@ -143,24 +144,14 @@ class StreamCheck:
             if not isinstance(samples, ImuSamples):
                 passed.append((epoch, samples))
                 continue
-            if epoch != self._filtered_epoch:
-                passed += self._let_out()
-                self._filtered_epoch = epoch
-            for unwrapped in self._wraps.push(samples):
-                passed += [(epoch, part) for part in self._spikes.push(unwrapped)]
-        passed += self._let_out() if ended else []
+            passed += self._filters.push(epoch, samples)
+        if ended:
+            passed += self._filters.finish()
         if self._spikes.dropped:
             self.counts['spike'] = self._spikes.dropped
         if self._wraps.dropped:
             self.counts['wrapped'] = self._wraps.dropped
         return passed
-
-    def _let_out(self):
-        passed = []
-        for unwrapped in self._wraps.finish():
-            passed += self._spikes.push(unwrapped)
-        passed += self._spikes.finish()
-        return [(self._filtered_epoch, part) for part in passed]
 
     def _count(self, reason, number):
         self.counts += Counter({reason: int(number)})  # without zeros
@@ -261,6 +252,50 @@ class StreamCheck:
             self._newest = joined[-1]
             self._n_accepted += len(samples)
         return [(self.epoch, samples)]
+
+
+class ImuFilter(Protocol):
+    """Removes samples from a stream of an IMU; its result does not depend on the pieces."""
+
+    def push(self, samples: ImuSamples) -> list[ImuSamples]:
+        """Return the samples with a decision."""
+
+    def finish(self) -> list[ImuSamples]:
+        """Return the buffered samples, and begin a new stream."""
+
+
+class EpochFilters:
+    """Passes the samples of an IMU through filters; each epoch of the clock is one stream."""
+
+    def __init__(self, *filters: ImuFilter) -> None:
+        self._filters = filters
+        self._epoch = 0
+
+    def push(self, epoch: int, samples: ImuSamples) -> list[tuple[int, ImuSamples]]:
+        """Return the (epoch, samples) with a decision."""
+        passed = []
+        if epoch != self._epoch:
+            passed += self.finish()
+            self._epoch = epoch
+        passed += [(epoch, part) for part in self._through(self._filters, [samples])]
+        return passed
+
+    def finish(self) -> list[tuple[int, ImuSamples]]:
+        """Return the buffered (epoch, samples)."""
+        passed = []
+        for number, imu_filter in enumerate(self._filters):
+            passed += self._through(self._filters[number + 1 :], imu_filter.finish())
+        return [(self._epoch, part) for part in passed]
+
+    @staticmethod
+    def _through(filters, parts):
+        """Return the samples that pass all of some filters."""
+        for imu_filter in filters:
+            passed = []
+            for part in parts:
+                passed += imu_filter.push(part)
+            parts = passed
+        return parts
 
 
 def _is_reset(step):
