@@ -13,6 +13,8 @@ WINDOW_S = 1.0
 """s; readings are collected over it before they are judged."""
 LEAST_READINGS = 10
 """Number of readings in a window, at least."""
+MOST_READINGS = 10_000
+"""Number of readings in a window, at most: the stamps of a driver may stand still."""
 REST_SPREAD = 0.05
 """Largest standard deviation of the length at rest, relative to its median."""
 MOST_IN_MOTION = 16 * STANDARD_GRAVITY
@@ -66,7 +68,9 @@ class UnitGate:
                 self._open()
                 return True
         self._lengths.append(length)
-        if stamp_ns - self._start_ns < WINDOW_S * 1e9 or len(self._lengths) < LEAST_READINGS:
+        is_long = stamp_ns - self._start_ns >= WINDOW_S * 1e9
+        is_complete = is_long and len(self._lengths) >= LEAST_READINGS
+        if not is_complete and len(self._lengths) < MOST_READINGS:
             return False
         self._judge()
         return self.is_open

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_live_compensation import field, imu_samples, messages
 
-from imu_calibration.compensation.unit_gate import UnitGate
+from imu_calibration.compensation.unit_gate import MOST_READINGS, UnitGate
 from imu_calibration.core.readings import SI_ACCELEROMETER, RawReadings, combined
 from imu_calibration.nodes.message_compensation import WITHHELD, LiveCompensation
 from validation.imu_messages import patch_imu
@@ -70,6 +70,14 @@ def test_a_violent_motion_at_the_start_delays_the_output_by_one_window():
     shaken = 40.0 + 25.0 * np.sin(np.arange(400))
     passed = run(UnitGate(SI_ACCELEROMETER), [60.0, *shaken])
     assert passed.index(True) == 100 and all(passed[100:])
+
+
+def test_frozen_stamps_do_not_keep_the_gate_from_a_decision():
+    gate = UnitGate(SI_ACCELEROMETER)
+    assert not any(run(gate, np.ones(MOST_READINGS), period=0.0))
+    assert gate.error is not None and gate.error.code == 'force_unit'
+    gate = UnitGate(SI_ACCELEROMETER)
+    assert run(gate, [60.0, *np.full(MOST_READINGS, 9.75)], period=0.0)[-1]
 
 
 def test_a_shaken_imu_in_g_does_not_pass():
