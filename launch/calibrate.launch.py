@@ -3,11 +3,11 @@ Calibrate an IMU on a table, live.
 
     ros2 launch imu_calibration calibrate.launch.py table:=/path/to/table.yaml imu:=/imu/data_raw
 
-    ros2 launch imu_calibration calibrate.launch.py table:=none urdf:=topic imu:=/imu/data_raw
     # on the arm of robot_description
+    ros2 launch imu_calibration calibrate.launch.py table:=none urdf:=topic imu:=/imu/data_raw
 
-    ros2 launch imu_calibration calibrate.launch.py table:=none imu:=/imu/data_raw      # by hand,
-    without a table
+    # by hand, without a table
+    ros2 launch imu_calibration calibrate.launch.py table:=none imu:=/imu/data_raw
 
 Several IMUs: one launch each with its own `namespace` and `save_file`. An empty argument has no
 effect on `params`.

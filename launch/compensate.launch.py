@@ -4,8 +4,10 @@ Correct an IMU's messages with a calibration, live.
 Optionally feed robot_localization with the corrected messages.
 
     ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml
-    imu:=/imu/data_raw ros2 launch imu_calibration compensate.launch.py
-    calibration:=/path/to/calibration.yaml corrected:=imu/data ekf:=true
+    imu:=/imu/data_raw
+
+    ros2 launch imu_calibration compensate.launch.py calibration:=/path/to/calibration.yaml
+    corrected:=imu/data ekf:=true
 
 Subscribers of imu/data, the usual topic, receive corrected readings with corrected:=imu/data and a
 driver on imu/data_raw. An empty argument has no effect on `params`.
@@ -21,6 +23,10 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
+USE_SIM_TIME = {
+    'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
+}
+"""Parameter of both nodes."""
 OPTIONAL_PARAMETERS = {
     'calibration': ('calibration_file', str),
     'adopt': ('adopt', str),
@@ -34,9 +40,6 @@ OPTIONAL_PARAMETERS = {
 
 def generate_launch_description():
     """Describe compensator_node, robot_localization's filter, and the names they can be given."""
-    use_sim_time = {
-        'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
-    }
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -125,7 +128,7 @@ def generate_launch_description():
                 parameters=[
                     # the file contains $(var frame_prefix)
                     ParameterFile(LaunchConfiguration('ekf_params'), allow_substs=True),
-                    use_sim_time,
+                    USE_SIM_TIME,
                 ],
                 remappings=[('imu/data', LaunchConfiguration('corrected'))],
             ),
@@ -135,9 +138,7 @@ def generate_launch_description():
 
 def _nodes(context):
     """Return the node; a parameter without an argument keeps its value in `params`."""
-    parameters = {
-        'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool)
-    }
+    parameters = dict(USE_SIM_TIME)
     for argument, (name, kind) in OPTIONAL_PARAMETERS.items():
         if LaunchConfiguration(argument).perform(context):
             parameters[name] = ParameterValue(LaunchConfiguration(argument), value_type=kind)

@@ -10,6 +10,7 @@ fixed-point steps.
 import ast
 import re
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
@@ -73,19 +74,18 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
             f' characters of arithmetic, got {len(text)}; use fewer or shorter effects',
             code='effects_too_long',
         )
-    try:
+    cost = 'a sum that Python cannot compile'
+    with suppress(RecursionError, MemoryError):  # the compiler steps into each term of a sum
         n_operations = count_operations(ast.parse(text))
         if n_operations <= MAX_OPERATIONS:
             exec(compile(text, '<compensation kernel>', 'exec'), namespace)
-    except (RecursionError, MemoryError):  # the compiler steps into each term of a sum
-        n_operations = 'a sum that Python cannot compile'
-    if 'kernel' not in namespace:
-        raise InputError(
-            f'the effects of a calibration must need at most {MAX_OPERATIONS} operations for one'
-            f' sample, got {n_operations}; use fewer or shorter effects',
-            code='effects_cost',
-        )
-    return namespace['kernel']
+            return namespace['kernel']
+        cost = str(n_operations)
+    raise InputError(
+        f'the effects of a calibration must need at most {MAX_OPERATIONS} operations for one'
+        f' sample, got {cost}; use fewer or shorter effects',
+        code='effects_cost',
+    )
 
 
 def count_operations(tree: ast.Module) -> int:

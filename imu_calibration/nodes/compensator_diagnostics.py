@@ -202,13 +202,9 @@ class CompensatorDiagnostics:
                 node.problem
                 + (f'; calibration {node.adopted.version} remains in use' if node.adopted else '')
             )
-        if compensation is not None and compensation.gate is not None:
-            error = compensation.gate.error
-            if error is not None:
-                serious.append(f'nothing is published: {error}')
-        if compensation is None and node.unready:
-            return serious, []
         if compensation is None:
+            if node.unready:
+                return serious, []
             what = self._uncorrected()
             waiting = (
                 f'waiting for {node.awaited}; {what}'
@@ -216,6 +212,8 @@ class CompensatorDiagnostics:
                 else f'waiting for a calibration, {what}'
             )
             return (serious + [waiting], []) if node.problem else (serious, [waiting])
+        if compensation.gate is not None and compensation.gate.error is not None:
+            serious.append(f'nothing is published: {compensation.gate.error}')
         notes = []
         for reason, count in self._new_counts(compensation).items():
             (serious if reason.startswith(SERIOUS) else notes).append(

@@ -333,9 +333,11 @@ class CompensatorNode(Node):
 
     def _wait_until_ready(self, source: str, why: str) -> None:
         """Report a calibration in progress, whose next version may be applied."""
-        if not self.unready:
-            self.get_logger().info(f'the calibration from {source} is not ready yet: {why}')
-        self.unready, self.problem = f'the calibration from {source} is not ready yet: {why}', ''
+        was_ready = not self.unready
+        self.unready = f'the calibration from {source} is not ready yet: {why}'
+        self.problem = ''
+        if was_ready:
+            self.get_logger().info(self.unready)
         self.diagnostics.publish_now()
 
     def _on_transforms(self) -> None:
