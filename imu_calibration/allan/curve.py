@@ -8,13 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from imu_calibration.allan.outliers import (
-    NO_FAULTS,
-    FaultSearch,
-    ReadingFaults,
-    RestOutliers,
-    without_outliers,
-)
+from imu_calibration.allan.outliers import RestOutliers, without_outliers
+from imu_calibration.allan.reading_faults import NO_FAULTS, FaultSearch, ReadingFaults
 from imu_calibration.allan.still_parts import StillPart
 from imu_calibration.allan.trends import AxisTrend, Parts, TrendReference
 from imu_calibration.core.readings import RawReadings
@@ -387,16 +382,14 @@ class RestReader:
             np.array([(part.first_ns, part.end_ns) for part in parts], np.int64).reshape(-1, 2)
             for parts in self.parts
         ]
-        for cleaned in without_outliers(self._cleaner().all_of(self.source()), RestOutliers()):
+        cleaner = BlockCleaner(nominal=self.nominal, one_sensor=True)
+        for cleaned in without_outliers(cleaner.all_of(self.source()), RestOutliers()):
             for epoch, imu in cleaned.imu:
                 for number, (first, last) in enumerate(
                     np.searchsorted(imu.stamp_ns, bounds[epoch]).tolist()
                 ):
                     if last > first:
                         yield epoch, number, imu.select(slice(first, last))
-
-    def _cleaner(self):
-        return BlockCleaner(nominal=self.nominal, one_sensor=True)
 
     def curve(self) -> AllanCurve:
         """Return the Allan variances of the parts."""

@@ -1,5 +1,7 @@
 """Readings that wrap around at the end of the range of the converter, with the turn around them."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples
@@ -26,6 +28,22 @@ CONTEXT = 4
 """Decided samples that are kept as neighbours of the next ones."""
 
 
+EARLIEST_NS = np.iinfo(np.int64).min
+"""A stamp before all others."""
+
+
+@dataclass(frozen=True)
+class WrappedSpan:
+    """The part of a stream in which one column has wrapped around."""
+
+    column: int
+    """Force x, y, z, then rate x, y, z."""
+    first_ns: int
+    """First wrapped reading."""
+    return_ns: int
+    """First reading within the range again."""
+
+
 class WrapFilter:
     """
     Removes the parts of a stream in which a reading has wrapped around.
@@ -46,9 +64,9 @@ class WrapFilter:
         """Begin a stream."""
         self._held = None
         self._n_before = 0
-        self._until_ns = -(1 << 62)
+        self._until_ns = EARLIEST_NS
         # Of each column, the last step that ended a wrapped part.
-        self._returned_ns = np.full(6, -(1 << 62))
+        self._returned_ns = np.full(6, EARLIEST_NS)
         # Of force and rate, the largest reading before the buffered ones.
         self._largest = np.zeros(2)
 
@@ -79,17 +97,19 @@ class WrapFilter:
         assert self._held is not None
         part = self._held.select(slice(self._n_before, stop))
         wrapped = part.stamp_ns <= self._until_ns
-        for axis, first_ns, return_ns in spans:
+        for span in spans:
             # A span that begins in the undecided samples is found again with the next piece.
-            if first_ns <= part.stamp_ns[-1]:
-                until_ns = return_ns + MARGIN_NS
-                wrapped |= (part.stamp_ns >= first_ns) & (part.stamp_ns <= until_ns)
-                self._until_ns = max(self._until_ns, until_ns)
-                self._returned_ns[axis] = return_ns
+            if span.first_ns > part.stamp_ns[-1]:
+                continue
+            until_ns = span.return_ns + MARGIN_NS
+            wrapped |= (part.stamp_ns >= span.first_ns) & (part.stamp_ns <= until_ns)
+            self._until_ns = max(self._until_ns, until_ns)
+            self._returned_ns[span.column] = span.return_ns
         self.dropped += int(np.count_nonzero(wrapped))
         first = max(stop - CONTEXT, 0)
         if first:
-            self._largest = largest_so_far(self._held, self._largest)[first - 1]
+            forgotten = self._held.select(slice(0, first))
+            self._largest = largest_so_far(forgotten, self._largest)[-1]
         self._held = self._held.select(slice(first, None))
         self._n_before = stop - first
         if wrapped.all():
@@ -97,25 +117,38 @@ class WrapFilter:
         return [part.select(~wrapped) if wrapped.any() else part]
 
     def _spans(self, samples):
-        """Return [(column, first, return)] of wrapped parts in ns, and the first without return."""
+        """Return the list of `WrappedSpan`, and the stamp of the first step without return, ns."""
         row, column, up = wrap_steps(samples, self._largest)
         new = samples.stamp_ns[row] > self._returned_ns[column]
         row, column, up = row[new], column[new], up[new]
-        stamps, spans, open_ns = samples.stamp_ns, [], None
-        for axis in np.unique(column):
-            of_axis = column == axis
-            times, directions = stamps[row[of_axis]], up[of_axis]
-            k = 0
-            while k < len(times):
-                returns = k + 1 < len(times) and directions[k + 1] != directions[k]
-                if returns and times[k + 1] - times[k] < LONGEST_NS:
-                    spans.append((int(axis), int(times[k]), int(times[k + 1])))
-                    k += 2
-                    continue
-                if k + 1 == len(times) and stamps[-1] - times[k] < LONGEST_NS:
-                    open_ns = int(times[k]) if open_ns is None else min(open_ns, int(times[k]))
-                k += 1
-        return spans, open_ns
+        spans = []
+        open_steps = []
+        for number in np.unique(column):
+            of_column = column == number
+            stamp_ns = samples.stamp_ns[row[of_column]]
+            returns_ns, open_ns = _returns(stamp_ns, up[of_column])
+            for first_ns, return_ns in returns_ns:
+                spans.append(WrappedSpan(int(number), int(first_ns), int(return_ns)))
+            # A step at the end may still return.
+            if open_ns is not None and samples.stamp_ns[-1] - open_ns < LONGEST_NS:
+                open_steps.append(int(open_ns))
+        return spans, min(open_steps, default=None)
+
+
+def _returns(stamp_ns, up):
+    """Return the stamps (step, opposite step) of one column, ns; and that of a last single step."""
+    pairs = []
+    k = 0
+    while k + 1 < len(stamp_ns):
+        opposite = up[k + 1] != up[k]
+        if opposite and stamp_ns[k + 1] - stamp_ns[k] < LONGEST_NS:
+            pairs.append((stamp_ns[k], stamp_ns[k + 1]))
+            k += 2
+        else:
+            k += 1
+    if k < len(stamp_ns):
+        return pairs, stamp_ns[k]
+    return pairs, None
 
 
 def largest_so_far(samples: ImuSamples, before: np.ndarray) -> np.ndarray:
@@ -167,6 +200,8 @@ def wrap_steps(
     row, column = np.nonzero(np.abs(step) > LEAST_STEP)
     inside = (row >= 2) & (row + 2 < len(step))
     row, column = row[inside], column[inside]
+    if not len(row):
+        return none, none, none.astype(bool)
     size = step[row, column]
     before, after = values[row, column], values[row + 1, column]
     earlier, later = step[row - 1, column], step[row + 1, column]

@@ -5,7 +5,8 @@ import pytest
 
 from imu_calibration.allan.document import lines, noise_from_text, noise_to_text
 from imu_calibration.allan.identify import figures_of, identify_noise
-from imu_calibration.allan.outliers import FaultSearch, outliers
+from imu_calibration.allan.outliers import outliers
+from imu_calibration.allan.reading_faults import FaultSearch
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.base import SENSORS
 
