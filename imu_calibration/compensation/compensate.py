@@ -42,7 +42,7 @@ class FittedErrors(Protocol):
 
     @property
     def knows_density(self) -> bool:
-        """Whether the noise is known at any sampling rate."""
+        """Whether the noise of a sensor is known at any sampling rate."""
 
     @property
     def frame_id(self) -> str:

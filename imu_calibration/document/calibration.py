@@ -170,8 +170,8 @@ class Calibration:
 
     @property
     def knows_density(self) -> bool:
-        """Whether the noise is known at any sampling rate."""
-        return 'noise_density' in self.statistics.get('accelerometer', {})
+        """Whether the noise of a sensor is known at any sampling rate."""
+        return any('noise_density' in self.statistics.get(sensor, {}) for sensor in SENSORS)
 
     def noise(self, sensor: str, period: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -451,8 +451,12 @@ LARGEST_BIAS = {'accelerometer': 16 * STANDARD_GRAVITY, 'gyroscope': 4000 * DEG}
 def worst_scale(calibration: Calibration, sensor: str) -> float:
     """Return the scale factor of a sensor that lies worst in the table of `core.scales`."""
     diagonal = np.diag(np.asarray(calibration.of(sensor, Role.LINEAR)))
-    smallest, largest = float(diagonal.min()), float(diagonal.max())
-    return max(smallest, largest, key=lambda factor: list(ScaleRange).index(scale_range(factor)))
+    smallest = float(diagonal.min())
+    largest = float(diagonal.max())
+    severity = list(ScaleRange)
+    if severity.index(scale_range(largest)) > severity.index(scale_range(smallest)):
+        return largest
+    return smallest
 
 
 def scale_supported(calibration: Calibration, sensor: str) -> bool:
