@@ -145,6 +145,10 @@ class RawReadings:
         """Whether both sensors are in SI."""
         return self.accelerometer.is_si and self.gyroscope.is_si
 
+    def has_units_of(self, other: 'RawReadings') -> bool:
+        """Return whether both sensors have the units of another description, in any axes."""
+        return self.accelerometer == other.accelerometer and self.gyroscope == other.gyroscope
+
     def apply(self, imu: ImuSamples) -> ImuSamples:
         """Return the samples in SI."""
         if self.is_si:

@@ -394,11 +394,9 @@ def _anchor_from_topic(
         references = [before.used.calibration, before.anchor]
     for reference in references:
         why = implausible_change(calibration, reference)
+        known = RawReadings() if reference is None else reference.readings
         # Another unit changes the readings by any factor.
-        known = RawReadings()
-        if reference is not None:
-            known = reference.readings
-        if replace(calibration.readings, axes=known.axes) != known:
+        if not calibration.readings.has_units_of(known):
             why = 'it describes readings in other units'
         if why:
             near = 'uncorrected readings' if reference is None else 'the one in use'

@@ -16,8 +16,11 @@ from msg_adapters.csv_log import autopilot_of
 
 from worlds.compensation_cases import random_calibration
 
-BIAS, SCALE = {'px4': ('CAL_ACC0_{}OFF', 'CAL_ACC0_{}SCALE')}, 'INS_ACCSCAL_{}'
-BIAS['ardupilot'] = ('INS_ACCOFFS_{}', SCALE)
+PARAMETERS = {
+    'px4': ('CAL_ACC0_{}OFF', 'CAL_ACC0_{}SCALE'),
+    'ardupilot': ('INS_ACCOFFS_{}', 'INS_ACCSCAL_{}'),
+}
+"""Autopilot -> parameter of an offset and of a scale, by letter of the axis."""
 FORWARD_RIGHT_DOWN = {
     'flu': ((0, 1), (1, -1), (2, -1)),
     'frd': ((0, 1), (1, 1), (2, 1)),
@@ -31,7 +34,7 @@ def calibration_in(axes):
     return replace(random_calibration(6, ()), readings=RawReadings(axes=axes))
 
 
-@pytest.mark.parametrize('name', BIAS)
+@pytest.mark.parametrize('name', PARAMETERS)
 @pytest.mark.parametrize('axes', FORWARD_RIGHT_DOWN)
 def test_offsets_and_scales_have_the_axes_of_the_vehicle(name, axes):
     calibration = calibration_in(axes)
@@ -39,12 +42,12 @@ def test_offsets_and_scales_have_the_axes_of_the_vehicle(name, axes):
     matrix = np.diag(calibration.value('accelerometer', 'matrix'))
     found = export(calibration, find_target(name)).numbers
     for letter, (index, sign) in zip('XYZ', FORWARD_RIGHT_DOWN[axes], strict=True):
-        offset, scale = (text.format(letter) for text in BIAS[name])
-        assert found[offset] == pytest.approx(sign * bias[index], rel=1e-12)
-        assert found[scale] == pytest.approx(1 / matrix[index], rel=1e-12)
+        offset, scale = PARAMETERS[name]
+        assert found[offset.format(letter)] == pytest.approx(sign * bias[index], rel=1e-12)
+        assert found[scale.format(letter)] == pytest.approx(1 / matrix[index], rel=1e-12)
 
 
-@pytest.mark.parametrize('name', BIAS)
+@pytest.mark.parametrize('name', PARAMETERS)
 @pytest.mark.parametrize('axes', FORWARD_RIGHT_DOWN)
 def test_a_file_that_is_imported_and_exported_again_keeps_its_numbers(tmp_path, name, axes):
     first = export(calibration_in(axes), find_target(name))
@@ -57,7 +60,7 @@ def test_a_file_that_is_imported_and_exported_again_keeps_its_numbers(tmp_path, 
         assert again.numbers[key] == pytest.approx(value, rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.parametrize('name', BIAS)
+@pytest.mark.parametrize('name', PARAMETERS)
 def test_an_export_without_stated_axes_is_refused(tmp_path, name, capsys):
     with refused(InputError, 'axes_missing', 'flu', 'frd') as caught:
         export(calibration_in(''), find_target(name))
