@@ -91,7 +91,7 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
 @pytest.mark.parametrize(
     'shock, what, axes',
     [
-        (((0.03, 0.0, 0.0), (2e-3, 0.0, 0.0)), 'accelerometer and gyroscope', 'x'),
+        (((0.03, 0.0, 0.0), (0.0, 2e-3, 0.0)), 'accelerometer and gyroscope', 'xy'),
         (((0.0, 0.0, 0.0), (0.0, 2e-3, 0.0)), 'gyroscope', 'y'),
     ],
 )
