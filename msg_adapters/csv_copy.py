@@ -7,12 +7,10 @@ from os import PathLike
 import numpy as np
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.readings import SI_UNITS
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.files import write_whole
 from msg_adapters.csv_log import SENSOR_OF, CsvLog, cells_of, name_with_unit
-
-SI_UNITS = {'force': 'm/s^2', 'rate': 'rad/s'}
-"""Quantity -> unit of the corrected readings."""
 
 
 def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSamples) -> None:
@@ -46,15 +44,20 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
         )
     # White space is no delimiter of names that contain it.
     delimiter = '\t' if text.delimiter is None else text.delimiter
-    readings = {'force': corrected.force_s, 'rate': corrected.rate_s}
-    readings = {quantity: readings[quantity] for quantity in SENSOR_OF if quantity in text.places}
+    readings = {}
+    for quantity, values in (('force', corrected.force_s), ('rate', corrected.rate_s)):
+        if quantity in text.places:
+            readings[quantity] = values
 
     # The header states the unit of each column that was read.
     names = list(text.names)
     for columns in log.columns:
         for place in text.places.get(columns.quantity, ()):
-            unit = SI_UNITS.get(columns.quantity, columns.unit)
-            if unit is not None and (columns.quantity != 'time' or _is_number(text, place)):
+            unit = columns.unit
+            if columns.quantity in SENSOR_OF:
+                unit = SI_UNITS[SENSOR_OF[columns.quantity]]
+            # A date or a time of day has no unit.
+            if columns.quantity != 'time' or _is_number(text, place):
                 names[place] = name_with_unit(names[place], columns.quantity, unit)
     out = io.StringIO()
     writer = csv.writer(out, delimiter=delimiter, lineterminator='\n')

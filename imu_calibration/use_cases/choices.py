@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypedDict
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import ImuCalibrationError, InputError
-from imu_calibration.core.readings import UNIT_KEYS, RawReadings, combined
+from imu_calibration.core.readings import AXES_KEY, UNIT_KEYS, RawReadings, combined
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import override
 from imu_calibration.document import files
@@ -37,6 +37,7 @@ from imu_calibration.use_cases.recordings import (
     table_of,
 )
 from imu_calibration.use_cases.resources import config_file
+from msg_adapters.csv_log import SENSOR_OF
 
 
 class Choices(TypedDict, total=False):
@@ -249,7 +250,7 @@ def readings_of(choices: Mapping[str, Any]) -> RawReadings | None:
 
     """
     nominal = choices.get('nominal')
-    stated = {name: choices.get(name) for name in (*UNIT_KEYS.values(), 'axes')}
+    stated = _stated(choices)
     if nominal is None and not any(stated.values()):
         return None
     mapping: Mapping[str, Any] = {}
@@ -276,13 +277,17 @@ def readings_for(calibration: Calibration, choices: Mapping[str, Any]) -> RawRea
 
     That of the calibration; a sensor, or axes, that the choices state replace its own.
     """
-    stated = readings_of(choices)
-    if stated is None:
+    described = readings_of(choices)
+    if described is None:
         return calibration.readings
     if choices.get('nominal') is not None:
-        return stated
-    named = {name: choices.get(name) for name in (*UNIT_KEYS.values(), 'axes')}
-    return combined(calibration.readings, **named)
+        return described
+    return combined(calibration.readings, **_stated(choices))
+
+
+def _stated(choices):
+    """Return the units and axes that options state, as arguments of `readings.combined`."""
+    return {name: choices.get(name) for name in (*UNIT_KEYS.values(), AXES_KEY)}
 
 
 def raw_columns(readings: RawReadings | None, choices: Mapping[str, Any]) -> tuple[str, ...]:
@@ -294,7 +299,7 @@ def raw_columns(readings: RawReadings | None, choices: Mapping[str, Any]) -> tup
     if readings is None:
         return ()
     quantities = []
-    for quantity, sensor in (('force', 'accelerometer'), ('rate', 'gyroscope')):
+    for quantity, sensor in SENSOR_OF.items():
         stated = choices.get(UNIT_KEYS[sensor])
         if stated or not getattr(readings, sensor).is_si:
             quantities.append(quantity)
