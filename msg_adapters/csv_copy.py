@@ -57,7 +57,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
             if columns.quantity in SENSOR_OF:
                 unit = SI_UNITS[SENSOR_OF[columns.quantity]]
             # A date or a time of day has no unit.
-            if columns.quantity != 'time' or _is_number(text, place):
+            if unit is not None and (columns.quantity != 'time' or _is_number(text, place)):
                 names[place] = name_with_unit(names[place], columns.quantity, unit)
     out = io.StringIO()
     writer = csv.writer(out, delimiter=delimiter, lineterminator='\n')

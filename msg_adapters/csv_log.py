@@ -230,8 +230,6 @@ def read_csv(
 
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f'a text log must be a regular file, got {path}; check the path')
     table = _Table(path)
     found = [_parse(text) for text in columns]
     given = {(each.quantity, each.joint) for each in found}
@@ -249,11 +247,7 @@ def read_csv(
             key='columns',
         )
     table.load([name for each in found for name in each.names], where)
-    _require_distinct_times(table.raw(by_quantity['time'].names[0]), path)
-    time = _with_unit(
-        by_quantity['time'], lambda: _time_unit(table.raw(by_quantity['time'].names[0])), path
-    )
-    stamp_ns, n_overflows = without_overflows(table.stamps(time))
+    time, stamp_ns, n_overflows = _times(table, by_quantity['time'])
     readings = _sensors(table, by_quantity, stamp_ns)
     used, temperature, joints = [time, *readings.columns], None, []
     for each in found:
@@ -316,7 +310,7 @@ def _lacking(table, by_quantity, *, stated):
     """
     if 'time' not in by_quantity:
         return 'time'
-    missing = [quantity for quantity in ('force', 'rate') if quantity not in by_quantity]
+    missing = [quantity for quantity in SENSOR_OF if quantity not in by_quantity]
     if not missing:
         return ''
     taken = {name.removeprefix('-') for each in by_quantity.values() for name in each.names}
@@ -324,6 +318,15 @@ def _lacking(table, by_quantity, *, stated):
     if len(missing) == 2 or (len(unknown) >= 3 and not stated):
         return missing[0]
     return ''
+
+
+def _times(table, columns):
+    """Return (Columns with the unit, stamps in ns, overflows of the counter, now undone)."""
+    values = table.raw(columns.names[0])
+    _require_distinct_times(values, table.path)
+    columns = _with_unit(columns, lambda: _time_unit(values), table.path)
+    stamp_ns, n_overflows = without_overflows(table.stamps(columns))
+    return columns, stamp_ns, n_overflows
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,27 +354,31 @@ def _sensors(table, by_quantity, stamp_ns):
     if 'rate' not in by_quantity:
         return _Readings((force,), ImuSamples(stamp_ns, force_s, nothing, 'imu_link'))
     raw_rate = table.values(by_quantity['rate'].names)
-    accelerometer, gyroscope = (finite_stream(stamp_ns, values) for values in (force_s, raw_rate))
+
+    # Rows of both sensors give samples as they are.
     common = np.isfinite(force_s).all(axis=1) & np.isfinite(raw_rate).all(axis=1)
+    accelerometer = finite_stream(stamp_ns, force_s)
+    gyroscope = finite_stream(stamp_ns, raw_rate)
     fewest = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
     if np.count_nonzero(common) >= MIN_COMMON_ROWS * fewest:
-        _require_one_imu(stamp_ns, force_s, raw_rate)
-        rate = _with_unit(
-            by_quantity['rate'], lambda: _rate_unit(stamp_ns, force_s, raw_rate), table.path
-        )
-        rate_s = raw_rate * _size_of(rate)
-        return _Readings((force, rate), ImuSamples(stamp_ns, force_s, rate_s, 'imu_link'))
+        imu = ImuSamples(stamp_ns, force_s, raw_rate, 'imu_link')
+        return _with_rate_unit(force, by_quantity['rate'], imu, path=table.path)
+
+    # Otherwise each sensor has rows of its own.
     return _joined(force, by_quantity['rate'], accelerometer, gyroscope, path=table.path)
 
 
 def _joined(force, rate, accelerometer, gyroscope, *, path):
     """Return the `_Readings` of sensors with stamps of their own; the rates as in the log."""
     joined = join_sensors(accelerometer, gyroscope, 'imu_link')
-    imu = joined.imu
-    _require_one_imu(imu.stamp_ns, imu.force_s, imu.rate_s)
+    return _with_rate_unit(force, rate, joined.imu, path=path, joined=joined)
+
+
+def _with_rate_unit(force, rate, imu, *, path, joined=None):
+    """Return the `_Readings` of samples with the rates as in the log."""
+    _require_one_imu(imu)
     rate = _with_unit(rate, lambda: _rate_unit(imu.stamp_ns, imu.force_s, imu.rate_s), path)
-    imu = replace(imu, rate_s=imu.rate_s * _size_of(rate))
-    return _Readings((force, rate), imu, joined)
+    return _Readings((force, rate), replace(imu, rate_s=imu.rate_s * _size_of(rate)), joined)
 
 
 def read_logs(
@@ -406,7 +413,7 @@ def read_logs(
         )
     in_folder = len(files) == 1
     if in_folder:
-        files = sorted(path for path in files[0].iterdir() if path.suffix.lower() in SUFFIXES)
+        files = sorted(path for path in files[0].iterdir() if is_text_log(path))
     found: dict[str, list[_SensorLog]] = {'force': [], 'rate': []}
     for path in files:
         try:
@@ -430,8 +437,16 @@ def read_logs(
     force, rate = found['force'][0], found['rate'][0]
     readings = _joined(force.columns, rate.columns, force.stream, rate.stream, path=rate.path)
     used = (force.time, readings.columns[0], rate.time, readings.columns[1])
-    n_dropped = force.n_dropped + rate.n_dropped
-    return CsvLog(used, readings.imu, None, None, (), n_dropped, joined=readings.joined)
+    return CsvLog(
+        used,
+        readings.imu,
+        joints=None,
+        temperature=None,
+        unused=(),
+        n_dropped=force.n_dropped + rate.n_dropped,
+        n_overflows=force.n_overflows + rate.n_overflows,
+        joined=readings.joined,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,27 +460,25 @@ class _SensorLog:
     stream: SensorStream
     """Force in SI; rates as in the log."""
     n_dropped: int
+    n_overflows: int
 
 
 def _sensor_log(path, where):
     """Return the `_SensorLog` of a path; None where it has neither sensor."""
-    if not path.is_file():
-        raise InputError(f'a text log must be a regular file, got {path}; check the path')
     table = _Table(path)
     found = {each.quantity: each for each in _guess(table)}
-    sensors = [quantity for quantity in ('force', 'rate') if quantity in found]
+    sensors = [quantity for quantity in SENSOR_OF if quantity in found]
     if 'time' not in found or len(sensors) != 1:
         return None
     columns = found[sensors[0]]
     table.load([*found['time'].names, *columns.names], where)
-    time = _with_unit(found['time'], lambda: _time_unit(table.raw(found['time'].names[0])), path)
+    time, stamp_ns, n_overflows = _times(table, found['time'])
     values = table.values(columns.names)
     if columns.quantity == 'force':
         columns = _with_unit(columns, lambda: _force_unit(values), path)
         values = values * _size_of(columns)
-    return _SensorLog(
-        path, time, columns, finite_stream(table.stamps(time), values), table.n_dropped
-    )
+    stream = finite_stream(stamp_ns, values)
+    return _SensorLog(path, time, columns, stream, table.n_dropped, n_overflows)
 
 
 AUTOPILOT_COLUMNS = {
@@ -487,11 +500,11 @@ def autopilot_of(path: str | PathLike[str]) -> str:
     return ''
 
 
-def _require_one_imu(stamp_ns, force_s, rate):
+def _require_one_imu(imu):
     """Raise where the rows are those of two IMUs; units of force and rate do not matter."""
     sources = TwoSourceSearch()
-    good = np.isfinite(force_s).all(axis=1) & np.isfinite(rate).all(axis=1)
-    sources.push(ImuSamples(stamp_ns[good], force_s[good], rate[good]))
+    good = np.isfinite(imu.force_s).all(axis=1) & np.isfinite(imu.rate_s).all(axis=1)
+    sources.push(imu.select(good))
     sources.require_one(key='where')
 
 
@@ -526,7 +539,7 @@ def _parse(text):
     if (
         not units
         or (quantity == 'joint') != bool(joint)
-        or len(names) != (3 if quantity in ('force', 'rate') else 1)
+        or len(names) != (3 if quantity in SENSOR_OF else 1)
     ):
         raise InputError(
             'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and'
@@ -574,6 +587,8 @@ class _Table:
     """Header and columns of a text log."""
 
     def __init__(self, path):
+        if not path.is_file():
+            raise InputError(f'a text log must be a regular file, got {path}; check the path')
         self.path = path
         with _opened(path) as file:
             head = file.read(HEAD_BYTES)

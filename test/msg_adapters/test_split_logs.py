@@ -109,6 +109,34 @@ def test_convert_writes_them(folder, tmp_path, capsys):
     assert np.isfinite(samples.force_s).all() and np.isfinite(samples.rate_s).all()
 
 
+def test_the_overflow_of_a_counter_in_two_logs_is_undone(streams, tmp_path):
+    """Stamps of 32 bits in microseconds; the readings after the overflow were left out."""
+    overflow_us = 2**32
+    start_us = overflow_us - 15_000_000
+    paths = []
+    for name, stream, head in (
+        ('a.csv', streams[0], 'time (us),ax (m/s^2),ay (m/s^2),az (m/s^2)'),
+        ('g.csv', streams[1], 'time (us),gx (rad/s),gy (rad/s),gz (rad/s)'),
+    ):
+        time_us = start_us + (stream.stamp_ns - START_NS) // 1000
+        paths.append(tmp_path / name)
+        write(paths[-1], SensorStream(time_us % overflow_us, stream.values[:, ::-1]), head)
+    log = read_logs(paths)
+    assert log.n_overflows == 2
+    assert len(log.imu) > 0.95 * len(streams[0].stamp_ns)
+    assert np.ptp(log.imu.stamp_ns) > 0.95 * np.ptp(streams[0].stamp_ns)
+
+
+def test_two_logs_of_too_few_digits_are_refused(streams, tmp_path):
+    paths = []
+    for name, stream, unit in (('a', streams[0], 'm/s^2'), ('g', streams[1], 'rad/s')):
+        head = 'time (s)' + ''.join(f',{name}{axis} ({unit})' for axis in 'xyz')
+        paths.append(tmp_path / f'{name}.csv')
+        write(paths[-1], SensorStream(0 * stream.stamp_ns + 1_730_000_000, stream.values), head)
+    with refused(InputError, 'stamps_equal', len(streams[0].stamp_ns)):
+        read_logs(paths)
+
+
 def test_two_logs_of_one_sensor_are_refused(folder):
     with refused(InputError, 'several_logs', 'Gyroscope.csv'):
         read_logs([folder / 'Gyroscope.csv', folder / 'Gyroscope.csv'])
