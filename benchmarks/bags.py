@@ -15,7 +15,7 @@ import numpy as np
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
@@ -57,7 +57,7 @@ def long_session(minutes, imu_rate=1000.0, joint_rate=200.0):
     model = SensorModel(
         accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=table.joint_names
     )
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         model,
         random_values(model),
         table,

@@ -50,9 +50,9 @@ from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
 from imu_calibration.simulation.session import (
     SimulationOptions,
     random_values,
-    simulate,
+    simulate_session,
 )  # noqa: E402
-from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
+from imu_calibration.use_cases.calibrate import calibrate_recordings  # noqa: E402
 
 from worlds.random_tables import random_table  # noqa: E402
 from worlds.stands import STANDS, quarter_tolerances, stand  # noqa: E402
@@ -101,7 +101,7 @@ def followed(plan, table, grade, seed):
     )
     model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names)
     values = random_values(model, grade, seed)
-    samples = simulate(
+    samples = simulate_session(
         model,
         values,
         table,
@@ -109,7 +109,7 @@ def followed(plan, table, grade, seed):
         options=SimulationOptions(noise=GRADES[grade].noise),
         seed=seed,
     )
-    return calibrate(SampleBlock(*samples), table).calibration, dict(
+    return calibrate_recordings(SampleBlock(*samples), table).calibration, dict(
         zip(model.param_names, values, strict=True)
     )
 

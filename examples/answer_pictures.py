@@ -14,9 +14,9 @@ from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.document import files
 from imu_calibration.document.exports.export import all_targets
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.compensate import compensate_recording
 from imu_calibration.use_cases.exporting import export_calibration
-from imu_calibration.use_cases.noise import noise
+from imu_calibration.use_cases.noise import identify_recording
 from imu_calibration.use_cases.recordings import Topics, source_of, temperatures
 
 RESULT = 'result/calibration.yaml'
@@ -136,7 +136,7 @@ def rest_against_temperature(imu):
 
 def warming_up(path):
     drawn, axes = figure(2)
-    corrected = compensate('warm', 'warm_result/calibration.yaml').imu
+    corrected = compensate_recording('warm', 'warm_result/calibration.yaml').imu
     for axis, imu, title in zip(axes, (readings('warm'), corrected), ('raw', 'compensated')):
         degrees, rate = rest_against_temperature(imu)
         axis.plot(degrees, rate - (0 if title == 'compensated' else rate[0]), '.')
@@ -254,7 +254,7 @@ def continuous_or_discrete(path):
 
 
 def noise_curve(path):
-    noise('rest').plot('gyroscope').save(path.with_suffix('.svg'))
+    identify_recording('rest').plot('gyroscope').save(path.with_suffix('.svg'))
 
 
 def imu_calib(path):

@@ -29,7 +29,7 @@ from imu_calibration.core.samples import ImuSamples  # noqa: E402
 from imu_calibration.document import files  # noqa: E402
 from imu_calibration.effects.forward_equations import sensor_output  # noqa: E402
 from imu_calibration.kinematics.rotations import Reference, align  # noqa: E402
-from imu_calibration.use_cases.calibrate import calibrate  # noqa: E402
+from imu_calibration.use_cases.calibrate import calibrate_recordings  # noqa: E402
 from msg_adapters.imu_stream import ImuStream  # noqa: E402
 from msg_adapters.write import write_session  # noqa: E402
 
@@ -269,7 +269,7 @@ def run(domain_id, picture, seconds, folder):
     time_, rate, force, path = drive(3, seconds)
     imu = measured(time_, rate, force, 4)
     write_session(folder / 'drive', imu)
-    calibrate([str(SESSION)], str(SESSION / 'table.yaml')).save(folder, report=False)
+    calibrate_recordings([str(SESSION)], str(SESSION / 'table.yaml')).save(folder, report=False)
     paths = navigate(folder / 'drive', folder / 'calibration.yaml', domain_id)
     lost = {topic: len(imu) - len(rows) for topic, rows in paths.items()}
     if max(lost.values()) > MOST_LOST:

@@ -10,7 +10,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import SI_UNITS
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.files import write_whole
-from msg_adapters.csv_log import SENSOR_OF, CsvLog, cells_of, name_with_unit
+from msg_adapters.csv_log import SENSOR_OF, CsvLog, name_with_unit, split_cells
 
 
 def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSamples) -> None:
@@ -66,7 +66,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
     # Rows as they were read, with new cells of force and rate.
     comma = text.decimal_comma and delimiter != ','
     for k, row in enumerate(text.row_of_sample.tolist()):
-        cells = cells_of(text.lines[row], text.delimiter, text.path)
+        cells = split_cells(text.lines[row], text.delimiter, text.path)
         for quantity, values in readings.items():
             for place, value in zip(text.places[quantity], values[k].tolist(), strict=True):
                 cells[place] = _number(value, comma)
@@ -76,7 +76,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
 
 def _is_number(text, place):
     """Return whether the first cell of a column is a number, not a date or a time of day."""
-    cell = cells_of(text.lines[0], text.delimiter, text.path)[place]
+    cell = split_cells(text.lines[0], text.delimiter, text.path)[place]
     return ':' not in cell
 
 

@@ -567,7 +567,7 @@ def _opened(path):
     return io.TextIOWrapper(open_regular(path), encoding='utf-8-sig', errors='replace')
 
 
-def cells_of(line: str, delimiter: str | None, path: Path) -> list[str]:
+def split_cells(line: str, delimiter: str | None, path: Path) -> list[str]:
     """Return the cells of a line; `delimiter` None: white space; `path` is named in errors."""
     line = line.lstrip('# ')
     if delimiter is None:
@@ -653,7 +653,7 @@ class _Table:
         self._values = {}
 
     def _cells(self, line):
-        return cells_of(line, self.delimiter, self.path)
+        return split_cells(line, self.delimiter, self.path)
 
     def column(self, name):
         """Return the index of a column by name or number."""

@@ -26,7 +26,7 @@ MESSAGE_HEADER = np.dtype(
 """Prefix of the data of a Message record, 31 bytes."""
 
 
-def text(value: bytes | str) -> bytes:
+def prefixed_string(value: bytes | str) -> bytes:
     """A string with its length in front."""
     data = value if isinstance(value, bytes) else value.encode()
     return struct.pack('<I', len(data)) + data
@@ -44,7 +44,9 @@ class McapWriter:
     def __init__(self, path: Path, _ros_distro: str, compression: str = ''):
         self.file = open(path, 'xb')
         self.compression, self.compress = compression, compressor(compression)
-        self.file.write(MAGIC + record(0x01, text('ros2'), text('imu_calibration')))
+        self.file.write(
+            MAGIC + record(0x01, prefixed_string('ros2'), prefixed_string('imu_calibration'))
+        )
         self.schemas, self.channels = {}, {}
         self.new_records = b''
         self.chunk_indexes = []
@@ -55,24 +57,24 @@ class McapWriter:
             schema = record(
                 0x03,
                 struct.pack('<H', len(self.schemas) + 1),
-                text(definition.type),
-                text(definition.encoding),
-                text(definition.text),
+                prefixed_string(definition.type),
+                prefixed_string(definition.encoding),
+                prefixed_string(definition.text),
             )
             self.schemas[definition.type] = (len(self.schemas) + 1, schema)
             self.new_records += schema
         metadata = (
-            text('offered_qos_profiles')
-            + text(qos)
-            + text('topic_type_hash')
-            + text(definition.digest)
+            prefixed_string('offered_qos_profiles')
+            + prefixed_string(qos)
+            + prefixed_string('topic_type_hash')
+            + prefixed_string(definition.digest)
         )
         channel = record(
             0x04,
             struct.pack('<HH', topic_id, self.schemas[definition.type][0]),
-            text(name),
-            text('cdr'),
-            text(metadata),
+            prefixed_string(name),
+            prefixed_string('cdr'),
+            prefixed_string(metadata),
         )
         self.channels[topic_id] = channel
         self.new_records += channel
@@ -105,7 +107,7 @@ class McapWriter:
         self.new_records = b''
         packed = self.compress(content)
         times = struct.pack('<QQ', int(headers['log_ns'].min()), int(headers['log_ns'].max()))
-        sizes = text(self.compression) + struct.pack('<Q', len(packed))
+        sizes = prefixed_string(self.compression) + struct.pack('<Q', len(packed))
         start = self.file.tell()
         self.file.write(
             record(
@@ -119,7 +121,7 @@ class McapWriter:
                 0x08,
                 times,
                 struct.pack('<QQ', start, length),
-                text(places),
+                prefixed_string(places),
                 struct.pack('<Q', self.file.tell() - start - length),
                 sizes,
                 struct.pack('<Q', len(content)),
@@ -132,7 +134,9 @@ class McapWriter:
             mine = headers['channel'] == channel
             entries = np.stack([headers['log_ns'][mine], offset[mine].astype('<u8')], axis=1)
             places += struct.pack('<HQ', channel, self.file.tell())
-            self.file.write(record(0x07, struct.pack('<H', channel), text(entries.tobytes())))
+            self.file.write(
+                record(0x07, struct.pack('<H', channel), prefixed_string(entries.tobytes()))
+            )
         return places
 
     def close(self, information: dict[str, Any], metadata: str) -> None:
@@ -140,7 +144,11 @@ class McapWriter:
         if self.new_records:
             self.file.write(self.new_records)
         metadata_start = self.file.tell()
-        content = record(0x0C, text('rosbag2'), text(text('serialized_metadata') + text(metadata)))
+        content = record(
+            0x0C,
+            prefixed_string('rosbag2'),
+            prefixed_string(prefixed_string('serialized_metadata') + prefixed_string(metadata)),
+        )
         self.file.write(content + record(0x0F, struct.pack('<I', 0)))
         counts = b''.join(
             struct.pack('<HQ', channel, entry['message_count'])
@@ -164,8 +172,14 @@ class McapWriter:
             0x03: [schema for _, schema in self.schemas.values()],
             0x04: list(self.channels.values()),
             0x08: self.chunk_indexes,
-            0x0D: [record(0x0D, struct.pack('<QQ', metadata_start, len(content)), text('rosbag2'))],
-            0x0B: [record(0x0B, statistics, text(counts))],
+            0x0D: [
+                record(
+                    0x0D,
+                    struct.pack('<QQ', metadata_start, len(content)),
+                    prefixed_string('rosbag2'),
+                )
+            ],
+            0x0B: [record(0x0B, statistics, prefixed_string(counts))],
         }
         summary_start = self.file.tell()
         offsets = self._write_groups(groups)

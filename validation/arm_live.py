@@ -17,7 +17,7 @@ from examples.processes import NodeProcesses, local_environment
 from imu_calibration.between_imus.arm import RelativeArm, estimate_arm
 from imu_calibration.between_imus.pair import clipped
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
-from imu_calibration.compensation.compensate import Transfer, compensate
+from imu_calibration.compensation.compensate import Transfer, compensated_samples
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from msg_adapters.bag import open_recording
@@ -239,8 +239,10 @@ def looking_ahead(case):
     slope = np.gradient(imu.rate_s, 1e-9 * (imu.stamp_ns - imu.stamp_ns[0]), axis=0)
     slope = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
     transfer = Transfer.from_pose('imu_b', xyz, rpy)
-    central = compensate(calibration, imu.force_s, imu.rate_s, alpha_s=slope, transfer=transfer)
-    still = compensate(
+    central = compensated_samples(
+        calibration, imu.force_s, imu.rate_s, alpha_s=slope, transfer=transfer
+    )
+    still = compensated_samples(
         calibration, imu.force_s, imu.rate_s, alpha_s=np.zeros_like(slope), transfer=transfer
     )
     lags = range(-4, 5)

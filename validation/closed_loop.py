@@ -21,7 +21,7 @@ import numpy as np
 
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.effects.base import AXES
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.choices import catalogue_of
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.simulate import replay, simulate
@@ -206,7 +206,9 @@ def exchanged(calibration, finding, mate, measured):
         f'{part}_model': '+'.join(getattr(less.with_effect(sensor, mate), part)) or 'none'
         for part in ('accelerometer', 'gyroscope', 'reference')
     }
-    other = calibrate(measured.samples, measured.table, model_as_asked=True, **names).calibration
+    other = calibrate_recordings(
+        measured.samples, measured.table, model_as_asked=True, **names
+    ).calibration
     return other if 'held' not in np.array(other.status)[other.model.slices[sensor, mate]] else None
 
 

@@ -14,7 +14,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.reference_effects import FAMILY, total_lags
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate, check
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from validation.section import Section, text
 from validation.shaft import read
 
@@ -58,7 +58,7 @@ def halves(block):
 @cache
 def _calibrated(folder, name, part):
     table, block = recording(folder, name)
-    return calibrate(block if part is None else halves(block)[part], table)
+    return calibrate_recordings(block if part is None else halves(block)[part], table)
 
 
 def transfer(folder, made, used, parts=(None, None)):
@@ -72,7 +72,7 @@ def transfer(folder, made, used, parts=(None, None)):
         found = _calibrated(folder, made, parts[0])
     except ImuCalibrationError as error:
         return error, None
-    return found, check(
+    return found, check_recording(
         block if parts[1] is None else halves(block)[parts[1]], found.calibration, table
     )
 
@@ -173,7 +173,7 @@ def must_be_refused(folder):
 
 def _attempt(source, table: Table, **choices):
     try:
-        found = calibrate(source, table, **choices)
+        found = calibrate_recordings(source, table, **choices)
     except ImuCalibrationError as error:
         return f'refused: {error}', True
     warned = [

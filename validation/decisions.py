@@ -25,8 +25,8 @@ from imu_calibration.core.samples import SampleBlock  # noqa: E402
 from imu_calibration.core.units import DEG, MILLI_G  # noqa: E402
 from imu_calibration.kinematics.table import Table  # noqa: E402
 from imu_calibration.use_cases.calibrate import (
-    calibrate,  # noqa: E402
-    check,  # noqa: E402
+    calibrate_recordings,  # noqa: E402
+    check_recording,  # noqa: E402
 )
 from validation.recordings import BY_HAND, data_folder, gravity_of, label, load  # noqa: E402
 from validation.section import Section  # noqa: E402
@@ -61,8 +61,8 @@ def judged(case, first, second, table=None, **choices) -> Iterator[Outcome]:
     Yield the Outcome of each sensor: calibrated on the first session, with the error on the second.
     """
     try:
-        found = calibrate(first, table, **choices)
-        proof = check(second, found.calibration, table, **choices).proof
+        found = calibrate_recordings(first, table, **choices)
+        proof = check_recording(second, found.calibration, table, **choices).proof
     except ImuCalibrationError:
         yield from (
             Outcome(case, sensor, 'refused', float('nan'))

@@ -18,8 +18,8 @@ import numpy as np
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
+from imu_calibration.use_cases.compensate import compensate_recording
 from imu_calibration.use_cases.diagnose import diagnose
 from validation import foreign_worlds
 from validation.foreign_worlds import PLACED, TABLE, UNPLACED, make_world
@@ -152,8 +152,10 @@ def _second_session(block, table, kind, unit, motion):
     every_effect: dict[str, Any] = {}
     for choices in (every_effect, plain):
         try:
-            corrected = compensate(
-                block_of(second), calibrate(block, table, **choices).calibration, anyway=True
+            corrected = compensate_recording(
+                block_of(second),
+                calibrate_recordings(block, table, **choices).calibration,
+                anyway=True,
             ).imu
         except ImuCalibrationError as error:
             return {'refused': str(error)[:200]}

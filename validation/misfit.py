@@ -8,7 +8,7 @@ do not.
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.decision import HARM, HELPS, harmed
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate, check
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 from validation.section import Section, text
 
 SEED = 31
@@ -36,11 +36,11 @@ def outcome(cause, options):
     pair = make_pair(cause, SEED, **options)
     table = Table.from_mapping(pair.table)
     try:
-        found = calibrate(pair.first.block, table)
+        found = calibrate_recordings(pair.first.block, table)
     except ImuCalibrationError as error:
         return [f'refused: {error}', '', ''], []
     proof, decisions = (
-        check(pair.second.block, found.calibration, table).proof,
+        check_recording(pair.second.block, found.calibration, table).proof,
         found.calibration.decisions,
     )
     ratios = {sensor: entry['after'] / entry['before'] for sensor, entry in proof.items()}

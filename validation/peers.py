@@ -17,7 +17,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from validation.hand_peers import imu_calib, imu_tk, norm_fit, six_faces, turned
 from validation.second_opinions import Forward, fit_norm
 from validation.section import Section, text
@@ -167,7 +167,9 @@ def by_hand(make):
         bias_f, matrix_f, bias_w, matrix_w = unpack(values)
         truth = Forward(bias_f, matrix_f), Forward(bias_w, matrix_w)
         try:
-            mine = errors(ours(calibrate(SampleBlock(imu), gravity=GRAVITY).calibration), truth)
+            mine = errors(
+                ours(calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration), truth
+            )
         except ImuCalibrationError:
             mine = [np.inf, np.inf]
         rows.append(
@@ -193,7 +195,7 @@ def trial(make):
         bias_f, matrix_f, bias_w, matrix_w = unpack(values)
         truth = Forward(bias_f, matrix_f), Forward(bias_w, matrix_w)
         methods = {
-            'ours': ours(calibrate(SampleBlock(imu), gravity=GRAVITY).calibration),
+            'ours': ours(calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration),
             **{
                 peer.__name__: peer(imu, ranges, GRAVITY)
                 for peer in (imu_tk, imu_calib, norm_fit, six_faces)
@@ -266,7 +268,7 @@ def on_a_table():
             [
                 errors(found, truth)
                 for found in (
-                    ours(calibrate(session.block, table).calibration),
+                    ours(calibrate_recordings(session.block, table).calibration),
                     plain_on_a_table(session.block, table),
                 )
             ]

@@ -1,6 +1,6 @@
 """One joint is a table too: a motor shaft with a coarse encoder."""
 
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.calibration import Calibration
@@ -30,7 +30,7 @@ def calibrations(folder, name):
     found: dict[str, Calibration | str] = {}
     for what, options in (('default', CalibrationOptions()), ('with lag', WITH_LAG)):
         try:
-            found[what] = calibrate([lambda: iter(blocks)], table, options).calibration
+            found[what] = calibrate_on_table([lambda: iter(blocks)], table, options).calibration
         except ImuCalibrationError as error:
             found[what] = str(error)
     return found

@@ -13,7 +13,7 @@ from unittest import mock
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.samples import ImuSamples, JointSamples
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
@@ -129,7 +129,7 @@ def calibrate_through_a_bag(imu, joints):
         write_session(path, imu, joints)
         with open_recording(path) as recording:
             blocks = list(recording.blocks(table.joint_names))
-    return calibrate([lambda: iter(blocks)], table).calibration
+    return calibrate_on_table([lambda: iter(blocks)], table).calibration
 
 
 def compare(calibration):

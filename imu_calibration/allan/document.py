@@ -61,10 +61,10 @@ STATUSES = (DETERMINED, WEAK, HELD)
 
 def noise_to_text(figures: NoiseFigures, horizon: float = HORIZON) -> str:
     """Return noise.yaml."""
-    return to_text(to_mapping(figures, horizon))
+    return to_text(noise_mapping(figures, horizon))
 
 
-def to_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
+def noise_mapping(figures: NoiseFigures, horizon: float = HORIZON) -> dict:
     """Return the document as plain dicts, lists, numbers and strings, in a fixed order."""
     document = {
         'format': NOISE_FORMAT,
@@ -544,12 +544,12 @@ def counts(figures: NoiseFigures) -> dict[str, int]:
     return {status: statuses.count(status) for status in STATUSES}
 
 
-def exit_code(figures: NoiseFigures) -> int:
+def noise_exit_code(figures: NoiseFigures) -> int:
     """Return 0 when every required figure is determined and few samples were dropped, else 3."""
-    return exit_code_of(shortcomings(figures))
+    return exit_code_of(noise_shortcomings(figures))
 
 
-def shortcomings(figures: NoiseFigures) -> list[str]:
+def noise_shortcomings(figures: NoiseFigures) -> list[str]:
     """Return why the exit code is 3, a line each; empty for 0."""
     found, lines = counts(figures), []
     if lacking := found[WEAK] + found[HELD]:

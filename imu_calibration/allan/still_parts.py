@@ -15,7 +15,7 @@ from imu_calibration.allan.outliers import RestOutliers, without_outliers
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock, runs_of
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.rest_detection import shrunk
+from imu_calibration.preprocessing.rest_detection import shrunk_mask
 from imu_calibration.preprocessing.scan import (
     CHUNK_SECONDS,
     Chunks,
@@ -103,7 +103,7 @@ def still_parts(
         chunks.select(~frozen), still_chunks(chunks.select(~frozen)) & same[~frozen]
     )
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
-    inner = shrunk(still, margin)
+    inner = shrunk_mask(still, margin)
     parts, short = [], 0.0
     for first, last in runs_of(inner, np.diff(chunks.time) > BRIDGE):
         part = _part(chunks, first, last)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.coverage import DIRECTIONS, excess, share_gained
+from imu_calibration.calibration.coverage import DIRECTIONS, sd_excess, share_gained
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import LACKING
@@ -251,7 +251,7 @@ class HandKnowledge:
 
         Leading axes are kept.
         """
-        return excess(self.sd(information)[..., only], self.tolerances[only])
+        return sd_excess(self.sd(information)[..., only], self.tolerances[only])
 
     def best(
         self, only: Sequence[int] | slice = slice(None), *, weight: float = 1.0

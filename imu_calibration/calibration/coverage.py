@@ -176,7 +176,7 @@ NOTHING_SEEN = Coverage(
 """Before anything is known."""
 
 
-def excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
+def sd_excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
     """
     Return the excess of standard deviations over their tolerances.
 
@@ -220,7 +220,7 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     wider = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
 
     def left(information):
-        return excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
+        return sd_excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
 
     def added(motion):
         return added_information(
@@ -315,7 +315,7 @@ WANTED, VISITED, DONE_COLOUR, ARROW, NOW, TEXT_COLOUR = (
 SEEN_DIAMETER = 0.03
 
 
-def cells_of(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...], float]]:
+def sphere_cells(coverage: Coverage) -> Iterator[tuple[np.ndarray, tuple[float, ...], float]]:
     """
     Yield (place, colour, diameter) of each cell.
 

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from imu_calibration.calibration.proof import compared
-from imu_calibration.compensation.compensate import Corrected, compensate
+from imu_calibration.compensation.compensate import Corrected, compensated_samples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import Uncorrected, judged_from_of, uncorrected_in_time
 from imu_calibration.effects.forward_equations import applied_values
@@ -219,7 +219,9 @@ def corrected_with(
     known = Calibration(
         model.model.at(values), values, np.zeros((model.size,) * 2), (HELD,) * model.size
     )
-    return compensate(known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c)
+    return compensated_samples(
+        known, force, rate, alpha_s=np.zeros_like(force), temperature_c=temperature_c
+    )
 
 
 def turn_errors(

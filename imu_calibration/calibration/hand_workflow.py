@@ -79,7 +79,7 @@ class EvidentHand:
     """Changes of the requested model by the evidence."""
 
 
-def solve_by_evidence(
+def solve_hand_by_evidence(
     data: HandData, options: HandOptions = HandOptions(), *, as_asked: bool = False
 ) -> EvidentHand:
     """
@@ -416,7 +416,7 @@ def evident_result(
     """Return (the HandResult, the search results); `stills` as in `calibrate_by_hand`."""
     asked = hand_options(options)
     data = gather_by_hand(recording.imu, stills, temperature_c=recording.temperature_c)
-    evident = solve_by_evidence(data, asked, as_asked=options.as_asked)
+    evident = solve_hand_by_evidence(data, asked, as_asked=options.as_asked)
     return (
         hand_result(evident, recording, options, provenance=provenance, turns=data.turns),
         evident,
@@ -562,7 +562,7 @@ def check_by_hand(
         )
     gravity = gravity_of(calibration, options)
     return CheckResult(
-        prove_readings(data, recording.imu, corrected, gravity=gravity, absent=absent),
+        prove_hand_readings(data, recording.imu, corrected, gravity=gravity, absent=absent),
         recording.findings,
         dropped=dropped_text(lost, len(recording.imu)),
     )
@@ -577,7 +577,7 @@ def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
     return options.gravity or calibration.conditions.get('gravity') or STANDARD_GRAVITY
 
 
-def prove_readings(
+def prove_hand_readings(
     data: HandData,
     before: ImuSamples,
     after: ImuSamples,

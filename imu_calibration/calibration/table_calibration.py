@@ -61,7 +61,7 @@ from imu_calibration.references.turntable.session_data import HeldOut, SessionDa
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
 
 
-def calibrate(
+def calibrate_on_table(
     sources: Sequence[Callable],
     table: Table,
     options: CalibrationOptions = CalibrationOptions(),

@@ -26,16 +26,16 @@ def run(options: Options) -> VerbResult:
     """Calibrate into a folder that can be written, print the verdict, return the exit code."""
     from imu_calibration.cli.show import show_calibration, warn
     from imu_calibration.document import files
-    from imu_calibration.document.calibration_text import to_mapping
-    from imu_calibration.use_cases.calibrate import calibrate
+    from imu_calibration.document.calibration_text import calibration_mapping
+    from imu_calibration.use_cases.calibrate import calibrate_recordings
 
     options.require_place(options.bags)
     with files.output_folder(options.output) as folder:
         choices = options.choices()
-        found = calibrate(
+        found = calibrate_recordings(
             options.bags, options.stand(), jobs=options.jobs, earlier=options.earlier, **choices
         )
         warn(found.calibration.statistics['preflight'])
         found.save(folder, report=not options.no_report, force=True)  # `require_place`
         show_calibration(found, folder, options.hints(), report=not options.no_report)
-        return VerbResult(found.exit_code, to_mapping(found.calibration), found.reasons)
+        return VerbResult(found.exit_code, calibration_mapping(found.calibration), found.reasons)

@@ -42,10 +42,10 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.document import files
     from imu_calibration.preprocessing.checks import warnings
     from imu_calibration.report.answer_page import answer_page
-    from imu_calibration.use_cases.calibrate import check
+    from imu_calibration.use_cases.calibrate import check_recording
 
     page = options.page('check.html')
-    found = check(
+    found = check_recording(
         options.bag,
         options.calibration,
         options.stand(),

@@ -73,10 +73,10 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Compensate into a new bag, print warnings and losses, return the exit code."""
-    from imu_calibration.use_cases.compensate import compensate
+    from imu_calibration.use_cases.compensate import compensate_recording
     from msg_adapters.csv_log import is_text_log
 
-    found = compensate(options.bag, **options.arguments_for(compensate))
+    found = compensate_recording(options.bag, **options.arguments_for(compensate_recording))
     for line in found.warnings:
         print_line(f'note: {line}')
     for line in found.reasons:

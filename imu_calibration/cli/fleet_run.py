@@ -93,7 +93,7 @@ def is_bag(path: Path) -> bool:
     )
 
 
-def unit_of(
+def fleet_unit(
     name: str,
     paths: Sequence[Path],
     topics: Topics,
@@ -131,7 +131,7 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     choices = options.choices()
     used = provenance_with('fleet', (), choices, stand=options.stand())['options']
     units = [
-        unit_of(name, paths, topics_of(choices), joint_names=table.joint_names, options=used)
+        fleet_unit(name, paths, topics_of(choices), joint_names=table.joint_names, options=used)
         for name, paths in found
     ]
     with files.output_folder(options.output) as folder:
@@ -148,7 +148,7 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
         for result in results:
             if result.files:
                 files.write_texts(folder / result.name, result.files)
-        rows = {'summary.csv': parameter_rows(spreads), 'units.csv': unit_rows(results)}
+        rows = {'summary.csv': fleet_parameter_rows(spreads), 'units.csv': fleet_unit_rows(results)}
         files.write_texts(
             folder,
             {name: csv_text(table) for name, table in rows.items()}
@@ -179,7 +179,7 @@ def _table(options, bags):
     return table_of(stand, bags[-1:], topics)
 
 
-def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
+def fleet_parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
     """Return the summary: one row per parameter, SI."""
     return [
         dict(
@@ -202,7 +202,7 @@ def parameter_rows(spreads: Sequence[Spread]) -> list[dict[str, Any]]:
     ]
 
 
-def unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
+def fleet_unit_rows(results: Sequence[UnitResult]) -> list[dict[str, Any]]:
     """
     Return one row per unit.
 
@@ -269,7 +269,7 @@ def _cell(value):
     return '' if isinstance(value, float) and math.isnan(value) else value
 
 
-def shown(spread: Spread) -> tuple[str, ...]:
+def printed_parameter(spread: Spread) -> tuple[str, ...]:
     """
     Return the printed cells of a parameter.
 
@@ -311,7 +311,7 @@ def show_fleet(
     show_table(
         out,
         SPREAD_HEADINGS,
-        map(shown, spreads),
+        map(printed_parameter, spreads),
         numbers=[SPREAD_HEADINGS[k] for k in (1, 2, 3, 5)],
     )
     for result in results:
@@ -350,5 +350,5 @@ def summary_html(results: Sequence[UnitResult], spreads: Sequence[Spread]) -> st
         word=word,
         results=results,
         columns=SPREAD_HEADINGS,
-        rows=[shown(spread) for spread in spreads],
+        rows=[printed_parameter(spread) for spread in spreads],
     )

@@ -35,7 +35,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.preprocessing.checks import refuse
     from imu_calibration.use_cases.choices import calibration_options, topics_of
-    from imu_calibration.use_cases.inspect import imu_topics_of, inspect, split_topics
+    from imu_calibration.use_cases.inspect import imu_topics_of, inspect_recording, split_topics
     from imu_calibration.use_cases.recordings import Topics, existing, table_of
 
     bag, choices, stand, hints = (
@@ -50,7 +50,7 @@ def run(options: Options) -> VerbResult:
         if stand is None
         else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
     )
-    looks = inspect(
+    looks = inspect_recording(
         bag, topics, table, options=calibration_options(choices), exclude=options.exclude
     )
     out = Terminal.of()

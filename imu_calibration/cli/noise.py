@@ -42,20 +42,22 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def run(options: Options) -> VerbResult:
     """Identify into a folder that can be written, print the figures, return the exit code."""
-    from imu_calibration.allan.document import to_mapping
+    from imu_calibration.allan.document import noise_mapping
     from imu_calibration.document import files
     from imu_calibration.use_cases.choices import require_same_inputs
-    from imu_calibration.use_cases.noise import noise, noise_provenance
+    from imu_calibration.use_cases.noise import identify_recording, noise_provenance
     from imu_calibration.use_cases.recordings import existing
 
     choices = {
-        name: value for name, value in options.arguments_for(noise).items() if value is not None
+        name: value
+        for name, value in options.arguments_for(identify_recording).items()
+        if value is not None
     }
     if not options.force and (Path(options.output) / 'noise.yaml').exists():
         found = noise_provenance(existing(options.bag))
         require_same_inputs(options.output, found, 'noise.yaml')
     with files.output_folder(options.output) as folder:
-        found = noise(options.bag, **choices)
+        found = identify_recording(options.bag, **choices)
         for warning in found.warnings:
             complain(f'warning: {warning}')
         found.save(folder, report=not options.no_report, force=True)
@@ -65,7 +67,9 @@ def run(options: Options) -> VerbResult:
             folder,
             'noise.yaml' + ('' if options.no_report else ' and report.html'),
         )
-        return VerbResult(found.exit_code, to_mapping(found.figures, found.horizon), found.reasons)
+        return VerbResult(
+            found.exit_code, noise_mapping(found.figures, found.horizon), found.reasons
+        )
 
 
 def _show(found, rates, folder, names):

@@ -145,14 +145,14 @@ def _stand(options):
 
 
 def _show(planned, folder):
-    from imu_calibration.use_cases.plan import summary
+    from imu_calibration.use_cases.plan import plan_summary
 
     made, most = planned.plan, None if planned.table is None else MAX_PRINTED_MOTIONS
     for end, motion in list(zip(made.ends, made.motions, strict=True))[:most]:
         print_line(f'until {end:6.1f} s  {motion.words}', ' ' * 16)
     if most is not None and len(made.motions) > most:
         print(f'... and {len(made.motions) - most} more, in plan.yaml')
-    for line in [*summary(made), *planned.notes]:
+    for line in [*plan_summary(made), *planned.notes]:
         print_line(line, '    ')
     print_line(
         f'written: plan.yaml{"" if planned.table is None else " and the trajectory"} in {folder}'

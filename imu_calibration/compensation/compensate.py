@@ -194,7 +194,7 @@ def invertible_values(calibration: FittedErrors) -> tuple[SensorModel, np.ndarra
     return model, values
 
 
-def compensate(
+def compensated_samples(
     calibration: FittedErrors,
     force_s: np.ndarray,
     rate_s: np.ndarray,
@@ -247,7 +247,7 @@ def compensate(
     flagged = marks.any(axis=1) | beyond
     if transfer is None:
         return Corrected(true_force, true_rate, flagged, marks)
-    return Corrected(*moved(transfer, true_force, true_rate, alpha_s=alpha_s), flagged, marks)
+    return Corrected(*at_target(transfer, true_force, true_rate, alpha_s=alpha_s), flagged, marks)
 
 
 def _invert(model, values, force_s, rate_s, alpha_s, beside):
@@ -283,7 +283,7 @@ def _invert(model, values, force_s, rate_s, alpha_s, beside):
     )
 
 
-def moved(
+def at_target(
     transfer: Transfer, force_s: np.ndarray, rate_s: np.ndarray, *, alpha_s: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (force, rate) at the target point in the target frame."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imu_calibration.compensation.compensate import FittedErrors, compensate
+from imu_calibration.compensation.compensate import FittedErrors, compensated_samples
 from imu_calibration.core.units import STANDARD_GRAVITY, significant
 from imu_calibration.effects.base import SENSORS, UNITS
 
@@ -84,7 +84,7 @@ def implausible_change(calibration: FittedErrors, reference: FittedErrors | None
 
 
 def _corrected(calibration, raw, temperature_c):
-    corrected = compensate(
+    corrected = compensated_samples(
         calibration,
         raw.force,
         raw.rate,

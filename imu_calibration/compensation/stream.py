@@ -19,7 +19,7 @@ from imu_calibration.compensation.compensate import (
     FittedErrors,
     Transfer,
     arms_of,
-    compensate,
+    compensated_samples,
     invertible,
     outside_conditions,
     saturation_level,
@@ -107,7 +107,7 @@ class CompensationStream:
             )
         )
         vibration = self._vibration_of(imu.force_s, has_force)
-        corrected = compensate(
+        corrected = compensated_samples(
             self.calibration,
             force_s,
             rate_s,

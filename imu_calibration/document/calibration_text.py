@@ -481,7 +481,7 @@ def checked_tolerances(
     return mapping
 
 
-def to_mapping(calibration: Calibration) -> dict:
+def calibration_mapping(calibration: Calibration) -> dict:
     """Return the document as plain dicts, lists, floats and strings, in a fixed order."""
     document: dict[str, Any] = {
         'format': CALIBRATION_FORMAT,
@@ -600,7 +600,7 @@ def _check_format(found):
 
 def calibration_to_text(calibration: Calibration) -> str:
     """Return a calibration as the YAML of its document."""
-    return to_text(to_mapping(calibration))
+    return to_text(calibration_mapping(calibration))
 
 
 def calibration_from_text(text: str) -> Calibration:

@@ -255,7 +255,7 @@ def helps_everywhere(entry: Mapping | None) -> bool:
     )
 
 
-def misfits(calibration: Calibration) -> list[Reason]:
+def motion_misfits(calibration: Calibration) -> list[Reason]:
     """
     Return the residuals in motion above the noise at rest.
 
@@ -391,7 +391,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
         _undetermined(calibration)
         + _blind(calibration)
         + _implausible(calibration)
-        + misfits(calibration)
+        + motion_misfits(calibration)
     )
     reasons += _doubtful_scales(calibration) + _strange_causes(calibration)
     reasons += _worse(calibration) + _unused_rests(calibration)

@@ -20,9 +20,9 @@ from imu_calibration.calibration.coverage import (
     Coverage,
     GroupState,
     arrows_of,
-    cells_of,
     label_of,
     seen_of,
+    sphere_cells,
 )
 from imu_calibration.calibration.diagnosis import live_diagnosis as diagnosis
 from imu_calibration.core.progress import LiveState
@@ -302,7 +302,7 @@ def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:
     made = [Marker(ns='all', action=Marker.DELETEALL)]
     made += [
         _marker('cells', k, Marker.SPHERE, color=(*color, 0.9), scale=(size,) * 3, place=place)
-        for k, (place, color, size) in enumerate(cells_of(coverage))
+        for k, (place, color, size) in enumerate(sphere_cells(coverage))
     ]
     seen, color, diameter = seen_of(coverage)
     if len(seen):

@@ -17,7 +17,11 @@ from imu_calibration.core.units import DEG
 from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.planning.path_watch import PathWatch
-from imu_calibration.simulation.table_controller import LIMIT_ROUNDING, excess, trajectory_from
+from imu_calibration.simulation.table_controller import (
+    LIMIT_ROUNDING,
+    limit_excess,
+    trajectory_from,
+)
 
 OVERSPEED = 1.25
 """
@@ -269,7 +273,7 @@ class Driver:
     def _require_within_limits(self, points):
         assert self.position is not None
         path = trajectory_from(rest_at(self.position[None]), points)
-        beyond, speed, acceleration = excess(path, self.limits)
+        beyond, speed, acceleration = limit_excess(path, self.limits)
         # A joint whose encoder reads slightly outside its range may return into it.
         outside = np.maximum(self.limits.lower - self.position, self.position - self.limits.upper)
         beyond -= max(float(np.max(outside)), 0.0)

@@ -135,7 +135,7 @@ def remaining(problem: PlanningProblem, sequence: Sequence[int], start: int) -> 
     )
 
 
-def exchanged(
+def shortened_plan(
     problem: PlanningProblem, sequence: Sequence[int], start: int, *, fixed: int = 0
 ) -> list[int]:
     """
@@ -387,7 +387,7 @@ class Planner:
 
     def _sequence(self, place, first, longest):
         sequence = greedy(self.problem, place, first=first, longest=longest)
-        return exchanged(self.problem, sequence, place, fixed=len(first))
+        return shortened_plan(self.problem, sequence, place, fixed=len(first))
 
     def within(self, seconds: float) -> None:
         """Drop causes that no plan of this time separates."""

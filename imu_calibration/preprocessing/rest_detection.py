@@ -278,7 +278,9 @@ class Cells:
 
     def samples(self, mask: np.ndarray) -> np.ndarray:
         """Return the samples of the cells of a mask, without a margin at its ends."""
-        return np.repeat(shrunk(mask, int(np.ceil(self.cells_in(_GUARD)))), np.diff(self.edges))
+        return np.repeat(
+            shrunk_mask(mask, int(np.ceil(self.cells_in(_GUARD)))), np.diff(self.edges)
+        )
 
 
 def _running(values):
@@ -293,7 +295,7 @@ def _covered(calm, width):
     return maximum_filter1d(padded, width, origin=(width - 1) // 2, mode='constant')
 
 
-def shrunk(mask: np.ndarray, margin: int) -> np.ndarray:
+def shrunk_mask(mask: np.ndarray, margin: int) -> np.ndarray:
     """
     Return `mask` without the cells within `margin` cells of a False one.
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.result import CalibrationResult, WindowErrors
-from imu_calibration.compensation.compensate import compensate
+from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.observability import _attitudes
@@ -240,7 +240,7 @@ def _moving_runs(result, window, length):
         if window.temperature_c is None
         else window.temperature_c[some]
     )
-    corrected = compensate(
+    corrected = compensated_samples(
         result.calibration,
         window.force_s[some],
         window.rate_s[some],

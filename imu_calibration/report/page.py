@@ -32,7 +32,7 @@ def _environment():
         lstrip_blocks=True,
     )
     environment.filters |= {
-        'number': text,
+        'number': number_text,
         'fixed': fixed,
         'in_unit': in_unit,
         'chance': chance,
@@ -52,7 +52,7 @@ def _environment():
     return environment
 
 
-def text(value: float | None, digits: int = 3) -> str:
+def number_text(value: float | None, digits: int = 3) -> str:
     """
     Return a number with `digits` significant digits and a real minus sign.
 
@@ -96,12 +96,12 @@ def people(value: float, sd: float, unit: str, *, quantity: str = '') -> tuple[s
 def in_unit(value: float, unit: str, digits: int = 3, *, quantity: str = '') -> str:
     """Return a value with its unit of `units.for_people`."""
     factor, shown = for_people(unit, quantity)
-    return text(value * factor, digits) + ('' if shown == '1' else f' {shown}')
+    return number_text(value * factor, digits) + ('' if shown == '1' else f' {shown}')
 
 
 def chance(probability: float) -> str:
     """Return a probability as text; an underflow is not shown as zero."""
-    return text(probability, 2) if probability > 1e-99 else 'below 10⁻⁹⁹'
+    return number_text(probability, 2) if probability > 1e-99 else 'below 10⁻⁹⁹'
 
 
 def in_type(sentence: str) -> str:

@@ -19,8 +19,8 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import WindowEvidence, agree, folds_of
 from imu_calibration.selection.noise_beside_effects import (
-    first_noise,
     in_trusted_band,
+    noise_before_fit,
     noise_beside_effects,
 )
 from imu_calibration.selection.parameter_space import (
@@ -290,7 +290,7 @@ def _at_baseline(recording, baseline, used):
         space = in_trusted_band(parameter_space(recording, baseline))
         values = recording.values.copy()
         values[list(used)] += solve_normal(
-            normal_matrix(space, first_noise(space)),
+            normal_matrix(space, noise_before_fit(space)),
             used,
             space.prior_sd,
             prior_mean=space.prior_mean,

@@ -113,7 +113,7 @@ def noise_beside_effects(
         Sensor -> its bias processes, where measured separately.
 
     """
-    noise, every = first_noise(space), np.arange(space.size)
+    noise, every = noise_before_fit(space), np.arange(space.size)
     noise = {
         sensor: replace(own, known=(known or {}).get(sensor, ())) for sensor, own in noise.items()
     }
@@ -160,7 +160,7 @@ def plausible_processes(
     return tuple(replace(process, sd=share * process.sd) for process in noise.bias_processes)
 
 
-def first_noise(space: ParameterSpace) -> dict[str, NoiseModel]:
+def noise_before_fit(space: ParameterSpace) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel before anything is fitted: the noise at rest."""
     found = {}
     for sensor in SENSORS:

@@ -77,7 +77,7 @@ def measured(window: Window, sensor: str) -> np.ndarray:
     return window.force_s if sensor == 'accelerometer' else window.rate_s
 
 
-def noise_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
+def sample_sd_at_rest(windows: Sequence[Window], sensor: str) -> np.ndarray:
     """
     Return the sd of samples in static windows, shape (3,).
 
@@ -122,7 +122,7 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
             coefficients(model, sensor, values),
             coefficient_jacobian(model, sensor, values),
         )
-        weight = 1 / noise_at_rest(windows, sensor) ** 2
+        weight = 1 / sample_sd_at_rest(windows, sensor) ** 2
         for axis in range(3):
             rows = np.column_stack(
                 [design @ slope[:, axis], output[:, axis] - design @ base[:, axis]]
@@ -295,7 +295,7 @@ def _limits(windows, table, model):
         sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows))
         for sensor in suspects
     }
-    noise_sd = {sensor: noise_at_rest(windows, sensor) for sensor in SENSORS}
+    noise_sd = {sensor: sample_sd_at_rest(windows, sensor) for sensor in SENSORS}
     kept = windows
     for _ in range(2):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))

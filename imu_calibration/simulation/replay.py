@@ -14,7 +14,7 @@ from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, WindowKind, all_samples, chunks
 from imu_calibration.preprocessing.window_finder import MotionGatherer
-from imu_calibration.simulation.sensor_noise import gauss_markov
+from imu_calibration.simulation.sensor_noise import gauss_markov_samples
 from imu_calibration.simulation.session import turning_world, unit_hum
 
 BIAS_TIME = 100.0
@@ -52,7 +52,7 @@ def predict_windows(
     return {sensor: output[rows] for sensor, output in zip(SENSORS, outputs)}
 
 
-def noise_at_rest(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
+def recorded_noise(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
     """
     Return sensor -> noise of a recording.
 
@@ -78,7 +78,7 @@ def noise_at_rest(windows: Sequence[Window]) -> dict[str, ReplayNoise]:
     }
 
 
-def replay(
+def simulate_on_recording(
     blocks: Iterable[SampleBlock],
     table: Table,
     model: SensorModel,
@@ -123,7 +123,7 @@ def replay(
     outputs = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
     stamps = np.concatenate([window.stamp_ns for window in windows])
     period = float(np.median([window.period for window in windows if len(window) > 1] or [1.0]))
-    noise, rng = noise or noise_at_rest(windows), np.random.default_rng([seed, 3])
+    noise, rng = noise or recorded_noise(windows), np.random.default_rng([seed, 3])
     exact = {sensor: np.concatenate([output[sensor] for output in outputs]) for sensor in SENSORS}
     if model.uses('vibration'):  # biases follow the vibration of the readings
         known = [
@@ -137,7 +137,7 @@ def replay(
     for sensor in SENSORS:
         own, shape = noise[sensor], exact[sensor].shape
         noisy = exact[sensor] + rng.normal(0.0, own.white_sd, shape)
-        noisy += gauss_markov(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
+        noisy += gauss_markov_samples(own.bias_sd, own.bias_time, period, shape=shape, rng=rng)
         readings.append(clip(model, sensor, values, output=noisy))
     frame = next(block.imu.frame_id for block in blocks if block.imu is not None and len(block.imu))
     joints, temperature = (

@@ -134,7 +134,7 @@ def realistic(
     )
 
 
-def gauss_markov(
+def gauss_markov_samples(
     standard_deviation: float | np.ndarray,
     correlation_time: float,
     step: float,
@@ -219,7 +219,7 @@ class ImuNoise:
     def _added(self, true, density, instability, before):
         """Return (values with noise, last value of the bias)."""
         values = true + self._rng.normal(0.0, density * np.sqrt(self._rate), true.shape)
-        bias = gauss_markov(
+        bias = gauss_markov_samples(
             instability,
             self._model.correlation_time,
             1.0 / self._rate,

@@ -288,7 +288,10 @@ class LiveSimulation:
     ) -> SimulatedBlock:
         """Return the samples at the times of each stream, s."""
         imu = self._imu(imu_time)
-        motion, warmth = self.motion.at(joint_time), temperature_at(temperature_time, self.options)
+        motion, warmth = (
+            self.motion.at(joint_time),
+            warm_up_temperature(temperature_time, self.options),
+        )
         position = read_encoders(motion.position, self.options.noise, self._rng)
         velocity = motion.rate if self.options.with_velocity else np.full_like(motion.rate, np.nan)
         joints = JointSamples(
@@ -364,7 +367,7 @@ class LiveSimulation:
         return true_force, gyroscope.rate_s
 
 
-def simulate(
+def simulate_session(
     model: SensorModel,
     values: np.ndarray,
     table: Table,
@@ -419,7 +422,7 @@ def answered(
 
     Motion, warm-up, and a machine if biases depend on vibration.
     """
-    warmth, hum = temperature_at(time, options), 0.0
+    warmth, hum = warm_up_temperature(time, options), 0.0
     if warmth is not None:  # it never turns (`kinematics.signal_history`)
         motion = replace(
             motion,
@@ -432,7 +435,7 @@ def answered(
     return force + hum, rate
 
 
-def temperature_at(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
+def warm_up_temperature(time: np.ndarray, options: SimulationOptions) -> np.ndarray | None:
     """
     Return the temperature of the warm-up, or None without a temperature topic.
 

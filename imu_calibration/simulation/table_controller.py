@@ -118,7 +118,7 @@ def braking_from(start: JointMotion, limits: MotionLimits) -> JointTrajectory:
     )
 
 
-def excess(
+def limit_excess(
     trajectory: JointTrajectory, limits: MotionLimits, step: float = 0.005
 ) -> tuple[float, float, float]:
     """
@@ -279,7 +279,7 @@ class TableController:
         self._taken = [*self._taken, (begin, trajectory)][-KEPT_MOTIONS:]
 
     def _within_limits(self, start, points, trajectory):
-        beyond, speed, acceleration = excess(trajectory, self.limits)
+        beyond, speed, acceleration = limit_excess(trajectory, self.limits)
         if beyond > LIMIT_ROUNDING:
             raise InputError(
                 'a trajectory must stay within the range of the joints, it exceeds it by'

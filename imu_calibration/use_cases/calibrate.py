@@ -131,7 +131,7 @@ class Calibrated:
         return f'<p><b>{self.verdict.text}</b></p><ul>{lines}</ul>{self.calibration._repr_html_()}'
 
 
-def calibrate(
+def calibrate_recordings(
     recordings: str | PathLike | SampleBlock | Sequence,
     table: Stand | None = None,
     *,
@@ -237,7 +237,7 @@ def _side_by_side(sources, table, options, recordings, jobs):
     return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result
 
 
-def check(
+def check_recording(
     recording: str | PathLike | SampleBlock,
     calibration: Calibration | str | PathLike,
     table: Stand | None = None,

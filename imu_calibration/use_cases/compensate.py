@@ -86,7 +86,7 @@ class Compensated:
         return '\n'.join([f'<Compensated: {self.count} samples>', *self.warnings])
 
 
-def compensate(
+def compensate_recording(
     recording: str | PathLike | ImuSamples | SampleBlock,
     calibration: Calibration | str | PathLike,
     *,

@@ -13,9 +13,9 @@ from imu_calibration.document.exports.export import Export, export, find_target
 from imu_calibration.document.exports.loss import (
     TrialMotion,
     import_file,
+    measured_temperature,
     motion_of,
     recorded_motion,
-    temperature_at,
 )
 from imu_calibration.preprocessing.window_finder import session_truth
 from imu_calibration.use_cases.choices import raw_columns
@@ -106,7 +106,7 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
         )
     table = table_of(stand, [bag], topics)
     imu, ref = session_truth(source_of(bag, topics, table.joint_names)(), table)
-    warmth = temperature_at(calibration, temperature, imu.stamp_ns)
+    warmth = measured_temperature(calibration, temperature, imu.stamp_ns)
     return motion_of(
         ref.force_s,
         ref.rate_s,

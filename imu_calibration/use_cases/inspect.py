@@ -15,7 +15,7 @@ from imu_calibration.calibration.hand_workflow import (
     hand_result,
     read_by_hand,
 )
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
@@ -147,7 +147,7 @@ def _by_frame(bag, topics):
     return [topics._replace(frame=frame) for frame in frames] if len(frames) > 1 else [topics]
 
 
-def inspect(
+def inspect_recording(
     bag: str | PathLike | SampleBlock,
     topics: Iterable[Topics],
     table: Table | None,
@@ -207,7 +207,7 @@ def _look(bag, topics, table, *, options, exclude):
     by_hand = None
     if table is not None:
         try:
-            calibrated = calibrate(
+            calibrated = calibrate_on_table(
                 sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude),
                 table,
                 options,

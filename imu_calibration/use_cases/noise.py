@@ -5,7 +5,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 
-from imu_calibration.allan.document import exit_code, lines, noise_to_text, shortcomings
+from imu_calibration.allan.document import (
+    lines,
+    noise_exit_code,
+    noise_shortcomings,
+    noise_to_text,
+)
 from imu_calibration.allan.figures import HORIZON, NoiseFigures
 from imu_calibration.allan.identify import NoiseIdentification, figures_of, identify_noise
 from imu_calibration.core.progress import report
@@ -36,12 +41,12 @@ class IdentifiedNoise:
     @property
     def exit_code(self) -> int:
         """0 when every required figure is determined and few messages were lost, otherwise 3."""
-        return exit_code(self.figures)
+        return noise_exit_code(self.figures)
 
     @property
     def reasons(self) -> list[str]:
         """Why the exit code is 3, a line each."""
-        return shortcomings(self.figures)
+        return noise_shortcomings(self.figures)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -85,7 +90,7 @@ def noise_provenance(recording: str | PathLike | SampleBlock) -> dict:
     return provenance_of([recording], {})
 
 
-def noise(
+def identify_recording(
     recording: str | PathLike | SampleBlock,
     *,
     imu_topic: str | None = None,

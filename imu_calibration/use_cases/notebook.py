@@ -19,16 +19,16 @@ from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.use_cases.calibrate import Calibrated
-from imu_calibration.use_cases.calibrate import calibrate as _calibrate
-from imu_calibration.use_cases.calibrate import check as _check
+from imu_calibration.use_cases.calibrate import calibrate_recordings as _calibrate
+from imu_calibration.use_cases.calibrate import check_recording as _check
 from imu_calibration.use_cases.choices import Choices, calibration_options, topics_of
 from imu_calibration.use_cases.compensate import Compensated
-from imu_calibration.use_cases.compensate import compensate as _compensate
+from imu_calibration.use_cases.compensate import compensate_recording as _compensate
 from imu_calibration.use_cases.diagnose import diagnose as _diagnose
 from imu_calibration.use_cases.inspect import RecordingSummary, imu_topics_of
-from imu_calibration.use_cases.inspect import inspect as _inspect
+from imu_calibration.use_cases.inspect import inspect_recording as _inspect
 from imu_calibration.use_cases.noise import IdentifiedNoise
-from imu_calibration.use_cases.noise import noise as _noise
+from imu_calibration.use_cases.noise import identify_recording as _noise
 from imu_calibration.use_cases.recordings import Stand, table_of
 from imu_calibration.use_cases.simulate import simulate as _simulate
 
@@ -151,7 +151,7 @@ def calibrate(
     time, force, rate, joints, temperature_c
         See `SampleBlock.from_arrays`.
     choices
-        As for `use_cases.calibrate.calibrate`.
+        As for `use_cases.calibrate.calibrate_recordings`.
 
     """
     arrays = Arrays(time, force, rate, joints, temperature_c)
@@ -175,7 +175,7 @@ def check(
     Test a calibration on a recording, or on arrays.
 
     ``check(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
-    `use_cases.calibrate.check`.
+    `use_cases.calibrate.check_recording`.
     """
     arrays = Arrays(time, force, rate, joints, temperature_c)
     block = arrays.or_given('check', recording)
@@ -197,7 +197,7 @@ def compensate(
     Correct the calibrated errors in a recording, or in arrays.
 
     ``compensate(calibration=c, time=t, force=f, rate=w)``; arguments as for `calibrate` and
-    `use_cases.compensate.compensate`.
+    `use_cases.compensate.compensate_recording`.
     """
     arrays = Arrays(time, force, rate, None, temperature_c)
     block = arrays.or_given('compensate', recording)
@@ -242,7 +242,7 @@ def noise(
     """
     Identify the noise of an IMU from a recording at rest, or from arrays.
 
-    Arguments as for `calibrate` and `use_cases.noise.noise`.
+    Arguments as for `calibrate` and `use_cases.noise.identify_recording`.
     """
     arrays = Arrays(time, force, rate, None, temperature_c)
     return _noise(arrays.or_given('noise', recording), **options)

@@ -150,7 +150,7 @@ class Planned:
         ]
 
     def __str__(self):
-        return '\n'.join(summary(self.plan) + self.notes)
+        return '\n'.join(plan_summary(self.plan) + self.notes)
 
 
 def plan(
@@ -356,7 +356,7 @@ def class_in(document: Mapping[str, Any]) -> tuple[tuple[str, ...], dict[str, fl
     )
 
 
-def summary(made: Plan) -> list[str]:
+def plan_summary(made: Plan) -> list[str]:
     """Return the predictions of a plan, a line each."""
     if made.told_apart:
         head = f'{len(made.motions)} motions in {made.seconds:.0f} s'

@@ -24,7 +24,7 @@ from imu_calibration.effects.catalogue import Catalogue
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.replay import BIAS_TIME, ReplayNoise
-from imu_calibration.simulation.replay import replay as run_replay
+from imu_calibration.simulation.replay import simulate_on_recording as run_replay
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import (
     SimulationOptions,
@@ -32,7 +32,7 @@ from imu_calibration.simulation.session import (
     require_joints,
     true_imu,
 )
-from imu_calibration.simulation.session import simulate as run_session
+from imu_calibration.simulation.session import simulate_session as run_session
 from imu_calibration.use_cases.choices import Choices, catalogue_of, inputs_of
 from imu_calibration.use_cases.recordings import LIKELY_LINK, Arm, Stand, name_of, table_of
 from imu_calibration.use_cases.resources import config_file

@@ -14,10 +14,10 @@ import numpy as np
 from imu_calibration.calibration.coverage import (
     Coverage,
     arrows_of,
-    cells_of,
     group_states,
     label_of,
     seen_of,
+    sphere_cells,
     table_coverage,
 )
 from imu_calibration.calibration.diagnosis.traces import Traces
@@ -34,7 +34,7 @@ from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.solution import tolerances_of
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.report.diagnosis_page import WHEN, histogram
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.recordings import Stand
 
@@ -276,7 +276,7 @@ def scene_of(coverage: Coverage, frame_id: str) -> Any:
         )
 
     (seen, of_seen, diameter), (above, of_line, line) = seen_of(coverage), label_of(coverage)
-    balls = [ball(*cell) for cell in cells_of(coverage)] + [
+    balls = [ball(*cell) for cell in sphere_cells(coverage)] + [
         ball(place, of_seen, diameter) for place in seen
     ]
     arrows = [arrow(start, end - start, rgb) for _, start, end, rgb in arrows_of(coverage)]
@@ -473,7 +473,7 @@ def view(
     """
     path = None if isinstance(source, SampleBlock) else _document_of(Path(source))
     if path is None:
-        result = calibrate(source, table, **choices).result
+        result = calibrate_recordings(source, table, **choices).result
         contents = {
             PARAMETERS_TOPIC: parameters(result.calibration, result.tolerances),
             RESIDUAL_TOPIC: residual(result),

@@ -7,7 +7,7 @@ from refusal import refused
 from imu_calibration.allan.document import noise_from_text, noise_to_text
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
-from imu_calibration.use_cases.noise import noise
+from imu_calibration.use_cases.noise import identify_recording
 
 HZ, SECONDS = 50.0, 200.0
 FORCE_SD, RATE_SD = 0.02, 0.0015
@@ -23,7 +23,7 @@ def still(seed):
 
 
 def identified(stamps, force, rate):
-    return noise(SampleBlock(ImuSamples(stamps, force, rate, 'imu_link')))
+    return identify_recording(SampleBlock(ImuSamples(stamps, force, rate, 'imu_link')))
 
 
 def contains(axes, density):

@@ -15,9 +15,9 @@ from scipy.signal import lfilter
 
 from imu_calibration.allan import identify
 from imu_calibration.allan.document import (
-    exit_code,
     filter_lines,
     lines,
+    noise_exit_code,
     noise_from_text,
     noise_to_text,
 )
@@ -370,7 +370,7 @@ def test_the_verb_writes_prints_and_says_what_is_not_determined(tmp_path, capsys
     assert (
         figures.frame_id == 'imu_link'
         and figures.rate == pytest.approx(50.0)
-        and exit_code(figures) == 3
+        and noise_exit_code(figures) == 3
     )
     assert figures.provenance['bags'][0]['name'] == 'bag'
     assert (tmp_path / 'out/report.html').read_text().startswith('<!DOCTYPE html>')

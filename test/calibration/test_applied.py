@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.hand_workflow import prove_readings, read_by_hand
+from imu_calibration.calibration.hand_workflow import prove_hand_readings, read_by_hand
 from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import DEG
@@ -106,7 +106,7 @@ def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
         read_by_hand(source_of(tmp_path / 'corrected', Topics(topic), want_joints=False)()).imu
         for topic in ('/imu/data_raw', '/imu/data_corrected')
     )
-    written = prove_readings(gather_by_hand(raw), raw, corrected, gravity=GRAVITY)
+    written = prove_hand_readings(gather_by_hand(raw), raw, corrected, gravity=GRAVITY)
     for sensor, entry in checked.proof.items():
         assert (
             entry['after'] == pytest.approx(written[sensor]['after'], rel=1e-9)

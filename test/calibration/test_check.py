@@ -12,7 +12,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate, check
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.misfit_worlds import make_pair
 from worlds.physics import write_bag
@@ -27,11 +27,13 @@ def pair():
 
 @pytest.fixture(scope='module')
 def calibrated(pair):
-    return calibrate(pair.first.block, Table.from_mapping(pair.table))
+    return calibrate_recordings(pair.first.block, Table.from_mapping(pair.table))
 
 
 def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
-    found = check(pair.second.block, calibrated.calibration, Table.from_mapping(pair.table))
+    found = check_recording(
+        pair.second.block, calibrated.calibration, Table.from_mapping(pair.table)
+    )
     assert found.helps and found.exit_code == 0
     assert all(
         part['after'] < 0.6 * part['before']
@@ -42,22 +44,24 @@ def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
 
 def test_a_file_of_another_imu_does_not_help(pair, calibrated):
     other = make_pair(None, 4)
-    found = check(other.second.block, calibrated.calibration, Table.from_mapping(other.table))
+    found = check_recording(
+        other.second.block, calibrated.calibration, Table.from_mapping(other.table)
+    )
     assert not found.helps and found.exit_code == 3
 
 
 def test_a_bias_that_moved_is_named(pair, calibrated):
     imu = pair.second.imu
     moved = replace(pair.second.block, imu=replace(imu, rate_s=imu.rate_s + 0.02))
-    found = check(moved, calibrated.calibration, Table.from_mapping(pair.table))
+    found = check_recording(moved, calibrated.calibration, Table.from_mapping(pair.table))
     assert not found.helps and any('the bias has changed' in line for line in found.lines)
 
 
 def test_the_recording_that_a_file_was_made_from_is_noticed(pair, calibrated):
     table = Table.from_mapping(pair.table)
     assert (
-        check(pair.first.block, calibrated.calibration, table).notes
-        and not check(pair.second.block, calibrated.calibration, table).notes
+        check_recording(pair.first.block, calibrated.calibration, table).notes
+        and not check_recording(pair.second.block, calibrated.calibration, table).notes
     )
 
 
@@ -85,10 +89,10 @@ def test_an_earlier_calibration_is_proven_beside_a_new_one(pair, calibrated):
     spoiled = calibrated.calibration.values.copy()
     spoiled[calibrated.calibration.param_names.index('gyroscope.matrix.zz')] *= 1.05
     earlier = replace(calibrated.calibration, values=spoiled)
-    found = calibrate(
+    found = calibrate_recordings(
         pair.second.block, Table.from_mapping(pair.table), model_as_asked=True, earlier=earlier
     )
     entry = found.calibration.proof['gyroscope']
     assert entry['earlier']['after'] > 3 * entry['after']
     with refused(InputError, 'table_missing'):
-        calibrate(pair.second.block, earlier=earlier)
+        calibrate_recordings(pair.second.block, earlier=earlier)

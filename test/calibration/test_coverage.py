@@ -38,7 +38,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.estimation.observability import MOTIONS, motions_about
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY
 from worlds.person import Person
@@ -150,7 +150,7 @@ def test_who_follows_only_the_picture_has_everything_determined_in_time():
 
 
 def test_on_a_table_the_picture_shows_what_the_motion_did():
-    found = calibrate(
+    found = calibrate_recordings(
         [str(ROOT / 'bags/sample_session')],
         str(ROOT / 'bags/sample_session/table.yaml'),
         model_as_asked=True,

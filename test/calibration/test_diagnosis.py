@@ -13,8 +13,8 @@ import pytest
 from refusal import refused
 from scipy.stats import chi2
 
-from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
-from imu_calibration.compensation.compensate import compensate
+from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
+from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.kinematics.chain import reference_motion
@@ -115,7 +115,7 @@ def test_earlier_choice_is_replaced_by_the_simpler_effect_that_does_as_well(size
 
 def test_document_holds_what_the_contract_asks_for(sizes):
     recording, diagnosis = seek('accel_quadratic', sizes)
-    document = json.loads(json.dumps(to_mapping(diagnosis)))
+    document = json.loads(json.dumps(diagnosis_mapping(diagnosis)))
     assert document['format'] == 'imu_calibration/diagnosis/1'
     finding = document['findings'][0]
     assert set(finding) >= {
@@ -229,7 +229,7 @@ def test_effects_without_their_data_are_not_testable():
     recording = record(
         SEED, None, 'white', through_bag=False, profile='static_only', temperature=None
     )
-    document = to_mapping(diagnose(recording.windows, recording.table, recording.model))
+    document = diagnosis_mapping(diagnose(recording.windows, recording.table, recording.model))
     lacking = {entry['effect']: entry for entry in document['not_testable']}
     assert {'accel_thermal_bias', 'gyro_thermal_scale'} <= set(lacking)
     assert all(entry['why'] and entry['needs'] for entry in lacking.values())
@@ -285,7 +285,9 @@ def test_the_gain_is_that_of_corrected_readings(sizes):
             alpha = np.broadcast_to(ref.alpha_s, (len(window), 3))
             means.append(
                 (
-                    compensate(calibration, window.force_s, window.rate_s, alpha_s=alpha).force
+                    compensated_samples(
+                        calibration, window.force_s, window.rate_s, alpha_s=alpha
+                    ).force
                     - ref.force_s
                 ).mean(axis=0)
             )

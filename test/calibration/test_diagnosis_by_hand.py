@@ -13,10 +13,10 @@ import pytest
 from numpy.testing import assert_allclose
 from refusal import refused
 
-from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
+from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
 from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand
-from imu_calibration.calibration.hand_workflow import extended_by_hand, solve_by_evidence
+from imu_calibration.calibration.hand_workflow import extended_by_hand, solve_hand_by_evidence
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
@@ -29,7 +29,7 @@ from imu_calibration.selection import regimes
 from imu_calibration.selection.gain import APPLIED, OF_MODEL
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values
-from imu_calibration.simulation.session import simulate as simulate_session
+from imu_calibration.simulation.session import simulate_session as simulate_session
 
 from worlds.hand_sessions import GRAVITY, simulate
 
@@ -149,7 +149,7 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
     imu, ranges, _ = simulate(
         21500, n_poses=24, spoil=spoil
     )  # calibrate and diagnose use one test of the unexplained residual
-    assert solve_by_evidence(
+    assert solve_hand_by_evidence(
         gather_by_hand(imu, ranges), HandOptions(GRAVITY)
     ).changes.unexplained == {'gyroscope': rest.entry}
     assert rest.entry['rms'] == rest.rms > 0 and rest.entry['axes'] == ['y']
@@ -331,14 +331,14 @@ def test_what_turns_leave_is_an_angle_per_turn():
     )
     assert (
         rest.significant
-        and rest.unit == to_mapping(found)['unexplained']['gyroscope']['unit'] == 'rad/turn'
+        and rest.unit == diagnosis_mapping(found)['unexplained']['gyroscope']['unit'] == 'rad/turn'
     )
     assert 'deg per turn' in text
     assert rest.rms == pytest.approx(0.6 * DEG * 1.6, rel=0.4)  # the matrix takes a part
 
 
 def test_the_document_and_the_extended_model_go_together(responding):
-    document = to_mapping(responding.diagnosis)
+    document = diagnosis_mapping(responding.diagnosis)
     json.dumps(document)
     assert document['findings'][0]['gain']['measure'] == 'poses'
     assert 'gyro_g_sensitivity' in responding.hand.model.gyroscope

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.calibration.table_result import (
     JOINT_POSITION_SD,
     _faster,
@@ -29,7 +29,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 TABLE = Table.from_mapping(
     {
@@ -55,7 +55,7 @@ def recording():
     """A short session of an IMU with a size effect."""
     model = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
     values = random_values(model, 'industrial', 4)
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         model,
         values,
         TABLE,
@@ -68,7 +68,7 @@ def recording():
 
 def calibrated(recording, table, options=NO_TILT):
     """Calibrate against a table."""
-    return calibrate([lambda: iter([recording])], table, options)
+    return calibrate_on_table([lambda: iter([recording])], table, options)
 
 
 @pytest.fixture(scope='module')

@@ -10,7 +10,11 @@ from refusal import refused
 
 from imu_calibration.calibration import collector
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings, SolvePacer
-from imu_calibration.calibration.table_calibration import calibrate, conclude, solve_gathered
+from imu_calibration.calibration.table_calibration import (
+    calibrate_on_table,
+    conclude,
+    solve_gathered,
+)
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.decision import HELPS
@@ -19,7 +23,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
@@ -51,7 +55,7 @@ def session(tilt=(0.0, 0.0), seed=1):
     )
     values = random_values(model, 'industrial', seed)
     values[model.slices['reference', 'table_tilt']] = tilt
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         model.at(values),
         values,
         TABLE,
@@ -88,7 +92,9 @@ def blocks(*streams, seed=0, mean_seconds=0.2):
 
 def offline(*sessions, options=CalibrationOptions()):
     """Return what the offline tool says."""
-    return calibrate([lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, options)
+    return calibrate_on_table(
+        [lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, options
+    )
 
 
 def run(live, *streams, seed=0):

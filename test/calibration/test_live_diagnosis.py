@@ -13,7 +13,11 @@ from test_live_calibration import assert_same, blocks
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
-from imu_calibration.calibration.diagnosis.live_diagnosis import Answer, describe, question_about
+from imu_calibration.calibration.diagnosis.live_diagnosis import (
+    Answer,
+    live_state_of,
+    question_about,
+)
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.core.errors import DocumentError
@@ -337,7 +341,7 @@ def test_what_stays_unexplained_is_said(expected):
         sensor: replace(found, significant=sensor == 'gyroscope', rms=1e-3)
         for sensor, found in diagnosis.unexplained.items()
     }
-    state = describe(replace(diagnosis, findings=(), unexplained=rest))
+    state = live_state_of(replace(diagnosis, findings=(), unexplained=rest))
     assert (
         state.word == 'unexplained'
         and state.message.startswith('unexplained: ')

@@ -1,7 +1,7 @@
 """Noise that is larger in motion is no error of the model."""
 
 import imu_calibration as imu
-from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios, misfits
+from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios, motion_misfits
 from imu_calibration.kinematics.table import Table
 
 from worlds.moments import LouderInMotion
@@ -17,6 +17,6 @@ def test_noise_that_is_larger_in_motion_is_no_error_of_the_model():
         gyroscope_model='bias+matrix',
     )
     assert max(misfit_ratios(result.calibration, 'gyroscope').values()) > NOTED_MISFIT
-    found = misfits(result.calibration)
+    found = motion_misfits(result.calibration)
     assert found
     assert {(reason.key, reason.sensors) for reason in found} == {(None, ('gyroscope',))}

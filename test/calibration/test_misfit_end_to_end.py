@@ -10,7 +10,7 @@ import pytest
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.document.decision import HELPS
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate, check
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.misfit_worlds import make_pair
 
@@ -32,11 +32,11 @@ def test_what_is_handed_over_helps_in_another_session(cause, world):
     pair = make_pair(cause, 21, **world)
     table = Table.from_mapping(pair.table)
     try:
-        found = calibrate(pair.first.block, table)
+        found = calibrate_recordings(pair.first.block, table)
     except ImuCalibrationError as refused:
         assert '\n' not in str(refused)
         return
-    proof = check(pair.second.block, found.calibration, table).proof
+    proof = check_recording(pair.second.block, found.calibration, table).proof
     for sensor, entry in proof.items():
         if found.verdict.decisions[sensor] is not HELPS:
             assert found.exit_code == 3

@@ -12,7 +12,7 @@ from imu_calibration.document.decision import UNPROVEN, decide, reason_of
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate, check
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.misfit_worlds import SHAFT, make_pair
 
@@ -25,7 +25,7 @@ VERTICAL = {**SHAFT, 'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0,
 def vertical():
     """Return two sessions of a shaft with motor ripple and the calibration of the first."""
     pair = make_pair('motor_ripple', 3, table=VERTICAL, profile='sweeps')
-    return pair, calibrate(pair.first.block, Table.from_mapping(pair.table)).calibration
+    return pair, calibrate_recordings(pair.first.block, Table.from_mapping(pair.table)).calibration
 
 
 def test_matrix_and_size_effect_are_fixed_and_bias_and_common_arm_are_estimated(vertical):
@@ -63,7 +63,7 @@ def test_a_calibration_of_one_attitude_is_unproven_for_others_and_applies_to_the
 
 def test_check_on_the_same_attitude_reports_the_error_of_that_recording(vertical):
     pair, calibration = vertical
-    proof = check(pair.second.block, calibration, Table.from_mapping(pair.table)).proof
+    proof = check_recording(pair.second.block, calibration, Table.from_mapping(pair.table)).proof
     assert 'one_attitude' not in proof['accelerometer']
 
 
@@ -81,7 +81,7 @@ def test_one_attitude_is_never_called_harmful():
 
 def test_a_horizontal_shaft_has_many_attitudes():
     pair = make_pair(None, 3, table='shaft', profile='sweeps')
-    calibration = calibrate(pair.first.block, Table.from_mapping(pair.table)).calibration
+    calibration = calibrate_recordings(pair.first.block, Table.from_mapping(pair.table)).calibration
     assert 'one_attitude' not in calibration.proof['accelerometer']
     assert set(calibration.status[calibration.model.part('accelerometer', Role.LINEAR)]) != {HELD}
 
@@ -90,6 +90,8 @@ def test_a_horizontal_shaft_has_many_attitudes():
 def test_a_vertical_motor_shaft_gives_no_size_effect_of_centimetres(recordings):
     """It was -29 mm on a chip of 4 mm."""
     folder = recordings / 'shaft_yaw_slow_later'
-    calibration = calibrate(folder, folder / 'table.yaml', model_as_asked=True).calibration
+    calibration = calibrate_recordings(
+        folder, folder / 'table.yaml', model_as_asked=True
+    ).calibration
     assert not calibration.values[calibration.model.part('accelerometer', Role.ARMS)].any()
     assert calibration.decisions['accelerometer'] is UNPROVEN

@@ -14,7 +14,7 @@ from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import Regime, moving_pieces
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldOut
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.misfit_worlds import make_pair
 
@@ -24,7 +24,7 @@ SENSORS = ('accelerometer', 'gyroscope')
 
 
 def calibrated(pair, **choices):
-    return calibrate(pair.first.block, Table.from_mapping(pair.table), **choices)
+    return calibrate_recordings(pair.first.block, Table.from_mapping(pair.table), **choices)
 
 
 @pytest.fixture(scope='module')

@@ -10,7 +10,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.decision import HELPS, decide
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY, NOMINAL, simulate
 
@@ -60,7 +60,7 @@ def test_a_part_is_left_out_as_if_it_had_not_been_recorded(session):
 
 def test_an_imu_without_errors_is_not_helped_and_says_so():
     imu, _, _ = simulate(5, n_poses=20, truth=NOMINAL.copy(), pose_sd=0.02)
-    found = calibrate(SampleBlock(imu), gravity=GRAVITY)
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY)
     assert found.verdict.word is not HELPS and found.exit_code == 3
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.documents import from_text
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.kinematics.table import Table
@@ -41,7 +41,7 @@ def test_gyroscope_scale_and_lag_along_the_shaft(recordings, name, diagonal, sca
     joint states follow, must not bend the scale.
     """
     table, blocks = opened(recordings / name)
-    calibration = calibrate([lambda: iter(blocks)], table, options).calibration
+    calibration = calibrate_on_table([lambda: iter(blocks)], table, options).calibration
     values, sds = (
         dict(zip(calibration.param_names, numbers))
         for numbers in (calibration.values, calibration.sd)
@@ -100,7 +100,7 @@ def test_what_one_axis_cannot_show_is_held(recordings):
     folder = recordings / 'shaft_yaw_medium'
     table = Table.from_mapping(from_text((folder / 'table.yaml').read_text()))
     with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-        result = calibrate([lambda: recording.blocks(table.joint_names)], table)
+        result = calibrate_on_table([lambda: recording.blocks(table.joint_names)], table)
     status = dict(zip(result.calibration.param_names, result.calibration.status))
     assert all(
         status[f'gyroscope.matrix.{name}'] == 'held'

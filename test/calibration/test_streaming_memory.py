@@ -14,7 +14,7 @@ from imu_calibration.estimation import accumulator as least_squares
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from imu_calibration.use_cases.resources import config_file
 
 TABLE = Table.from_mapping(
@@ -37,7 +37,7 @@ cost 56 times as many bytes as samples.
 def piece():
     """Return the IMU and the joints of a short session at 100 Hz."""
     profile = make_profile('quick', 4, TABLE)
-    return simulate(
+    return simulate_session(
         MODEL,
         random_values(MODEL, 'industrial', 4),
         TABLE,

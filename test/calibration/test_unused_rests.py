@@ -8,7 +8,7 @@ import pytest
 
 from imu_calibration.document.decision import WARNING
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.physics import make_session
 
@@ -20,7 +20,7 @@ def session():
 
 
 def calibrated(session, minimum):
-    return calibrate(
+    return calibrate_recordings(
         session.block,
         Table.from_mapping(session.table),
         setting={'static_minimum': minimum},

@@ -20,8 +20,8 @@ from imu_calibration.estimation.solution import (
 )
 from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
+from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.compensation_cases import random_calibration
 from worlds.misfit_worlds import SHAFT, make_pair, sweeps
@@ -33,7 +33,7 @@ VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 
 def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
     pair = make_pair(None, 1, table='shaft', profile='sweeps')
     table = Table.from_mapping(pair.table)
-    result = calibrate(
+    result = calibrate_recordings(
         pair.first.block, table, accelerometer_model='bias+matrix', model_as_asked=True
     ).result
     needs = {text for text, _ in motions_needed(result.solution, result.tolerances, table).values()}
@@ -52,7 +52,7 @@ def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
     """
     table = Table.from_mapping(VERTICAL)
     session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
-    result = calibrate(
+    result = calibrate_recordings(
         SampleBlock(session.imu, session.joints),
         table,
         accelerometer_model='bias+matrix',
@@ -83,7 +83,9 @@ def test_an_uncertain_gravity_needs_its_value_and_no_spins():
     """0.03 m/s^2 in 9.8 m/s^2 is 0.3 % of scale; more data do not reduce it."""
     session = make_session(3, profile='quick', noise='realistic', grade='industrial')
     table = Table.from_mapping(session.table | {'gravity_sd': 0.03})
-    result = calibrate(SampleBlock(session.imu, session.joints), table, model_as_asked=True).result
+    result = calibrate_recordings(
+        SampleBlock(session.imu, session.joints), table, model_as_asked=True
+    ).result
     scales = [f'accelerometer.matrix.{axis}' for axis in ('xx', 'yy', 'zz')]
     needed = motions_needed(result.solution, result.tolerances, table)
     assert {needed[name][0] for name in scales} == {REMEDIES[GRAVITY,]}
@@ -151,10 +153,14 @@ def test_a_ros_1_bag_is_told_how_to_be_converted(tmp_path):
         writer.write(connection, 10**9, store.serialize_ros1(message, imu.__msgtype__))
     calibration = random_calibration(1)
     with refused(InputError, 'ros1_bag', 'rosbags-convert'):
-        compensate(tmp_path / 'old.bag', calibration, output=tmp_path / 'new', anyway=True)
+        compensate_recording(
+            tmp_path / 'old.bag', calibration, output=tmp_path / 'new', anyway=True
+        )
 
 
 def test_the_report_shows_the_proof_by_motion():
     pair = make_pair(None, 1)
-    found = calibrate(pair.first.block, Table.from_mapping(pair.table), model_as_asked=True)
+    found = calibrate_recordings(
+        pair.first.block, Table.from_mapping(pair.table), model_as_asked=True
+    )
     assert 'id="proof"' in found.report and f'<td class="k">{Regime.FAST}</td>' in found.report

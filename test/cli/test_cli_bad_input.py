@@ -16,7 +16,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from msg_adapters.write import write_session
 
 JOINTS = [
@@ -34,7 +34,7 @@ def session():
     """A short session: (ImuSamples, JointSamples)."""
     model = SensorModel()
     options = SimulationOptions(noise=GRADES['industrial'].noise)
-    return simulate(
+    return simulate_session(
         model,
         random_values(model, 'industrial', 2),
         TABLE,

@@ -8,7 +8,7 @@ import pytest
 from imu_calibration.cli.main import main
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.csv_log import read_csv
 from msg_adapters.write import write_session
 
@@ -109,7 +109,7 @@ def test_a_text_log_gives_a_text_log(name, calibration, tmp_path, monkeypatch, c
 
     # The readings are those that are corrected in memory, and a bag has the same exit code.
     read = read_csv(out)
-    expected = compensate(read_csv(log).imu, calibration).imu
+    expected = compensate_recording(read_csv(log).imu, calibration).imu
     np.testing.assert_allclose(read.imu.force_s, expected.force_s, atol=1e-7)
     np.testing.assert_allclose(read.imu.rate_s, expected.rate_s, atol=1e-8)
     assert np.abs(read.imu.force_s - read_csv(log).imu.force_s).max() > 0.01
@@ -127,7 +127,9 @@ def test_readings_in_the_unit_of_the_calibration_become_si(tmp_path, monkeypatch
     np.savetxt('log.csv', columns, delimiter=',', header='t,ax,ay,az,gx,gy,gz', comments='')
     verb = ['compensate', 'log.csv', '--calibration', 'calibration.yaml', '--output', 'out.csv']
     main([*verb, '--accelerometer-unit', 'counts:2048/g'])
-    expected = compensate(read_csv('log.csv', ['force=ax,ay,az:counts:2048/g']).imu, found).imu
+    expected = compensate_recording(
+        read_csv('log.csv', ['force=ax,ay,az:counts:2048/g']).imu, found
+    ).imu
     np.testing.assert_allclose(read_csv('out.csv').imu.force_s, expected.force_s, atol=1e-6)
 
 
@@ -146,7 +148,7 @@ def test_rows_of_one_sensor_each_are_joined(calibration, tmp_path, monkeypatch):
     verb = ['compensate', 'log.csv', '--calibration', 'calibration.yaml', '--output', 'out.csv']
     assert main(verb) in (0, 3)
     log, read = read_csv('log.csv'), read_csv('out.csv')
-    expected = compensate(log.imu, calibration).imu
+    expected = compensate_recording(log.imu, calibration).imu
     assert log.joined.slower == 'accelerometer' and len(read.imu) == len(log.imu)
     np.testing.assert_array_equal(np.diff(read.imu.stamp_ns), np.diff(log.imu.stamp_ns))
     np.testing.assert_allclose(read.imu.rate_s, expected.rate_s, atol=1e-8)

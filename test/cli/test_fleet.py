@@ -14,7 +14,7 @@ import yaml
 from refusal import refused
 
 from imu_calibration.calibration.fleet import UnitResult, summarise
-from imu_calibration.cli.fleet_run import summary_html, unit_rows
+from imu_calibration.cli.fleet_run import fleet_unit_rows, summary_html
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration import Calibration
@@ -22,7 +22,7 @@ from imu_calibration.document.files import read_calibration
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
@@ -35,7 +35,7 @@ MODEL = SensorModel(
 
 def session(seed, values):
     """Return (imu, joints) of a short session."""
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         MODEL,
         values,
         TABLE,
@@ -152,7 +152,7 @@ def test_a_unit_has_the_word_of_each_sensor(result):
     unit = UnitResult(
         'unit_d', replace(known, decision={'accelerometer': 'harms', 'gyroscope': 'helps'}), 'harms'
     )
-    row = unit_rows([unit])[0]
+    row = fleet_unit_rows([unit])[0]
     assert (row['decision'], row['accelerometer'], row['gyroscope']) == ('harms', 'harms', 'helps')
     assert isinstance(row['exit_code'], int) and all(
         isinstance(value, float) for name, value in row.items() if '.' in name

@@ -14,7 +14,7 @@ import pytest
 from refusal import refused as expected
 
 from imu_calibration.calibration.collector import from_bytes
-from imu_calibration.cli.fleet_run import csv_text, unit_rows
+from imu_calibration.cli.fleet_run import csv_text, fleet_unit_rows
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.document.calibration_text import calibration_to_text
@@ -145,7 +145,9 @@ def test_a_name_is_neither_a_formula_nor_mathematics(tmp_path):
 
     assert 'bad' in draw('x', (2, 2), paint, label='x')
     result = UnitResult('=cmd|calc!A1')
-    assert list(csv.reader(csv_text(unit_rows([result])).splitlines()))[1][0] == "'=cmd|calc!A1"
+    assert (
+        list(csv.reader(csv_text(fleet_unit_rows([result])).splitlines()))[1][0] == "'=cmd|calc!A1"
+    )
 
 
 class UnitResult:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.compensation.compensate import (
     Transfer,
-    compensate,
+    compensated_samples,
     invertible,
     outside_conditions,
 )
@@ -63,7 +63,7 @@ def measured(calibration, force, rate, alpha, temperature):
 def test_compensation_undoes_the_forward_equations(effects):
     calibration = random_calibration(3, *effects)
     force, rate, alpha, temperature = random_motion()
-    corrected = compensate(
+    corrected = compensated_samples(
         calibration,
         *measured(calibration, force, rate, alpha, temperature),
         alpha_s=alpha,
@@ -94,7 +94,7 @@ def test_the_whole_way_from_a_table_through_prediction_and_back():
     motion = make_profile('random_short', 1, table).at(np.linspace(1.0, 160.0, 500))
     reference = reference_motion(table, motion)
     force, rate = predict(calibration.model, calibration.values, table, motion=motion)
-    corrected = compensate(calibration, force, rate, alpha_s=reference.alpha_s)
+    corrected = compensated_samples(calibration, force, rate, alpha_s=reference.alpha_s)
     np.testing.assert_allclose(corrected.force, reference.force_s, atol=1e-11)
     np.testing.assert_allclose(corrected.rate, reference.rate_s, atol=1e-11)
 
@@ -115,8 +115,10 @@ def test_transfer_there_and_back_is_the_identity():
     there = Transfer.from_pose('base', (0.3, -0.2, 0.5), (0.2, -0.4, 2.0))
     mat_ts = there.mat_ts
     back = Transfer('imu', mat_ts.T, -mat_ts.T @ there.arm_t)
-    moved = compensate(plain, force, rate, alpha_s=alpha, transfer=there)
-    again = compensate(plain, moved.force, moved.rate, alpha_s=alpha @ mat_ts.T, transfer=back)
+    moved = compensated_samples(plain, force, rate, alpha_s=alpha, transfer=there)
+    again = compensated_samples(
+        plain, moved.force, moved.rate, alpha_s=alpha @ mat_ts.T, transfer=back
+    )
     np.testing.assert_allclose(
         again.force, force, atol=1e-13 * 100
     )  # centripetal terms of 30 m/s^2 come and go
@@ -129,7 +131,7 @@ def test_transfer_of_a_steady_turn_takes_the_centripetal_force_out():
     # The sensor sits 0.5 m ahead of the axis, x outwards; in the target frame it looks backwards
     # (yaw of 180 degrees).
     transfer = Transfer.from_pose('base', (0.5, 0.0, 0.0), (0.0, 0.0, np.pi))
-    moved = compensate(
+    moved = compensated_samples(
         plain,
         np.array([[2.0**2 * 0.5, 0.0, 9.8]]),
         np.array([[0.0, 0.0, 2.0]]),
@@ -158,7 +160,7 @@ def test_saturated_readings_are_flagged():
     values[calibration.model.slices['accelerometer', 'accel_saturation']] = 19.6
     calibration = Calibration(calibration.model, values, calibration.covariance, calibration.status)
     force = np.array([[0.0, 0.0, 9.8], [19.6, 0.0, 0.0], [0.0, -19.6, 0.0], [19.5, 0.0, 0.0]])
-    corrected = compensate(calibration, force, np.zeros((4, 3)), alpha_s=np.zeros((4, 3)))
+    corrected = compensated_samples(calibration, force, np.zeros((4, 3)), alpha_s=np.zeros((4, 3)))
     assert corrected.flagged.tolist() == [False, True, True, False]
     np.testing.assert_allclose(
         corrected.marks, [[0, 0], [19.6**2, 0], [19.6**2, 0], [0, 0]], rtol=1e-5
@@ -171,7 +173,7 @@ def test_readings_beyond_what_can_be_inverted_are_flagged():
     values[calibration.model.slices['accelerometer', 'accel_quadratic']] = 0.05
     calibration = Calibration(calibration.model, values, calibration.covariance, calibration.status)
     force = np.array([[0.0, 0.0, 0.1], [-100.0, 0.0, 0.0]])  # x + 0.05 x^2 never reaches -100
-    corrected = compensate(calibration, force, np.zeros((2, 3)), alpha_s=np.zeros((2, 3)))
+    corrected = compensated_samples(calibration, force, np.zeros((2, 3)), alpha_s=np.zeros((2, 3)))
     assert corrected.flagged.tolist() == [False, True]
     assert np.isfinite(corrected.force[0]).all() and np.isnan(corrected.force[1]).all()
     assert all(np.isnan(x) for x in make_kernel(calibration)(*force[1].tolist(), *[0.0] * 7))
@@ -181,7 +183,7 @@ def test_thermal_effects_ask_for_temperatures():
     calibration = random_calibration(1, ('accel_thermal_bias',))
     force, rate, alpha, _ = random_motion(5)
     with refused(InputError, 'temperature_missing'):
-        compensate(calibration, force, rate, alpha_s=alpha)
+        compensated_samples(calibration, force, rate, alpha_s=alpha)
     with refused(InputError, 'temperature_missing', 'imu/temperature'):
         CompensationStream(calibration)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from refusal import refused
 
 from imu_calibration.compensation import kernel
-from imu_calibration.compensation.compensate import Transfer, compensate
+from imu_calibration.compensation.compensate import Transfer, compensated_samples
 from imu_calibration.compensation.kernel import (
     MAX_OPERATIONS,
     count_operations,
@@ -38,7 +38,7 @@ def both(calibration, transfer, seed=0, n=12):
     alpha = slope @ np.linalg.inv(calibration.value('gyroscope', 'matrix')).T
     branch = np.random.default_rng([seed, 23]).uniform(-1.0, 1.0, n)
     vibration = np.random.default_rng([seed, 24]).uniform(0.0, 0.1, (n, 3))
-    expected = compensate(
+    expected = compensated_samples(
         calibration,
         force,
         rate,
@@ -81,7 +81,7 @@ def test_zero_input_does_not_trip_the_asymmetry():
     force, rate = (
         calibration.value(sensor, 'bias')[None] for sensor in ('accelerometer', 'gyroscope')
     )
-    expected = compensate(calibration, force, rate, alpha_s=np.zeros((1, 3)))
+    expected = compensated_samples(calibration, force, rate, alpha_s=np.zeros((1, 3)))
     got = corrected(*force[0].tolist(), *rate[0].tolist(), 0.0, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(got, np.column_stack([expected.force, expected.rate])[0], atol=1e-15)
 

@@ -9,7 +9,7 @@ from refusal import refused
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.change import changes_since
 from imu_calibration.kinematics.table import Table
-from imu_calibration.use_cases.calibrate import calibrate, check
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.physics import make_session
 
@@ -45,8 +45,8 @@ def test_check_gives_3_when_the_error_has_changed_even_if_it_still_helps():
     session = make_session(3, profile='quick', noise='realistic', grade='industrial')
     table = Table.from_mapping(session.table)
     block = session.block
-    calibration = calibrate(block, table, model_as_asked=True).calibration
-    same = check(block, calibration, table)
+    calibration = calibrate_recordings(block, table, model_as_asked=True).calibration
+    same = check_recording(block, calibration, table)
     assert same.exit_code == 0 and same.changes and not same.changed
     assert all(each.factor == pytest.approx(1.0, abs=0.15) for each in same.changes)
     better = {
@@ -59,9 +59,12 @@ def test_check_gives_3_when_the_error_has_changed_even_if_it_still_helps():
         }
         for sensor, entry in calibration.proof.items()
     }
-    changed = check(block, replace(calibration, proof=better), table)
+    changed = check_recording(block, replace(calibration, proof=better), table)
     assert changed.exit_code == 3 and changed.helps and len(changed.reasons) == 2
     assert {each.sensor for each in changed.changed} == {'accelerometer', 'gyroscope'}
-    assert check(block, replace(calibration, proof=better), table, change=20.0).exit_code == 0
+    assert (
+        check_recording(block, replace(calibration, proof=better), table, change=20.0).exit_code
+        == 0
+    )
     with refused(InputError, 'change_limit', 0.5):
-        check(block, calibration, table, change=0.5)
+        check_recording(block, calibration, table, change=0.5)

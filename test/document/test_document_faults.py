@@ -21,10 +21,10 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import trust
 from imu_calibration.document.calibration_text import (
+    calibration_mapping,
     calibration_to_text,
     checked_tolerances,
     from_mapping,
-    to_mapping,
 )
 from imu_calibration.document.decision import decisions_text
 from imu_calibration.kinematics.table import Table
@@ -170,7 +170,7 @@ def use(found):
         outside_conditions(found, 3**0.5, [25.0]),
     )
     assert '\n' not in ''.join(line for part in against for line in part)
-    assert to_mapping(found)
+    assert calibration_mapping(found)
     noise = [found.noise(sensor) for sensor in ('accelerometer', 'gyroscope')]
     numbers = (
         found.values.tobytes(),
@@ -195,7 +195,9 @@ def use(found):
 def test_the_document_that_is_damaged_is_whole():
     found = from_mapping(GOOD)
     use(found)
-    assert to_mapping(found).keys() == GOOD.keys() and not trust.refused_sensors(found, live=True)
+    assert calibration_mapping(found).keys() == GOOD.keys() and not trust.refused_sensors(
+        found, live=True
+    )
 
 
 @pytest.mark.parametrize(

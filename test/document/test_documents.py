@@ -18,9 +18,9 @@ from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.document.calibration import Calibration, implausible
 from imu_calibration.document.calibration_text import (
     calibration_from_text,
+    calibration_mapping,
     calibration_to_text,
     from_mapping,
-    to_mapping,
 )
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -168,7 +168,9 @@ def test_written_read_and_written_again_is_the_same_text(calibration):
 def plain():
     """Return the mapping of a simple calibration."""
     model = SensorModel()
-    return to_mapping(Calibration(model, model.start(), 1e-6 * np.eye(24), (DETERMINED,) * 24))
+    return calibration_mapping(
+        Calibration(model, model.start(), 1e-6 * np.eye(24), (DETERMINED,) * 24)
+    )
 
 
 def test_the_document_has_the_published_layout():

@@ -19,7 +19,7 @@ from scipy.io import loadmat
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.terms import Term
 from imu_calibration.cli.main import main
-from imu_calibration.compensation.compensate import compensate
+from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration_text import calibration_to_text
@@ -722,7 +722,7 @@ def test_imu_tk_is_read_with_both_its_files(seed):
         for named in texts:
             path = Path(folder, f'test_imu{named}')
             found = import_file(find_target('imu-tk', read=True), path.read_bytes(), path)
-            true = compensate(found, ref.force_s, ref.rate_s, alpha_s=ref.alpha_s)
+            true = compensated_samples(found, ref.force_s, ref.rate_s, alpha_s=ref.alpha_s)
             for made, ending, raw in (
                 (true.force, '.acc', ref.force_s),
                 (true.rate, '.gyro', ref.rate_s),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -16,9 +16,9 @@ from imu_calibration.document import decision, trust
 from imu_calibration.document.calibration import HAND_AXES
 from imu_calibration.document.calibration_text import (
     calibration_from_text,
+    calibration_mapping,
     calibration_to_text,
     from_mapping,
-    to_mapping,
 )
 from imu_calibration.document.decision import (
     HARMS,
@@ -66,7 +66,7 @@ def test_the_decision_follows_from_the_interval(interval, word):
 
 def test_a_file_without_a_decision_derives_it_and_one_with_a_decision_cannot_hide_its_proof():
     for words in ((HELPS, HARMS), (UNPROVEN, None)):
-        document = to_mapping(proven(*words))
+        document = calibration_mapping(proven(*words))
         assert 'decision' not in document
         assert list(from_mapping(document).decisions.values()) == [
             word or UNPROVEN for word in words
@@ -137,7 +137,7 @@ def test_parameters_that_are_not_determined_are_named():
 
 def test_a_document_with_one_ill_conditioned_sensor_loads_for_the_other():
     """The matrix of condition number 33 is not applied, not even with consent."""
-    document = to_mapping(proven(HELPS, HELPS))
+    document = calibration_mapping(proven(HELPS, HELPS))
     document['accelerometer']['matrix']['value'] = [
         [1.0, 0.0, 0.0],
         [0.0, 1.0, 0.0],
@@ -162,7 +162,9 @@ def test_a_rest_in_one_attitude_is_unproven():
     from worlds.live_sessions import OPTIONS, TABLE, make_session
 
     imu, joints, _, _ = make_session(3, seconds=8.0)
-    found = calibrate([lambda: iter([SampleBlock(imu, joints)])], TABLE, OPTIONS).calibration
+    found = calibrate_on_table(
+        [lambda: iter([SampleBlock(imu, joints)])], TABLE, OPTIONS
+    ).calibration
     assert set(found.decisions.values()) == {UNPROVEN}
     assert any('accelerometer' in line for line in found.notes)
     assert calibration_from_text(calibration_to_text(found)).decisions == found.decisions

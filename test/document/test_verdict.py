@@ -7,7 +7,7 @@ import pytest
 
 from imu_calibration.document.calibration import Calibration, parameter_rows
 from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS, UNPROVEN, WARNING
-from imu_calibration.document.verdict import judge, judged, misfits
+from imu_calibration.document.verdict import judge, judged, motion_misfits
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK, tolerances_of
 
@@ -144,7 +144,7 @@ def test_only_residuals_with_structure_show_an_incomplete_model(
     statistics = with_statistics(
         'gyroscope', chi2_per_dof={'spin': 20.0}, slow_over_fast={'spin': slow_over_fast}
     ).statistics
-    found = misfits(calibration(statistics=statistics | {'windows': windows}))
+    found = motion_misfits(calibration(statistics=statistics | {'windows': windows}))
     assert [reason.word for reason in found] == kinds
     assert [reason.key for reason in found] == keys
 

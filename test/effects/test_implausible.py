@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.diagnosis.live_diagnosis import describe
+from imu_calibration.calibration.diagnosis.live_diagnosis import live_state_of
 from imu_calibration.core.units import STANDARD_GRAVITY as G
 from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.catalogue import CATALOGUE
@@ -50,7 +50,7 @@ def test_it_is_named_with_its_size_and_a_mark(diagnosed):
 
 
 def test_live_it_is_said_too(diagnosed):
-    state = describe(diagnosed.result.diagnosis)
+    state = live_state_of(diagnosed.result.diagnosis)
     assert (
         state.message.startswith('accel_cubic (implausible): ')
         and state.values['implausible'] == 'accel_cubic'

@@ -31,9 +31,9 @@ from imu_calibration.simulation.session import (
     SimulationOptions,
     hidden_effect,
     random_values,
-    simulate,
+    simulate_session,
 )
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.stands import stand
 
@@ -406,7 +406,7 @@ def test_the_example_file_is_a_catalogue_whose_effects_are_found():
         truth[model.slices[hidden_effect(model, name, 3)[0], name]] = hidden_effect(model, name, 3)[
             1
         ]
-    samples = simulate(
+    samples = simulate_session(
         model,
         truth,
         table,
@@ -414,7 +414,7 @@ def test_the_example_file_is_a_catalogue_whose_effects_are_found():
         options=SimulationOptions(noise=GRADES['industrial'].noise),
         seed=3,
     )
-    found = calibrate(SampleBlock(*samples), table, catalogue=example).calibration
+    found = calibrate_recordings(SampleBlock(*samples), table, catalogue=example).calibration
     for name, sensor in names.items():
         where = found.model.slices[sensor, name]
         np.testing.assert_allclose(

@@ -16,9 +16,9 @@ from imu_calibration.compensation.compensate import invertible_values
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import (
     calibration_from_text,
+    calibration_mapping,
     calibration_to_text,
     from_mapping,
-    to_mapping,
 )
 from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
@@ -131,7 +131,7 @@ def test_terms_and_reasons_pass_through_the_file(by_table):
     assert found.held_reason == by_table.calibration.held_reason
     for name, variance in by_table.calibration.covariance_terms.items():
         np.testing.assert_array_equal(found.covariance_terms[name], variance)
-    document = to_mapping(by_table.calibration)
+    document = calibration_mapping(by_table.calibration)
     document['covariance_terms']['noise'][0] *= 2
     with refused(DocumentError, 'covariance_terms'):
         from_mapping(document)

@@ -20,7 +20,7 @@ from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 from worlds.misfit_worlds import make_pair
 from worlds.physics import make_session
@@ -51,7 +51,9 @@ def motion():
     """Windows of a short session and their columns; each trial puts outputs on them."""
     profile = make_profile('quick', 0, TABLE)
     options = SimulationOptions(noise=SimulatedNoise(accel_density=1e-5, gyro_density=1e-6))
-    imu, joints, _ = simulate(MODEL, MODEL.start(), TABLE, profile=profile, options=options, seed=0)
+    imu, joints, _ = simulate_session(
+        MODEL, MODEL.start(), TABLE, profile=profile, options=options, seed=0
+    )
     gatherer = MotionGatherer(TABLE)
     windows = gatherer.push(SampleBlock(imu, joints)) + gatherer.finish()
     return [

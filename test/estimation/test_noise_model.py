@@ -18,8 +18,8 @@ from imu_calibration.estimation.noise_model import (
     dof_factor,
 )
 from imu_calibration.estimation.session_noise import least_misfit, misfit_along, white_noise
-from imu_calibration.selection.saturation import noise_at_rest
-from imu_calibration.simulation.sensor_noise import gauss_markov
+from imu_calibration.selection.saturation import sample_sd_at_rest
+from imu_calibration.simulation.sensor_noise import gauss_markov_samples
 
 
 def rest(variance, inflation=1.0, count=1000):
@@ -67,7 +67,7 @@ def test_a_code_that_is_constant_at_rest_has_the_noise_of_rounding():
             ('dynamic', 0.08 * np.repeat(np.arange(30.0)[:, None], 3, axis=1)),
         )
     )
-    np.testing.assert_allclose(noise_at_rest([still, turning], 'gyroscope'), 0.08 / np.sqrt(12))
+    np.testing.assert_allclose(sample_sd_at_rest([still, turning], 'gyroscope'), 0.08 / np.sqrt(12))
 
 
 def test_a_variance_from_few_data_is_taken_larger():
@@ -120,7 +120,7 @@ def test_a_mean_over_a_window_differs_from_the_bias_in_its_middle_by_what_it_wan
     Windows of 4 and 16 s of one that forgets in 100 s.
     """
     process, rng = BiasProcess(1.0, 100.0), np.random.default_rng(6)
-    bias = gauss_markov(process.sd, process.time, 0.1, shape=(161, 4000), rng=rng)
+    bias = gauss_markov_samples(process.sd, process.time, 0.1, shape=(161, 4000), rng=rng)
     noise = NoiseModel(np.zeros(3), np.ones(3), bias_processes=(process,))
     for count in (41, 161):
         drawn = (bias[:count].mean(axis=0) - bias[count // 2]).var()

@@ -24,7 +24,7 @@ from imu_calibration.planning.campaign import Campaign, CampaignSettings
 from imu_calibration.planning.planner import Decision, make_planner
 from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.table_controller import excess, trajectory_from
+from imu_calibration.simulation.table_controller import limit_excess, trajectory_from
 from imu_calibration.use_cases.resources import config_file
 
 from worlds.arms import SIX_AXES
@@ -124,7 +124,7 @@ def test_an_endless_joint_keeps_to_its_turns_and_is_unwound_at_the_end(start):
     for number in np.random.default_rng(1).permutation(len(planner.problem.motions))[:60]:
         points = planner.problem.motions[number].points(at)
         if len(points):
-            assert excess(trajectory_from(rest_at(at[None]), points), limits)[0] <= 1e-9, (
+            assert limit_excess(trajectory_from(rest_at(at[None]), points), limits)[0] <= 1e-9, (
                 planner.problem.motions[number].words
             )
             reached.append(points.position[:, 0])

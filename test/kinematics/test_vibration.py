@@ -19,7 +19,7 @@ from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.selection.questions import testable_effects as asked_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
-from imu_calibration.simulation.session import SimulationOptions, answered, simulate
+from imu_calibration.simulation.session import SimulationOptions, answered, simulate_session
 
 from worlds.compensation_cases import random_calibration
 from worlds.diagnosing import diagnose
@@ -137,8 +137,8 @@ def test_a_machine_shakes_simulated_sensors_whose_bias_follows_vibration_recorde
         make_profile('static_only', seed=1, table=TABLES['three_axis']),
         SimulationOptions(noise=SimulatedNoise()),
     )
-    imu, joints, _ = simulate(model, values, table, profile=profile, options=options)
-    bare = simulate(plain, plain.start(), table, profile=profile, options=options)[0]
+    imu, joints, _ = simulate_session(model, values, table, profile=profile, options=options)
+    bare = simulate_session(plain, plain.start(), table, profile=profile, options=options)[0]
     gatherer = MotionGatherer(table)
     vibration = np.concatenate(
         [

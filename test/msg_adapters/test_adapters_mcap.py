@@ -16,7 +16,7 @@ from msg_adapters.definitions import standard_definition
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
 from msg_adapters.mcap_file import MAGIC, indexed_messages, walk
-from msg_adapters.mcap_writer import record, text
+from msg_adapters.mcap_writer import prefixed_string, record
 from msg_adapters.write import encode_imu, encode_joints
 
 
@@ -29,17 +29,23 @@ def topic_records(number, name, message_type):
     return record(
         0x03,
         struct.pack('<H', number),
-        text(definition.type),
-        text('ros2msg'),
-        text(definition.text),
-    ) + record(0x04, struct.pack('<HH', number, number), text(name), text('cdr'), text(b''))
+        prefixed_string(definition.type),
+        prefixed_string('ros2msg'),
+        prefixed_string(definition.text),
+    ) + record(
+        0x04,
+        struct.pack('<HH', number, number),
+        prefixed_string(name),
+        prefixed_string('cdr'),
+        prefixed_string(b''),
+    )
 
 
 def chunk(content):
     return record(
         0x06,
         struct.pack('<QQQI', 0, 0, len(content), 0),
-        text(''),
+        prefixed_string(''),
         struct.pack('<Q', len(content)),
         content,
     )
@@ -47,7 +53,12 @@ def chunk(content):
 
 def write_file(path, data_section, finished=True):
     footer = record(0x0F, bytes(4)) + record(0x02, bytes(20)) + MAGIC if finished else b''
-    path.write_bytes(MAGIC + record(0x01, text('ros2'), text('test')) + data_section + footer)
+    path.write_bytes(
+        MAGIC
+        + record(0x01, prefixed_string('ros2'), prefixed_string('test'))
+        + data_section
+        + footer
+    )
     return path
 
 
@@ -114,7 +125,7 @@ def test_an_index_that_is_wrong_is_not_believed(tmp_path, parts):
     entries = np.stack(
         [offsets, offsets + 1], axis=1
     )  # every offset one too large, and channel 2 forgotten
-    index = record(0x07, struct.pack('<H', 1), text(entries.astype('<u8').tobytes()))
+    index = record(0x07, struct.pack('<H', 1), prefixed_string(entries.astype('<u8').tobytes()))
     check(
         write_file(
             tmp_path / 'x.mcap',

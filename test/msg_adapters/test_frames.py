@@ -7,7 +7,7 @@ from refusal import refused
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import OTHER_FRAME, FrameChoice
@@ -86,9 +86,11 @@ def test_the_option_selects_the_frame_and_its_absence_is_one_line(capsys, two, t
     ) in (0, 3)
     assert 'frame_id: rear' in (out / 'calibration.yaml').read_text()
     with refused(InputError, 'frame_ambiguous'):
-        compensate(two[0], out / 'calibration.yaml', output=tmp_path / 'refused', anyway=True)
+        compensate_recording(
+            two[0], out / 'calibration.yaml', output=tmp_path / 'refused', anyway=True
+        )
     assert not (tmp_path / 'refused').exists()
-    found = compensate(
+    found = compensate_recording(
         two[0],
         out / 'calibration.yaml',
         output=tmp_path / 'corrected',

@@ -14,7 +14,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import yaml
-from test_adapters_mcap import chunk, message, record, text, write_file
+from test_adapters_mcap import chunk, message, prefixed_string, record, write_file
 
 from imu_calibration.core.documents import parsed
 from imu_calibration.core.errors import InputError
@@ -78,7 +78,7 @@ def test_a_chunk_expands_to_its_declared_size_at_most(tmp_path, compression, dec
             packed = packed[:6] + struct.pack('<Q', 2**45) + packed[14:]
     content = (
         struct.pack('<QQQI', 0, 1, declared, 0)
-        + text(compression[:4])
+        + prefixed_string(compression[:4])
         + struct.pack('<Q', len(packed))
         + packed
     )
@@ -98,7 +98,10 @@ def test_frames_without_content_do_not_take_quadratic_time(tmp_path):
     refused('inspect', tmp_path / 'x.mcap.zstd')
     packed = zstd().compress(b'') * 300_000
     content = (
-        struct.pack('<QQQI', 0, 1, 1000, 0) + text('zstd') + struct.pack('<Q', len(packed)) + packed
+        struct.pack('<QQQI', 0, 1, 1000, 0)
+        + prefixed_string('zstd')
+        + struct.pack('<Q', len(packed))
+        + packed
     )
     write_file(tmp_path / 'x.mcap', record(0x06, content))
     refused('inspect', tmp_path / 'x.mcap')

@@ -15,7 +15,7 @@ from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import CAUSES, Felt, SimulatedNoise, hidden_causes
-from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, simulate
+from imu_calibration.simulation.session import LiveSimulation, SimulationOptions, simulate_session
 from imu_calibration.simulation.table_controller import (
     ControllerSettings,
     TableController,
@@ -243,7 +243,7 @@ def test_blocks_without_noise_are_the_offline_simulation():
     _, _, values, model = make_session(2, 100.0, seconds=1.0)
     options = SimulationOptions(100.0, 50.0, SimulatedNoise(), temperature_start_c=20.0)
     profile = make_profile('quick', 1, TABLE)
-    expected = simulate(model, values, TABLE, profile=profile, options=options)
+    expected = simulate_session(model, values, TABLE, profile=profile, options=options)
     live = LiveSimulation(
         model,
         values,

@@ -38,7 +38,7 @@ from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.table_controller import (
     ControllerSettings,
     TableController,
-    excess,
+    limit_excess,
     trajectory_from,
 )
 
@@ -424,7 +424,7 @@ def test_no_limit_of_any_table_is_ever_exceeded_by_what_is_sent(seed, hurry):
     except InputError:
         assert driver.state is DriveState.IDLE and hurry > 1.0
         return
-    beyond, speed, acceleration = excess(
+    beyond, speed, acceleration = limit_excess(
         trajectory_from(rest_at(start[None]), sent), limits, step=0.001
     )
     assert beyond < 1e-5 and speed < 1 + 1e-3 and acceleration < 1 + 1e-3

@@ -32,8 +32,8 @@ from imu_calibration.references.options import CalibrationOptions, choose_model
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.plan import class_in
 from imu_calibration.use_cases.recordings import table_of
 from imu_calibration.use_cases.resources import config_file
@@ -91,7 +91,7 @@ def test_what_is_promised_is_what_a_calibration_of_the_motion_comes_to(plan, tab
     errors = []
     for seed in range(4):
         values = random_values(model, 'industrial', seed)
-        samples = simulate(
+        samples = simulate_session(
             model,
             values,
             table,
@@ -99,7 +99,7 @@ def test_what_is_promised_is_what_a_calibration_of_the_motion_comes_to(plan, tab
             options=SimulationOptions(noise=GRADES['industrial'].noise),
             seed=seed,
         )
-        found = calibrate(SampleBlock(*samples), table).calibration
+        found = calibrate_recordings(SampleBlock(*samples), table).calibration
         errors += [
             (found.values[found.param_names.index(name)] - value)
             / plan.sd[plan.model.param_names.index(name)]
@@ -175,10 +175,10 @@ def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_di
     )
     model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names)
     for seed in range(4):
-        samples = simulate(
+        samples = simulate_session(
             model, random_values(model, 'industrial', seed), table, profile=profile, seed=seed
         )
-        found = calibrate(SampleBlock(*samples), table).calibration
+        found = calibrate_recordings(SampleBlock(*samples), table).calibration
         status = dict(zip(found.param_names, found.status, strict=True))
         assert {
             status[name]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.planning.motion_library import MotionKind, MotionLibrary, rest_at, up_at
-from imu_calibration.simulation.table_controller import excess, trajectory_from
+from imu_calibration.simulation.table_controller import limit_excess, trajectory_from
 
 from worlds.random_tables import random_table
 
@@ -29,7 +29,7 @@ def test_no_trajectory_leaves_the_limits_of_any_joint(seed, count, ends):
     for number in rng.permutation(len(motions))[:12]:
         points = motions[number].points(position)
         if len(points):
-            beyond, speed, acceleration = excess(
+            beyond, speed, acceleration = limit_excess(
                 trajectory_from(rest_at(position[None]), points), limits
             )
             assert beyond <= 1e-9 and speed <= 1.0 and acceleration <= 1.0, motions[number].words

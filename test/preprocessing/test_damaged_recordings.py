@@ -12,7 +12,7 @@ from imu_calibration.cli.main import main
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
@@ -31,7 +31,7 @@ STORAGES = ('sqlite3', 'mcap')
 def bags(tmp_path_factory):
     """The same session as a bag of each kind."""
     folder = tmp_path_factory.mktemp('bags')
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         MODEL,
         VALUES,
         TABLE,

@@ -13,14 +13,14 @@ from refusal import refused
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document import files, verdict
 from imu_calibration.estimation import observability
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.use_cases.inspect import inspect
+from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.bag import Recording
 
@@ -57,7 +57,7 @@ def seen(monkeypatch):
 
 
 def test_calibration_cleans_each_sample_once_for_windows_and_checks(table, seen):
-    calibrate([source_of(BAG, Topics(), table.joint_names)], table, PLAIN)
+    calibrate_on_table([source_of(BAG, Topics(), table.joint_names)], table, PLAIN)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] > 0
 
 
@@ -71,7 +71,7 @@ def test_calibration_by_hand_cleans_each_sample_once(seen):
 
 @pytest.mark.parametrize('with_table', [True, False], ids=['table', 'no table'])
 def test_inspect_reads_a_recording_once_for_streams_checks_and_motions(table, seen, with_table):
-    (look,) = inspect(BAG, [Topics()], table if with_table else None, options=PLAIN)
+    (look,) = inspect_recording(BAG, [Topics()], table if with_table else None, options=PLAIN)
     assert seen['passes'] == 1 and seen['cleaned'] == seen['samples'] == look.streams['imu'].count
     assert (look.calibrated is not None) == with_table and (look.by_hand is not None) != with_table
 
@@ -104,7 +104,7 @@ def test_verdict_and_needed_motions_are_worked_out_once_per_solution(table, monk
         counting(monkeypatch, verdict, 'judge'),
         counting(monkeypatch, observability, 'needed_motions'),
     )
-    result = calibrate(
+    result = calibrate_on_table(
         [source_of(BAG, Topics(), table.joint_names)],
         table,
         CalibrationOptions(reference_model='table_tilt'),

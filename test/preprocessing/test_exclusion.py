@@ -13,9 +13,9 @@ from imu_calibration.preprocessing.exclusion import (
     parse_exclusions,
     without_excluded,
 )
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.choices import inputs_of
-from imu_calibration.use_cases.noise import noise
+from imu_calibration.use_cases.noise import identify_recording
 
 from worlds.hand_sessions import GRAVITY
 from worlds.physics_hand import hold_and_turn
@@ -73,10 +73,10 @@ def test_the_use_cases_leave_it_out():
     part = (time > 20) & (time < 29)
     shaken[part] += np.random.default_rng(1).normal(0, 8, (np.count_nonzero(part), 3))
     block = SampleBlock(ImuSamples(imu.stamp_ns, shaken, imu.rate_s, 'imu'))
-    found = calibrate([block], gravity=GRAVITY, model_as_asked=True, exclude='19.8:29.2')
+    found = calibrate_recordings([block], gravity=GRAVITY, model_as_asked=True, exclude='19.8:29.2')
     assert found.calibration.statistics['dropped'][EXCLUDED] == pytest.approx(9.4 * 80, abs=1)
     assert found.exit_code == 3
     (source,) = inputs_of([block], None, {'exclude': '1:2'}).sources
     assert sum((each.dropped or {}).get(EXCLUDED, 0) for each in source()) == 80
     with refused(InputError, 'exclude_outside', '70:71'):
-        noise(block, exclude='70:71')
+        identify_recording(block, exclude='70:71')

@@ -21,7 +21,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.hand_sessions import GRAVITY
 from worlds.physics import make_session
@@ -108,9 +108,9 @@ def test_check_and_compensate_note_the_part(clean, usual):
     good = check_by_hand(lambda: iter([SampleBlock(other)]), usual.calibration, OPTIONS)
     assert (checked.exit_code, good.exit_code) == (3, 0)
     assert checked.proof['accelerometer']['after'] < 2 * good.proof['accelerometer']['after']
-    corrected = compensate(bad, usual.calibration)
+    corrected = compensate_recording(bad, usual.calibration)
     assert corrected.exit_code == 3 and corrected.frozen == pytest.approx(16 * 90, rel=0.05)
-    unharmed = compensate(other, usual.calibration)
+    unharmed = compensate_recording(other, usual.calibration)
     assert unharmed.frozen == 0 and len(corrected.warnings) == len(unharmed.warnings) + 1
 
 

@@ -22,7 +22,7 @@ from imu_calibration.preprocessing.on_table import (
     signs_or_delay,
 )
 from imu_calibration.preprocessing.window import Window, WindowKind
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.diagnose import diagnose
 
 from worlds.misfit_worlds import make_pair
@@ -89,7 +89,7 @@ def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(
 ):
     block, table = gimbals
     with refused(InputError, 'on_table') as caught:
-        calibrate(change(block), table)
+        calibrate_recordings(change(block), table)
     assert all(word in str(caught.value) for word in words) and '\n' not in str(caught.value)
     assert ('--imu-topic' in caught.value.with_hint({'imu_topic': '--imu-topic'})) == (
         not words
@@ -102,12 +102,12 @@ def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(
 )
 def test_streams_that_are_apart_in_time_are_told_from_a_wrong_imu(shaft, seconds, delay, side):
     with refused(InputError, 'on_table', delay, side):
-        calibrate(later(shaft[0], seconds), shaft[1])
+        calibrate_recordings(later(shaft[0], seconds), shaft[1])
 
 
 def test_one_joint_the_other_way_round_is_told_from_a_wrong_imu(shaft):
     with refused(InputError, 'on_table', 'shaft turns the other way round', 'measured x is minus'):
-        calibrate(joints(shaft[0], sign=-1.0), shaft[1])
+        calibrate_recordings(joints(shaft[0], sign=-1.0), shaft[1])
 
 
 def sweeps(table, measured_rate, joint_rate):
@@ -236,7 +236,7 @@ def test_the_joints_with_a_reversed_sign_are_named_and_no_mount_or_standstill_is
     Gravity separates them.
     """
     with refused(InputError, 'on_table') as caught:
-        calibrate(joints(gimbals[0], sign=np.array(signs)), gimbals[1])
+        calibrate_recordings(joints(gimbals[0], sign=np.array(signs)), gimbals[1])
     assert [
         name for name in gimbals[1].joint_names if re.search(rf'\b{name}\b', str(caught.value))
     ] == corrected
@@ -329,7 +329,9 @@ def test_imu_axes_exchanged_in_a_part_of_the_recording_are_reported_with_the_tim
     part = slice(2 * len(rate) // 5, 4 * len(rate) // 5)
     force[part], rate[part] = force[part][:, order] * signs, rate[part][:, order] * signs
     with refused(InputError, 'on_table', words, ' s to ', 'the driver of the IMU') as caught:
-        calibrate(replace(block, imu=replace(block.imu, force_s=force, rate_s=rate)), table)
+        calibrate_recordings(
+            replace(block, imu=replace(block.imu, force_s=force, rate_s=rate)), table
+        )
     duration = (block.imu.stamp_ns[-1] - block.imu.stamp_ns[0]) * 1e-9
     start, stop = (
         float(each) for each in re.search(r'from (\d+) s to (\d+) s', str(caught.value)).groups()
@@ -354,7 +356,9 @@ def test_one_joint_that_stands_still_is_named_with_the_time(gimbals, joint):
     block, table = gimbals
     count = len(block.joints.position)
     with refused(InputError, 'frozen', table.joint_names[joint], ' s to '):
-        calibrate(frozen(block, joint=joint, start=count // 3, stop=3 * count // 4), table)
+        calibrate_recordings(
+            frozen(block, joint=joint, start=count // 3, stop=3 * count // 4), table
+        )
 
 
 def test_a_gyroscope_that_repeats_one_reading_on_a_shaft_is_left_out(shaft):
@@ -362,16 +366,18 @@ def test_a_gyroscope_that_repeats_one_reading_on_a_shaft_is_left_out(shaft):
     moving = np.flatnonzero(np.abs(rate[:, 0]) > 1.0)
     start = moving[len(moving) // 2]
     rate[start : start + 1000] = rate[start]
-    found = calibrate(replace(shaft[0], imu=replace(shaft[0].imu, rate_s=rate)), shaft[1])
+    found = calibrate_recordings(
+        replace(shaft[0], imu=replace(shaft[0].imu, rate_s=rate)), shaft[1]
+    )
     (frozen,) = [each for each in found.result.gathered.findings if each.samples]
     assert frozen.check == 'frozen' and frozen.samples == pytest.approx(1000, abs=50)
     assert found.exit_code == 3 and found.calibration.decisions['gyroscope'] == 'helps'
-    away = found.calibration.values - calibrate(*shaft).calibration.values
+    away = found.calibration.values - calibrate_recordings(*shaft).calibration.values
     assert (np.abs(away) <= 2 * found.calibration.sd).all()
 
 
 def test_a_wrong_gain_is_no_frozen_joint(gimbals):
-    assert calibrate(
+    assert calibrate_recordings(
         replace(gimbals[0], imu=replace(gimbals[0].imu, rate_s=1.1 * gimbals[0].imu.rate_s)),
         gimbals[1],
     ).calibration
@@ -398,7 +404,7 @@ def test_gain_and_coherence_decide(gain, noise, fails):
 def test_the_imu_on_the_bench_is_refused(recordings):
     folder = recordings / 'shaft_yaw_medium'
     with refused(InputError, 'on_table', '0 %'):
-        calibrate(folder, folder / 'table.yaml', imu_topic='/imu_fixed/data_raw')
+        calibrate_recordings(folder, folder / 'table.yaml', imu_topic='/imu_fixed/data_raw')
 
 
 def test_a_live_session_tells_the_same_causes(gimbals):

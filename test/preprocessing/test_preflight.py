@@ -25,7 +25,7 @@ from imu_calibration.preprocessing.recording_evidence import GOOD, NOTE, REFUSE,
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
 from imu_calibration.preprocessing.value_checks import force_error
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import random_values, simulate
+from imu_calibration.simulation.session import random_values, simulate_session
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import standard_definition
@@ -563,7 +563,7 @@ def test_motions_of_the_papers_are_left_in_peace(profile):
     made = make_profile(profile)
     table = Table.from_mapping(made.table)
     model = SensorModel(joint_names=tuple(table.joint_names))
-    found = findings(simulate(model, random_values(model), table, profile=made))
+    found = findings(simulate_session(model, random_values(model), table, profile=made))
     assert [f for f in found if f.severity not in (GOOD, NOTE)] == []
     assert 'rate_unit' in {f.check for f in found} or profile == 'avrutov_rates_3'
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.hand_workflow import read_by_hand
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
@@ -149,7 +149,7 @@ def test_one_per_cent_of_spikes_does_not_matter_on_the_table():
     table = Table.from_mapping(session.table)
 
     def result(imu):
-        return calibrate(
+        return calibrate_on_table(
             [lambda: iter([SampleBlock(imu, session.joints, session.temperature)])], table
         ).calibration
 

@@ -7,7 +7,7 @@ What of it can be known, and that the rest of the calibration does not suffer.
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.estimation.solution import HELD, WEAK
 from imu_calibration.references.options import CalibrationOptions
 
@@ -71,7 +71,9 @@ def test_joints_taken_at_their_word_spoil_the_calibration(world):
     true = {name: value for name, value in truth(world).items() if '.matrix.' in name}
     errors = []
     at_their_word = CalibrationOptions(reference_model='table_tilt')
-    spoilt = calibrate([lambda: iter([world.block])], world.table, at_their_word).calibration
+    spoilt = calibrate_on_table(
+        [lambda: iter([world.block])], world.table, at_their_word
+    ).calibration
     for calibration in (calibrated(world), spoilt):
         found = dict(
             zip(

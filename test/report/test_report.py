@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import with_sd
 from imu_calibration.effects.base import Role
@@ -34,10 +34,10 @@ from imu_calibration.report.navigation_section import (
     motion_growth,
     noise_densities,
 )
-from imu_calibration.report.page import fixed, text
+from imu_calibration.report.page import fixed, number_text
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
@@ -73,7 +73,7 @@ VOID = {'meta', 'link', 'br', 'img', 'hr', 'input'}
 def session(profile, seed=6):
     """Simulate one recording."""
     values = random_values(MODEL, 'industrial', seed)
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         MODEL,
         values,
         TABLE,
@@ -93,7 +93,7 @@ def quick():
 @pytest.fixture(scope='module')
 def on_table(quick):
     """Its calibration on the table."""
-    return calibrate([lambda: iter([quick])], TABLE, provenance=PROVENANCE)
+    return calibrate_on_table([lambda: iter([quick])], TABLE, provenance=PROVENANCE)
 
 
 @pytest.fixture(scope='module')
@@ -105,7 +105,7 @@ def by_hand(quick):
 @pytest.fixture(scope='module')
 def demanding(quick):
     """The recording judged by tolerances on the arms that it does not meet."""
-    return calibrate(
+    return calibrate_on_table(
         [lambda: iter([quick])],
         TABLE,
         CalibrationOptions(tolerances={'accelerometer': {'accel_size_effect': 1e-5}}),
@@ -311,15 +311,15 @@ def test_a_recording_with_an_unmodelled_effect_recommends_a_diagnosis(quick):
         quick.imu,
         rate_s=np.concatenate([np.repeat(quick.imu.rate_s[:1], 2, axis=0), quick.imu.rate_s[:-2]]),
     )
-    result = calibrate([lambda: iter([SampleBlock(late, quick.joints)])], TABLE)
+    result = calibrate_on_table([lambda: iter([SampleBlock(late, quick.joints)])], TABLE)
     page = calibration_report(result)
     assert 'imu_calibration diagnose' in page
 
 
 def test_numbers_are_printed_for_people():
-    assert text(0.00012345) == '0.000123'
-    assert text(-4.5e-7, 2) == '−4.5·10⁻⁷'
-    assert text(float('nan')) == '–'
+    assert number_text(0.00012345) == '0.000123'
+    assert number_text(-4.5e-7, 2) == '−4.5·10⁻⁷'
+    assert number_text(float('nan')) == '–'
     assert fixed(-0.0000001, 3) == '0.000'
 
 

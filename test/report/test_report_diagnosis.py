@@ -35,7 +35,7 @@ from imu_calibration.selection.gain import APPLIED, Gain
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 TABLE = Table.from_mapping(
     {
@@ -59,7 +59,7 @@ def result():
     values[MODEL.slices['gyroscope', 'gyro_g_sensitivity']] = 8e-5 * np.array(
         [1, -0.5, 0.3, 0.2, 1, -0.4, 0.5, 0.1, -1]
     )
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         MODEL,
         values,
         TABLE,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.diagnosis.diagnosis_result import to_mapping
+from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import timing_lines
 from imu_calibration.document.decision import WARNING
-from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios, misfits
+from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios, motion_misfits
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.selection.stamp_jitter import jitter_ratio, stamp_jitter
@@ -74,7 +74,7 @@ def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
     recording = record(5, None, 'realistic@navigation', through_bag=False)
     diagnosis = diagnose(recording.windows, recording.table, recording.model)
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
-    assert to_mapping(diagnosis)['stamp_jitter_s'] == pytest.approx(50e-6, rel=0.1)
+    assert diagnosis_mapping(diagnosis)['stamp_jitter_s'] == pytest.approx(50e-6, rel=0.1)
     assert timing_lines(diagnosis) == diagnosis.stamp_jitter.lines != []
 
 
@@ -87,16 +87,16 @@ def test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model()
         and entry['variance_ratio']['gyroscope']['spin'] > 100
     )
     assert max(misfit_ratios(result.calibration, 'gyroscope').values()) < NOTED_MISFIT
-    assert not misfits(result.calibration)
+    assert not motion_misfits(result.calibration)
     without = replace(
         result.calibration,
         statistics={k: v for k, v in result.calibration.statistics.items() if k != 'stamp_jitter'},
     )
     # Scatter by the stamps is white: it is louder noise, with structure in time it is a misfit.
-    assert {reason.key for reason in misfits(without)} == {None}
+    assert {reason.key for reason in motion_misfits(without)} == {None}
     unjudged = {
         key: {k: v for k, v in part.items() if k != 'slow_over_fast'} if key in SENSORS else part
         for key, part in without.statistics.items()
     }
-    found = misfits(replace(without, statistics=unjudged))
+    found = motion_misfits(replace(without, statistics=unjudged))
     assert {reason.word for reason in found} >= {WARNING}

@@ -7,7 +7,7 @@ from imu_calibration.simulation.sensor_noise import (
     GRADES,
     ImuNoise,
     SimulatedNoise,
-    gauss_markov,
+    gauss_markov_samples,
     jitter_stamps,
     quantise,
     read_encoders,
@@ -27,7 +27,7 @@ def test_white_noise_integrates_to_a_random_walk_of_its_density():
 
 
 def test_bias_wander_is_stationary_with_its_correlation_time():
-    wander = gauss_markov(3.0, 5.0, 0.1, shape=(2000, 400), rng=np.random.default_rng(2))
+    wander = gauss_markov_samples(3.0, 5.0, 0.1, shape=(2000, 400), rng=np.random.default_rng(2))
     for row in (0, 500, 1999):
         # 400 independent paths: 3.5 % sampling error.
         assert np.std(wander[row]) == pytest.approx(3.0, rel=0.12)
@@ -38,8 +38,8 @@ def test_bias_wander_is_stationary_with_its_correlation_time():
 
 def test_bias_wander_continues_from_block_to_block():
     rng = np.random.default_rng(5)
-    first = gauss_markov(3.0, 5.0, 0.1, shape=(10, 4000), rng=rng)
-    second = gauss_markov(3.0, 5.0, 0.1, shape=(10, 4000), rng=rng, before=first[-1])
+    first = gauss_markov_samples(3.0, 5.0, 0.1, shape=(10, 4000), rng=rng)
+    second = gauss_markov_samples(3.0, 5.0, 0.1, shape=(10, 4000), rng=rng, before=first[-1])
     # 4000 independent paths: 1.6 % sampling error.
     assert np.mean(second[0] * first[-1]) / 9.0 == pytest.approx(np.exp(-0.1 / 5.0), abs=0.06)
     assert np.std(second[0] - first[-1]) == pytest.approx(

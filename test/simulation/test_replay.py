@@ -12,9 +12,9 @@ from imu_calibration.document import files
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.replay import ReplayNoise, replay
+from imu_calibration.simulation.replay import ReplayNoise, simulate_on_recording
 from imu_calibration.simulation.sensor_noise import SimulatedNoise
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 from imu_calibration.use_cases import simulate as use_case
 from imu_calibration.use_cases.resources import config_file
 
@@ -35,7 +35,7 @@ def session():
     options = SimulationOptions(noise=SimulatedNoise(stamp_jitter=1e-6), temperature_start_c=25.0)
     return (
         SampleBlock(
-            *simulate(
+            *simulate_session(
                 MODEL,
                 values,
                 table,
@@ -56,7 +56,7 @@ def test_without_noise_the_replay_of_a_simulation_repeats_its_readings(session):
     The readings agree to the error of the joints' curve.
     """
     samples, table, values = session
-    made, lost = replay([samples], table, MODEL, values=values, noise=QUIET)
+    made, lost = simulate_on_recording([samples], table, MODEL, values=values, noise=QUIET)
     assert len(made.imu) + lost == len(samples.imu) and lost < 20
     kept = np.isin(samples.imu.stamp_ns, made.imu.stamp_ns)
     np.testing.assert_array_equal(made.imu.stamp_ns, samples.imu.stamp_ns[kept])
@@ -73,7 +73,7 @@ def test_the_noise_of_a_replay_is_the_identified_one(session):
         'gyroscope': ReplayNoise(np.zeros(3), 1e-3 * sd, 1.0),
     }
     quiet, noisy = (
-        replay([samples], table, MODEL, values=values, noise=each, seed=1)[0].imu
+        simulate_on_recording([samples], table, MODEL, values=values, noise=each, seed=1)[0].imu
         for each in (QUIET, noise)
     )
     np.testing.assert_allclose((noisy.force_s - quiet.force_s).std(axis=0), 1e-2 * sd, rtol=0.03)
@@ -94,7 +94,8 @@ def test_without_noise_in_the_calibration_that_at_rest_is_taken(session):
         ),
     )
     quiet, made = (
-        replay([noisy], table, MODEL, values=values, noise=noise)[0].imu for noise in (QUIET, None)
+        simulate_on_recording([noisy], table, MODEL, values=values, noise=noise)[0].imu
+        for noise in (QUIET, None)
     )
     np.testing.assert_allclose((made.rate_s - quiet.rate_s).std(axis=0), 1e-3, rtol=0.05)
 
@@ -109,11 +110,11 @@ def test_a_replay_vibrates_as_its_recording(session):
     values = model.start_from(MODEL, session[2])
     options = SimulationOptions(noise=SimulatedNoise(), temperature_start_c=25.0)
     samples = SampleBlock(
-        *simulate(
+        *simulate_session(
             model, values, table, profile=make_profile('quick', 3, table), options=options, seed=3
         )
     )
-    made = replay([samples], table, model, values=values, noise=QUIET)[0].imu
+    made = simulate_on_recording([samples], table, model, values=values, noise=QUIET)[0].imu
     recorded, replayed = (
         BandVariance().of(0.01, each.force_s)[500:]
         for each in (samples.imu.select(np.isin(samples.imu.stamp_ns, made.stamp_ns)), made)
@@ -125,8 +126,8 @@ def test_a_replay_vibrates_as_its_recording(session):
 def test_what_a_replay_requires(session):
     samples, table, values = session
     with refused(InputError, 'temperature_missing'):
-        replay([replace(samples, temperature=None)], table, MODEL, values=values)
+        simulate_on_recording([replace(samples, temperature=None)], table, MODEL, values=values)
     with refused(InputError, 'no_motion'):
-        replay([replace(samples, joints=None)], table, MODEL, values=values)
+        simulate_on_recording([replace(samples, joints=None)], table, MODEL, values=values)
     with refused(InputError, 'replay_by_hand'):
         use_case.replay(samples, 'nowhere.yaml', None)

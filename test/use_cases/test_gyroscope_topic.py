@@ -9,7 +9,7 @@ from refusal import refused
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.definitions import standard_definition
 from msg_adapters.imu import IMU_TYPE
@@ -38,7 +38,7 @@ def bag(tmp_path_factory):
 
 
 def test_both_sensors_are_calibrated(bag):
-    result = calibrate(bag, imu_topic='/accel', gyroscope_topic='/gyro', gravity=GRAVITY)
+    result = calibrate_recordings(bag, imu_topic='/accel', gyroscope_topic='/gyro', gravity=GRAVITY)
     found = result.calibration
     assert found.decisions == {'accelerometer': 'helps', 'gyroscope': 'helps'}
     # x of the body is the x axis of the accelerometer in both matrices
@@ -52,11 +52,11 @@ def test_both_sensors_are_calibrated(bag):
 
 def test_a_topic_that_is_missing_is_named(bag):
     with refused(InputError, 'topic_unknown', '/gyr'):
-        calibrate(bag, imu_topic='/accel', gyroscope_topic='/gyr', gravity=GRAVITY)
+        calibrate_recordings(bag, imu_topic='/accel', gyroscope_topic='/gyr', gravity=GRAVITY)
 
 
 def test_one_topic_alone_is_one_sensor(bag):
-    found = calibrate(bag, imu_topic='/accel', gravity=GRAVITY)
+    found = calibrate_recordings(bag, imu_topic='/accel', gravity=GRAVITY)
     assert list(found.calibration.decisions) == ['accelerometer']
     assert found.exit_code == 3
 

@@ -8,8 +8,8 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.preprocessing.absent_sensor import MIN_ABSENT_SAMPLES, SensorPresence
-from imu_calibration.use_cases.calibrate import calibrate, check
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
+from imu_calibration.use_cases.compensate import compensate_recording
 
 from worlds.small_hand import ACCELEROMETER, GRAVITY, GYROSCOPE, hand_motion
 
@@ -34,7 +34,7 @@ def without(values):
 @pytest.fixture(scope='module')
 def accelerometer_only():
     time, force, rate = readings(31)
-    return calibrate([block(time, force, without(rate))], gravity=GRAVITY)
+    return calibrate_recordings([block(time, force, without(rate))], gravity=GRAVITY)
 
 
 def test_an_accelerometer_alone_is_calibrated(accelerometer_only):
@@ -63,10 +63,10 @@ def test_the_document_keeps_what_is_absent(accelerometer_only):
 def test_it_is_checked_and_applied_to_one_sensor(accelerometer_only):
     time, force, rate = readings(32)
     calibration = accelerometer_only.calibration
-    found = check(block(time, force, without(rate)), calibration, gravity=GRAVITY)
+    found = check_recording(block(time, force, without(rate)), calibration, gravity=GRAVITY)
     assert list(found.proof) == ['accelerometer']
     assert found.exit_code == 0
-    corrected = compensate(block(time, force, without(rate)), calibration)
+    corrected = compensate_recording(block(time, force, without(rate)), calibration)
     assert corrected.exit_code == 0
     assert np.isnan(corrected.imu.rate_s).all()
     still = np.linalg.norm(rate - GYROSCOPE.bias, axis=1) < 0.02
@@ -76,7 +76,7 @@ def test_it_is_checked_and_applied_to_one_sensor(accelerometer_only):
 
 def test_readings_of_the_absent_sensor_pass_with_a_reason(accelerometer_only):
     time, force, rate = readings(33)
-    corrected = compensate(block(time, force, rate), accelerometer_only.calibration)
+    corrected = compensate_recording(block(time, force, rate), accelerometer_only.calibration)
     assert list(corrected.refused) == ['gyroscope']
     assert corrected.exit_code == 3
     assert np.allclose(corrected.imu.rate_s, rate, rtol=0, atol=1e-12)
@@ -84,7 +84,7 @@ def test_readings_of_the_absent_sensor_pass_with_a_reason(accelerometer_only):
 
 def test_a_gyroscope_alone_has_its_bias():
     time, force, rate = readings(34)
-    result = calibrate([block(time, without(force), rate)], gravity=GRAVITY)
+    result = calibrate_recordings([block(time, without(force), rate)], gravity=GRAVITY)
     found = result.calibration
     assert found.absent == ('accelerometer',)
     assert list(found.decisions) == ['gyroscope']
@@ -93,11 +93,11 @@ def test_a_gyroscope_alone_has_its_bias():
     z = (found.values[places] - GYROSCOPE.bias) / found.sd[places]
     assert np.abs(z).max() < 4.0
     assert result.exit_code == 3  # without gravity no turn determines its matrix
-    corrected = compensate(block(time, without(force), rate), found)
+    corrected = compensate_recording(block(time, without(force), rate), found)
     still = np.linalg.norm(rate - GYROSCOPE.bias, axis=1) < 0.02
     assert np.abs(corrected.imu.rate_s[still].mean(axis=0)).max() < 2e-4
     with refused(InputError, 'absent'):
-        check(block(time, force, without(rate)), found, gravity=GRAVITY)
+        check_recording(block(time, force, without(rate)), found, gravity=GRAVITY)
 
 
 def test_presence_does_not_depend_on_the_pieces():
@@ -131,7 +131,7 @@ def test_a_sensor_that_starts_soon_is_present():
 
 def test_a_gyroscope_that_measures_nothing_does_not_refuse_the_accelerometer():
     time, force, rate = readings(35)
-    result = calibrate([block(time, force, np.zeros_like(rate))], gravity=GRAVITY)
+    result = calibrate_recordings([block(time, force, np.zeros_like(rate))], gravity=GRAVITY)
     assert list(result.calibration.decisions) == ['accelerometer']
     assert result.calibration.decisions['accelerometer'] == 'helps'
     assert list(result.calibration.statistics['unusable_sensors']) == ['gyroscope']
@@ -141,4 +141,6 @@ def test_a_gyroscope_that_measures_nothing_does_not_refuse_the_accelerometer():
 def test_an_accelerometer_that_reads_zero_is_no_traceback():
     time, force, rate = readings(36)
     with refused(InputError, 'frozen'):
-        calibrate([block(time, np.zeros_like(force), np.zeros_like(rate))], gravity=GRAVITY)
+        calibrate_recordings(
+            [block(time, np.zeros_like(force), np.zeros_like(rate))], gravity=GRAVITY
+        )

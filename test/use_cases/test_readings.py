@@ -14,8 +14,8 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings, parse_axes, unit_of
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
-from imu_calibration.use_cases.calibrate import calibrate, check
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
+from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
@@ -65,7 +65,7 @@ def in_g(truth):
     """A calibration of readings in g and deg/s."""
     raw = in_units(truth[0], 'g', 'deg/s')
     units = {'accelerometer_unit': 'g', 'gyroscope_unit': 'deg/s'}
-    return calibrate(SampleBlock(raw), gravity=GRAVITY, **units).calibration
+    return calibrate_recordings(SampleBlock(raw), gravity=GRAVITY, **units).calibration
 
 
 def lengths_at_rest(imu, ranges):
@@ -93,13 +93,13 @@ def test_units_travel_from_the_recording_to_the_corrected_readings(truth, force_
     imu, ranges, values = truth
     raw = in_units(imu, force_unit, rate_unit)
     units = {'accelerometer_unit': force_unit, 'gyroscope_unit': rate_unit}
-    found = calibrate(SampleBlock(raw), gravity=GRAVITY, **units).calibration
+    found = calibrate_recordings(SampleBlock(raw), gravity=GRAVITY, **units).calibration
     assert max_z(found, values) < 5.0
     assert found.readings.accelerometer.scale == pytest.approx(1 / SIZES[force_unit], rel=1e-12)
     assert found.readings.gyroscope.scale == pytest.approx(1 / SIZES[rate_unit], rel=1e-12)
     read_again = calibration_from_text(calibration_to_text(found))
     assert read_again.readings == found.readings
-    corrected = compensate(SampleBlock(raw), read_again).imu
+    corrected = compensate_recording(SampleBlock(raw), read_again).imu
     np.testing.assert_allclose(lengths_at_rest(corrected, ranges), GRAVITY, rtol=1e-3)
     bias_w, matrix_w = unpack(values)[2:]
     true_rate = np.linalg.solve(matrix_w, (imu.rate_s - bias_w).T).T
@@ -138,15 +138,17 @@ def test_a_recording_in_another_unit_is_refused_with_the_option_that_states_it(
     assert '(--accelerometer-unit m/s^2)' in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
     with refused(InputError, 'force_unit') as caught:
-        check(SampleBlock(imu), in_g, gravity=GRAVITY)
+        check_recording(SampleBlock(imu), in_g, gravity=GRAVITY)
     assert (caught.value.key, caught.value.value) == ('accelerometer_unit', 'm/s^2')
-    stated = compensate(SampleBlock(imu), in_g, accelerometer_unit='m/s^2', gyroscope_unit='rad/s')
+    stated = compensate_recording(
+        SampleBlock(imu), in_g, accelerometer_unit='m/s^2', gyroscope_unit='rad/s'
+    )
     np.testing.assert_allclose(lengths_at_rest(stated.imu, ranges), GRAVITY, rtol=1e-3)
 
 
 def test_check_reads_the_unit_from_the_calibration(in_g):
     later, _, _ = session(seed=3)
-    found = check(SampleBlock(in_units(later, 'g', 'deg/s')), in_g, gravity=GRAVITY)
+    found = check_recording(SampleBlock(in_units(later, 'g', 'deg/s')), in_g, gravity=GRAVITY)
     assert found.helps
 
 
@@ -162,7 +164,7 @@ def test_check_reads_the_unit_from_the_calibration(in_g):
 def test_the_proposed_unit_is_that_of_the_readings(truth, force_unit, rate_unit, key):
     raw = in_units(truth[0], force_unit, rate_unit)
     with pytest.raises(InputError) as caught:
-        calibrate(SampleBlock(raw), gravity=GRAVITY)
+        calibrate_recordings(SampleBlock(raw), gravity=GRAVITY)
     proposed = {'accelerometer_unit': force_unit, 'gyroscope_unit': rate_unit}[key]
     assert (caught.value.key, caught.value.value) == (key, proposed)
 
@@ -170,10 +172,10 @@ def test_the_proposed_unit_is_that_of_the_readings(truth, force_unit, rate_unit,
 def test_a_wrongly_stated_unit_is_refused_with_the_right_one(truth):
     raw = in_units(truth[0], 'mg', 'rad/s')
     with pytest.raises(InputError) as caught:
-        calibrate(SampleBlock(raw), gravity=GRAVITY, accelerometer_unit='g')
+        calibrate_recordings(SampleBlock(raw), gravity=GRAVITY, accelerometer_unit='g')
     assert caught.value.value == 'mg'
     with pytest.raises(InputError) as caught:
-        calibrate(SampleBlock(truth[0]), gravity=GRAVITY, gyroscope_unit='deg/s')
+        calibrate_recordings(SampleBlock(truth[0]), gravity=GRAVITY, gyroscope_unit='deg/s')
     assert (caught.value.key, caught.value.value) == ('gyroscope_unit', 'rad/s')
 
 
@@ -185,9 +187,9 @@ def test_counts_of_a_text_log_are_stated_for_calibrate_and_compensate(tmp_path, 
     log = tmp_path / 'log.csv'
     np.savetxt(log, rows, '%.4f', ',', header='time (s),ax,ay,az,gx,gy,gz', comments='')
     units = {'accelerometer_unit': 'counts:4096/g', 'gyroscope_unit': 'counts:65.5/(deg/s)'}
-    found = calibrate(log, gravity=GRAVITY, **units).calibration
+    found = calibrate_recordings(log, gravity=GRAVITY, **units).calibration
     assert max_z(found, values) < 5.0
-    corrected = compensate(log, found).imu
+    corrected = compensate_recording(log, found).imu
     np.testing.assert_allclose(lengths_at_rest(corrected, ranges), GRAVITY, rtol=1e-3)
     columns = ['time=time (s):s', 'force=ax,ay,az:counts:4096/g', 'rate=gx,gy,gz:counts:65.5/dps']
     output = tmp_path / 'converted'
@@ -218,11 +220,13 @@ def test_the_nominal_file_takes_flat_keys_and_those_of_the_document(tmp_path, tr
     for name, content in (('flat', flat), ('nested', nested)):
         path = tmp_path / f'{name}.yaml'
         path.write_text(yaml.safe_dump(content))
-        found.append(calibrate(SampleBlock(raw), gravity=GRAVITY, nominal=path).calibration)
+        found.append(
+            calibrate_recordings(SampleBlock(raw), gravity=GRAVITY, nominal=path).calibration
+        )
     np.testing.assert_allclose(found[0].values, found[1].values, rtol=1e-9)
     path = tmp_path / 'nested.yaml'
     with refused(InputError, 'unit_twice', 'mg'):
-        calibrate(SampleBlock(raw), nominal=path, accelerometer_unit='mg')
+        calibrate_recordings(SampleBlock(raw), nominal=path, accelerometer_unit='mg')
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.choices import inputs_of
-from imu_calibration.use_cases.compensate import compensate
+from imu_calibration.use_cases.compensate import compensate_recording
 from msg_adapters.bag import list_topics, open_recording
 from msg_adapters.write import write_session
 
@@ -83,12 +83,12 @@ def test_the_chosen_rows_are_those_of_one_imu(log):
     (source,) = inputs_of([log], None, {'where': ['I=1']}).sources
     (imu,) = [block.imu for block in source()]
     np.testing.assert_allclose(imu.force_s, other.force_s + FORCE, atol=1e-9)
-    corrected = compensate(log, 'calibration.yaml', where=['I=1'])
-    expected = compensate(imu, 'calibration.yaml')
+    corrected = compensate_recording(log, 'calibration.yaml', where=['I=1'])
+    expected = compensate_recording(imu, 'calibration.yaml')
     np.testing.assert_allclose(corrected.imu.force_s, expected.imu.force_s, atol=1e-9)
-    compensate(log, 'calibration.yaml', where=['I=1'], output='one.csv')
+    compensate_recording(log, 'calibration.yaml', where=['I=1'], output='one.csv')
     assert len(log.with_name('one.csv').read_text().splitlines()) == N + 1
-    compensate(log, 'calibration.yaml', where=['I=0'], output='bag')
+    compensate_recording(log, 'calibration.yaml', where=['I=0'], output='bag')
     with open_recording('bag', '/imu/data_corrected', want_joints=False) as recording:
         assert recording.message_counts['/imu/data_corrected'] == N
 
@@ -97,11 +97,11 @@ def test_compensate_refuses_two_imus_of_a_topic(log):
     """Before the bag is completed, and in memory."""
     write_session('both', mixed())
     with refused(InputError, 'one_source', '50 %'):
-        compensate('both', 'calibration.yaml', output='out')
+        compensate_recording('both', 'calibration.yaml', output='out')
     with refused(InputError, 'one_source'):
-        compensate('both', 'calibration.yaml')
+        compensate_recording('both', 'calibration.yaml')
     with refused(InputError, 'one_source'):
-        compensate(mixed(), 'calibration.yaml')
+        compensate_recording(mixed(), 'calibration.yaml')
     assert sorted(path.name for path in log.parent.iterdir()) == [
         'both',
         'calibration.yaml',

@@ -20,7 +20,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.calibration import UNKNOWN_SD
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.use_cases.calibrate import calibrate
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.view import (
     PARAMETERS_TOPIC,
@@ -45,7 +45,7 @@ SESSION, TABLE = str(ROOT / 'bags/sample_session'), str(ROOT / 'bags/sample_sess
 @pytest.fixture(scope='module')
 def result():
     """The sample session, calibrated."""
-    return calibrate(SESSION, TABLE, model_as_asked=True).result
+    return calibrate_recordings(SESSION, TABLE, model_as_asked=True).result
 
 
 def read(path):

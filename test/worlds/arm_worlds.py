@@ -264,9 +264,9 @@ def truth(world):
 @lru_cache(maxsize=1)
 def calibrated(world):
     """Return the calibration of a world, which several tests judge."""
-    from imu_calibration.calibration.table_calibration import calibrate
+    from imu_calibration.calibration.table_calibration import calibrate_on_table
 
-    return calibrate([lambda: iter([world.block])], world.table).calibration
+    return calibrate_on_table([lambda: iter([world.block])], world.table).calibration
 
 
 def deviations(world):

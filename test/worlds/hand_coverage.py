@@ -9,7 +9,7 @@ from argparse import ArgumentParser
 
 import numpy as np
 
-from imu_calibration.calibration.hand_workflow import solve_by_evidence
+from imu_calibration.calibration.hand_workflow import solve_hand_by_evidence
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD_PRIORS, of_fit
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
@@ -67,7 +67,7 @@ def errors(world, seed, **options):
     The factor is the ratio to the sds that only noise and scatter give.
     """
     data, truth, moved = session(world, seed, **options)
-    hand, truth = solve_by_evidence(data, HandOptions(GRAVITY)).hand, truth.copy()
+    hand, truth = solve_hand_by_evidence(data, HandOptions(GRAVITY)).hand, truth.copy()
     for sensor, part in zip(SENSORS, (slice(0, 3), slice(9, 12)), strict=True):
         if not any(
             effect.sensor == sensor and effect.time_constant for effect in hand.hand_model.extras

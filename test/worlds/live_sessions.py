@@ -6,14 +6,14 @@ Enough motion for an answer in a few seconds of processing.
 
 import numpy as np
 
-from imu_calibration.calibration.table_calibration import calibrate
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core import documents
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 from ros.live_station import TABLE as TABLE_FILE
 
@@ -28,7 +28,7 @@ def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='qui
         accelerometer=('bias', 'matrix', 'accel_size_effect'), joint_names=TABLE.joint_names
     )
     values = random_values(model, 'industrial', seed)
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         model,
         values,
         TABLE,
@@ -44,7 +44,7 @@ def make_session(seed=1, rate=100.0, joint_rate=None, seconds=None, profile='qui
 
 def offline(*sessions):
     """Return the offline answer for (imu, joints) as they were sent."""
-    return calibrate(
+    return calibrate_on_table(
         [lambda s=s: iter([SampleBlock(*s)]) for s in sessions], TABLE, OPTIONS
     ).calibration
 

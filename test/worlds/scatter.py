@@ -17,8 +17,8 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
-from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, gauss_markov
-from imu_calibration.simulation.session import SimulationOptions, random_values, simulate
+from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, gauss_markov_samples
+from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
 TABLE = Table.from_mapping(
     {
@@ -51,7 +51,7 @@ def windows_of_a_short_session():
     white = SimulatedNoise(
         accel_density=INDUSTRIAL.accel_density, gyro_density=INDUSTRIAL.gyro_density
     )
-    imu, joints, _ = simulate(
+    imu, joints, _ = simulate_session(
         SensorModel(),
         SensorModel().start(),
         TABLE,
@@ -89,7 +89,7 @@ class SameMotion:
         """
         found, times = [], np.arange(0.0, session[-1].time[-1] + 1.0, 0.5)
         wander = [
-            gauss_markov(sd, 100.0, 0.5, shape=(len(times), 3), rng=rng)
+            gauss_markov_samples(sd, 100.0, 0.5, shape=(len(times), 3), rng=rng)
             for sd in (INDUSTRIAL.accel_instability, INDUSTRIAL.gyro_instability)
         ]
         for window in session:

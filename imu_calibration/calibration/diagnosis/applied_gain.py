@@ -9,7 +9,7 @@ import numpy as np
 from imu_calibration.calibration.diagnosis.traces import DistanceSums
 from imu_calibration.calibration.hand_proof import corrected_with, end_by_hand, turn_errors
 from imu_calibration.calibration.proof import nominal_values, with_reference
-from imu_calibration.compensation.compensate import compensate
+from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import judged_from_of, uncorrected_in_time, uncorrected_on_table
 from imu_calibration.effects.base import SENSORS
@@ -259,7 +259,7 @@ def _errors(windows, table, model, values, applied):
     ref = refs[1].select(rows)
     raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
     known = Calibration(model, applied, np.zeros((len(values),) * 2), (HELD,) * len(values))
-    corrected = compensate(
+    corrected = compensated_samples(
         known,
         *raw,
         alpha_s=ref.alpha_s,

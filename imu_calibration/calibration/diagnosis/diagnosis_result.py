@@ -142,7 +142,7 @@ def parameters_of(
 DIAGNOSIS_FORMAT = 'imu_calibration/diagnosis/1'
 
 
-def to_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
+def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     """
     Return the content of diagnosis.json.
 

@@ -11,7 +11,7 @@ from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
     Diagnosis,
-    to_mapping,
+    diagnosis_mapping,
 )
 from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
@@ -27,7 +27,7 @@ from imu_calibration.calibration.hand_workflow import evident_result, read_by_ha
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.verdict import misfits, unsteady
+from imu_calibration.document.verdict import motion_misfits, unsteady
 from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
@@ -91,7 +91,7 @@ class DiagnosisResult:
             sensor: {'value': value, 'sd': sd, 'unit': 's'}
             for sensor, (value, sd) in self.lags.items()
         }
-        return to_mapping(self.diagnosis) | {'lags': lags, 'notes': self.notes}
+        return diagnosis_mapping(self.diagnosis) | {'lags': lags, 'notes': self.notes}
 
     @property
     def lines(self) -> list[str]:
@@ -134,7 +134,7 @@ class DiagnosisResult:
         }
         wandering = unsteady(self.calibration, self.tolerances)
         notes = []
-        for reason in (*misfits(self.calibration), *wandering):
+        for reason in (*motion_misfits(self.calibration), *wandering):
             if not quiet.issuperset(reason.sensors):
                 continue
             # Noise that is larger in motion has no effect that could explain it.

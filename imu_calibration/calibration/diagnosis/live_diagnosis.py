@@ -86,7 +86,7 @@ class DiagnosisQuestion:
                 evidence
             )  # its columns, of a wider model than those of the session, need much memory
             return Answer(
-                describe(build_diagnosis(self.snapshot.table, found, calibrated=calibrated)),
+                live_state_of(build_diagnosis(self.snapshot.table, found, calibrated=calibrated)),
                 extension,
             )
         except ImuCalibrationError as error:
@@ -106,7 +106,7 @@ def question_about(live: LiveCalibration | None) -> DiagnosisQuestion | None:
     )
 
 
-def describe(diagnosis: Diagnosis) -> LiveState:
+def live_state_of(diagnosis: Diagnosis) -> LiveState:
     """
     Return the LiveState of a Diagnosis: the first finding, or none, or the unexplained residual.
     """

@@ -199,7 +199,7 @@ class Placement:
         ) @ self.mat_ts.T, rate @ self.mat_ts.T
 
 
-def moved(imu: AffineImu, to: Placement) -> AffineImu:
+def calibration_moved(imu: AffineImu, to: Placement) -> AffineImu:
     """
     Return the same IMU in the frame, origin and axes of another program.
 

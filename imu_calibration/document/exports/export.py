@@ -15,7 +15,7 @@ from imu_calibration.core.errors import InputError, did_you_mean
 from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.calibration_text import to_mapping
+from imu_calibration.document.calibration_text import calibration_mapping
 from imu_calibration.document.exports import targets
 from imu_calibration.document.exports.affine import (
     ARMS,
@@ -24,8 +24,8 @@ from imu_calibration.document.exports.affine import (
     UNNAMED,
     Placement,
     affine_of,
+    calibration_moved,
     forward_right_down,
-    moved,
     pose_line,
 )
 from imu_calibration.document.exports.loss import (
@@ -151,7 +151,7 @@ def export(
 def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement, Numbers]:
     """Return the placement of a target for a calibration and the numbers there."""
     if target.whole:
-        return Placement(), to_mapping(calibration)
+        return Placement(), calibration_mapping(calibration)
     held = affine_of(calibration, target.holds)
     # a target with diagonals only chooses its axes by the full matrices too
     if target.forward_right_down:
@@ -160,7 +160,7 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
         placement = target.placement(
             affine_of(calibration, MATRICES + ARMS if np.any(held.arms) else MATRICES)
         )
-    return placement, target.numbers(moved(held, placement))
+    return placement, target.numbers(calibration_moved(held, placement))
 
 
 def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, list[str]]:

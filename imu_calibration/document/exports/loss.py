@@ -119,12 +119,12 @@ def recorded_motion(
         corrected.force[kept],
         corrected.rate[kept],
         alpha,
-        temperature_c=temperature_at(calibration, temperature, stamps),
+        temperature_c=measured_temperature(calibration, temperature, stamps),
         text=f'{name} ({int(kept.sum())} samples)',
     )
 
 
-def temperature_at(
+def measured_temperature(
     calibration: Calibration, temperature: TemperatureSamples | None, stamp_ns: np.ndarray
 ) -> np.ndarray:
     """
@@ -300,10 +300,17 @@ def import_file(target: Target, content: bytes, path: Any, *, frame_id: str = ''
             back = affine.forward_right_down(IMPORTED_FROM_AUTOPILOT)
         else:
             back = target.back(read)
-        return _document(target, found, affine.moved(read, back), target.axes, path, frame_id)
+        return _document(
+            target, found, affine.calibration_moved(read, back), target.axes, path, frame_id
+        )
     placement, parent = own
     return _document(
-        target, found, affine.moved(read, placement.inverse()), 'mount', path, frame_id or parent
+        target,
+        found,
+        affine.calibration_moved(read, placement.inverse()),
+        'mount',
+        path,
+        frame_id or parent,
     )
 
 

@@ -48,7 +48,7 @@ from imu_calibration.references.gravity.pose_solver import (
     first_state,
     possible_turns,
     solve_joint,
-    without_outliers,
+    without_outlying_poses,
 )
 from imu_calibration.references.gravity.poses import (
     average_poses,
@@ -377,7 +377,7 @@ def _solved(data, options, point, *, untested=()):
             {} if model.model.relinearised else integrated
         )  # the columns below are computed at the estimate
         settled, model = _settled(model, found), model.at(found.state.values)
-        poses, turns, out = without_outliers(
+        poses, turns, out = without_outlying_poses(
             model, found, poses=poses, turns=turns, integrated=integrated
         )
         left |= {

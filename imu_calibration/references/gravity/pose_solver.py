@@ -233,7 +233,7 @@ def possible_turns(
     return kept, len(turns) - len(kept)
 
 
-def without_outliers(
+def without_outlying_poses(
     model: HandModel,
     found: RowEstimate,
     *,
