@@ -35,13 +35,14 @@ def run(options: Options) -> VerbResult:
 
     if options.mcap:
         foxglove()  # before the work, not after it
+        options.require_new(options.mcap)
     options.require_place([options.bag])
     with files.output_folder(options.output) as folder:
         found = diagnose(options.bag, options.stand(), **options.choices())
         warn(found.calibration.statistics['preflight'])
         found.save(folder, force=True)  # `require_place` has looked
         if options.mcap:
-            found.save_overlay(options.mcap)
+            found.save_overlay(options.mcap, force=options.force)
         also = (
             ''
             if found.transferable is None

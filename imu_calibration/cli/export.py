@@ -24,7 +24,7 @@ def add_arguments(parser: OneLineParser) -> None:
         help='rate at which the program gets the readings; default that of noise.yaml',
     )
     parser.common('--output', metavar='FILE', help='the file to write')
-    parser.common('--force', action='store_true', help='replace an existing file')
+    parser.add_force('replace an existing file')
     parser.expert(
         '--bag',
         metavar='BAG',

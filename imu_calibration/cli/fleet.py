@@ -28,6 +28,7 @@ def add_arguments(parser: OneLineParser) -> None:
         '--scheduler', metavar='ADDRESS', help='address of a dask scheduler (needs the extra dask)'
     )
     parser.common('--no-report', action='store_true', help='no report.html per unit')
+    parser.add_force()
     parser.add_recording('a table or robot is required, the same for all units')
     parser.add_model()
 

@@ -12,7 +12,7 @@ from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResul
 from imu_calibration.cli.parser import Options, VerbResult
 from imu_calibration.cli.show import show_table, warn
 from imu_calibration.cli.terminal import Terminal
-from imu_calibration.core.errors import InputError, with_hint
+from imu_calibration.core.errors import ImuCalibrationError, InputError, with_hint
 from imu_calibration.core.progress import counter
 from imu_calibration.core.units import for_people, significant, with_sd
 from imu_calibration.document import files
@@ -21,7 +21,7 @@ from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.report.page import render
-from imu_calibration.use_cases.choices import provenance_with, topics_of
+from imu_calibration.use_cases.choices import provenance_with, require_same_inputs, topics_of
 from imu_calibration.use_cases.recordings import (
     Topics,
     cluster_mapper,
@@ -134,6 +134,8 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
         fleet_unit(name, paths, topics_of(choices), joint_names=table.joint_names, options=used)
         for name, paths in found
     ]
+    if not options.force:
+        _require_same_units(Path(options.output), units)
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
         mapper = (
@@ -160,6 +162,18 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
         {'units': rows['units.csv'], 'parameters': rows['summary.csv']},
         [f'{result.name}: {line}' for result in results for line in result.reasons],
     )
+
+
+def _require_same_units(folder, units):
+    """Refuse a folder with a result of other recordings for one of the units."""
+    for unit in units:
+        if not (folder / unit.name / 'calibration.yaml').exists():
+            continue
+        try:
+            found = unit.provenance()
+        except (ImuCalibrationError, OSError):
+            continue  # A unit that cannot be read gives no file.
+        require_same_inputs(folder / unit.name, found)
 
 
 def _table(options, bags):

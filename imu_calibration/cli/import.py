@@ -19,6 +19,7 @@ def add_arguments(parser: OneLineParser) -> None:
         help="the program, as 'export --list' shows it",
     )
     parser.common('--output', metavar='FILE', required=True, help='calibration.yaml to write')
+    parser.add_force('replace an existing file')
     parser.common(
         '--frame-id',
         metavar='FRAME',

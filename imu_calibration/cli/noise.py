@@ -33,7 +33,7 @@ def add_arguments(parser: OneLineParser) -> None:
         help='averaging time at which a random walk replaces other slow noise, default 100 s',
     )
     parser.common('--no-report', action='store_true', help='write noise.yaml only')
-    parser.common('--force', action='store_true', help='overwrite the noise of other inputs')
+    parser.add_force('overwrite the noise of other inputs')
     parser.add_topics(joints=False)
     parser.add_readings()
     parser.add_exclusion()

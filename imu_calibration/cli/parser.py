@@ -222,7 +222,11 @@ class OneLineParser(argparse.ArgumentParser):
     def add_page(self, name: str) -> None:
         """Add the options of a page that shows the answer."""
         self.common('--output', metavar='DIR', help=f'folder for {name}, the answer as one page')
-        self.common('--force', action='store_true', help=f'replace an existing {name}')
+        self.add_force(f'replace an existing {name}')
+
+    def add_force(self, text: str = 'overwrite the result of another verb or other inputs') -> None:
+        """Add the consent to replace files, with its help."""
+        self.common('--force', action='store_true', help=text)
 
     def add_gravity(self) -> None:
         """Add the options of the local gravity."""
@@ -253,11 +257,7 @@ class OneLineParser(argparse.ArgumentParser):
             '--serial', metavar='TEXT', help='serial number of the IMU, for calibration.yaml'
         )
         self.common('--operator', metavar='TEXT', help='name of the operator, likewise')
-        self.common(
-            '--force',
-            action='store_true',
-            help='overwrite the result of another verb or other inputs',
-        )
+        self.add_force()
         self.add_model(searched=searched)
 
     def add_model(self, *, searched: bool = True) -> None:
@@ -357,6 +357,12 @@ class Options(argparse.Namespace):
         from imu_calibration.report.answer_page import page_in
 
         return page_in(self.output, name, force=self.force)
+
+    def require_new(self, path: str) -> None:
+        """Refuse to replace an existing file before any work is done, except with --force."""
+        from imu_calibration.document.files import require_new
+
+        require_new(path, force=self.force)
 
     def require_place(self, bags: Sequence[str]) -> None:
         """

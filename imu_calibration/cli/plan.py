@@ -82,6 +82,7 @@ def add_arguments(parser: OneLineParser) -> None:
         default='sqlite3',
         help='of the trajectory, default sqlite3',
     )
+    parser.add_force('replace an existing plan; its trajectory is moved to trajectory.1')
     parser.expert(
         '--no-bound',
         action='store_true',
@@ -94,9 +95,10 @@ def run(options: Options) -> VerbResult:
     """Plan into a folder that can be written, print the prediction, return the exit code."""
     from imu_calibration.document import files
     from imu_calibration.planning.planner import plan_to_mapping
-    from imu_calibration.use_cases.plan import by_hand, plan
+    from imu_calibration.use_cases.plan import by_hand, plan, require_no_plan
 
     stand = None if options.by_hand and options.motion == 'any' else _stand(options)
+    require_no_plan(options.output, force=options.force)
     with files.output_folder(options.output) as folder:
         if stand is None:
             made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **options.choices())
@@ -113,7 +115,12 @@ def run(options: Options) -> VerbResult:
                 reach=options.reach,
                 **options.choices(),
             )
-        made.save(folder, report=not options.no_report, storage=options.storage)
+        made.save(
+            folder,
+            report=not options.no_report,
+            storage=options.storage,
+            force=options.force,
+        )
     _show(made, folder)
     return VerbResult(made.exit_code, plan_to_mapping(made.plan, made.provenance), made.reasons)
 

@@ -14,6 +14,7 @@ def add_arguments(parser: OneLineParser) -> None:
         'the parameters are shown',
     )
     parser.common('--output', metavar='FILE', required=True, help='the MCAP to write')
+    parser.add_force('replace an existing file')
     parser.common(
         '--gravity',
         type=float,
@@ -31,9 +32,10 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.view import foxglove, view
 
     foxglove()  # before the work, not after it
+    options.require_new(options.output)
     layout = config_file('view.foxglove.json')
     found = view(options.source, options.stand(), **options.choices())
-    found.save(options.output)
+    found.save(options.output, force=options.force)
     for line in found.lacks:
         complain(f'warning: {line}')
     print_line(f'written: {options.output}; open it in Foxglove with the layout {layout}')

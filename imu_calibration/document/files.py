@@ -152,11 +152,14 @@ def read_robot_description(path: str | PathLike[str], allow_xacro: bool = False)
         ) from error
 
 
+def calibration_path(path: str | PathLike[str]) -> Path:
+    """Return the path of a calibration; that of calibration.yaml in a folder."""
+    return Path(path) / 'calibration.yaml' if Path(path).is_dir() else Path(path)
+
+
 def read_calibration(path: str | PathLike[str]) -> Calibration:
     """Return the calibration in a file, or in calibration.yaml of a folder."""
-    if Path(path).is_dir():
-        path = Path(path) / 'calibration.yaml'
-    return calibration_from_text(read_text(path, 'calibration'))
+    return calibration_from_text(read_text(calibration_path(path), 'calibration'))
 
 
 def given_calibration(chosen: Calibration | str | PathLike[str]) -> Calibration:

@@ -1,6 +1,7 @@
 """Settings of the compensator, and adoption of a calibration from a file or topic."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.compensation.health import CalibrationHealth, HealthOptions, StopWatch
@@ -37,7 +38,7 @@ class CompensatorSettings:
     calibration_file: str = setting(
         '',
         '',
-        'calibration.yaml to correct with, read again on ~/reload; empty: wait for imu/calibration',
+        'calibration.yaml or its folder, read again on ~/reload; empty: wait for imu/calibration',
         symptom='no messages are published, see diagnostics',
         session=True,
         path=True,
@@ -177,6 +178,11 @@ class CompensatorSettings:
         symptom='messages are lost above 3 kHz',
         fixed='the loop is chosen when the node starts',
     )
+
+    @property
+    def calibration_path(self) -> Path:
+        """Path of the calibration, also where `calibration_file` names its folder."""
+        return files.calibration_path(files.user_path(self.calibration_file))
 
     @property
     def takes_topic(self) -> bool:

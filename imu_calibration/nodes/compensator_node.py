@@ -124,10 +124,8 @@ class CompensatorNode(Node):
         self._set_refresh(self.settings.covariance_rate)
 
     def _start(self) -> None:
-        if (
-            self.settings.calibration_file
-            and not (path := files.user_path(self.settings.calibration_file)).exists()
-        ):
+        path = self.settings.calibration_path
+        if self.settings.calibration_file and not path.exists():
             if not self.settings.wait_for_file:
                 raise InputError(
                     f"parameter 'calibration_file' must name an existing file, {path} is missing;"
@@ -146,7 +144,7 @@ class CompensatorNode(Node):
             )
 
     def _look_for_file(self) -> None:
-        if files.user_path(self.settings.calibration_file).exists():
+        if self.settings.calibration_path.exists():
             self.destroy_timer(self._waiting)
             self._try_file()
 
@@ -299,7 +297,7 @@ class CompensatorNode(Node):
         self._adopt(self._heard, self._topic, settings, from_topic=True)
 
     def _load_file(self, settings: CompensatorSettings) -> None:
-        path = files.user_path(settings.calibration_file)
+        path = settings.calibration_path
         self._adopt(files.read_text(path, 'calibration'), f'file {path}', settings)
 
     def _try_file(self) -> str:

@@ -125,14 +125,16 @@ class Diagnosed:
             },
         )
 
-    def save_overlay(self, path: str | PathLike) -> None:
+    def save_overlay(self, path: str | PathLike, *, force: bool = False) -> None:
         """
         Write signals, residuals, spectra and histograms as MCAP for Foxglove.
 
-        The signals are measured and simulated ones (`overlay_topics`).
+        The signals are measured and simulated ones (`overlay_topics`). An existing file is replaced
+        only with `force`.
         """
         from imu_calibration.use_cases.view import mcap_bytes, overlay_topics
 
+        files.require_new(path, force=force)
         diagnosis = self.result.diagnosis
         files.write_whole(
             path, mcap_bytes(overlay_topics(diagnosis.traces, diagnosis.baseline.model.joint_names))

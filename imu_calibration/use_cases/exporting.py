@@ -117,7 +117,12 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
 
 
 def import_calibration(
-    path: str | PathLike, source: str, *, output: str | PathLike | None = None, frame_id: str = ''
+    path: str | PathLike,
+    source: str,
+    *,
+    output: str | PathLike | None = None,
+    frame_id: str = '',
+    force: bool = False,
 ) -> Calibration:
     """
     Read the file of another program as a calibration.
@@ -131,6 +136,8 @@ def import_calibration(
         calibration.yaml to write; None: no file is written.
     frame_id : str
         Frame of the Imu messages.
+    force : bool
+        Whether an existing file is replaced.
 
     Raises
     ------
@@ -143,5 +150,6 @@ def import_calibration(
         target, files.read_bytes(path, f'file of {target.name}'), Path(path), frame_id=frame_id
     )
     if output is not None:
+        files.require_new(output, force=force)
         files.write_text(output, calibration_to_text(found))
     return found

@@ -46,6 +46,8 @@ from imu_calibration.use_cases.recordings import Stand, table_of
 
 ACCUMULATOR = '.npz'
 """Suffix of the accumulator that a live session saves with its calibration."""
+TRAJECTORIES = ('trajectory', 'trajectory.yaml')
+"""Names of the bag and the file with the motions of a plan."""
 PLAN_START_NS = 1_000_000_000
 """First stamp of the bag with the trajectories: any, but the same every time."""
 
@@ -110,22 +112,32 @@ class Planned:
         return draw_progress(self.plan)
 
     def save(
-        self, folder: str | PathLike, *, report: bool = True, storage: str = 'sqlite3'
+        self,
+        folder: str | PathLike,
+        *,
+        report: bool = True,
+        storage: str = 'sqlite3',
+        force: bool = False,
     ) -> None:
         """
         Write plan.yaml, and trajectory.yaml and the bag `trajectory` for joints.
 
-        The bag has a message per motion, and report.html is written when wanted.
+        The bag has a message per motion, and report.html is written when wanted. An existing plan
+        is replaced only with `force`; its trajectory is then moved to the next free name.
         """
         from msg_adapters.write import write_trajectories
 
-        place, moves_joints = (
-            files.make_folder(folder),
-            self.table is not None and bool(self.plan.motions),
-        )
+        require_no_plan(folder, force=force)
+        place = files.make_folder(folder)
+        moves_joints = self.table is not None and bool(self.plan.motions)
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
-        if moves_joints:  # first, since it refuses where there is one already
+
+        # The trajectory of another plan must not remain beside this one.
+        for name in TRAJECTORIES:
+            if (place / name).exists():
+                files.put_aside(place / name)
+        if moves_joints:
             write_trajectories(place / 'trajectory', self._messages(), storage=storage)
         if report:
             files.write_text(place / 'report.html', page)
@@ -151,6 +163,12 @@ class Planned:
 
     def __str__(self):
         return '\n'.join(plan_summary(self.plan) + self.notes)
+
+
+def require_no_plan(folder: str | PathLike, *, force: bool) -> None:
+    """Refuse to replace an existing plan without consent; raises as `files.require_new`."""
+    for name in ('plan.yaml', *TRAJECTORIES):
+        files.require_new(Path(folder) / name, force=force)
 
 
 def plan(

@@ -426,9 +426,9 @@ class View:
             )
         return ()
 
-    def save(self, path: str | PathLike) -> None:
+    def save(self, path: str | PathLike, *, force: bool = False) -> None:
         """
-        Write the view as MCAP, atomically.
+        Write the view as MCAP, atomically; an existing file is replaced only with `force`.
 
         Raises
         ------
@@ -436,6 +436,7 @@ class View:
             When foxglove-sdk is not installed or the place cannot be written.
 
         """
+        files.require_new(path, force=force)
         shown: dict[str, Any] = dict(self.contents)
         if self.coverage is not None:
             shown[SPHERE_TOPIC] = scene_of(self.coverage, self.calibration.frame_id or 'imu_link')

@@ -309,6 +309,20 @@ def test_a_missing_file_ends_the_node_unless_it_is_waited_for(bench, tmp_path, m
     bench.until(lambda: node.adopted is not None, 'the calibration')
 
 
+def test_a_folder_is_the_calibration_in_it(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(compensator_node, 'LOOK_FOR_FILE', 0.05)
+    with refused(InputError, 'calibration_missing', 'calibration.yaml'):
+        bench.start(CompensatorNode, {'calibration_file': str(tmp_path)})
+    node = bench.start(
+        CompensatorNode,
+        {'calibration_file': str(tmp_path), 'wait_for_file': True},
+        namespace='patient',
+    )
+    (tmp_path / 'calibration.yaml').write_text(GOOD_TEXT)
+    bench.until(lambda: node.adopted is not None, 'the calibration')
+    assert node.adopted.version == version_of(GOOD_TEXT)
+
+
 def test_the_process_of_a_node_whose_file_is_missing_ends_with_code_1(tmp_path):
     with Station(tmp_path / 'out.txt') as station:
         process = station.start('compensator_node', {'calibration_file': tmp_path / 'none.yaml'})

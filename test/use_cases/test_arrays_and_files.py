@@ -14,6 +14,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.calibrate import Calibrated
+from imu_calibration.use_cases.resources import config_file
 from imu_calibration.use_cases.simulate import simulate
 from msg_adapters.write import write_session
 
@@ -113,6 +114,57 @@ def test_the_noise_of_another_recording_is_not_replaced_on_the_command_line(tmp_
     assert json.loads(capsys.readouterr().out)['error']['code'] == 'other_result'
     assert document.read_bytes() == before
     assert main([*second, '--force']) in (0, 3) and document.read_bytes() != before
+
+
+def refused_code(capsys, *arguments):
+    """Return the code of the error with which the command line refuses."""
+    capsys.readouterr()
+    assert main([*map(str, arguments), '--json']) == 1
+    return json.loads(capsys.readouterr().out)['error']['code']
+
+
+def test_an_imported_calibration_and_a_view_replace_a_file_only_by_force(tmp_path, capsys):
+    known, other = tmp_path / 'calibration.yaml', tmp_path / 'imu.yaml'
+    known.write_text(calibration_to_text(random_calibration(3)))
+    assert main(['export', str(known), '--to', 'kalibr', '--output', str(other)]) == 0
+    before = known.read_bytes()
+    again = ['import', other, '--from', 'kalibr', '--output', known]
+    assert refused_code(capsys, *again) == 'file_exists' and known.read_bytes() == before
+    assert main([*map(str, again), '--force']) == 0 and known.read_bytes() != before
+
+    pytest.importorskip('foxglove', reason='the extra view is not installed')
+    picture = tmp_path / 'picture.mcap'
+    picture.write_bytes(b'mine')
+    drawn = ['view', known, '--output', picture]
+    assert refused_code(capsys, *drawn) == 'file_exists' and picture.read_bytes() == b'mine'
+    assert refused_code(
+        capsys, 'diagnose', known, '--mcap', picture, '--output', tmp_path / 'd'
+    ) == ('file_exists')
+    assert main([*map(str, drawn), '--force']) in (0, 3) and picture.read_bytes() != b'mine'
+
+
+def test_a_plan_is_replaced_only_by_force_and_keeps_no_old_trajectory(tmp_path, capsys):
+    by_hand = ['plan', '--by-hand', '--no-report', '--output', tmp_path]
+    (tmp_path / 'trajectory').mkdir()
+    assert refused_code(capsys, *by_hand) == 'file_exists'
+    assert [path.name for path in tmp_path.iterdir()] == ['trajectory']
+    assert main([*map(str, by_hand), '--force']) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['plan.yaml', 'trajectory.1']
+    assert refused_code(capsys, *by_hand) == 'file_exists'
+
+
+def test_a_fleet_does_not_replace_the_result_of_another_recording(tmp_path, capsys):
+    units, out = tmp_path / 'units', tmp_path / 'out'
+    write_session(units / 'unit', SampleBlock.from_arrays(**at_rest()).imu.select(slice(0, 100)))
+    files.write_texts(
+        out / 'unit',
+        {'calibration.yaml': calibration_to_text(random_calibration(2, ()))},
+    )
+    before = (out / 'unit' / 'calibration.yaml').read_bytes()
+    run = ['fleet', units, '--table', config_file('table_simulated.yaml'), '--output', out]
+    assert refused_code(capsys, *run) == 'other_result'
+    assert (out / 'unit' / 'calibration.yaml').read_bytes() == before
+    assert sorted(path.name for path in out.iterdir()) == ['unit']
 
 
 def test_check_reads_a_folder_and_compares_with_the_given_gravity(tmp_path, capsys):
