@@ -342,12 +342,13 @@ def read_rest(
         )
     clock = _Clock(found.epochs)
     search = TrendSearch(_blocks(found, parts, clock))
-    skipped = _axes_of({*found.absent, *found.unusable})
+    skipped_sensors = {*found.absent, *found.unusable}
+    skipped = _axes_of(skipped_sensors)
     trends = tuple(() if axis in skipped else search.find(axis) for axis in range(6))
     detrending = Detrending(trends, search.reference, clock.temperature(found))
     reader = RestReader(source, parts, found.period, detrending, clock.time, nominal)
     curve = reader.curve()
-    unusable = found.unusable | _without_scatter(curve, {*found.absent, *found.unusable})
+    unusable = found.unusable | _without_scatter(curve, skipped_sensors)
     skipped = _axes_of({*found.absent, *unusable})
     scales = ScaleCovariance(curve.factors, list(curve.lengths), curve.period)
     moments: list[Moments | None] = []
@@ -359,15 +360,15 @@ def read_rest(
         moments.append(Moments(scales, variance, variance > 0, kept, curve.parts[axis]))
     flat = tuple(part for of_epoch in parts for part in of_epoch)
     return RestingRecord(
-        curve,
-        tuple(moments),
-        trends,
-        flat,
-        left_out,
-        _sample_sd(found, parts),
-        found,
-        reader,
-        unusable,
+        curve=curve,
+        moments=tuple(moments),
+        trends=trends,
+        parts=flat,
+        left_out=left_out,
+        sample_sd=_sample_sd(found, parts),
+        survey=found,
+        reader=reader,
+        unusable=unusable,
     )
 
 
@@ -387,43 +388,41 @@ def _without_scatter(curve, skipped):
     The quantisation of these readings hides the noise. Refused where no other sensor remains;
     `skipped` are the sensors that are absent or unusable.
     """
-    found = {}
+    reasons = {}
     for sensor, part in SENSOR_COLUMNS.items():
-        scales = np.sum(curve.variance[:, part] > 0, axis=0)
+        if sensor in skipped:
+            continue
+        n_scales = np.sum(curve.variance[:, part] > 0, axis=0)
         frozen = [
             f'{sensor} {letter}'
-            for letter, count in zip(AXES, scales, strict=True)
+            for letter, count in zip(AXES, n_scales, strict=True)
             if count < LEAST_SCALES
         ]
-        if frozen and sensor not in skipped:
-            found[sensor] = (
+        if frozen:
+            reasons[sensor] = (
                 f'every axis must scatter at rest, {" and ".join(frozen)} remains on one step of'
                 ' its readings; record with a finer resolution'
             )
-    if found and {*found, *skipped} == set(SENSORS):
-        raise InputError(next(iter(found.values())), code='coarse_steps')
-    return found
+    if reasons and {*reasons, *skipped} == set(SENSORS):
+        raise InputError(next(iter(reasons.values())), code='coarse_steps')
+    return reasons
 
 
 def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> NoiseFigures:
     """Return what is written to noise.yaml: the figures of all axes and the excluded parts."""
     record, times = result.record, RecordingTimes(result.record.curve.period)
-    axes = [
-        AxisFigures(
+    axes_of_sensor: dict[str, list[AxisFigures]] = {sensor: [] for sensor in SENSORS}
+    for number, axis in enumerate(result.axes):
+        if axis is None:
+            continue
+        figures = AxisFigures(
             **vars(axis),
-            trends=trends,
+            trends=record.trends[number],
             record_for=_record_for(axis, times),
-            sample_sd=float(sample_sd),
-            deviation=tuple(np.sqrt(variance).tolist()),
+            sample_sd=float(record.sample_sd[number]),
+            deviation=tuple(np.sqrt(record.curve.variance[:, number]).tolist()),
         )
-        for axis, trends, sample_sd, variance in zip(
-            result.axes, record.trends, record.sample_sd, record.curve.variance.T
-        )
-        if axis is not None
-    ]
-    of_sensor: dict[str, tuple[AxisFigures, ...]] = {sensor: () for sensor in SENSORS}
-    for number, sensor in enumerate(result.sensors):
-        of_sensor[sensor] = tuple(axes[3 * number : 3 * number + 3])
+        axes_of_sensor[SENSORS[number // 3]].append(figures)
     dropped = dict(record.survey.dropped)
     if frozen := record.left_out['frozen_output']:
         dropped['imu frozen output'] = round(frozen / record.curve.period)
@@ -439,8 +438,8 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
     if record.unusable:
         recording['unusable'] = dict(record.unusable)
     return NoiseFigures(
-        of_sensor['accelerometer'],
-        of_sensor['gyroscope'],
+        tuple(axes_of_sensor['accelerometer']),
+        tuple(axes_of_sensor['gyroscope']),
         1.0 / record.curve.period,
         record.survey.frame_id,
         recording,

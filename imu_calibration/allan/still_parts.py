@@ -76,7 +76,7 @@ sampling rate, one reading again and again.
 
 
 def still_parts(
-    chunks: Chunks, period: float, resolution: np.ndarray | None = None
+    chunks: Chunks, period: float, resolution: np.ndarray
 ) -> tuple[list[StillPart], dict[str, float]]:
     """
     Return the parts at rest, and the seconds that were left out for each reason of `LEFT_OUT`.
@@ -87,21 +87,17 @@ def still_parts(
         Of one epoch of the clock.
     period : float
         Usual time between samples, s.
-    resolution : array, shape (6,), optional
-        Smallest step between readings of each column; without it no output counts as frozen.
+    resolution : array, shape (6,)
+        Smallest step between readings of each column.
 
     """
-    if resolution is None:
-        frozen = np.zeros(len(chunks), bool)
-    else:
-        frozen = np.logical_or(*frozen_chunks(chunks, resolution).values())
+    frozen = np.logical_or(*frozen_chunks(chunks, resolution).values())
     seconds = float(np.median(chunks.duration)) if len(chunks) else 0.0
     same = _at_the_usual_rate(chunks, period)
     # frozen chunks have no scatter: with them nothing else would be as quiet as the quietest tenth
+    live = chunks.select(~frozen)
     still = np.zeros(len(chunks), bool)
-    still[~frozen] = _usual(
-        chunks.select(~frozen), still_chunks(chunks.select(~frozen)) & same[~frozen]
-    )
+    still[~frozen] = _usual(live, still_chunks(live) & same[~frozen])
     margin = int(np.ceil(SETTLING / seconds)) if seconds else 0
     inner = shrunk_mask(still, margin)
     parts, short = [], 0.0
@@ -301,7 +297,7 @@ def _period(epochs):
     if np.mean(np.abs(steps / usual_step - 1.0) < SAME_PERIOD) > USUAL_STEP_SHARE:
         middle = usual_step
     return float(
-        f'{np.mean(steps[np.abs(steps / middle - 1.0) < 0.02]):.9g}'
+        f'{np.mean(steps[np.abs(steps / middle - 1.0) < SAME_PERIOD]):.9g}'
     )  # without rounding errors in the file
 
 
