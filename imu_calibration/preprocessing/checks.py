@@ -26,12 +26,14 @@ from imu_calibration.preprocessing.recording_evidence import (
     EvidenceGatherer,
     RecordingEvidence,
 )
-from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, FrozenPart, in_long_runs
+from imu_calibration.preprocessing.scan import SENSOR_COLUMNS, FrozenPart
 from imu_calibration.preprocessing.stamping import IRREGULAR, MAX_IRREGULAR_SHARE
-from imu_calibration.preprocessing.stream_cleaning import MESSAGES, BlockCleaner, StreamStatistics
-
-MIN_MOVING_STEPS = 50.0
-"""A constant axis is frozen if another axis moves by this many steps of the converter."""
+from imu_calibration.preprocessing.stream_cleaning import (
+    MESSAGES,
+    NO_RANGES,
+    BlockCleaner,
+    StreamStatistics,
+)
 
 
 def one_source(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
@@ -91,7 +93,7 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                     sensor=sensor,
                 )
         for axis in np.flatnonzero(~constant):
-            stuck = _stuck(evidence, part, axis)
+            stuck = evidence.stuck[:, part][:, axis]
             if stuck.any():
                 seconds = stuck.sum() * float(np.median(chunks.duration))
                 yield CheckFinding(
@@ -103,19 +105,6 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 )
 
 
-def _stuck(evidence, part, axis):
-    """Return the chunks in which one axis of a sensor is constant while another one moves."""
-    chunks = evidence.chunks
-    if evidence.quiet_range[part][axis] == 0:
-        return np.zeros(len(chunks), bool)
-    steps = np.delete(evidence.resolution[part], axis)
-    moving = np.delete(chunks.range[:, part], axis, axis=1) > MIN_MOVING_STEPS * steps
-    same = (chunks.range[:, part][:, axis] == 0) & ~_at_end(
-        chunks.mean[:, part][:, axis], evidence.ends[part][axis]
-    )
-    return in_long_runs(same & moving.any(axis=1))
-
-
 def without_readings(evidence: RecordingEvidence) -> np.ndarray:
     """
     Return the ranges of samples that are no readings, half open, shape (n, 2).
@@ -125,40 +114,30 @@ def without_readings(evidence: RecordingEvidence) -> np.ndarray:
     """
     chunks = evidence.chunks
     flags = np.logical_or(*evidence.frozen.values())
-    for part in SENSOR_COLUMNS.values():
-        for axis in np.flatnonzero(evidence.n_changed[part]):
-            flags |= _stuck(evidence, part, axis)
+    flags |= evidence.stuck[:, evidence.n_changed > 0].any(axis=1)
     for part in evidence.frozen_parts:
         half = 0.5 * chunks.duration
         flags |= (chunks.time - half >= part.start) & (chunks.time + half <= part.stop)
-    runs = runs_of(maximum_filter1d(flags, 3)) if len(flags) else np.zeros((0, 2), int)
+    if not len(flags):
+        return NO_RANGES
+    runs = runs_of(maximum_filter1d(flags, 3))
     ranges = runs * chunks.size
     # samples after the last full chunk belong to no chunk
     ranges[runs[:, 1] == len(chunks), 1] = evidence.n_samples
     return ranges
 
 
-def _at_end(values, ends):
-    """Return which values are clipping limits of an output: clipped, not frozen."""
-    return np.logical_or.reduce(
-        [
-            np.isclose(values, sign * end.level, rtol=1e-9) & (end.n_clipped > 0)
-            for sign, end in zip((1, -1), ends)
-        ]
-    )
-
-
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sensor and every joint measures until the end."""
     joints = [part for part in evidence.frozen_parts if part.who == 'joints']
-    for span, parts in _by_span(evidence.frozen_parts).items():
+    for part in _sensor_parts(evidence.frozen_parts):
         yield CheckFinding(
             'frozen',
             WARNING,
-            f'the {"IMU" if len(parts) > 1 else parts[0].who} must measure all the time, it repeats'
-            f' one reading {span_words([span])}, which its noise does not allow; check the sensor'
-            ' and its driver; that time is left out',
-            samples=parts[0].samples,
+            f'the {part.who} must measure all the time, it repeats one reading'
+            f' {span_words([(part.start, part.stop)])}, which its noise does not allow; check the'
+            ' sensor and its driver; that time is left out',
+            samples=part.samples,
         )
     if joints:
         yield CheckFinding(
@@ -171,22 +150,25 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         )
 
 
-def _by_span(parts):
-    """Return (start, stop) -> the `FrozenPart` of each sensor that is frozen there."""
-    spans: dict[tuple[float, float], list[FrozenPart]] = {}
+def _sensor_parts(parts):
+    """Return the `FrozenPart` of sensors, joined as 'IMU' where both are frozen at one time."""
+    by_span: dict[tuple[float, float], FrozenPart] = {}
     for part in parts:
-        if part.who != 'joints':
-            spans.setdefault((part.start, part.stop), []).append(part)
-    return spans
+        span = (part.start, part.stop)
+        if part.who == 'joints':
+            continue
+        if span in by_span:
+            part = replace(by_span[span], who='IMU')
+        by_span[span] = part
+    return list(by_span.values())
 
 
 def frozen_lines(parts: Sequence[FrozenPart], consequence: str) -> list[str]:
     """Return a line for each time in which a sensor is frozen, with the consequence."""
-    lines = []
-    for span, of_span in _by_span(parts).items():
-        who = 'IMU' if len(of_span) > 1 else of_span[0].who
-        lines.append(f'the {who} repeats one reading {span_words([span])}: {consequence}')
-    return lines
+    return [
+        f'the {part.who} repeats one reading {span_words([(part.start, part.stop)])}: {consequence}'
+        for part in _sensor_parts(parts)
+    ]
 
 
 def span_words(spans: Sequence[tuple[float, float]]) -> str:
@@ -416,16 +398,17 @@ class Preflight(EvidenceGatherer):
         self._strict, self._one_sensor = strict, one_sensor
         self.unusable: dict[str, str] = {}
         """Sensor that cannot be used, one at most -> why; for `one_sensor`."""
+        # Complete after `finish`.
         self.findings: tuple[CheckFinding, ...] = ()
+        """Findings of all checks."""
         self.streams: dict[str, StreamStatistics] = {}
+        """Name -> StreamStatistics."""
         self.lost: dict[str, int] = {}
-        self.without_readings = np.zeros((0, 2), int)
+        """Reason -> number of unreadable messages."""
+        self.without_readings = NO_RANGES
+        """Ranges of cleaned samples that are no readings, shape (n, 2)."""
         self.resolution = np.zeros(6)
-        """
-        Findings; name -> StreamStatistics; reason -> number of unreadable messages; ranges of
-        cleaned samples that are no readings; smallest step between readings of each column:
-        complete after `finish`.
-        """
+        """Smallest step between readings of each column."""
 
     def finish(self, cleaner: BlockCleaner) -> None:
         """
@@ -438,13 +421,9 @@ class Preflight(EvidenceGatherer):
 
         """
         self.streams, self.lost = cleaner.statistics(), cleaner.lost
-        evidence = replace(self.evidence(self.streams), readings=cleaner.readings)
-        self.findings = (
-            tuple(finding for check in CHECKS for finding in check(evidence))
-            if 'imu' in evidence.streams
-            else ()
-        )
+        evidence = self.evidence(self.streams, cleaner.readings)
         if 'imu' in evidence.streams:
+            self.findings = tuple(finding for check in CHECKS for finding in check(evidence))
             self.without_readings = without_readings(evidence)
             self.resolution = evidence.resolution
         if self._one_sensor:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import smallest_step
 from imu_calibration.preprocessing import scan
 from imu_calibration.preprocessing.full_scale import (
     Extremes,
@@ -22,6 +21,9 @@ from imu_calibration.preprocessing.full_scale import (
     relate_turns,
 )
 from imu_calibration.preprocessing.stream_cleaning import CleanedBlock, StreamStatistics
+
+MIN_MOVING_STEPS = 50.0
+"""A constant axis is frozen if another axis moves by this many steps of the converter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +100,33 @@ class RecordingEvidence:
         return np.quantile(self.awake.range, 0.1, axis=0) if len(self.awake) else np.zeros(6)
 
     @cached_property
+    def stuck(self) -> np.ndarray:
+        """
+        Chunks in which one axis is constant while another one of its sensor moves, shape (n, 6).
+
+        An axis with constant readings in quiet chunks has no known noise, and no such chunk.
+        """
+        stuck = np.zeros(self.chunks.range.shape, bool)
+        for columns in scan.SENSOR_COLUMNS.values():
+            moving = self.chunks.range[:, columns] > MIN_MOVING_STEPS * self.resolution[columns]
+            for axis, column in enumerate(range(columns.start, columns.stop)):
+                if self.quiet_range[column] == 0:
+                    continue
+                other_moves = np.delete(moving, axis, axis=1).any(axis=1)
+                same = (self.chunks.range[:, column] == 0) & ~self._at_end(column)
+                stuck[:, column] = scan.in_long_runs(same & other_moves)
+        return stuck
+
+    def _at_end(self, column):
+        """Return in which chunks an output is at a clipping limit: clipped, not frozen."""
+        mean = self.chunks.mean[:, column]
+        at_end = np.zeros(len(mean), bool)
+        for sign, end in zip((1, -1), self.ends[column], strict=True):
+            if end.n_clipped:
+                at_end |= np.isclose(sign * mean, end.level, rtol=1e-9)
+        return at_end
+
+    @cached_property
     def length(self) -> Any:
         """Gravity as the accelerometer reads it, or None without samples."""
         if self.rest is not None:
@@ -118,7 +147,8 @@ class EvidenceGatherer:
             scan.ChunkSeries(),
             tuple((Extremes(), Extremes()) for _ in range(6)),
         )
-        self._resolution, self._joints = np.full(6, np.inf), scan.StandingJoints()
+        self._resolution = scan.ResolutionSearch()
+        self._joints = scan.StandingJoints()
         self._temperature_c: tuple[float, float] | None = None
 
     def push(self, cleaned: CleanedBlock) -> None:
@@ -134,10 +164,11 @@ class EvidenceGatherer:
                 max(high, float(temperature.temperature_c.max())),
             )
 
-    def evidence(self, statistics: dict[str, StreamStatistics]) -> RecordingEvidence:
+    def evidence(
+        self, statistics: dict[str, StreamStatistics], readings: RawReadings
+    ) -> RecordingEvidence:
         """Return the RecordingEvidence, with the StreamStatistics of each stream."""
         streams = {name: found for name, found in statistics.items() if found.count}
-        resolution = np.where(np.isfinite(self._resolution), self._resolution, 0.0)
         chunks, series = self._chunks.chunks(), self._chunks
         return RecordingEvidence(
             streams,
@@ -145,19 +176,17 @@ class EvidenceGatherer:
             series.n_samples,
             series.n_changed,
             series.n_repeated,
-            resolution,
+            self._resolution.result(),
             self._ends,
             self._temperature_c,
             self.gravity,
             self._joints.stretches(),
+            readings,
         )
 
     def _take_imu(self, imu):
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
-        if self._chunks.n_samples < scan.RESOLUTION_SAMPLES:
-            self._resolution = np.minimum(
-                self._resolution, smallest_step(columns[:, : scan.RESOLUTION_SAMPLES].T)
-            )
+        self._resolution.push(columns.T)
         self._chunks.push(imu.stamp_ns, columns)
         for column, (upwards, downwards) in zip(columns, self._ends):
             upwards.push(column)

@@ -338,12 +338,12 @@ def frozen_chunks(chunks: Chunks, resolution: np.ndarray) -> dict[str, np.ndarra
         Smallest step between readings of each column.
 
     """
-    flat = {
-        sensor: (chunks.range[:, part] == 0).all(axis=1) for sensor, part in SENSOR_COLUMNS.items()
-    }
-    for sensor, flags in flat.items():
+    flat = {}
+    for sensor, part in SENSOR_COLUMNS.items():
+        flags = (chunks.range[:, part] == 0).all(axis=1)
         if flags.all():  # an absent sensor, or one without any reading: no part of it is frozen
-            flat[sensor] = np.zeros(len(chunks), bool)
+            flags = np.zeros(len(chunks), bool)
+        flat[sensor] = flags
     found = {sensor: in_long_runs(flags) for sensor, flags in flat.items()}
     rest = (
         find_rest(chunks.select(~np.logical_or(*flat.values())))
@@ -371,12 +371,30 @@ def frozen_parts(chunks: Chunks, frozen: dict[str, np.ndarray]) -> list[FrozenPa
     return sorted(parts, key=lambda part: part.start)
 
 
+class ResolutionSearch:
+    """The smallest step between readings of each column, from the first samples of a stream."""
+
+    def __init__(self) -> None:
+        self._n_samples = 0
+        self._step = np.full(6, np.inf)
+
+    def push(self, readings: np.ndarray) -> None:
+        """Process the next readings, shape (n, 6)."""
+        if self._n_samples < RESOLUTION_SAMPLES:
+            self._step = np.minimum(self._step, smallest_step(readings[:RESOLUTION_SAMPLES]))
+        self._n_samples += len(readings)
+
+    def result(self) -> np.ndarray:
+        """Return the smallest step of each column, shape (6,); 0 where no reading changes."""
+        return np.where(np.isfinite(self._step), self._step, 0.0)
+
+
 class FrozenSearch:
     """Searches raw readings for parts with frozen output, in bounded memory."""
 
     def __init__(self) -> None:
         self._series = ChunkSeries()
-        self._step = np.full(6, np.inf)
+        self._resolution = ResolutionSearch()
 
     def push(self, stamp_ns: np.ndarray, force: np.ndarray, rate: np.ndarray) -> None:
         """Process readings in order of arrival: stamps, shape (n,), and two arrays (n, 3)."""
@@ -385,15 +403,13 @@ class FrozenSearch:
         if not finite.any():
             return
         readings = readings[finite]
-        if self._series.n_samples < RESOLUTION_SAMPLES:
-            self._step = np.minimum(self._step, smallest_step(readings))
+        self._resolution.push(readings)
         self._series.push(stamp_ns[finite], readings.T)
 
     def parts(self) -> list[FrozenPart]:
         """Return the parts with frozen output until now, in order of time."""
         chunks = self._series.chunks()
-        resolution = np.where(np.isfinite(self._step), self._step, 0.0)
-        return frozen_parts(chunks, frozen_chunks(chunks, resolution))
+        return frozen_parts(chunks, frozen_chunks(chunks, self._resolution.result()))
 
 
 def frozen_joints(
