@@ -113,6 +113,7 @@ lint-size: $(STAMP)
 
 lint-words: $(STAMP)
 	@$(PY) tools/plain.py
+	@$(PY) tools/quoted_names.py
 
 $(STAMP)-lint: $(STAMP) constraints/lint.txt
 	@$(PIP) --prefer-binary --requirement constraints/lint.txt

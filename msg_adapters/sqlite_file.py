@@ -233,7 +233,7 @@ class SqliteFile(StorageFile):
 
 def _connect(path, logged):
     """
-    Open read-only; `immutable` keeps SQLite from looking for locks, but hides a write-ahead log.
+    Open read-only; ``immutable`` keeps SQLite from looking for locks, but hides a write-ahead log.
     """
     if os.path.getsize(path) < 512:
         raise sqlite3.DatabaseError('the file is shorter than one page')

@@ -219,7 +219,7 @@ def compensated_samples(
     force_s, rate_s : ndarray, shape (n, 3)
         Measured specific force (m/s^2) and rate (rad/s) in the sensor frame.
     alpha_s : ndarray, shape (n, 3)
-        Angular acceleration in the sensor frame, rad/s^2 (see `differentiation`).
+        Angular acceleration in the sensor frame, rad/s^2 (see `angular_acceleration`).
     temperature_c : ndarray, shape (n,), optional
         Needed when the calibration has thermal effects.
     thermal_branch : ndarray, shape (n,), optional

@@ -144,7 +144,7 @@ class Uncertainty:
         rate: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
         derivative: tuple[float, float, float] | np.ndarray = (0.0, 0.0, 0.0),
         *,
-        dt: float = 0.0,
+        warming: float = 0.0,
         branch: float = 0.0,
         vibration: tuple[float, ...] = (0.0, 0.0, 0.0),
         slope_error: SlopeError | None = None,
@@ -156,7 +156,7 @@ class Uncertainty:
         ----------
         force, rate, derivative : sequence of 3 floats
             Measured specific force, rate, and derivative of the rate.
-        dt : float
+        warming : float
             Temperature above the calibration's reference temperature, K.
         branch : float
             Thermal branch (`kinematics.signal_history`).
@@ -166,7 +166,10 @@ class Uncertainty:
             Error of the derivative; None: noise only.
 
         """
-        sample, beside = np.concatenate([force, rate, derivative]), (dt, branch, *vibration)
+        sample, beside = (
+            np.concatenate([force, rate, derivative]),
+            (warming, branch, *vibration),
+        )
         gain = np.stack(
             [self._slope(sample, step, beside) for step in np.diag(DIFFERENCE_STEPS)], axis=1
         )

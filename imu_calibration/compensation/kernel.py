@@ -46,8 +46,8 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     """
     Return the function that compensates one sample.
 
-    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch, sx, sy, sz) -> (fx, fy, fz, wx, wy,
-    wz)`` reads the measured specific force (m/s^2) and rate (rad/s), the derivative of the
+    ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, warming, branch, sx, sy, sz)``
+    ``-> (fx, fy, fz, wx, wy, wz)`` reads the measured specific force (m/s^2) and rate (rad/s), the derivative of the
     *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here), and the
     temperature above the calibration's reference temperature (K). Where they are left out, which
     way that came (`kinematics.signal_history`) and how much it vibrates
@@ -126,7 +126,8 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     at_arm = [_sum(arm, products[start : start + 3]) for start in (0, 3, 6)]
     slope = _turned(gyro.inverse, _vector('a'))
     lines = [
-        'def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, dt, branch=0.0, sx=0.0, sy=0.0, sz=0.0):'
+        'def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, warming,'
+        ' branch=0.0, sx=0.0, sy=0.0, sz=0.0):'
     ]
     if (
         gyro.uses <= BEFOREHAND
@@ -190,7 +191,7 @@ def _known(temperature_ref_c):
         for k in AXES
     }
     return vectors | {
-        'temperature_c': {('dt',): 1.0, (): temperature_ref_c},
+        'temperature_c': {('warming',): 1.0, (): temperature_ref_c},
         'temperature_ref_c': {(): temperature_ref_c},
         'thermal_branch': {('branch',): 1.0},
     }

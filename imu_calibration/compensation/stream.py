@@ -131,7 +131,7 @@ class CompensationStream:
                 'force': imu.force_s[k],
                 'rate': imu.rate_s[k],
                 'derivative': slope[k],
-                'dt': (
+                'warming': (
                     0.0
                     if temperature is None
                     else float(temperature[k]) - self.calibration.model.temperature_ref_c
@@ -395,7 +395,7 @@ class SampleCompensation:
         self.counts, self.corrected, self.fastest_squared = Counter(), 0, 0.0
         model = invertible(calibration.model)
         self.needs_temperature = model.needs_temperature
-        self.dt = None if self.needs_temperature else 0.0
+        self.warming = None if self.needs_temperature else 0.0
         self.branch, self.vibration = ThermalBranch(), BandVariance()
         self._shakes = model.uses('vibration')
         self.at_zero = {
@@ -430,7 +430,7 @@ class SampleCompensation:
             return
         self.branch.push(temperature_c)
         if self.needs_temperature:
-            self.dt = temperature_c - self.calibration.model.temperature_ref_c
+            self.warming = temperature_c - self.calibration.model.temperature_ref_c
 
     def correct(
         self, stamp_ns: int, wx: float, wy: float, wz: float, fx: float, fy: float, fz: float
@@ -440,9 +440,9 @@ class SampleCompensation:
 
         `counts` has the reason.
         """
-        total, dt = wx + wy + wz + fx + fy + fz, self.dt
-        if total - total != 0.0 or dt is None:
-            self.counts['no temperature yet' if dt is None else 'not finite'] += 1
+        total, warming = wx + wy + wz + fx + fy + fz, self.warming
+        if total - total != 0.0 or warming is None:
+            self.counts['no temperature yet' if warming is None else 'not finite'] += 1
             return None
         slope = self.slope.push(stamp_ns, wx, wy, wz) if self._follows else NO_SLOPE
         vibration = (
@@ -451,13 +451,20 @@ class SampleCompensation:
             else NO_SLOPE
         )
         ux, uy, uz, vx, vy, vz = self._kernel(
-            fx, fy, fz, wx, wy, wz, *slope, dt, self.branch.now, *vibration
+            fx, fy, fz, wx, wy, wz, *slope, warming, self.branch.now, *vibration
         )
         squared = vx * vx + vy * vy + vz * vz
         if squared != squared:
             self.counts['outside the invertible range'] += 1
             return None
-        self.last = ((fx, fy, fz), (wx, wy, wz), slope, dt, self.branch.now, vibration)
+        self.last = (
+            (fx, fy, fz),
+            (wx, wy, wz),
+            slope,
+            warming,
+            self.branch.now,
+            vibration,
+        )
         if squared > self.fastest_squared:
             self.fastest_squared = squared
         self.corrected += 1
@@ -486,7 +493,7 @@ class SampleCompensation:
         """Update the covariances of the corrected readings at the latest sample."""
         self._sensitivity = self._uncertainty.at(
             *self.last[:3],
-            dt=self.last[3],
+            warming=self.last[3],
             branch=self.last[4],
             vibration=self.last[5],
             slope_error=self.slope.error() if self.needs_slope else None,
@@ -522,9 +529,9 @@ class SampleCompensation:
             before.corrected,
             before.fastest_squared,
         )
-        if before.dt is not None and before.needs_temperature and self.dt is None:
-            self.dt = (
-                before.dt
+        if before.warming is not None and before.needs_temperature and self.warming is None:
+            self.warming = (
+                before.warming
                 + before.calibration.model.temperature_ref_c
                 - self.calibration.model.temperature_ref_c
             )

@@ -89,10 +89,9 @@ class BandMisfit:
             np.where(self.apart, self.fast, self.overall),
             np.where(self.apart, 0.0, self.slow),
         )
-        every = np.maximum.reduce([samples / white, pieces / unit, np.ones(3)])
-        return MovingFactors(
-            every, np.where(self.apart, np.minimum(np.maximum(self.slow / unit, 1.0), every), every)
-        )
+        factor = np.maximum.reduce([samples / white, pieces / unit, np.ones(3)])
+        slow_factor = np.minimum(np.maximum(self.slow / unit, 1.0), factor)
+        return MovingFactors(factor, np.where(self.apart, slow_factor, factor))
 
     def without_fast(self) -> 'BandMisfit':
         """Return the same with a variance of the fast part so large that its weight is zero."""

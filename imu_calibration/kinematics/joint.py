@@ -152,7 +152,7 @@ class Joint:
     """Range, speed and acceleration."""
     sag: float = 0.0
     """
-    Angle by which it hangs towards the ground where its axis lies level, rad (`leaning_axes`):
+    Angle by which it hangs towards the ground where its axis lies level, rad (`axis_sag`):
     estimated, no description holds it.
     """
     wobble: tuple[tuple[int, complex], ...] = ()

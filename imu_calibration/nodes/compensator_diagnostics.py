@@ -246,8 +246,8 @@ class CompensatorDiagnostics:
         fastest, compensation.fastest_squared = sqrt(compensation.fastest_squared), 0.0
         temperature = (
             None
-            if not compensation.needs_temperature or compensation.dt is None
-            else [compensation.dt + compensation.calibration.model.temperature_ref_c]
+            if not compensation.needs_temperature or compensation.warming is None
+            else [compensation.warming + compensation.calibration.model.temperature_ref_c]
         )
         return outside_conditions(compensation.calibration, fastest, temperature)
 

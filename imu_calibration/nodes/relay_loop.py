@@ -26,7 +26,7 @@ except ImportError:
 MAX_MESSAGES_IN_ROW = 256
 """Largest number of messages read in a row before the context is checked."""
 WAIT_NS = 100_000_000
-"""Longest wait, s, after which a replaced subscription is noticed; a signal ends it at once."""
+"""Longest wait, ns, after which a replaced subscription is noticed; a signal ends it at once."""
 SWITCH_INTERVAL = 5e-4
 """The message thread gets the interpreter back from the other thread within this time, s."""
 

@@ -212,8 +212,9 @@ def _with_moving_factors(space, sensor, noise, values, look_along):
             else:
                 variances[axis] = reduced @ space.within_sum(sensor, axis, rows) @ reduced / dof
         share = float(np.clip(np.mean(along / variances), 1.0, None)) if look_along else 1.0
-        every = np.maximum(variances / noise.white_variance, LEAST_FACTOR) * share / noise.inflation
-        found[str(kind)] = MovingFactors(every, every, np.maximum(every, 1.0), share)
+        factor = np.maximum(variances / noise.white_variance, LEAST_FACTOR)
+        factor = factor * share / noise.inflation
+        found[str(kind)] = MovingFactors(factor, factor, np.maximum(factor, 1.0), share)
     return replace(noise, moving=found)
 
 

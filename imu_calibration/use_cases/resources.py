@@ -15,7 +15,7 @@ PACKAGE = 'imu_calibration'
 
 def share_folder() -> Path:
     """
-    Return the folder that holds `config` and `launch`.
+    Return the folder that holds ``config`` and ``launch``.
 
     The checkout or installation of this module has priority, so that a second
     installation on the machine cannot replace it; then the sourced workspaces; then the

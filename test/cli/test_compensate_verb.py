@@ -118,7 +118,7 @@ def test_the_corrected_topic_holds_the_true_readings(tmp_path, effects, capsys):
     dt = float(temperature[-1]) - calibration.model.temperature_ref_c
     expected = (
         Uncertainty(calibration)
-        .at(force[-1], rate[-1], dt=dt)
+        .at(force[-1], rate[-1], warming=dt)
         .covariances(*Uncertainty(calibration).noise)[1]
     )
     assert np.diag(cov) == pytest.approx(

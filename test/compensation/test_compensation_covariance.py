@@ -54,7 +54,8 @@ def test_noise_agrees_with_monte_carlo(effects, transfer):
     slope = SLOPE + np.einsum('k,nki->ni', DERIVATIVE.weights, rates)
     rows = np.column_stack([force, RATE + rates[:, 0], slope, np.full(N_DRAWS, DT)])
     out = np.array([kernel(*row) for row in rows.tolist()])
-    sensitivity = with_derivative(calibration, transfer).at(FORCE, RATE, SLOPE, dt=DT)
+    at = with_derivative(calibration, transfer).at
+    sensitivity = at(FORCE, RATE, SLOPE, warming=DT)
     for got, predicted in zip(
         (out[:, :3], out[:, 3:]),
         sensitivity.covariances(FORCE_COV, RATE_COV, with_parameters=False),
@@ -72,7 +73,8 @@ def test_parameters_agree_with_monte_carlo(effects, transfer):
     out = np.array(
         [make_kernel(replace(calibration, values=values), transfer)(*sample) for values in draws]
     )
-    predicted = with_derivative(calibration, transfer).at(FORCE, RATE, SLOPE, dt=DT).parameters
+    at = with_derivative(calibration, transfer).at
+    predicted = at(FORCE, RATE, SLOPE, warming=DT).parameters
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     # 300 draws: 8 %, four times that; the derivative of the inverse gyroscope matrix in the
     # tangential term is left out.
@@ -83,7 +85,8 @@ def test_what_is_published_has_the_share_of_the_parameters():
     """It is there, and grows with their variance: by a hundred from 1e-4 to 1e-3."""
     shares = []
     for sd in (1e-4, 1e-3):
-        sensitivity = with_derivative(random_calibration(1, sd=sd)).at(FORCE, RATE, SLOPE, dt=DT)
+        at = with_derivative(random_calibration(1, sd=sd)).at
+        sensitivity = at(FORCE, RATE, SLOPE, warming=DT)
         whole, noise_only = (
             sensitivity.covariances(FORCE_COV, RATE_COV, flag) for flag in (True, False)
         )

@@ -234,7 +234,7 @@ def test_a_temperature_that_is_nan_or_stops_is_told(bench, tmp_path, monkeypatch
     publisher.publish(Temperature(temperature=float('nan')))
     bench.until(lambda: bench.shows(STATUS, '/imu/temperature', 'finite'), 'NaN')
     publisher.publish(Temperature(temperature=28.0))
-    bench.until(lambda: node.compensation.dt is not None, 'the temperature')
+    bench.until(lambda: node.compensation.warming is not None, 'the temperature')
     bench.until(
         lambda: bench.shows(STATUS, '28.0 C', '/imu/temperature', '/tester'), 'that it stopped'
     )
@@ -348,7 +348,7 @@ def test_a_temperature_in_kelvin_is_refused(bench, tmp_path):
     for temperature, used in ((298.15, None), (25.0, 25.0), (float('nan'), 25.0), (310.0, 25.0)):
         node._on_temperature(Temperature(temperature=temperature))
         assert node.diagnostics._temperature == used
-        assert node.compensation.dt == (
+        assert node.compensation.warming == (
             None if used is None else used - thermal.model.temperature_ref_c
         )
     node.diagnostics.publish_now()
