@@ -47,8 +47,8 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     Return the function that compensates one sample.
 
     ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, warming, branch, sx, sy, sz)``
-    ``-> (fx, fy, fz, wx, wy, wz)`` reads the measured specific force (m/s^2) and rate (rad/s), the derivative of the
-    *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here), and the
+    ``-> (fx, fy, fz, wx, wy, wz)`` reads the measured specific force (m/s^2) and rate (rad/s), the
+    derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here), and the
     temperature above the calibration's reference temperature (K). Where they are left out, which
     way that came (`kinematics.signal_history`) and how much it vibrates
     (`kinematics.signal_history`, (m/s^2)^2) are 0. Where the non-linear effects cannot be undone it
