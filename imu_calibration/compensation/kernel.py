@@ -48,10 +48,9 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
 
     ``kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, warming, branch, sx, sy, sz)``
     ``-> (fx, fy, fz, wx, wy, wz)`` reads the measured specific force (m/s^2) and rate (rad/s), the
-    derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix here), and the
-    temperature above the calibration's reference temperature (K). Where they are left out, which
-    way that came (`kinematics.signal_history`) and how much it vibrates
-    (`kinematics.signal_history`, (m/s^2)^2) are 0. Where the non-linear effects cannot be undone it
+    derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix
+    here), and the temperature above the calibration's reference temperature (K). The thermal branch
+    and the vibration ((m/s^2)^2; `kinematics.signal_history`) are 0 if they are not given. Where the non-linear effects cannot be undone it
     returns NaN.
 
     Parameters
