@@ -50,8 +50,8 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     ``-> (fx, fy, fz, wx, wy, wz)`` reads the measured specific force (m/s^2) and rate (rad/s), the
     derivative of the *measured* rate (rad/s^2; it is multiplied by the inverse gyroscope matrix
     here), and the temperature above the calibration's reference temperature (K). The thermal branch
-    and the vibration ((m/s^2)^2; `kinematics.signal_history`) are 0 if they are not given. Where the
-    non-linear effects cannot be undone it returns NaN.
+    and the vibration ((m/s^2)^2; `kinematics.signal_history`) are 0 if they are not given.
+    Where the non-linear effects cannot be undone it returns NaN.
 
     Parameters
     ----------
