@@ -11,13 +11,15 @@ from scipy.special import chdtrc
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import exit_code_of
-from imu_calibration.document.calibration import HAND_AXES, Calibration
+from imu_calibration.document.calibration import HAND_AXES, Calibration, listed
 from imu_calibration.document.exports.affine import lower_times_rotation
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.solution import FIXED, HELD
 
 COMPARISON_P_VALUE = 0.01
 """Significance level: two calibrations differ when the p-value is below this."""
+MOTION_COLUMNS = {'force', 'rate', 'angular acceleration', 'joint rate', 'vibration'}
+"""Quantities with components along the axes of the sensor (`ColumnGroup.uses`)."""
 TABLE_AXES = 'mount'
 """Axes of a calibration on a table: those of the mount."""
 
@@ -127,7 +129,8 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
     With the accelerometer matrix ``M = L Q``, L lower triangular with positive diagonal, Q a
     rotation, and with the true quantities ``Q f``, ``Q w``: matrices M to ``M Q'``, lever arms r to
     ``Q (r - mean of r)``, the response K to specific force to ``K Q'``. The covariance follows by
-    differences. Other effects are unchanged: they are small, and so is the rotation.
+    differences. Other effects are unchanged; `compare` omits the ones that depend on the axes
+    (`_kept_axes`) where the axes of both files differ too much.
     """
     model = calibration.model
     values = _turned(model, calibration.values)
@@ -171,11 +174,40 @@ def _turned(model, values):
 
 def _compared_turned(first, second, common, notes):
     """Compare the common parameters of two calibrations in the axes of the accelerometer."""
-    return _compared(in_accelerometer_axes(first), in_accelerometer_axes(second), common, notes)
+    turns = [
+        lower_times_rotation(c.model.value('accelerometer', Role.LINEAR, c.values))[1]
+        for c in (first, second)
+    ]
+    cosine = 0.5 * (np.trace(turns[0] @ turns[1].T) - 1.0)
+    angle = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return _compared(
+        in_accelerometer_axes(first), in_accelerometer_axes(second), common, notes, angle=angle
+    )
 
 
-def _compared(first, second, common, notes):
-    """Compare the common parameters of two calibrations as they are."""
+def _kept_axes(calibration):
+    """
+    Return {name: largest value of its effect} of parameters in the axes of their own file.
+
+    Their columns are products of components of the true motion, which a rotation mixes.
+    """
+    found = {}
+    for effect in calibration.model.effects:
+        used = set().union(*(group.uses for group in effect.groups)) & MOTION_COLUMNS
+        if effect.role is Role.TERM and effect.sensor in SENSORS and used:
+            largest = float(
+                np.max(np.abs(calibration.values[calibration.model.slices[effect.key]]))
+            )
+            found |= dict.fromkeys(effect.param_names(), largest)
+    return found
+
+
+def _compared(first, second, common, notes, *, angle=0.0):
+    """
+    Compare the common parameters of two calibrations.
+
+    `angle`: rotation, rad, between the axes in which the parameters of `_kept_axes` are.
+    """
     a, b = ([c.param_names.index(name) for name in common] for c in (first, second))
     difference = second.values[b] - first.values[a]
     parts = [
@@ -186,6 +218,12 @@ def _compared(first, second, common, notes):
         [bool({first.status[i], second.status[j]} & {HELD, FIXED}) for i, j in zip(a, b)]
     )
     sd = np.sqrt(np.diag(covariance))
+
+    # A rotation by the angle changes a coefficient by at most about the angle times the largest.
+    sizes = [_kept_axes(each) for each in (first, second)]
+    turned = np.array([angle * max(each.get(name, 0.0) for each in sizes) for name in common])
+    in_other_axes = turned > sd
+    held |= in_other_axes
     units = {
         name: effect.unit_of(k)
         for effect in first.model.effects
@@ -227,9 +265,14 @@ def _compared(first, second, common, notes):
             'off-diagonal terms of a matrix include how the IMU was mounted on the table: '
             'they differ after remounting without a change of the IMU'
         )
-    if held.any():
+    fixed = int(np.count_nonzero(held & ~in_other_axes))
+    if fixed:
+        lines.append(f'{fixed} parameters are held or fixed in one of them and were not compared')
+    if in_other_axes.any():
+        names = [name for name, other in zip(common, in_other_axes) if other]
         lines.append(
-            f'{int(held.sum())} parameters are held or fixed in one of them and were not compared'
+            f'not compared, because their axes differ by {np.degrees(angle):.2g} deg:'
+            f' {listed(names)}'
         )
     if len(parts) < 2:
         lines.append(

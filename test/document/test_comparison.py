@@ -23,6 +23,7 @@ from imu_calibration.document.comparison import (
 )
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED, FIXED, HELD
+from imu_calibration.kinematics.joint import JointNames
 
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 COUNT = len(MODEL.param_names)
@@ -180,3 +181,52 @@ def test_the_clock_of_another_session_is_no_disagreement_of_the_imu():
     assert (found.agree, found.reference_agree, found.exit_code) == (True, False, 0)
     found = compare(one, moved(one, 'gyroscope.bias.x', 0.4))
     assert (found.agree, found.reference_agree, found.exit_code) == (False, True, 3)
+
+
+def test_the_encoder_zero_of_another_session_is_no_disagreement_of_the_imu():
+    model = SensorModel(
+        reference=('encoder_zero',), joint_names=JointNames.of(('outer', 'middle', 'inner'))
+    )
+    count = len(model.param_names)
+    sd = 1e-5
+    one = Calibration(
+        model, model.start(), sd**2 * np.eye(count), (DETERMINED,) * count, 'imu', {'axes': 'mount'}
+    )
+    [name] = [name for name in model.param_names if name.startswith('reference.')]
+    found = compare(one, moved(one, name, 3897 * np.sqrt(2) * sd))
+    assert (found.agree, found.reference_agree, found.exit_code) == (True, False, 0)
+    assert next(row for row in found.rows if row.name == name).ratio == pytest.approx(3897)
+
+
+@pytest.mark.parametrize(('degrees', 'compared'), ((90.0, False), (0.01, True)))
+def test_products_of_components_are_compared_only_in_nearly_the_same_axes(degrees, compared):
+    """A rotation mixes the squares of components: their coefficients belong to the axes."""
+    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_quadratic', 'accel_thermal_bias'))
+    count, sd = len(model.param_names), 1e-5
+    at = [model.param_names.index(f'accelerometer.accel_quadratic.{axis}') for axis in 'xyz']
+    values = model.start()
+    values[at] = (1e-3, -2e-3, 5e-4)
+    one = Calibration(
+        model,
+        values,
+        sd**2 * np.eye(count),
+        (DETERMINED,) * count,
+        'imu',
+        {'origin': 'mount', 'axes': 'mount'},
+    )
+    turn = np.eye(count)
+    rotation = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    for name in ('accelerometer.matrix', 'gyroscope.matrix'):
+        start = one.param_names.index(f'{name}.xx')
+        turn[start : start + 9, start : start + 9] = np.kron(np.eye(3), rotation)
+    # Twenty sds of the largest coefficient, which only nearly equal axes can show.
+    by_hand = replace(one, gauge={'axes': 'accelerometer_lower_triangular'})
+    values = turn @ values
+    values[at[1]] += 20 * np.sqrt(2) * sd
+    found = compare(by_hand, replace(one, values=values))
+    ratios = {row.name: row.ratio for row in found.rows}
+    assert found.agree is not compared
+    assert (ratios['accelerometer.accel_quadratic.y'] is not None) is compared
+    assert ratios['accelerometer.accel_thermal_bias.x'] == 0
+    named = [line for line in found.lines if 'accel_quadratic' in line and f'{degrees:g}' in line]
+    assert bool(named) is not compared
