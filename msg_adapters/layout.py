@@ -75,7 +75,12 @@ class Packed:
     def join(cls, messages: Sequence[bytes]) -> 'Packed':
         """Pack a list of bytes objects."""
         size = np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
-        return cls(np.frombuffer(b''.join(messages), dtype=np.uint8), np.cumsum(size) - size, size)
+        return cls.of_sizes(b''.join(messages), size)
+
+    @classmethod
+    def of_sizes(cls, data: bytes, size: np.ndarray) -> 'Packed':
+        """Return the messages that follow each other in `data`; `size`: int64, shape (n,)."""
+        return cls(np.frombuffer(data, dtype=np.uint8), np.cumsum(size) - size, size)
 
     @classmethod
     def of_rows(cls, table: np.ndarray) -> 'Packed':

@@ -1,14 +1,17 @@
 """
 rosbag2 sqlite3 storage, read and written (schema version 4).
 
-Topics are read by SQL, and messages from the pages or row by row.
+The standard module ``sqlite3`` reads the rows. A file can declare more rows than it contains, so
+two limits hold that an undamaged file does not reach: the messages of a scan have fewer bytes than
+the file, and the instructions of SQLite are proportional to the size of the file.
 """
 
 import os
 import sqlite3
-from collections import defaultdict
-from collections.abc import Callable
-from contextlib import closing, suppress
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from itertools import chain, islice
 from os import PathLike
@@ -18,14 +21,30 @@ from urllib.parse import quote
 
 import numpy as np
 
+from imu_calibration.core.documents import open_regular
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from msg_adapters.definitions import TypeDefinition
 from msg_adapters.layout import Packed, clean_name
-from msg_adapters.sqlite_pages import PageReader
-from msg_adapters.storage import StorageFile, Stretch, read_ahead
+from msg_adapters.storage import StorageFile, Stretch
 
-MESSAGE_COLUMNS = ['id', 'topic_id', 'timestamp', 'data']
+BATCH_ROWS = 256
+"""Rows per ``fetchmany``; the objects of more rows do not fit into the cache of the processor."""
+SMALL_BYTES = 16384
+"""Larger messages are read one by one, so that a batch has at most 4 MB."""
 STRETCH_ROWS = 8192
+STRETCH_BYTES = 16 << 20
+"""Rows, or bytes of messages, that complete a stretch."""
+FIRST_ID, LAST_ID = -(2**63), 2**63 - 1
+STEP_IDS = 16
+MOST_STEPS = 2000
+"""Ids of one step behind damage, and steps in a scan until the rest of the file is given up."""
+INSTRUCTIONS_PER_BYTE = 8
+"""
+Instructions of SQLite in a scan, per byte of the file. A row has at least 11 bytes and costs about
+40 instructions in all; a page that is listed again and again needs more.
+"""
+INSTRUCTIONS_PER_CALL = 1_000_000
+"""Instructions between two tests of this limit."""
 TABLES = ('topics', 'messages', 'message_definitions')
 MOST_TABLES, MOST_TOPICS = 1000, 100_000
 """Entries of the schema and of the table of topics that are read."""
@@ -49,7 +68,9 @@ class SqliteFile(StorageFile):
         self.lost = {}
         log = Path(f'{path}-wal')
         self.logged = log.exists() and log.stat().st_size > 0
-        self.connection = _connect(self.path, self.logged)
+        self.size = self.path.stat().st_size + (log.stat().st_size if self.logged else 0)
+        self._n_calls = 0
+        self.connection = self._open()
         try:
             self._read_topics()
         except sqlite3.OperationalError as error:
@@ -57,11 +78,31 @@ class SqliteFile(StorageFile):
             if not self.logged:
                 raise
             self.lost[f'write-ahead log {log.name} that cannot be read ({error})'] = 1
-            self.logged, self.connection = False, _connect(self.path, False)
+            self.logged = False
+            self.connection = self._open()
             self._read_topics()
         except BaseException:
             self.connection.close()
             raise
+        self._cut_page = None if self.logged else _incomplete_page(self.path)
+        if self._cut_page is not None:
+            self._lose(f'incomplete last page {UNKNOWN_EXTENT}', 1)
+
+    def _open(self):
+        connection = _connect(self.path, self.logged)
+        connection.set_progress_handler(self._count_call, INSTRUCTIONS_PER_CALL)
+        self._longest = connection.getlimit(sqlite3.SQLITE_LIMIT_LENGTH)
+        self._is_utf8 = connection.execute('PRAGMA encoding').fetchone() == ('UTF-8',)
+        return connection
+
+    def _count_call(self):
+        """Count the instructions of SQLite; it stops where this returns True."""
+        self._n_calls += 1
+        return self._is_beyond_limit()
+
+    def _is_beyond_limit(self):
+        limit = INSTRUCTIONS_PER_BYTE * self.size + 20 * INSTRUCTIONS_PER_CALL
+        return self._n_calls * INSTRUCTIONS_PER_CALL > limit
 
     def _read_topics(self):
         self._require_tables()
@@ -112,12 +153,18 @@ class SqliteFile(StorageFile):
 
     def count(self) -> dict[str, int]:
         """Return topic -> messages by counting them."""
-        by_id = defaultdict(int)
-        for stretch in self._stretches(list(self.topic_ids)):
-            for topic_id, count in zip(
-                *np.unique(stretch.topic_ids, return_counts=True), strict=True
-            ):
-                by_id[int(topic_id)] += int(count)
+        self._n_calls = 0
+        by_id: Counter = Counter()
+        try:
+            rows = self.connection.execute('SELECT topic_id FROM messages NOT INDEXED')
+            by_id.update(chain.from_iterable(rows))
+        except sqlite3.Error:
+            # Damage: the readable rows are counted, and the loss is reported when they are read.
+            by_id = Counter()
+            lost = dict(self.lost)
+            for stretch in self._stretches(list(self.topic_ids)):
+                by_id.update(stretch.topic_ids.tolist())
+            self.lost = lost
         return {name: sum(by_id[k] for k in ids) for name, ids in self.topic_ids.items()}
 
     def time_range(self) -> tuple[int, int] | None:
@@ -126,6 +173,7 @@ class SqliteFile(StorageFile):
 
         Or None when there are no messages or they cannot be read.
         """
+        self._n_calls = 0
         with suppress(sqlite3.Error):
             (first,) = self.connection.execute('SELECT min(timestamp) FROM messages').fetchone()
             (last,) = self.connection.execute('SELECT max(timestamp) FROM messages').fetchone()
@@ -138,109 +186,273 @@ class SqliteFile(StorageFile):
         """Close the file."""
         self.connection.close()
 
-    def _stretches(self, _topics):
-        root = self._root()
-        if root is None:
-            yield from self._rows_by_sql()
-            return
-        reader = PageReader(self.path, root)
-        try:
-            with closing(read_ahead(reader.stretches())) as pieces:
-                for buffer, starts in pieces:
-                    rows = reader.rows(buffer, starts)
-                    yield Stretch(rows.topic_id, partial(self._pack, rows), rows.received_ns)
-        finally:
-            reader.close()
-            if reader.damaged_pages:
-                # A page that cannot be read has an unknown number of rows.
-                self._lose(f'unreadable pages {UNKNOWN_EXTENT}', reader.damaged_pages)
-            if reader.damaged_rows:
-                self._lose('unreadable rows', reader.damaged_rows)
+    def _stretches(self, topics):
+        wanted = {number for topic in topics for number in self.topic_ids.get(topic, ())}
+        self._n_calls = self._n_steps = 0
+        n_total = n_rows = n_bytes = 0
+        parts: list[Part] = []
+        for part in self._parts(wanted):
+            n_total += len(part.messages)
+            if n_total > self.size:
+                self._lose(f'rest {UNKNOWN_EXTENT} after rows that share their pages', 1)
+                break
+            parts.append(part)
+            n_rows += len(part.sizes)
+            n_bytes += len(part.messages)
+            if n_rows >= STRETCH_ROWS or n_bytes >= STRETCH_BYTES:
+                yield _stretch(parts)
+                parts, n_rows, n_bytes = [], 0, 0
+        if parts:
+            yield _stretch(parts)
 
-    def _root(self):
-        """
-        Return the root page of the table of messages.
-
-        Or None when only SQL can read it (write-ahead log, other columns).
-        """
-        columns = [row[1] for row in self.connection.execute('PRAGMA table_info(messages)')]
-        found = self.connection.execute(
-            "SELECT rootpage, sql FROM sqlite_master WHERE type = 'table' AND name = 'messages'"
-        ).fetchone()
-        if (
-            self.logged
-            or columns != MESSAGE_COLUMNS
-            or not found
-            or 'INTEGER PRIMARY KEY' not in found[1].upper()
-        ):
-            return None
-        return found[0]
-
-    def _pack(self, rows, index):
-        """
-        Return the data of some rows.
-
-        Data that continue in overflow pages are read by SQL and appended to the pages.
-        """
-        start, size = rows.start[index], rows.size[index]
-        outside = np.flatnonzero(~rows.inside[index])
-        if not len(outside):
-            return index, Packed(rows.buffer, start, size)
-        found = [self._by_id(int(rows.row_id[index[k]])) for k in outside]
-        tail = Packed.join([data or b'' for data in found])
-        start[outside], size[outside] = len(rows.buffer) + tail.start, tail.size
-        kept = np.ones(len(index), dtype=bool)
-        kept[outside] = [data is not None for data in found]
-        return index[kept], Packed(
-            np.concatenate([rows.buffer, tail.buffer]), start[kept], size[kept]
-        )
-
-    def _by_id(self, row_id):
-        try:
-            return memoryview(
-                self.connection.execute(
-                    'SELECT data FROM messages WHERE id = ?', (row_id,)
-                ).fetchone()[0]
-            ).tobytes()
-        except (sqlite3.Error, TypeError):
-            self._lose('unreadable rows', 1)
-            return None
-
-    def _rows_by_sql(self):
-        cursor = iter(
-            self.connection.execute('SELECT topic_id, timestamp, data FROM messages ORDER BY id')
-        )
-        while True:
-            rows: list[Any] = []
+    def _parts(self, wanted):
+        """Yield the Parts of the rows of some topics, in the order of the ids."""
+        after = FIRST_ID
+        if not wanted:
+            after = None
+        elif len(wanted) == 1 and self._is_utf8 and self._cut_page is None:
+            after = yield from self._equal_messages(min(wanted))
+        known = {number for numbers in self.topic_ids.values() for number in numbers}
+        others = known - wanted
+        statement = _statement(wanted, others)
+        while after is not None:
+            rows = []
             try:
-                rows.extend(islice(cursor, STRETCH_ROWS))
-            except sqlite3.Error as error:
-                self._lose(f'rest {UNKNOWN_EXTENT} after damage ({error})', 1)
-            usable = [row for row in rows if tuple(map(type, row)) == (int, int, bytes)]
-            if len(usable) < len(rows):
-                self._lose('rows with values of other types', len(rows) - len(usable))
-            if usable:
-                ids, received, messages = zip(*usable, strict=True)
-                packed, received = Packed.join(messages), np.array(received, dtype=np.int64)
-                yield Stretch(
-                    np.array(ids),
-                    lambda index, packed=packed: (index, packed.select(index)),
-                    received.__getitem__,
-                )
-            if len(rows) < STRETCH_ROWS:  # the end, or damage
+                cursor = self.connection.execute(statement, (after, LAST_ID))
+                while found := cursor.fetchmany(BATCH_ROWS):
+                    rows = found
+                    yield from self._usable(rows, wanted)
                 return
+            except sqlite3.Error as error:
+                damage = error
+            # The id of a row of an unknown topic is damaged too.
+            ids = [row_id for row_id, topic_id, *_ in rows if topic_id in wanted]
+            after = max([after, *ids[-1:]])
+            after = yield from self._behind_damage(after, wanted, others)
+            if after is None:
+                self._lose(f'rest {UNKNOWN_EXTENT} after damage ({damage})', 1)
+
+    def _equal_messages(self, topic_id):
+        """
+        Yield the Parts of one topic while its messages have one size.
+
+        SQLite appends the messages to each other, which needs half the time of one object per row.
+        It treats the bytes as text, which changes nothing in a database with UTF-8; the size of the
+        result shows that nothing is missing. Return the last id, None at the end of the file.
+        """
+        after = FIRST_ID
+        chosen = f'WHERE topic_id = {topic_id} AND _rowid_ > ? LIMIT {STRETCH_ROWS}'
+        rows = f'FROM messages NOT INDEXED {chosen}'
+        statement = (
+            "SELECT max(id), count(*), min(size), max(size), CAST(group_concat(data, '') AS BLOB)"
+            f' FROM (SELECT _rowid_ AS id, length(data) AS size, data {rows})'
+        )
+        self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, STRETCH_BYTES)
+        try:
+            while True:
+                found = self.connection.execute(statement, (after,)).fetchone()
+                last, count, size, largest, messages = found
+                if not count:
+                    return None
+                if size is None or size != largest or len(messages) != count * size:
+                    return after
+                times = partial(self._times, f'SELECT timestamp {rows}', after)
+                yield Part(messages, np.full(count, size), np.full(count, topic_id), times)
+                after = last
+        except sqlite3.Error:
+            return after
+        finally:
+            self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, self._longest)
+
+    def _times(self, statement, after):
+        return [value for (value,) in self.connection.execute(statement, (after,))]
+
+    def _behind_damage(self, after, wanted, others):
+        """
+        Yield the Parts of ranges of a few ids, to the first readable one behind damage.
+
+        Ids that a range lacks are counted, because a damaged id ends a search without an error.
+        Return the last id of the range, None where nothing behind the damage can be read.
+        """
+        statement = _statement(wanted, ())
+        after = max(after, 0)  # the first id of a recorder is 1
+        n_lost = n_found = 0
+        while self._n_steps < MOST_STEPS and not self._is_beyond_limit():
+            self._n_steps += 1
+            until = min(after + STEP_IDS, LAST_ID)
+            found = []
+            with suppress(sqlite3.Error):
+                found = self.connection.execute(statement, (after, until)).fetchmany(STEP_IDS)
+            after = until
+            n_found += len(found)
+            n_lost += STEP_IDS - len(found)
+            rows = [row for row in found if row[1] not in others]
+            if rows:
+                yield from self._usable(rows, wanted)
+            # The damage lies within one batch behind the first id.
+            if found and n_lost:
+                self._lose('unreadable rows', n_lost)
+                return after
+            if n_found > BATCH_ROWS:
+                return after
+        return None
+
+    def _usable(self, rows, wanted):
+        """Yield the Parts of rows; those that cannot be used are counted and left out."""
+        _, topic_ids, times, messages = zip(*rows, strict=True)
+        joined = None
+        if self._cut_page is None:
+            with suppress(TypeError):  # of a message that is None, text or a number
+                joined = b''.join(messages)
+        if joined is not None:
+            yield Part(joined, _sizes(messages), np.array(topic_ids), lambda: times)
+            return
+        kept, messages, n_bytes = [], [], 0
+        for row_id, topic_id, received_ns, message in rows:
+            if message is None and topic_id in wanted:
+                message = self._large(row_id)
+            if topic_id not in wanted or not isinstance(message, bytes):
+                self._lose('rows with values of other types', 1)
+                continue
+            if self._is_cut(message):
+                self._lose('rows of the incomplete last page', 1)
+                continue
+            kept.append((topic_id, received_ns))
+            messages.append(message)
+            n_bytes += len(message)
+            if n_bytes >= STRETCH_BYTES:
+                yield _part(kept, messages)
+                kept, messages, n_bytes = [], [], 0
+        if kept:
+            yield _part(kept, messages)
+
+    def _large(self, row_id):
+        """Return a large message, None where it cannot be read."""
+        with suppress(sqlite3.Error):
+            (size,) = self.connection.execute(
+                'SELECT length(data) FROM messages WHERE _rowid_ = ?', (row_id,)
+            ).fetchone()
+            if size <= self.size:
+                (message,) = self.connection.execute(
+                    'SELECT data FROM messages WHERE _rowid_ = ?', (row_id,)
+                ).fetchone()
+                return message
+        return None
+
+    def _is_cut(self, message):
+        """
+        Return whether a message may end in the missing part of an incomplete page.
+
+        In a leaf page the present part of the message ends the file; of a message that continues
+        in an overflow page, this page, after the number of the next one, ends the present part.
+        """
+        if self._cut_page is None:
+            return False
+        present, overflow = message.rstrip(b'\0'), self._cut_page[4:]
+        return self._cut_page.endswith(present) or (overflow and present.endswith(overflow))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Usable messages of consecutive rows."""
+
+    messages: bytes
+    """All messages, one after the other."""
+    sizes: np.ndarray
+    """Bytes of each message, int64, shape (n,)."""
+    topic_ids: np.ndarray
+    """The file's number of the topic of each message, shape (n,)."""
+    times: Callable[[], Sequence[Any]]
+    """Called without arguments: the receive times, of any type in a damaged file."""
+
+
+def _statement(wanted, others):
+    """
+    Return the statement for the rows of some topics within a range of ids.
+
+    The message is NULL where it is read separately. Only rows of ``others`` are left out: rows of
+    an unknown topic are damaged and are counted.
+    """
+    # NOT INDEXED: a table scan in the order of the ids, whatever indices the file declares.
+    return (
+        f'SELECT _rowid_, topic_id, timestamp, CASE WHEN topic_id IN ({_listed(wanted)})'
+        f' AND length(data) <= {SMALL_BYTES} THEN data END'
+        ' FROM messages NOT INDEXED WHERE _rowid_ > ? AND _rowid_ <= ?'
+        f' AND (topic_id IN ({_listed(others)})) IS NOT TRUE'
+    )
+
+
+def _listed(numbers):
+    return ', '.join(map(str, sorted(numbers)))
+
+
+def _part(rows, messages):
+    """Return the Part of a list of (topic number, receive time) and their messages."""
+    topic_ids, times = zip(*rows, strict=True)
+    return Part(b''.join(messages), _sizes(messages), np.array(topic_ids), lambda: times)
+
+
+def _sizes(messages):
+    return np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
+
+
+def _stretch(parts):
+    """Return the Stretch of consecutive Parts."""
+    packed = Packed.of_sizes(
+        b''.join([part.messages for part in parts]), np.concatenate([part.sizes for part in parts])
+    )
+    topic_ids = np.concatenate([part.topic_ids for part in parts])
+
+    def received_ns(index):
+        values = chain.from_iterable(part.times() for part in parts)
+        return np.array(list(map(_integer, values)), dtype=np.int64)[index]
+
+    return Stretch(topic_ids, lambda index: (index, packed.select(index)), received_ns)
+
+
+def _integer(value):
+    """Return a receive time; 0 for the values of other types in a damaged file."""
+    return value if isinstance(value, int) else 0
+
+
+def _incomplete_page(path):
+    """
+    Return the bytes of an incomplete last page, without the zeros at their end; None without one.
+
+    SQLite reads such a page as if it continued with zeros.
+    """
+    with open_regular(path) as file:
+        header = file.read(32)
+        # File format, section 1.3: size of a page at byte 16, with 1 for 65536.
+        page_size = int.from_bytes(header[16:18], 'big')
+        if page_size == 1:
+            page_size = 65536
+        n_bytes = os.fstat(file.fileno()).st_size
+        n_rest = n_bytes % max(page_size, 512)
+        file.seek(n_bytes - n_rest)
+        return file.read(n_rest).rstrip(b'\0') if n_rest else None
 
 
 def _connect(path, logged):
     """
     Open read-only; ``immutable`` keeps SQLite from looking for locks, but hides a write-ahead log.
+
+    A log is read without locks and with its index in memory, because SQLite would write the index
+    next to the recording (``-shm``).
     """
     if os.path.getsize(path) < 512:
         raise sqlite3.DatabaseError('the file is shorter than one page')
-    address = f'file:{quote(str(path))}?mode=ro' + ('' if logged else '&immutable=1')
+    options = '&immutable=1'
+    if logged:
+        options = '&vfs=unix-none' if os.name == 'posix' else ''
+    address = f'file:{quote(str(path))}?mode=ro{options}'
     connection = sqlite3.connect(address, uri=True, check_same_thread=False)
+    if logged:
+        connection.execute('PRAGMA locking_mode = EXCLUSIVE')
     # Without this SQLite refuses a truncated file; with it the remaining rows can be read.
     connection.execute('PRAGMA writable_schema = ON')
+    # Cells are compared with their page when it is read: damage is an error, not a missing row.
+    connection.execute('PRAGMA cell_size_check = ON')
     connection.text_factory = partial(str, encoding='utf-8', errors='replace')
     return connection
 
@@ -278,7 +490,7 @@ values.
 
 
 class SqliteWriter:
-    """Writes one new file, which must not be opened elsewhere before `close`."""
+    """Writes one new file, which must not be opened elsewhere before ``close``."""
 
     def __init__(self, path: Path, ros_distro: str):
         self.connection = sqlite3.connect(path, isolation_level=None)

@@ -18,7 +18,7 @@ from imu_calibration.core.samples import ImuSamples, JointSamples
 from msg_adapters.bag import open_recording
 from msg_adapters.compression import zstd
 from msg_adapters.definitions import standard_definition
-from msg_adapters.sqlite_file import PAGE_SIZE
+from msg_adapters.sqlite_file import PAGE_SIZE, STEP_IDS
 from msg_adapters.write import encode_imu, encode_joints, write_session
 
 N = 9000
@@ -162,7 +162,7 @@ def test_bytes_overwritten_anywhere_never_crash(bags, session, tmp_path, kind):
     check()
 
 
-def test_a_damaged_page_costs_only_its_own_rows(bags, session, tmp_path):
+def test_a_damaged_page_costs_its_own_rows_and_few_more(bags, session, tmp_path):
     def overwrite(data):
         page = len(data) // PAGE_SIZE // 2
         while data[PAGE_SIZE * page] != 0x0D:  # a table leaf
@@ -170,11 +170,11 @@ def test_a_damaged_page_costs_only_its_own_rows(bags, session, tmp_path):
         return data[: PAGE_SIZE * page] + bytes(PAGE_SIZE) + data[PAGE_SIZE * (page + 1) :]
 
     imu, _, lost = read(damaged_copy(bags, 'sqlite3', tmp_path / 'bag', overwrite))
-    most = PAGE_SIZE // 300  # bytes of an Imu message
+    most = PAGE_SIZE // 300 + 2 * STEP_IDS  # bytes of an Imu message; both ends of the damage
     assert N - most < len(imu) < N
     assert_true_samples(imu, session[0], ('stamp_ns', 'force_s'))
-    assert lost['unreadable pages of unknown extent of sqlite3_0.db3'] == 1
-    assert lost['messages that the metadata announce and the files do not hold'] < most
+    assert N - len(imu) <= lost['unreadable rows of sqlite3_0.db3'] <= most
+    assert lost['messages that the metadata announce and the files do not hold'] <= most
 
 
 @pytest.mark.parametrize('kind', ['mcap', 'mcap_zstd', 'mcap_lz4'])
@@ -248,9 +248,43 @@ def test_rows_of_a_write_ahead_log_are_read(bags, session, tmp_path):
     row = encode_imu(session[0].select(slice(0, 1)))[0].tobytes()
     connection.execute('INSERT INTO messages (topic_id, timestamp, data) VALUES (1, 5, ?)', (row,))
     connection.commit()
-    imu, _, lost = read(folder)
+    copy = tmp_path / 'killed'
+    shutil.copytree(folder, copy, ignore=shutil.ignore_patterns('*-shm'))
     connection.close()
+    before = {path.name: path.read_bytes() for path in copy.iterdir()}
+    imu, _, lost = read(copy)
     assert len(imu) == N + 1 and not lost
+    # SQLite wrote the index of the log (-shm) next to the recording.
+    assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
+
+
+@pytest.mark.parametrize('want_joints', [False, 'optional'])
+def test_rows_of_other_types_and_sizes_are_read_or_counted(bags, session, tmp_path, want_joints):
+    """One frame_id of another length, one message that is text, one of an unknown topic."""
+    folder = tmp_path / 'mixed'
+    shutil.copytree(bags / 'sqlite3', folder)
+    renamed = encode_imu(replace(session[0].select(slice(5000, 5001)), frame_id='a_longer_frame'))
+    statements = [
+        (
+            'UPDATE messages SET data = ? WHERE data = ?',
+            (renamed[0].tobytes(), encode_imu(session[0].select(slice(5000, 5001)))[0].tobytes()),
+        ),
+        (
+            "UPDATE messages SET data = 'text' WHERE data = ?",
+            (encode_imu(session[0].select(slice(6000, 6001)))[0].tobytes(),),
+        ),
+    ]
+    connection = sqlite3.connect(storage_file(folder))
+    for statement in statements:
+        assert connection.execute(*statement).rowcount == 1
+    connection.commit()
+    connection.close()
+    with open_recording(folder, want_joints=want_joints, want_temperature=False) as recording:
+        imu = ImuSamples.concatenate([block.imu for block in recording.blocks()])
+        lost = recording.lost
+    assert_true_samples(imu, session[0], ('stamp_ns', 'force_s', 'rate_s'))
+    assert len(imu) == N - 1
+    assert lost['rows with values of other types of sqlite3_0.db3'] == 1
 
 
 def test_messages_in_overflow_pages_and_of_other_types(tmp_path, session):
