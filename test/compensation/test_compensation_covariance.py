@@ -27,6 +27,8 @@ EFFECTS = {
     'all': (FURTHER['accelerometer'], FURTHER['gyroscope']),
 }
 N_DRAWS = 4000
+N_COLUMNS = 30
+"""Of the root of a covariance: each moves all parameters."""
 
 
 def with_derivative(calibration, transfer=None):
@@ -65,20 +67,31 @@ def test_noise_agrees_with_monte_carlo(effects, transfer):
 
 @pytest.mark.parametrize('transfer', [None, TRANSFER], ids=['in place', 'transfer'])
 @pytest.mark.parametrize('effects', EFFECTS)
-def test_parameters_agree_with_monte_carlo(effects, transfer):
-    calibration = random_calibration(1, *EFFECTS[effects], sd=1e-5)
-    rng = np.random.default_rng(6)
-    draws = rng.multivariate_normal(calibration.values, calibration.covariance, 300)
+def test_parameters_agree_with_kernels_of_displaced_parameters(effects, transfer):
+    """
+    Add the outer products of the changes of the output by the columns of a root of the covariance.
+
+    With ``cov = L L^T`` the covariance of a linear output is ``sum_k d_k d_k^T``, where ``d_k`` is
+    the change by column ``k`` of ``L``. No draw of parameters is needed, and a root of few columns
+    moves all parameters in each of them.
+    """
+    calibration = random_calibration(1, *EFFECTS[effects])
+    root = np.random.default_rng(6).normal(0, 2e-6, (len(calibration.values), N_COLUMNS))
+    calibration = replace(calibration, covariance=root @ root.T)
     sample = [*np.concatenate([FORCE, RATE, SLOPE]).tolist(), DT]
-    out = np.array(
-        [make_kernel(replace(calibration, values=values), transfer)(*sample) for values in draws]
-    )
+
+    def output(values):
+        return np.array(make_kernel(replace(calibration, values=values), transfer)(*sample))
+
+    undisturbed = output(calibration.values)
+    changes = [output(calibration.values + column) - undisturbed for column in root.T]
+    expected = np.transpose(changes) @ changes
     at = with_derivative(calibration, transfer).at
     predicted = at(FORCE, RATE, SLOPE, warming=DT).parameters
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
-    # 300 draws: 8 %, four times that; the derivative of the inverse gyroscope matrix in the
-    # tangential term is left out.
-    assert np.abs((np.cov(out.T) - predicted) / scale).max() < 0.35
+    # In place the changes are linear to 1 %. In a transfer the derivative of the inverse gyroscope
+    # matrix in the tangential term is left out: a quarter of the variance of the usual model.
+    assert np.abs((expected - predicted) / scale).max() < (0.35 if transfer else 0.03)
 
 
 def test_what_is_published_has_the_share_of_the_parameters():
