@@ -36,8 +36,6 @@ SIMULATOR: dict[str, Any] = {
     'table_file': TABLE,
     'seed': 1,
     'imu_seed': 5,
-    'imu_rate': 100.0,
-    'joint_rate': 100.0,
     'truth': True,
     'hide_size': 2.0,
 }
@@ -49,6 +47,8 @@ class Length:
 
     time_factor: float
     """Simulated seconds per second."""
+    rate: float
+    """Samples of the IMU and of the joints per simulated second."""
     hidden: str
     """Physical fault of the simulated IMU, '' for none."""
     separations: int
@@ -59,11 +59,16 @@ class Length:
     @property
     def simulator(self) -> dict[str, Any]:
         """Parameters of the simulator."""
-        return SIMULATOR | {'time_factor': self.time_factor, 'hide': self.hidden}
+        return SIMULATOR | {
+            'time_factor': self.time_factor,
+            'imu_rate': self.rate,
+            'joint_rate': self.rate,
+            'hide': self.hidden,
+        }
 
 
-COMPLETE = Length(4.0, 'soft_spring', separations=2, planned_seconds=900.0)
-SMALLEST = Length(12.0, '', separations=0, planned_seconds=20.0)
+COMPLETE = Length(4.0, 100.0, 'soft_spring', separations=2, planned_seconds=900.0)
+SMALLEST = Length(12.0, 50.0, '', separations=0, planned_seconds=20.0)
 """The same nodes and steps without a fault and its diagnosis."""
 START = 1_800_000_000.0
 PATIENCE = 240.0
@@ -165,14 +170,14 @@ def once(samples):
     return samples.select(np.unique(samples.stamp_ns, return_index=True)[1])
 
 
-def differences(samples, truth):
+def differences(samples, truth, rate):
     """
     Return time (s) and one-second means of measured minus true force and rate.
 
-    Measured and true values are at the same stamps. The means have shape (n, 3) each.
+    Measured and true values are at the same stamps, `rate` per second. The means have shape (n, 3)
+    each.
     """
     _, here, there = np.intersect1d(samples.stamp_ns, truth.stamp_ns, return_indices=True)
-    rate = int(SIMULATOR['imu_rate'])
     count = len(here) // rate * rate
     means = [
         (getattr(samples, name)[here[:count]] - getattr(truth, name)[there[:count]])
@@ -296,7 +301,9 @@ def compare(watcher, processes, deadline, *, simulated):
     if corrected is None:
         print('compensator_node published nothing')
         return None
-    before, after = differences(once(raw), once(truth)), differences(once(corrected), once(truth))
+    rate = int(simulated['imu_rate'])
+    before = differences(once(raw), once(truth), rate)
+    after = differences(once(corrected), once(truth), rate)
     print(
         f'\nErrors against the truth over {len(after[0])} s, root mean square of one-second means'
     )
