@@ -25,25 +25,14 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.chain import tilt
-from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
-TABLE = Table.from_mapping(
-    {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [0, 1, 0]},
-            {'name': 'inner', 'axis': [1, 0, 0]},
-        ],
-        'up': [0, 0, 1],
-        'gravity': 9.81,
-        'latitude': 48.8,
-        'azimuth_deg': 0.0,
-    }
-)
+from worlds.tables import three_axis_table
+
+TABLE = three_axis_table(gravity=9.81)
 NO_TILT = CalibrationOptions(
     accelerometer_model='bias+matrix+accel_size_effect', reference_model='none'
 )

@@ -19,28 +19,16 @@ from imu_calibration.core.errors import DocumentError, InputError, NotObservable
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.decision import HELPS
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.stream_watch import StreamWatch
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
+from worlds.tables import three_axis_table
+
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
-TABLE = Table.from_mapping(
-    {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [0, 1, 0]},
-            {'name': 'inner', 'axis': [1, 0, 0]},
-        ],
-        'up': [0, 0, 1],
-        'latitude': 48.8,
-        'height': 150.0,
-        'azimuth_deg': 0.0,
-        'mount': {'rpy_deg': [0, 0, 0], 'xyz': None},
-    }
-)
+TABLE = three_axis_table(height=150.0, mount={'rpy_deg': [0, 0, 0], 'xyz': None})
 SD = 1e-6
 """Live and offline agree to this share of the standard deviation."""
 

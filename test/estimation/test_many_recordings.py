@@ -24,22 +24,11 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 
 from worlds.misfit_worlds import make_pair
 from worlds.physics import make_session
+from worlds.tables import three_axis_table
 
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
-TABLE = Table.from_mapping(
-    {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [0, 1, 0]},
-            {'name': 'inner', 'axis': [1, 0, 0]},
-        ],
-        'up': [0, 0, 1],
-        'latitude': 48.8,
-        'height': 150.0,
-        'azimuth_deg': 0.0,
-    }
-)
+TABLE = three_axis_table(height=150.0)
 MODEL = SensorModel()
 SENSORS = ('accelerometer', 'gyroscope')
 SDS = {'accelerometer': 0.01, 'gyroscope': 0.001}

@@ -5,33 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.hand_workflow import calibrate_without_table, read_by_hand
+from imu_calibration.calibration.hand_workflow import read_by_hand
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.counter_overflow import OverflowSearch, without_overflows
-from imu_calibration.references.options import CalibrationOptions
 from msg_adapters.csv_log import read_csv
 
+from worlds.calibrated_by_hand import calibrated
 from worlds.hand_sessions import GRAVITY
-from worlds.physics_hand import hold_and_turn
-
-OPTIONS = CalibrationOptions(gravity=GRAVITY, as_asked=True)
-
-
-@pytest.fixture(scope='module')
-def session():
-    """Readings of sixteen poses by hand at 70 Hz."""
-    return hold_and_turn(21, n_poses=16, rate_hz=70.0, pose_sd=0.0, drift_sd=0.0)[0]
-
-
-@pytest.fixture(scope='module')
-def usual(session):
-    return calibrated(session)
-
-
-def calibrated(imu):
-    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], OPTIONS)
 
 
 def counted(stamp_ns, bits, tick_ns, before):
@@ -71,24 +53,24 @@ def test_a_size_that_recurs_is_that_of_a_counter():
     assert count == 3 and np.diff(found) == pytest.approx(np.diff(true), abs=20_000_000)
 
 
-def test_stamps_of_a_bag_that_overflow_give_the_usual_result(session, usual):
-    stamps = counted(session.stamp_ns, 32, 1_000, 33_000_000_000)
-    found = calibrated(replace(session, stamp_ns=stamps))
+def test_stamps_of_a_bag_that_overflow_give_the_usual_result(clean, usual):
+    stamps = counted(clean.stamp_ns, 32, 1_000, 33_000_000_000)
+    found = calibrated(replace(clean, stamp_ns=stamps))
     away = found.calibration.values - usual.calibration.values
     assert (np.abs(away) <= 0.5 * found.calibration.sd).all()
     assert exit_code(found.calibration) == 0
     notes = read_by_hand(
-        [SampleBlock(replace(session, stamp_ns=stamps))], preflight=Preflight(GRAVITY)
+        [SampleBlock(replace(clean, stamp_ns=stamps))], preflight=Preflight(GRAVITY)
     ).findings
     assert ('stamps', 'note') in [(f.check, f.severity) for f in notes]
 
 
-def test_by_hand_the_parts_of_a_clock_that_was_set_are_used_separately(session, usual):
+def test_by_hand_the_parts_of_a_clock_that_was_set_are_used_separately(clean, usual):
     """Inspect promised it, and the calibration refused stamps that go backwards."""
-    stamps = session.stamp_ns.copy()
+    stamps = clean.stamp_ns.copy()
     at = len(stamps) // 2
     stamps[at:] -= 222_000_000_000
-    found = calibrated(replace(session, stamp_ns=stamps))
+    found = calibrated(replace(clean, stamp_ns=stamps))
     away = found.calibration.values - usual.calibration.values
     assert (np.abs(away) <= 3 * found.calibration.sd).all()
     poses = usual.calibration.statistics['windows']['static']
@@ -108,10 +90,10 @@ def test_temperatures_follow_the_parts():
     assert found.temperature_c[200:] == pytest.approx(30.0)
 
 
-def test_a_text_log_with_a_counter_that_overflows(tmp_path, session):
+def test_a_text_log_with_a_counter_that_overflows(tmp_path, clean):
     path = tmp_path / 'log.csv'
-    ticks = counted(session.stamp_ns, 32, 1_000, 9_000_000_000) // 1_000
-    columns = [ticks, *session.force_s.T, *session.rate_s.T]
+    ticks = counted(clean.stamp_ns, 32, 1_000, 9_000_000_000) // 1_000
+    columns = [ticks, *clean.force_s.T, *clean.rate_s.T]
     header = 'time (us),ax (m/s^2),ay (m/s^2),az (m/s^2),gx (rad/s),gy (rad/s),gz (rad/s)'
     np.savetxt(path, np.column_stack(columns), '%.8g', ',', header=header, comments='')
     rows = path.read_text().splitlines()
@@ -122,4 +104,4 @@ def test_a_text_log_with_a_counter_that_overflows(tmp_path, session):
     log = read_csv(path)
     assert log.n_overflows == 1
     steps = np.diff(log.imu.stamp_ns)
-    assert steps == pytest.approx(np.diff(session.stamp_ns), abs=2_000)
+    assert steps == pytest.approx(np.diff(clean.stamp_ns), abs=2_000)

@@ -9,7 +9,6 @@ from refusal import refused
 from imu_calibration.allan.identify import figures_of, identify_noise
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.hand_workflow import (
-    calibrate_without_table,
     check_by_hand,
     read_by_hand,
 )
@@ -20,29 +19,12 @@ from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner
-from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.compensate import compensate_recording
 
+from worlds.calibrated_by_hand import OPTIONS, calibrated
 from worlds.hand_sessions import GRAVITY
 from worlds.physics import make_session
 from worlds.physics_hand import hold_and_turn
-
-OPTIONS = CalibrationOptions(gravity=GRAVITY, as_asked=True)
-
-
-@pytest.fixture(scope='module')
-def clean():
-    """Readings of eighteen poses by hand at 90 Hz, 80 s."""
-    return hold_and_turn(11, n_poses=18, rate_hz=90.0, pose_sd=0.0, drift_sd=0.0)[0]
-
-
-@pytest.fixture(scope='module')
-def usual(clean):
-    return calibrated(clean)
-
-
-def calibrated(imu):
-    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], OPTIONS)
 
 
 def seconds_of(imu):
@@ -102,15 +84,14 @@ def test_a_recording_without_any_reading_is_refused(clean):
 
 
 def test_check_and_compensate_note_the_part(clean, usual):
-    other = hold_and_turn(11, n_poses=18, rate_hz=90.0, pose_sd=0.0, drift_sd=0.0)[0]
-    bad = without_output(other, 20.0, 36.0)
+    bad = without_output(clean, 20.0, 36.0)
     checked = check_by_hand(lambda: iter([SampleBlock(bad)]), usual.calibration, OPTIONS)
-    good = check_by_hand(lambda: iter([SampleBlock(other)]), usual.calibration, OPTIONS)
+    good = check_by_hand(lambda: iter([SampleBlock(clean)]), usual.calibration, OPTIONS)
     assert (checked.exit_code, good.exit_code) == (3, 0)
     assert checked.proof['accelerometer']['after'] < 2 * good.proof['accelerometer']['after']
     corrected = compensate_recording(bad, usual.calibration)
     assert corrected.exit_code == 3 and corrected.frozen == pytest.approx(16 * 90, rel=0.05)
-    unharmed = compensate_recording(other, usual.calibration)
+    unharmed = compensate_recording(clean, usual.calibration)
     assert unharmed.frozen == 0 and len(corrected.warnings) == len(unharmed.warnings) + 1
 
 

@@ -22,7 +22,6 @@ from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.kinematics import strapdown
-from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_sections import (
     autocorrelation,
@@ -39,21 +38,11 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
+from worlds.tables import three_axis_table
+
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
-TABLE = Table.from_mapping(
-    {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [0, 1, 0]},
-            {'name': 'inner', 'axis': [1, 0, 0]},
-        ],
-        'up': [0, 0, 1],
-        'latitude': 48.8,
-        'height': 150.0,
-        'azimuth_deg': 0.0,
-    }
-)
+TABLE = three_axis_table(height=150.0)
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 PROVENANCE = {'bags': [{'name': 'session <1>', 'sha256': '0123456789abcdef'}]}
 SECTIONS = (

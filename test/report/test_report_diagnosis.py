@@ -21,7 +21,6 @@ from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.diagnosis_page import (
     cause_of,
@@ -37,18 +36,9 @@ from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
-TABLE = Table.from_mapping(
-    {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [0, 1, 0]},
-            {'name': 'inner', 'axis': [1, 0, 0]},
-        ],
-        'up': [0, 0, 1],
-        'latitude': 48.8,
-        'azimuth_deg': 0.0,
-    }
-)
+from worlds.tables import three_axis_table
+
+TABLE = three_axis_table()
 MODEL = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'))
 
 

@@ -29,14 +29,10 @@ from worlds.physics_draw import Climate, draw_events, draw_imu, draw_value, gene
 from worlds.physics_sensor import filtered
 from worlds.physics_table import local_gravity, move_table
 from worlds.physics_vibration import Machine
+from worlds.tables import Z_Y_X
 from worlds.wanders import WANDERS, add_wander
 
 PLACE = {'gravity': None, 'latitude': 48.8, 'height': 150.0, 'azimuth_deg': 20.0}
-Z_Y_X = [
-    {'name': 'outer', 'axis': [0, 0, 1]},
-    {'name': 'middle', 'axis': [0, 1, 0]},
-    {'name': 'inner', 'axis': [1, 0, 0]},
-]
 TABLES = {
     'three_axis': {
         'joints': Z_Y_X,

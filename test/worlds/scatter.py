@@ -13,26 +13,15 @@ from imu_calibration.estimation import noise_model
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
-from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES, SimulatedNoise, gauss_markov_samples
 from imu_calibration.simulation.session import SimulationOptions, random_values, simulate_session
 
-TABLE = Table.from_mapping(
-    {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [0, 1, 0]},
-            {'name': 'inner', 'axis': [1, 0, 0]},
-        ],
-        'up': [0, 0, 1],
-        'latitude': 48.8,
-        'height': 150.0,
-        'azimuth_deg': 0.0,
-    }
-)
+from worlds.tables import three_axis_table
+
+TABLE = three_axis_table(height=150.0)
 INDUSTRIAL = GRADES['industrial'].noise
 WHITE = (INDUSTRIAL.accel_density * 10.0, INDUSTRIAL.gyro_density * 10.0)
 """Standard deviation of single samples at 100 Hz."""

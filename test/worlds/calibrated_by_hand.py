@@ -1,0 +1,14 @@
+"""Calibration of readings by hand with the requested model, without a search for effects."""
+
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.references.options import CalibrationOptions
+
+from worlds.hand_sessions import GRAVITY
+
+OPTIONS = CalibrationOptions(gravity=GRAVITY, as_asked=True)
+
+
+def calibrated(imu):
+    """Return the result for ImuSamples of one recording."""
+    return calibrate_without_table([lambda: iter([SampleBlock(imu)])], OPTIONS)
