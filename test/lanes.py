@@ -5,6 +5,7 @@ Keeps processes and DDS out of the core lane and reports the processor time of t
 """
 
 import functools
+import gc
 import multiprocessing.util
 import os
 import subprocess
@@ -74,6 +75,19 @@ def pytest_configure():
     except ImportError:
         return
     Context.init = _kept_out(Context.init, 'use DDS')
+
+
+def pytest_sessionstart():
+    """
+    Collect no garbage while the test files are imported, a fifth of the time that it takes.
+    """
+    gc.disable()
+
+
+def pytest_collection_finish():
+    """Begin with the collection of garbage, from which everything that was imported is exempt."""
+    gc.freeze()
+    gc.enable()
 
 
 def _processor_time():
