@@ -322,17 +322,21 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     Recommended is the next step of the common plan, shown in the picture, if it serves the sensor;
     otherwise the best step for the sensor.
     """
-    knowledge, lacking = knowledge_after(hand), {}
+    absent = hand.hand_model.absent
+    lacking: dict[str, dict[str, float]] = {}
     for name, status, sd, tolerance in zip(
         hand.param_names, hand.statuses, hand.judged_sd, hand.tolerances, strict=True
     ):
-        if status in LACKING and name.split('.')[0] not in hand.hand_model.absent:
-            lacking.setdefault(name.split('.')[0], {})[name] = float(sd / tolerance)
-    if 'accelerometer' in hand.hand_model.absent:
+        sensor = name.partition('.')[0]
+        if status in LACKING and sensor not in absent:
+            lacking.setdefault(sensor, {})[name] = float(sd / tolerance)
+    # No motion determines more without gravity in the readings.
+    if 'accelerometer' in absent:
         return tuple(
             {'parameters': names, 'needs': 'record the accelerometer of the same board as well'}
             for names in lacking.values()
         )
+    knowledge = knowledge_after(hand)
     parts = {
         sensor: [hand.param_names.index(name) for name in lacking[sensor]]
         for sensor in SENSORS

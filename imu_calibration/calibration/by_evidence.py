@@ -147,26 +147,29 @@ def solve_by_evidence(
         _examined(inquire(windows, table, baseline, bias_processes=options.bias_processes))
         for windows in parts
     )
-    more = _named_elsewhere(found, others)
-    added, point = (), {}
+    from_others = _named_elsewhere(found, others)
+    requested = model
     # An effect of the requested model is judged with the added effects in the solution: the misfit
     # of a missing delay or encoder zero widens every standard deviation.
-    while beyond := _beyond((*found.adopted, *more), first[2]):
+    while True:
+        beyond = _beyond((*found.adopted, *from_others), requested)
+        if not beyond:
+            added = ()
+            point = {}
+            solution, gathered, model = first
+            found = _without_faint(found, solution)
+            break
         point = {name: value for each in (*others, found) for name, value in _point(each).items()}
         added = tuple(question.effect.key for question in beyond)
         solution, gathered, model = solve_again(replace(options, added=added, point=point))
-        sure = [question for question in more if not _is_faint(solution, question)]
-        if len(sure) < len(
-            more
-        ):  # possible rivals of the effects found in the largest recording are removed first
-            more = sure
+        # Possible rivals of the effects found in the largest recording are removed first.
+        significant = [question for question in from_others if not _is_faint(solution, question)]
+        if len(significant) < len(from_others):
+            from_others = significant
             continue
         found = _without_faint(found, solution)
-        if len(_beyond((*found.adopted, *more), first[2])) == len(beyond):
+        if len(_beyond((*found.adopted, *from_others), requested)) == len(beyond):
             break
-    else:
-        added, point, (solution, gathered, model) = (), {}, first
-        found = _without_faint(found, solution)
     extension = ModelExtension(
         added, point, _changes([found, *others], added), _moves(found), _clipped(found)
     )
@@ -306,14 +309,13 @@ def _named_elsewhere(found, others):
     """
     Return the effects that the search found in other recordings only, larger recordings first.
     """
-    more = {}
-    for question in (question for other in others for question in other.adopted):
-        more.setdefault(question.effect.key, question)
-    return [
-        question
-        for key, question in more.items()
-        if key not in {known.effect.key for known in found.adopted}
-    ]
+    known = {question.effect.key for question in found.adopted}
+    from_others = {}
+    for other in others:
+        for question in other.adopted:
+            if question.effect.key not in known:
+                from_others.setdefault(question.effect.key, question)
+    return list(from_others.values())
 
 
 def stands_out(solution: Solution, question: Question) -> bool:

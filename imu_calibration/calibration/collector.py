@@ -244,13 +244,9 @@ def from_bytes(data: bytes) -> tuple[SessionData, SensorModel, ModelExtension]:
                     f"an accumulator must have the format '{SAVED_FORMAT}', got "
                     f'{shortened(repr(header.get("format")))}; remove the file'
                 )
-            ((parts, of_model, definitions, extension),) = _unpacked(
-                header['content'],
-                _SavedNumbers(
-                    arrays['numbers'].tobytes(),
-                    MOST_EMPTY + SAVED_DEPTH * (arrays['header'].nbytes + arrays['numbers'].nbytes),
-                ),
-            )
+            size = arrays['header'].nbytes + arrays['numbers'].nbytes
+            numbers = _SavedNumbers(arrays['numbers'].tobytes(), MOST_EMPTY + SAVED_DEPTH * size)
+            ((parts, of_model, definitions, extension),) = _unpacked(header['content'], numbers)
             return (
                 SessionData(**parts),
                 SensorModel(**of_model, catalogue=CATALOGUE.with_definitions(definitions)),

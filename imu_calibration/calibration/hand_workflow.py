@@ -43,7 +43,7 @@ from imu_calibration.preprocessing.absent_sensor import without_sensor
 from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_force
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
-from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, ContinuedStamps
+from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, ContinuedStamps, outside
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
 from imu_calibration.references.gravity.equations import TurnData
@@ -314,7 +314,9 @@ def read_by_hand(
         When no usable sample remains.
 
     """
-    watchers = [] if preflight is None else [preflight]
+    watchers = []
+    if preflight is not None:
+        watchers.append(preflight)
     cleaner = BlockCleaner(nominal=nominal, watchers=watchers, one_sensor=True)
     joined, temperatures = JoinedParts(), []
     # each epoch of the clock is a part of its own: no turn is used across a reset
@@ -328,12 +330,16 @@ def read_by_hand(
         raise InputError(
             'the recording must hold Imu messages that can be used, it holds none; check the topic'
         )
-    imu, warm = joined.samples(), None
+    imu = joined.samples()
+    findings: tuple[CheckFinding, ...] = ()
+    unusable_sensors: dict[str, str] = {}
     if preflight is not None:
+        findings = tuple(preflight.findings)
+        unusable_sensors = preflight.unusable
         imu = _readings_only(imu, preflight.without_readings)
-    unusable_sensors = {} if preflight is None else preflight.unusable
-    for sensor in unusable_sensors:
-        imu = without_sensor(imu, sensor)
+        for sensor in unusable_sensors:
+            imu = without_sensor(imu, sensor)
+    warm = None
     if temperatures:
         moved = [
             replace(part, stamp_ns=part.stamp_ns + shifts.get(epoch, stamps.shift_ns))
@@ -353,16 +359,14 @@ def read_by_hand(
         imu,
         warm,
         {reason: count for reason, count in counts.items() if count},
-        () if preflight is None else tuple(preflight.findings),
+        findings,
         unusable_sensors,
     )
 
 
 def _readings_only(imu, ranges):
     """Return the samples that are in none of the ranges of `Preflight.without_readings`."""
-    kept = np.ones(len(imu), bool)
-    for start, stop in ranges:
-        kept[start:stop] = False
+    kept = outside(ranges, np.arange(len(imu)))
     if not kept.any():
         raise InputError(
             f'the recording must hold readings, in all of its {len(imu)} samples an output is'
@@ -450,7 +454,9 @@ def hand_result(
         *notes(hand.statistics['bias_moved'], gathered.duration),
     )
     advice = missing_motion(hand)
-    unusable = {'unusable_sensors': dict(recording.unusable)} if recording.unusable else {}
+    statistics = _statistics(hand, gathered.counts, len(recording.imu))
+    if recording.unusable:
+        statistics['unusable_sensors'] = dict(recording.unusable)
     calibration = document(
         hand,
         hand.tolerances,
@@ -458,7 +464,7 @@ def hand_result(
         gravity=hand.gravity,
         gauge=dict(GAUGE),
         undetermined=advice,
-        statistics=_statistics(hand, gathered.counts, len(recording.imu)) | unusable,
+        statistics=statistics,
         provenance=provenance,
         proof=prove_by_hand(hand, hand.used_turns if turns else ()),
         changes=evident.changes,
@@ -595,7 +601,7 @@ def prove_hand_readings(
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
     lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
-    proof, rest = {}, {}
+    proof = {}
     for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate)), strict=True):
         if sensor not in absent:
             rest = entry_of(errors, UNITS[sensor]) | {'seconds': rested}
@@ -623,7 +629,8 @@ def prove_hand_readings(
         angles = entry_of(errors, TURN_ANGLE_UNIT) | {
             'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))
         }
-        proof['gyroscope'] = angles | {'regimes': {'rest': rest, 'turns': angles}}
+        regimes = proof['gyroscope']['regimes'] | {'turns': angles}
+        proof['gyroscope'] = angles | {'regimes': regimes}
     return proof
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.units import significant
+from imu_calibration.core.units import DEG_H, significant
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.kinematics.rotations import EARTH_RATE
+from imu_calibration.kinematics.rotations import EARTH_RATE, earth_rate_n
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
 
@@ -21,7 +21,6 @@ AGREEING_SHARE = 0.15
 """The same as a share of the effect of the cause."""
 FARTHEST_SHARE = 0.5
 """An estimate farther than this share from an effect does not agree with it, however uncertain."""
-DEG_PER_HOUR = np.degrees(1.0) * 3600.0
 
 
 def latitude_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]:
@@ -63,7 +62,7 @@ def _of_free_rate(solution, table, part):
         return ()
     rate = solution.values[part]
     covariance = solution.covariance[part, part]
-    expected_up = EARTH_RATE * float(np.sin(np.radians(table.latitude)))
+    expected_up = _vertical_rate(table)
     up_sd = float(np.sqrt(covariance[2, 2]))
     if _contradicts(rate[2] - expected_up, up_sd):
         if _agrees(rate[2] + expected_up, up_sd, expected_up):
@@ -79,21 +78,31 @@ def _of_free_rate(solution, table, part):
 
 def _refuse_vertical_rate(solution, table, part):
     """Refuse a g-sensitivity that is the vertical rate of a latitude with the wrong sign."""
-    values, sd = solution.values[part], np.sqrt(np.diag(solution.covariance[part, part]))
+    values = solution.values[part]
     if len(values) != 9 or solution.held[part].any():
         return
-    matrix, matrix_sd = values.reshape(3, 3), sd.reshape(3, 3)
+    matrix = values.reshape(3, 3)
+    matrix_sd = np.sqrt(np.diag(solution.covariance[part, part])).reshape(3, 3)
+    # Common to the three axes: k = trace(K) / 3, the sds as if they were fully correlated.
     common = float(np.trace(matrix)) / 3.0
-    # The sds of the three diagonal entries as if they were fully correlated.
     common_sd = float(matrix_sd.diagonal().mean())
-    left = -2.0 * EARTH_RATE * float(np.sin(np.radians(table.latitude))) / table.gravity_value
-    if abs(common) < CONTRADICTING_SDS * common_sd or not _agrees(common - left, common_sd, left):
+    if abs(common) < CONTRADICTING_SDS * common_sd:
         return
-    rest = np.abs(matrix - common * np.eye(3))
-    if np.any(rest > np.maximum(AGREEING_SDS * matrix_sd, AGREEING_SHARE * abs(left))):
+    expected_up = _vertical_rate(table)
+    # Of a latitude with the wrong sign: k g = -2 Omega sin(latitude), and no other entry.
+    of_wrong_sign = -2.0 * expected_up / table.gravity_value
+    if not _agrees(common - of_wrong_sign, common_sd, of_wrong_sign):
         return
-    expected_up = EARTH_RATE * float(np.sin(np.radians(table.latitude)))
+    remaining = np.abs(matrix - common * np.eye(3))
+    tolerated = np.maximum(AGREEING_SDS * matrix_sd, AGREEING_SHARE * abs(of_wrong_sign))
+    if np.any(remaining > tolerated):
+        return
     raise _wrong_sign(table, expected_up + common * table.gravity_value, expected_up)
+
+
+def _vertical_rate(table):
+    """Return the vertical component of the Earth's rate at the latitude, rad/s."""
+    return float(earth_rate_n(table.latitude, 0.0)[2])
 
 
 def _contradicts(difference, sd):
@@ -101,9 +110,8 @@ def _contradicts(difference, sd):
 
 
 def _agrees(difference, sd, size):
-    return abs(difference) < min(
-        max(AGREEING_SDS * sd, AGREEING_SHARE * abs(size)), FARTHEST_SHARE * abs(size)
-    )
+    tolerated = max(AGREEING_SDS * sd, AGREEING_SHARE * abs(size))
+    return abs(difference) < min(tolerated, FARTHEST_SHARE * abs(size))
 
 
 def _wrong_sign(table, measured, expected):
@@ -129,7 +137,7 @@ def _finding(name, measured, sd, *, expected):
 
 
 def _hourly(rate):
-    return significant(rate * DEG_PER_HOUR, 3)
+    return significant(rate / DEG_H, 3)
 
 
 def with_latitude_findings(

@@ -388,12 +388,12 @@ class CheckResult:
             if sensor not in self.helped
         ]
         changed = {each.sensor for each in self.changed}
-        lines += [line for sensor, line in self._since().items() if sensor in changed]
+        lines += [line for sensor, line in self._change_lines().items() if sensor in changed]
         if self.dropped:
             lines.append(self.dropped)
         return lines
 
-    def _since(self):
+    def _change_lines(self):
         """Return sensor -> how its error compares with that on the day of the calibration."""
         lines = {}
         for sensor in dict.fromkeys(each.sensor for each in self.changes):
@@ -401,15 +401,13 @@ class CheckResult:
             if changed:
                 parts = ', '.join(f'{each.regime}: {each.text}' for each in changed)
                 lines[sensor] = f'{sensor}: the error has changed since the calibration, {parts}'
-            else:
-                largest = max(
-                    (each for each in self.changes if each.sensor == sensor),
-                    key=lambda each: each.factor,
-                )
-                lines[sensor] = (
-                    f'{sensor}: the error is as on the day of the calibration, at most'
-                    f' {largest.text} in {largest.regime}'
-                )
+                continue
+            of_sensor = [each for each in self.changes if each.sensor == sensor]
+            largest = max(of_sensor, key=lambda each: each.factor)
+            lines[sensor] = (
+                f'{sensor}: the error is as on the day of the calibration, at most'
+                f' {largest.text} in {largest.regime}'
+            )
         return lines
 
     def decision(self, sensor: str) -> SensorDecision:
@@ -440,7 +438,7 @@ class CheckResult:
                 for sensor, entry in self.proof.items()
                 for line in worse_regimes(entry)
             ),
-            *self._since().values(),
+            *self._change_lines().values(),
         ]
 
     def __str__(self):

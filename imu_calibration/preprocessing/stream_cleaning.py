@@ -430,6 +430,21 @@ _SAMPLE_TYPES: dict[str, Any] = {
 }
 
 
+def outside(ranges: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """
+    Return which places are in none of the half open ranges.
+
+    Parameters
+    ----------
+    ranges : ndarray, shape (k, 2)
+        In order, without overlap.
+    place : ndarray, shape (n,)
+
+    """
+    # An odd number of bounds lies at or below a place within a range.
+    return np.searchsorted(ranges.ravel(), place, side='right') % 2 == 0
+
+
 @dataclass(frozen=True, eq=False)
 class CleanedBlock:
     """
@@ -649,8 +664,7 @@ class BlockCleaner:
         for epoch, imu in parts:
             place = np.arange(self._n_imu, self._n_imu + len(imu))
             self._n_imu += len(imu)
-            # an odd number of bounds lies at or below a place within a range
-            kept = np.searchsorted(self._without.ravel(), place, side='right') % 2 == 0
+            kept = outside(self._without, place)
             if kept.any():
                 kept_parts.append((epoch, imu if kept.all() else imu.select(kept)))
         return kept_parts

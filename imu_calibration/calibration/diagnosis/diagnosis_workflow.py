@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -112,12 +113,12 @@ class DiagnosisResult:
         """Proposed formulas that apply to this session only, a line each."""
         lines = []
         for effect in _proposed_effects(self.diagnosis):
-            if effect.compensation == 'exact':
-                continue
-            lines.append(
-                f'{effect.groups[0].text[0]} contains a quantity of this session (time, table):'
-                ' compensation of other recordings cannot undo it, it is left out of extended.yaml'
-            )
+            if not _is_transferable(effect):
+                lines.append(
+                    f'{effect.groups[0].text[0]} contains a quantity of this session (time, table):'
+                    ' compensation of other recordings cannot undo it, it is left out of'
+                    ' extended.yaml'
+                )
         return lines
 
     @property
@@ -218,22 +219,17 @@ def diagnose_recording(
     )
     if calibrated.found is None:
         raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
-    result, diagnosis = (
-        calibrated.result,
-        build_diagnosis(table, calibrated.found, calibrated=calibrated.result.solution),
+    result = calibrated.result
+    diagnosis = build_diagnosis(table, calibrated.found, calibrated=result.solution)
+    calibrate_with = partial(
+        _with_proposals, source, table, options, result, diagnosis, provenance, reader
     )
     effects = _proposed_effects(diagnosis)
-    proposed = _with_proposals(
-        source, table, options, result, diagnosis, provenance, reader, effects=effects
-    )
-    # Time, joints and attitude of another session are unknown to compensation. A model with such a
-    # formula would divide the error between the formula, which is not applied, and bias and matrix.
-    undone = [effect for effect in effects if effect.compensation == 'exact']
+    proposed = calibrate_with(effects=effects)
     transferable = proposed
-    if len(undone) < len(effects):
-        transferable = _with_proposals(
-            source, table, options, result, diagnosis, provenance, reader, effects=undone
-        )
+    transferable_effects = [effect for effect in effects if _is_transferable(effect)]
+    if len(transferable_effects) < len(effects):
+        transferable = calibrate_with(effects=transferable_effects)
     traces = residual_traces(
         reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution
     )
@@ -248,6 +244,16 @@ def diagnose_recording(
         proposed,
         transferable,
     )
+
+
+def _is_transferable(effect):
+    """
+    Return whether compensation of another recording can undo an effect.
+
+    Time, joints and attitude of another session are unknown to it. A model with such a formula
+    would divide the error between the formula, which is not applied, and bias and matrix.
+    """
+    return effect.compensation == 'exact'
 
 
 def _with_proposals(source, table, options, result, diagnosis, provenance, reader, *, effects):

@@ -332,8 +332,10 @@ def _missed_by(hand, turn):
 def _solved(data, options, point, *, untested=()):
     """Return the calibration with the cross terms `untested` held at their prior."""
     poses, turns = data.poses, data.turns
-    if data.absent:  # the g-sensitivity relates both sensors
-        default, evidence = BASE, dict(NO_EVIDENCE)
+    if data.absent:
+        # The g-sensitivity relates both sensors.
+        default = BASE
+        evidence = dict(NO_EVIDENCE)
     else:
         default, evidence = default_gyroscope(poses)
     reference_c = (
@@ -455,17 +457,14 @@ def _settled(model, found):
 
 def without_sensors(poses: Poses, absent: Sequence[str]) -> Poses:
     """Return poses in which the means of absent sensors have no weight."""
-    force_sem, rate_sem = poses.force_sem, poses.rate_sem
     if 'accelerometer' in absent:
-        force_sem = np.full_like(force_sem, ABSENT_SD)
+        poses = replace(poses, force_sem=np.full_like(poses.force_sem, ABSENT_SD))
     if 'gyroscope' in absent:
-        rate_sem = np.full_like(rate_sem, ABSENT_SD)
-    return replace(
-        poses,
-        force_sem=force_sem,
-        rate=np.zeros_like(poses.rate) if 'gyroscope' in absent else poses.rate,
-        rate_sem=rate_sem,
-    )
+        # The mean rate less the creep of the accelerometer is not zero.
+        no_rate = np.zeros_like(poses.rate)
+        no_weight = np.full_like(poses.rate_sem, ABSENT_SD)
+        poses = replace(poses, rate=no_rate, rate_sem=no_weight)
+    return poses
 
 
 def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:

@@ -35,6 +35,11 @@ from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.poses import missed_angle
 
+LEAST_SPREAD = 0.02
+"""Spread of the directions (1/3 when they are even) from which on a sphere is a starting point."""
+NORM_SD_SHARE = 1e-3
+"""Sd of the lengths of gravity in the search for a starting point, as a share of gravity."""
+
 
 def solve_joint(
     model: HandModel, poses: Poses, turns: list[TurnData], *, gravity_sd: float
@@ -90,12 +95,6 @@ def _model_error(reference, found):
     )
 
 
-LEAST_SPREAD = 0.02
-"""Spread of the directions (1/3 when they are even) from which on a sphere is a starting point."""
-NORM_SD_SHARE = 1e-3
-"""Sd of the lengths of gravity in the search for a starting point, as a share of gravity."""
-
-
 def first_state(model: HandModel, poses: Poses) -> State:
     """
     Return a `State` from the norms in poses, which determine directions too, and the rates at rest.
@@ -120,11 +119,10 @@ def _starting_points(model, poses):
     """Return parameter vectors: nominal, with the scale of the norms, and with the sphere."""
     bias_at = model.model.part('accelerometer', Role.OFFSET)
     matrix_at = model.model.part('accelerometer', Role.LINEAR)
-    starts = [model.nominal.copy()]
-    usual = float(np.median(np.linalg.norm(poses.force, axis=1)))
+    median_norm = float(np.median(np.linalg.norm(poses.force, axis=1)))
     scaled = model.nominal.copy()
-    scaled[matrix_at] *= usual / model.gravity
-    starts.append(scaled)
+    scaled[matrix_at] *= median_norm / model.gravity
+    starts = [model.nominal, scaled]
     sphere = fit_sphere(poses.force)
     if sphere.spread > LEAST_SPREAD:
         with_sphere = model.nominal.copy()
@@ -144,27 +142,32 @@ class _NormEstimate:
     """Sum of the squared residuals and of the distances from the priors, in sds."""
 
 
-def _by_norms(model, poses, values):
-    """Return the `_NormEstimate` from Gauss-Newton steps that begin at `values`."""
-    nominal, priors = model.nominal, model.priors
+def _by_norms(model, poses, start):
+    """Return the `_NormEstimate` from Gauss-Newton steps that begin at the parameters `start`."""
     norm_sd = NORM_SD_SHARE * model.gravity
-    own = model.base_index('accelerometer')
-    own = own[~model.withheld[own]]
-    nowhere = _NormEstimate(model.nominal.copy(), np.inf)
-    for _ in range(MAX_NEWTON_STEPS):
+    free = model.base_index('accelerometer')
+    free = free[~model.withheld[free]]
+    prior_sd = model.priors[free]
+
+    def linearised(values):
+        """Return the residuals in sds, those of the priors last, and their columns."""
         residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
-        rows = np.vstack([columns[:, own] / norm_sd, np.diag(1 / priors[own])])
-        target = np.concatenate([residual / norm_sd, (nominal - values)[own] / priors[own]])
+        distance = (model.nominal - values)[free] / prior_sd
+        rows = np.vstack([columns[:, free] / norm_sd, np.diag(1 / prior_sd)])
+        return np.concatenate([residual / norm_sd, distance]), rows
+
+    values = start.copy()
+    for _ in range(MAX_NEWTON_STEPS):
+        target, rows = linearised(values)
         step = np.linalg.lstsq(rows, target, rcond=None)[0]
-        values[own] += step
-        # beyond zero lies the mirrored solution, or none
+        values[free] += step
+        # Beyond a scale of zero lies the mirrored solution, or none.
         if not np.isfinite(values).all() or np.diag(model.linear(values)[1]).min() <= 0.0:
-            return nowhere
+            return _NormEstimate(model.nominal.copy(), np.inf)
         if np.max(np.abs(step)) < 1e-10:
             break
-    residual = model.norm_rows(values, poses.force, **poses.conditions)[0]
-    distance = (nominal - values)[own] / priors[own]
-    return _NormEstimate(values, float(np.sum((residual / norm_sd) ** 2) + distance @ distance))
+    target, _ = linearised(values)
+    return _NormEstimate(values, float(target @ target))
 
 
 def _of_gravity(model, values, relative_sd):
