@@ -223,26 +223,82 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
 
     """
     step = np.diff(stamp)
-    if len(step) < MIN_PERIOD_STEPS:
+    if len(step) < 2:
         return []
+    # The usual step is that within a packet if it would mean more than MOST_LOST lost samples for
+    # each received one.
+    least_period = period / (1 + MOST_LOST)
     usual = float(np.median(step))
-    usual = usual if MIN_REGULAR_STEP * period < usual < period else period
+    if not least_period < usual < period:
+        usual = period
     long = step > MAX_REGULAR_STEP * usual
     # the scatter about a line through the numbers, without lost samples and with them
     scatter = np.inf
     for number_step in (np.ones(len(step)), np.where(long, np.rint(step / usual), 1.0)):
         number = np.concatenate([[0.0], np.cumsum(number_step)])
-        line = np.polynomial.Polynomial.fit(number, stamp, 1)(number)
-        scatter = min(scatter, float(np.std(stamp - line)))
+        slope, _ = np.polyfit(number, stamp, 1)
+        if slope < least_period:
+            slope = period
+        scatter = min(scatter, float(np.std(stamp - slope * number)))
     edges = [0, *(np.flatnonzero(long) + 1), len(stamp)]
     found = []
     for start, stop in zip(edges, edges[1:]):
         late = stamp[start:stop] - times[start:stop]
         off = late.min() if arrivals else late.mean()
+        # The earliest stamp of a part is on the line also where the computed period is wrong.
+        distance = max(abs(float(off)), float(late.std()))
         limit = FIT_SDS + FIT_SDS_OF_ONE / np.sqrt(stop - start)
-        if abs(off) > limit * scatter + MIN_REGULAR_STEP * usual:
+        if distance > limit * scatter + MIN_REGULAR_STEP * usual:
             found.append(slice(int(start), int(stop)))
     return found
+
+
+class TimesInOrder:
+    """
+    Keeps times in the order of the stamps where recorded and computed times meet.
+
+    A sample recorded after all earlier ones has a later time than all of them. Otherwise it is
+    moved behind the latest of them by its recorded distance, or by less where the next time
+    requires it.
+    """
+
+    def __init__(self) -> None:
+        self._latest: np.ndarray = np.full(2, np.iinfo(np.int64).min)
+        """The highest recorded stamp and the highest time, ns."""
+
+    def passes(self, stamp_ns: np.ndarray) -> bool:
+        """Take stamps that are used unchanged; return whether the first is after every time."""
+        if stamp_ns[0] <= self._latest[1]:
+            return False
+        self._latest[:] = stamp_ns.max()
+        return True
+
+    def push(self, stamp_ns: np.ndarray, times_ns: np.ndarray) -> np.ndarray:
+        """
+        Return the times in order, int64, shape (n,).
+
+        Parameters
+        ----------
+        stamp_ns, times_ns : ndarray of int64, shape (n,)
+            Recorded stamps and the times chosen for them.
+
+        """
+        stamp = np.concatenate([self._latest[:1], stamp_ns])
+        times = np.concatenate([self._latest[1:], times_ns])
+        earlier_stamp = np.maximum.accumulate(stamp)[:-1]
+        earlier_time = np.maximum.accumulate(times)[:-1]
+        back = np.flatnonzero((stamp_ns > earlier_stamp) & (times_ns <= earlier_time)) + 1
+        if len(back):
+            for run in np.split(back, np.flatnonzero(np.diff(back) > 1) + 1):
+                before = times[: run[0]].max()
+                # as far apart as recorded, and before the next time
+                step = (stamp[run[-1]] - stamp[run[0] - 1]) / len(run)
+                if run[-1] + 1 < len(times):
+                    step = min(step, (times[run[-1] + 1] - before) / (len(run) + 1))
+                number = np.arange(1, len(run) + 1)
+                times[run] = before + (max(step, 1.0) * number).astype(np.int64)
+        self._latest = np.array([stamp.max(), times.max()])
+        return times[1:]
 
 
 CLOCK_BLOCK = LAG
@@ -438,6 +494,7 @@ class SampleTimes:
         self._clock: Any = None
         self._held: Any = None
         self._history, self._unseen, self._reviewed = np.zeros(0, np.int64), 0, 0
+        self._order = TimesInOrder()
 
     def push(self, samples: ImuSamples) -> ImuSamples | None:
         """
@@ -460,7 +517,9 @@ class SampleTimes:
         """Return the buffered samples, and reset."""
         if self._learning and self._held is not None:
             self._judge(describe_stamps(self._held.stamp_ns))
-        ready = self._counted(final=True) if self._clock is not None else [self._held]
+        ready = (
+            self._counted(final=True) if self._clock is not None else [self._ordered(self._held)]
+        )
         self._begin()
         return _joined(ready)
 
@@ -474,6 +533,8 @@ class SampleTimes:
             np.concatenate([self._history[-self._unseen - 1 :], samples.stamp_ns])
         )  # the complete block of the next review
         if not np.all(is_regular(step, self.line.period_ns)):
+            return False
+        if not self._order.passes(samples.stamp_ns):
             return False
         self._unseen = (self._unseen + len(samples)) % CLOCK_BLOCK
         self._history = np.concatenate([self._history, samples.stamp_ns[-STAMP_HISTORY:]])[
@@ -522,7 +583,7 @@ class SampleTimes:
             self.n_irregular += (
                 len(part or ()) if self.line is not None and self.line.word == IRREGULAR else 0
             )
-            return [held, part]
+            return [self._ordered(held), self._ordered(part)]
         if part is not None:
             self._clock.push(part.stamp_ns)
             self._held = part if self._held is None else ImuSamples.concatenate([self._held, part])
@@ -538,7 +599,14 @@ class SampleTimes:
             self._held.select(slice(len(times), None)),
         )
         self.n_rebuilt += len(times)
-        return [replace(timed, stamp_ns=times)]
+        return [replace(timed, stamp_ns=self._order.push(timed.stamp_ns, times))]
+
+    def _ordered(self, samples: ImuSamples | None) -> ImuSamples | None:
+        """Return samples with their recorded stamps, later than the computed times before them."""
+        if samples is None or not len(samples):
+            return samples
+        times = self._order.push(samples.stamp_ns, samples.stamp_ns)
+        return replace(samples, stamp_ns=times)
 
     def odd_line(self, count: int) -> StampLine | None:
         """

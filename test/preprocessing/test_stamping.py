@@ -198,7 +198,14 @@ def lossy_and_late(seed, *, rate_hz, lateness, share, burst, seconds=100.0):
 
 @pytest.mark.parametrize(
     ('rate_hz', 'lateness', 'share', 'burst'),
-    ((200.0, 4e-3, 0.1, 8), (200.0, 4e-3, 0.2, 20), (100.0, 8e-3, 0.1, 8)),
+    (
+        (200.0, 4e-3, 0.1, 8),
+        (200.0, 4e-3, 0.2, 20),
+        (100.0, 8e-3, 0.1, 8),
+        # about half of the samples are lost, so that the mean step is twice the period
+        (100.0, 2e-3, 1.0, 30),
+        (50.0, 4e-3, 1.5, 20),
+    ),
 )
 def test_computed_times_across_bursts_of_losses_are_no_worse_than_the_stamps(
     rate_hz, lateness, share, burst
@@ -212,3 +219,11 @@ def test_computed_times_across_bursts_of_losses_are_no_worse_than_the_stamps(
     assert computed.std() < 1.2 * recorded.std()
     assert np.abs(computed).max() < 1.2 * np.abs(recorded).max()
     assert len(imu) - len(found) < 0.002 * len(imu)
+
+
+def test_computed_times_are_in_the_order_of_the_stamps():
+    imu, _ = lossy_and_late(17, rate_hz=200.0, lateness=4e-3, share=0.5, burst=20)
+    assert np.all(np.diff(imu.stamp_ns) > 0)
+    number, times, state = timed(imu)
+    assert state.n_rebuilt > 0 and len(number) == len(imu)
+    assert np.all(np.diff(times) > 0)
