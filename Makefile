@@ -1,4 +1,4 @@
-# Two commands do all set-up on a machine that has Python 3.11 or later, its venv module and make:
+# Two commands do all set-up on a machine that has Python 3.10 or later, its venv module and make:
 #   make demo    a simulated recording, its calibration, a compensated bag and a report
 #   make test    the core and the live lane of the tests; make test-long runs the longest tests
 # With a ROS 2 Jazzy sourced its rclpy is used, otherwise rclpy comes from PyPI; all versions are pinned in constraints/.
@@ -29,6 +29,9 @@ VENV_OPTIONS = --system-site-packages
 # ROS registers pytest plugins of its own, written for other pytest versions.
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 PLUGINS = -p xdist
+else ifeq ($(shell $(PYTHON) -c 'import sys; print(sys.version_info < (3, 11))' 2>/dev/null),True)
+# The latest numpy and scipy need Python 3.11.
+PINS ?= constraints/oldest.txt
 else
 PINS ?= constraints/pypi.txt
 endif
@@ -49,8 +52,8 @@ help:
 setup: $(STAMP)
 
 $(STAMP): $(filter-out $(addprefix constraints/,docs.txt validate.txt oracles.txt oracles-alone.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	  { echo 'Python 3.11 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+	  { echo 'Python 3.10 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
 	  { echo 'The venv module of $(PYTHON) is missing; run: apt-get install python3-venv' >&2; exit 1; }
 	@echo 'Installing $(PINS) into $(VENV): a minute or two, once.'
@@ -119,7 +122,7 @@ $(STAMP)-lint: $(STAMP) constraints/lint.txt
 	@$(PIP) --prefer-binary --requirement constraints/lint.txt
 	@touch $@
 
-# The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.11.
+# The same tests on the oldest supported versions, those of Ubuntu 24.04; needs Python 3.10 to 3.12.
 test-oldest:
 	$(MAKE) test-all VENV=.venv-oldest PINS=constraints/oldest.txt JAZZY=
 

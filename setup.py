@@ -59,6 +59,7 @@ setup(
         'Development Status :: 4 - Beta',
         'Intended Audience :: Science/Research',
         'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3.10',
         'Programming Language :: Python :: 3.11',
         'Programming Language :: Python :: 3.12',
         'Programming Language :: Python :: 3.13',
@@ -74,7 +75,7 @@ setup(
         (f'share/{NAME}/config', sorted(glob('config/*.*'))),
         (f'share/{NAME}/launch', sorted(glob('launch/*.launch.py'))),
     ],
-    python_requires='>=3.11',
+    python_requires='>=3.10',
     install_requires=[
         # The oldest versions that are tested, constraints/oldest.txt; a test compares.
         'numpy>=1.26',

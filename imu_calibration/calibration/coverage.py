@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 
 from imu_calibration.calibration.from_solution import possible_motions
 from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.observability import (

@@ -1,13 +1,13 @@
 """Health of a compensated stream: bias at stops, range, temperature."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from imu_calibration.compensation.compensate import FittedErrors, Transfer
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.core.progress import LiveState
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.core.units import DEG, GRAVITY_PLACE_SHARE, STANDARD_GRAVITY, unit_of_rest
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.rotations import EARTH_RATE

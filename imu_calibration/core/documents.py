@@ -10,7 +10,6 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping
-from enum import StrEnum
 from errno import EINVAL
 from functools import cache
 from os import PathLike
@@ -20,6 +19,7 @@ from typing import Any, BinaryIO, cast
 import numpy as np
 
 from imu_calibration.core.errors import DocumentError, shortened
+from imu_calibration.core.text_enum import StrEnum
 
 MAX_DOCUMENT_CHARACTERS = 2_000_000
 """

@@ -5,7 +5,7 @@ Data sheets promise a few per cent. A factor far from one is usually a wrong uni
 full-scale range, or a wrong sampling rate in a driver that multiplies increments.
 """
 
-from enum import StrEnum
+from imu_calibration.core.text_enum import StrEnum
 
 USUAL_SCALE = (0.6, 1.7)
 """Scale factors without remark."""

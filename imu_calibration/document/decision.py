@@ -2,10 +2,10 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 
 from imu_calibration.core.errors import with_hint
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.core.units import error_text
 from imu_calibration.effects.base import SENSORS
 

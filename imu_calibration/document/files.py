@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from errno import EISDIR
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import count
 from os import PathLike
 from pathlib import Path
@@ -259,6 +259,9 @@ def hash_of(path: str | PathLike[str]) -> str:
     )
 
 
+HASHED_PIECE_BYTES = 1 << 20
+
+
 @lru_cache
 def _hash_of_unchanged(files):
     """
@@ -269,7 +272,8 @@ def _hash_of_unchanged(files):
     digest = hashlib.sha256()
     for file, *_ in files:
         with open(file, 'rb') as stream:
-            hashlib.file_digest(stream, lambda: digest)
+            for piece in iter(partial(stream.read, HASHED_PIECE_BYTES), b''):
+                digest.update(piece)
     return digest.hexdigest()
 
 

@@ -6,12 +6,12 @@ Its covariance as named terms whose sum is the total, and the status of its para
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import cached_property
 from typing import ClassVar, TypeVar
 
 import numpy as np
 
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.weighted_system import make_prior

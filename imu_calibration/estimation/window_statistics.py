@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 
 import numpy as np
 
 from imu_calibration.core.samples import rounding_variance
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import References, columns

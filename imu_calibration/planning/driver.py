@@ -7,12 +7,12 @@ Each fault stops all joints with one sentence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.settings import setting
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.core.units import DEG
 from imu_calibration.kinematics.joint_motion import rest_at
 from imu_calibration.kinematics.motion_limits import MotionLimits, TrajectoryPoints

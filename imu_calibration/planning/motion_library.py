@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint import Joint, JointLimits

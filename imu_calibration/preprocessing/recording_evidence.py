@@ -6,13 +6,13 @@ The checks of messages are of the header and covariance of single messages.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.preprocessing import scan
 from imu_calibration.preprocessing.full_scale import (
     Extremes,

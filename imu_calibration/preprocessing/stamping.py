@@ -1,12 +1,12 @@
 """Stamps of samples: period, losses, counted clocks, and times of samples."""
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
 from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.text_enum import StrEnum
 
 
 class Stamping(StrEnum):

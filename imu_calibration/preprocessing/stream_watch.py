@@ -2,11 +2,11 @@
 
 from collections import Counter
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any
 
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.preprocessing.stamping import IRREGULAR, StampLine
 from imu_calibration.preprocessing.stream_cleaning import MESSAGES, STREAMS
 from imu_calibration.preprocessing.window_cutter import dropped

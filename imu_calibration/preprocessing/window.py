@@ -3,7 +3,6 @@
 import pickle
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from io import SEEK_END
 from tempfile import SpooledTemporaryFile
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.core.settings import setting
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.kinematics.joint_motion import JointMotion
 
 

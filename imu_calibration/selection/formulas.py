@@ -315,11 +315,11 @@ class FormulaSearch:
         known = {
             name: (getattr(ref, field), index) for name, (field, *index) in PLACES.items() if field
         }
-        places = {
-            name: values[:, *index]
-            for name, (values, index) in known.items()
-            if values is not None and (not index or index[-1] < values.shape[-1])
-        } | {'temperature_ref_c': reference_temperature}
+        places = {'temperature_ref_c': reference_temperature}
+        for name, (values, index) in known.items():
+            if values is not None and (not index or index[-1] < values.shape[-1]):
+                column = (slice(None), *index)  # of every sample
+                places[name] = values[column]
         means = np.empty((len(self.blocks.time), len(texts)))
         with np.errstate(all='ignore'):
             for first in range(0, len(texts), COLUMN_CHUNK):

@@ -6,7 +6,6 @@ Rests, moves, ramps, spins and oscillations, with exact derivatives.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -225,15 +224,15 @@ class MotionBuilder:
         """Number of joints."""
         return len(self._position)
 
-    def rest(self, duration: float) -> Self:
+    def rest(self, duration: float) -> 'MotionBuilder':
         """Rest for `duration` times dwell, s."""
         return self._append('rest', duration * self.dwell)
 
-    def rest_at_home(self, duration: float) -> Self:
+    def rest_at_home(self, duration: float) -> 'MotionBuilder':
         """Rest at zero, or at the nearest position within the limits."""
         return self.move_to(self.home).rest(duration)
 
-    def move(self, angles_deg: ArrayLike, shortest: bool = True) -> Self:
+    def move(self, angles_deg: ArrayLike, shortest: bool = True) -> 'MotionBuilder':
         """
         Move to the joint angles (NaN: do not move that joint).
 
@@ -243,7 +242,7 @@ class MotionBuilder:
             np.radians(np.resize(np.asarray(angles_deg, float), self.n_joints)), shortest
         )
 
-    def move_to(self, target: np.ndarray, shortest: bool = True) -> Self:
+    def move_to(self, target: np.ndarray, shortest: bool = True) -> 'MotionBuilder':
         """
         Move to joint positions in rad and m.
 
@@ -259,7 +258,7 @@ class MotionBuilder:
             else self._append('move', move_time(distance, self.limits), shift=shift)
         )
 
-    def spin(self, rates_deg: ArrayLike, duration: float) -> Self:
+    def spin(self, rates_deg: ArrayLike, duration: float) -> 'MotionBuilder':
         """
         Turn at each of the constant rates in `rates_deg`, shape (n_rates, n_joints).
 
@@ -280,7 +279,7 @@ class MotionBuilder:
         *,
         phase: ArrayLike = 0.0,
         fade: float | None = None,
-    ) -> Self:
+    ) -> 'MotionBuilder':
         """
         Swing every joint by sums of sines, arrays of shape (n_sines, n_joints) or (n_joints,).
 
@@ -296,7 +295,7 @@ class MotionBuilder:
         *,
         phase: ArrayLike = 0.0,
         fade: float | None = None,
-    ) -> Self:
+    ) -> 'MotionBuilder':
         """Do the same with amplitudes in rad and m."""
         amplitude = np.atleast_2d(np.asarray(amplitude, float))
         frequency, phase = (

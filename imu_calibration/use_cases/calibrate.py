@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.hand_workflow import (
@@ -48,6 +48,9 @@ from imu_calibration.use_cases.recordings import (
     process_mapper,
     provenance_of,
 )
+
+if TYPE_CHECKING:  # in the standard library from Python 3.11 on
+    from typing_extensions import Unpack
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +140,7 @@ def calibrate_recordings(
     *,
     jobs: int | None = 1,
     earlier: Calibration | str | PathLike | None = None,
-    **choices: Unpack[Choices],
+    **choices: 'Unpack[Choices]',
 ) -> Calibrated:
     """
     Calibrate from one or several recordings of the same IMU.
@@ -243,7 +246,7 @@ def check_recording(
     table: Stand | None = None,
     *,
     change: float = CHANGE,
-    **choices: Unpack[Choices],
+    **choices: 'Unpack[Choices]',
 ) -> CheckResult:
     """
     Test whether a calibration helps on a recording, and whether its error has changed.

@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import Unpack
+from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
     DiagnosisResult,
@@ -25,6 +25,9 @@ from imu_calibration.use_cases.choices import (
     require_same_inputs,
 )
 from imu_calibration.use_cases.recordings import Stand
+
+if TYPE_CHECKING:  # in the standard library from Python 3.11 on
+    from typing_extensions import Unpack
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +155,9 @@ class Diagnosed:
 
 
 def diagnose(
-    recording: str | PathLike | SampleBlock, table: Stand | None = None, **choices: Unpack[Choices]
+    recording: str | PathLike | SampleBlock,
+    table: Stand | None = None,
+    **choices: 'Unpack[Choices]',
 ) -> Diagnosed:
     """
     Find the model errors on a recording and their causes, and extend the model.

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Unpack, cast
+from typing import TYPE_CHECKING, cast
 
 from imu_calibration.core import documents
 from imu_calibration.core.errors import InputError
@@ -36,6 +36,9 @@ from imu_calibration.simulation.session import simulate_session as run_session
 from imu_calibration.use_cases.choices import Choices, catalogue_of, inputs_of
 from imu_calibration.use_cases.recordings import LIKELY_LINK, Arm, Stand, name_of, table_of
 from imu_calibration.use_cases.resources import config_file
+
+if TYPE_CHECKING:  # in the standard library from Python 3.11 on
+    from typing_extensions import Unpack
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +191,7 @@ def replay(
     table: Stand | None,
     *,
     seed: int = 0,
-    **choices: Unpack[Choices],
+    **choices: 'Unpack[Choices]',
 ) -> Simulated:
     """
     Simulate a calibrated IMU on the motion of a recording.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,8 @@ from imu_calibration.use_cases.choices import Choices
 from imu_calibration.use_cases.recordings import Stand
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from imu_calibration.preprocessing.window import Window
 
 PARAMETERS_TOPIC, SPHERE_TOPIC = '/imu/parameters', '/imu/coverage'

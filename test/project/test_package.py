@@ -98,6 +98,8 @@ found = run_setup('setup.py', stop_after='init')
 print(json.dumps({'name': found.get_name(), 'version': found.get_version(),
                   'packages': found.packages, 'requires': found.install_requires,
                   'scripts': found.entry_points['console_scripts'], 'data': found.data_files,
+                  'oldest_python': str(found.python_requires),
+                  'classifiers': found.get_classifiers(),
                   'extras': found.extras_require, 'license': found.get_license()}))
 """
 
@@ -196,8 +198,8 @@ def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
         )
 
 
-OPTIONAL = {'dask', 'distributed', 'foxglove'}
-"""Extras of setup.py that only their own option needs."""
+OPTIONAL = {'dask', 'distributed', 'foxglove', 'typing_extensions'}
+"""Extras of setup.py that only their own option needs; a module for type checkers only."""
 
 
 def test_the_manifest_declares_what_the_code_imports(manifest):
@@ -277,6 +279,18 @@ def test_the_oldest_versions_pinned_are_those_that_set_up_allows(installed):
         name, least = re.match(r'([\w.-]+)>=([\d.]+)', requirement).groups()
         tested = (oldest if distribution(name) in oldest else newest)[distribution(name)]
         assert f'{tested}.'.startswith(f'{least}.'), requirement
+
+
+@pytest.mark.live
+def test_one_oldest_python_is_declared_linted_and_stated(installed):
+    """The linter knows the syntax of that version, mypy the names of its standard library."""
+    major, minor = installed['oldest_python'].removeprefix('>=').split('.')
+    assert f'target-version = "py{major}{minor}"' in (ROOT / 'ruff.toml').read_text()
+    assert f'python_version = {major}.{minor}\n' in (ROOT / 'mypy.ini').read_text()
+    assert f'version_info < ({major}, {minor}))' in (ROOT / 'Makefile').read_text()
+    assert f'Python {major}.{minor} or later' in (ROOT / 'README.md').read_text()
+    versions = [name.split()[-1] for name in installed['classifiers'] if ':: 3.' in name]
+    assert versions[0] == f'{major}.{minor}'
 
 
 def test_the_readme_has_the_equation():

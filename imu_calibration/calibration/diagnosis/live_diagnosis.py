@@ -1,7 +1,6 @@
 """A diagnosis during the motion: its input, a solution, and its outcome as a status."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any
 
 from imu_calibration.calibration.by_evidence import windows_to_ask
@@ -16,6 +15,7 @@ from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.live import LiveCalibration, LiveSnapshot
 from imu_calibration.core.errors import ImuCalibrationError
 from imu_calibration.core.progress import LiveState
+from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.investigation import too_few_windows
 

@@ -1,0 +1,9 @@
+"""Named constants that are texts."""
+
+from enum import Enum
+
+
+class StrEnum(str, Enum):
+    """`enum.StrEnum` of Python 3.11, for Python 3.10 as well: str() and format() give the value."""
+
+    __str__ = str.__str__
