@@ -43,11 +43,11 @@ LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 4
 README_TEST = test/cli/test_pages.py
 
-.PHONY: help setup demo demo-check readme-check live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
+.PHONY: help setup dist demo demo-check readme-check live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, live-demo, test-long, test-all, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, docs, clean'
+	@echo 'also: setup, dist, live-demo, test-long, test-all, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, docs, clean'
 
 setup: $(STAMP)
 
@@ -71,9 +71,22 @@ demo-check: $(STAMP)
 	@folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && set -o pipefail && \
 	  $(PY) examples/demo.py --output "$$folder/demo" | tee "$$folder/log" && $(PY) tools/demo_figures.py "$$folder/log"
 
-# Every code block of the README runs, or has its reason in NOT_RUN of the test; a skipped test fails.
-readme-check: $(STAMP)
-	$(PY) -m pytest $(PLUGINS) -n 2 --dist load --fail-skipped $(README_TEST)
+# The source distribution and the wheel made of it, as the package index accepts them.
+dist: $(STAMP)
+	@rm -rf dist build && $(PY) setup.py --quiet sdist
+	@$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
+	@$(PY) -m twine check --strict dist/*
+
+# Every code block of the README runs, or has its reason in NOT_RUN of the test; a skipped test fails. The wheel runs, in an environment
+# that has only it; requirements and pytest are those of $(VENV).
+readme-check: dist
+	@set -e; folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && wheel=$$folder/wheel/bin/python; \
+	$(PY) -m venv --without-pip $$folder/wheel; \
+	$(PY) -m pip --disable-pip-version-check --quiet --python $$wheel install --no-deps dist/*.whl; \
+	site=$$($$wheel -c 'import sysconfig; print(sysconfig.get_path("purelib"))'); \
+	$(PY) -c 'import sysconfig; print(sysconfig.get_path("purelib"))' >$$site/requirements.pth; \
+	cd $$folder; IMPORTED_FROM=$$site $$wheel -m pytest $(PLUGINS) -n 2 --dist load --fail-skipped -o pythonpath=test \
+	  -p no:cacheprovider -c $(CURDIR)/pytest.ini --rootdir $(CURDIR) $(CURDIR)/$(README_TEST)
 
 live-demo: $(STAMP)
 	@$(PY) examples/live_demo.py --output $(OUTPUT)
@@ -176,5 +189,5 @@ docs: .venv-docs/.installed
 	@touch $@
 
 clean:
-	rm -rf site build install log $(OUTPUT) out .pytest_cache .hypothesis *.egg-info
+	rm -rf site build dist install log $(OUTPUT) out .pytest_cache .hypothesis *.egg-info
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +

@@ -4,6 +4,7 @@ Installation by colcon (ament_python) and by pip.
 Docs/decisions/packaging.md has the places of the files.
 """
 
+import re
 from glob import glob
 from pathlib import Path
 
@@ -12,6 +13,10 @@ from setuptools.command.develop import develop
 from setuptools.command.install_scripts import install_scripts
 
 NAME = 'imu_calibration'
+REPOSITORY = 'https://github.com/imu-calibration/imu_calibration'
+"""The one place of the address; package.xml repeats it, and a test compares."""
+LINK = re.compile(r'(!?)\[([^\]]*)\]\(([^)#:\s]+)(#[^)]*)?\)')
+"""A link of a page to a file of the repository, or an image."""
 NODES = (
     'calibration_node',
     'compensator_node',
@@ -19,6 +24,18 @@ NODES = (
     'bag_player_node',
     'planner_node',
 )
+
+
+def readme():
+    """Return the README with absolute links, for a page outside the repository."""
+    text = Path(__file__).with_name('README.md').read_text(encoding='utf-8')
+
+    def absolute(link):
+        image, label, path, anchor = link.groups()
+        view = 'raw' if image else 'blob'
+        return f'{image}[{label}]({REPOSITORY}/{view}/main/{path}{anchor or ""})'
+
+    return LINK.sub(absolute, text)
 
 
 class _OnPathToo:
@@ -52,9 +69,11 @@ setup(
     description=(
         'Calibration and compensation of inertial measurement units, offline and live on ROS 2'
     ),
-    long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    long_description=readme(),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
+    url=REPOSITORY,
+    project_urls={'Changes': f'{REPOSITORY}/blob/main/CHANGELOG.rst'},
     classifiers=[
         'Development Status :: 4 - Beta',
         'Intended Audience :: Science/Research',
@@ -64,11 +83,16 @@ setup(
         'Programming Language :: Python :: 3.12',
         'Programming Language :: Python :: 3.13',
         'Topic :: Scientific/Engineering',
+        'Typing :: Typed',
     ],
     maintainer='imu_calibration maintainers',
     maintainer_email='imu_calibration@users.noreply.github.com',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_adapters', 'msg_adapters.*']),
-    package_data={f'{NAME}.report': ['templates/*']},
+    package_data={
+        NAME: ['py.typed'],
+        'msg_adapters': ['py.typed'],
+        f'{NAME}.report': ['templates/*'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

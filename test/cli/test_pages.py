@@ -4,6 +4,7 @@ Every plain command of the README and of docs/turntable.md runs as printed.
 It runs in a folder with recordings of the names that the commands use.
 """
 
+import os
 import re
 import shlex
 import shutil
@@ -58,6 +59,12 @@ def test_each_command_of_the_readme_runs_or_has_a_reason():
     lines = [line.strip() for block in shell for line in block.splitlines()]
     lines += re.findall(r'`((?:make|pip|rosdep|colcon) [^`]+)`', text)
     assert set(lines) - set(commands('README.md')) == set(NOT_RUN)
+
+
+def test_the_package_is_the_one_to_be_checked():
+    """`make readme-check` checks an installed wheel, other targets the checkout."""
+    place = Path(os.environ.get('IMPORTED_FROM', ROOT))
+    assert Path(imu_calibration.__file__).is_relative_to(place)
 
 
 @pytest.fixture(scope='module')

@@ -25,6 +25,7 @@ FILES = (
     'setup.py',
     'setup.cfg',
     'MANIFEST.in',
+    'pyproject.toml',
 )
 
 

@@ -99,7 +99,8 @@ print(json.dumps({'name': found.get_name(), 'version': found.get_version(),
                   'packages': found.packages, 'requires': found.install_requires,
                   'scripts': found.entry_points['console_scripts'], 'data': found.data_files,
                   'oldest_python': str(found.python_requires),
-                  'classifiers': found.get_classifiers(),
+                  'classifiers': found.get_classifiers(), 'url': found.get_url(),
+                  'page': found.get_long_description(), 'package_data': found.package_data,
                   'extras': found.extras_require, 'license': found.get_license()}))
 """
 
@@ -166,6 +167,24 @@ def test_manifest_set_up_and_module_agree(manifest, installed):
     assert manifest.licenses[0] == installed['license'] == 'Apache-2.0'
     assert (ROOT / manifest.licenses[0].file).is_file()
     assert manifest.get_build_type() == 'ament_python'
+    assert manifest.urls[0].url == installed['url']
+
+
+@pytest.mark.live
+def test_the_page_of_the_package_index_has_absolute_links(installed):
+    targets = re.findall(r'\]\(([^)]+)\)', installed['page'])
+    assert len(targets) >= 10
+    assert {target.startswith(installed['url']) for target in targets} == {True}
+    for target in targets:
+        path = target.removeprefix(installed['url']).split('/main/')[1]
+        assert (ROOT / path.partition('#')[0]).is_file()
+
+
+@pytest.mark.live
+def test_types_of_both_packages_are_installed_for_type_checkers(installed):
+    for package in ('imu_calibration', 'msg_adapters'):
+        assert 'py.typed' in installed['package_data'][package]
+        assert (ROOT / package / 'py.typed').is_file()
 
 
 def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
@@ -244,7 +263,7 @@ def test_every_python_package_and_data_file_is_installed(installed):
     others = {
         path
         for path in (ROOT / 'imu_calibration').rglob('*')
-        if path.is_file() and path.suffix not in ('.py', '.pyc')
+        if path.is_file() and path.suffix not in ('.py', '.pyc') and path.name != 'py.typed'
     }
     assert {str(path.parent.relative_to(ROOT)) for path in others} <= {
         'imu_calibration/report/templates'
