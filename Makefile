@@ -43,15 +43,15 @@ LANES = $(PY) test/run_lanes.py
 PROCESSES = $(PLUGINS) -n 4
 README_TEST = test/cli/test_pages.py
 
-.PHONY: help setup dist demo demo-check readme-check live-demo test test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
+.PHONY: help setup dist rosdebian demo demo-check readme-check live-demo test test-live test-long test-all test-fast mutants lint lint-tools lint-code lint-types lint-size lint-words oracles test-oldest validate config answers bench soak fuzz noise-coverage hide-and-seek docs clean
 
 help:
 	@sed -n '1,4s/^# \{0,1\}//p' $(MAKEFILE_LIST)
-	@echo 'also: setup, dist, live-demo, test-long, test-all, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, docs, clean'
+	@echo 'also: setup, dist, rosdebian, live-demo, test-live, test-long, test-all, test-fast, lint, oracles, test-oldest, validate, config, answers, bench, soak, fuzz, noise-coverage, hide-and-seek, docs, clean'
 
 setup: $(STAMP)
 
-$(STAMP): $(filter-out $(addprefix constraints/,docs.txt validate.txt oracles.txt oracles-alone.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
+$(STAMP): $(filter-out $(addprefix constraints/,docs.txt rosdebian.txt validate.txt oracles.txt oracles-alone.txt lint.txt),$(wildcard constraints/*.txt)) setup.py setup.cfg
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 	  { echo 'Python 3.10 or later is needed, $(PYTHON) is older or missing; run: make PYTHON=/path/to/python3' >&2; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' || \
@@ -77,6 +77,15 @@ dist: $(STAMP)
 	@$(PY) -m pip --disable-pip-version-check wheel --quiet --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
 	@$(PY) -m twine check --strict dist/*
 
+# debian/ of the ROS package in build/, by bloom and a list of keys that was written by hand (no network but that of pip).
+rosdebian: .venv-rosdebian/.installed
+	@bash tools/rosdebian.sh .venv-rosdebian/bin build
+
+.venv-rosdebian/.installed: constraints/rosdebian.txt
+	@$(PYTHON) -m venv .venv-rosdebian
+	@.venv-rosdebian/bin/python -m pip --disable-pip-version-check --no-input install --quiet --requirement $<
+	@touch $@
+
 # Every code block of the README runs, or has its reason in NOT_RUN of the test; a skipped test fails. The wheel runs, in an environment
 # that has only it; requirements and pytest are those of $(VENV).
 readme-check: dist
@@ -93,6 +102,9 @@ live-demo: $(STAMP)
 
 test: $(STAMP)
 	$(LANES) core live -- $(PROCESSES) --dist loadfile $(TEST_OPTIONS)
+
+test-live: $(STAMP)
+	$(LANES) live -- $(PROCESSES) --dist loadfile $(TEST_OPTIONS)
 
 # The longest tests, distributed one by one rather than by file.
 test-long: $(STAMP)

@@ -4,7 +4,6 @@ import bz2
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,12 +16,13 @@ from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, 
 from msg_adapters.compression import LARGEST_CHUNK, decompress
 from msg_adapters.csv_log import SUFFIXES, CsvBag, is_text_log, require_no_rows
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
-from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard
+from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard, rosbags_missing
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
 from msg_adapters.joint_state import JOINT_STATE_TYPE
-from msg_adapters.layout import Packed, clean_name
+from msg_adapters.layout import clean_name
+from msg_adapters.ros_reader import RosReader
 from msg_adapters.rosbag2 import Rosbag2
-from msg_adapters.storage import LARGEST_STRETCH, RawMessages
+from msg_adapters.storage import RawMessages, grouped
 from msg_adapters.storages import suffixes
 
 DESCRIPTION_TOPIC = '/robot_description'
@@ -345,6 +345,8 @@ class Recording:
         """
         try:
             return deserializer(message_type, self.source.definitions, self.source.ros1)
+        except ModuleNotFoundError as error:
+            raise rosbags_missing(f'the definition of {message_type} in {self.path}') from error
         except Exception as error:  # rosbags' parser raises many kinds
             raise InputError(
                 f'the definition of {message_type} in {self.path} must be one that rosbags'
@@ -396,7 +398,10 @@ def _open_source(path, raw=(), where=()):
         if is_text_log(path):
             return CsvBag(path, raw, where)
         require_no_rows(where, path)
-        return Ros1File(path) if path.suffix == '.bag' else Rosbag2(path)
+        if path.suffix == '.bag':
+            return Ros1File(path)
+        by_ros = RosReader.needed(path) and RosReader.installed()
+        return RosReader(path) if by_ros else Rosbag2(path)
     except InputError:
         raise
     except Exception as error:  # rosbags, sqlite3 and the system raise many kinds
@@ -478,18 +483,16 @@ def _some(names):
     return text
 
 
-STRETCH_MESSAGES = 8192
-"""Messages per stretch."""
-
-
 class Ros1File:
     """One .bag file through rosbags' reader."""
 
     ros1 = True
 
     def __init__(self, path: Path):
-        from rosbags.rosbag1 import Reader
-
+        try:
+            from rosbags.rosbag1 import Reader
+        except ModuleNotFoundError as error:
+            raise rosbags_missing(f'the ROS 1 bag {path}') from error
         self.reader = Reader(Path(path))
         self.reader.open()
         self.reader.chunks = {place: _bounded(chunk) for place, chunk in self.reader.chunks.items()}
@@ -534,25 +537,23 @@ class Ros1File:
 
         Lost messages of the file are counted in `lost`.
         """
+        return grouped(self._messages(topics))
+
+    def _messages(self, topics):
+        """Yield (index of the topic, receive time, message); count what is lost by damage."""
         connections = [c for c in self.reader.connections if self.topics[c.id] in topics]
-        pending, n_pending, n_read = [], 0, 0
+        if not connections:
+            return
+        n_read = 0
         expected = sum(c.msgcount for c in connections)
         try:
-            for connection, received_ns, data in (
-                self.reader.messages(connections) if connections else ()
-            ):
-                pending.append((topics.index(self.topics[connection.id]), received_ns, bytes(data)))
+            for connection, received_ns, data in self.reader.messages(connections):
                 n_read += 1
-                n_pending += len(data)
-                if len(pending) == STRETCH_MESSAGES or n_pending >= LARGEST_STRETCH:
-                    yield _raw(pending)
-                    pending, n_pending = [], 0
+                yield topics.index(self.topics[connection.id]), received_ns, bytes(data)
         except Exception as error:  # rosbags raises various errors on damaged files
             extent = '' if expected > n_read else f' {UNKNOWN_EXTENT}'
             lost = max(expected - n_read, 1)
             self.lost[f'messages{extent} after damage ({error})'] = lost
-        if pending:
-            yield _raw(pending)
 
     def close(self) -> None:
         """Close the file."""
@@ -569,12 +570,4 @@ def _bounded(chunk: Any) -> Any:
         chunk
         if compression is None
         else chunk._replace(decompressor=lambda data: decompress(compression, data, LARGEST_CHUNK))
-    )
-
-
-def _raw(pending):
-    """Return the RawMessages of a list of (index of the topic, receive time, message)."""
-    numbers, times, messages = zip(*pending, strict=True)
-    return RawMessages(
-        np.array(numbers), partial(np.array, times, dtype=np.int64), Packed.join(messages)
     )

@@ -5,9 +5,14 @@ import shutil
 import sys
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+
+from imu_calibration.core.errors import InputError
+
+IN_LIBRARY = sys.version_info >= (3, 14)
 
 PACKED_PIECE_BYTES = 1 << 20
 LARGEST_CHUNK, LARGEST_MESSAGE = 64 << 20, 32 << 20
@@ -34,15 +39,43 @@ shrink by a factor of ten at most.
 @cache
 def zstd() -> ModuleType:
     """
-    Return the zstd module.
+    Return the zstd module: of Python 3.14, or of the package that rosbags requires.
 
-    Of the standard library where available, otherwise of the package that rosbags requires.
+    Raises
+    ------
+    InputError
+        Without either.
+
     """
-    if sys.version_info >= (3, 14):
-        from compression import zstd as module
-    else:
-        from backports import zstd as module
-    return module
+    try:
+        return import_module('compression.zstd' if IN_LIBRARY else 'backports.zstd')
+    except ModuleNotFoundError as error:
+        raise _not_installed('zstd', 'backports.zstd') from error
+
+
+def _lz4() -> Any:
+    try:
+        return import_module('lz4.frame')
+    except ModuleNotFoundError as error:
+        raise _not_installed('lz4', 'lz4') from error
+
+
+def _not_installed(compression, package):
+    return InputError(
+        f'a recording compressed by {compression} needs the Python package {package} or a sourced'
+        f" ROS 2 with rosbag2_py, both are absent; run 'pip install {package}'",
+        code='compression_missing',
+    )
+
+
+def all_installed() -> bool:
+    """Return whether this Python decompresses everything that rosbag2 compresses."""
+    try:
+        zstd()
+        _lz4()
+    except InputError:
+        return False
+    return True
 
 
 def decompress(compression: str, packed: bytes | memoryview, limit: int) -> bytes:
@@ -68,15 +101,16 @@ def decompress(compression: str, packed: bytes | memoryview, limit: int) -> byte
 
 def _decompressor(compression: str) -> Callable[[], Any]:
     if compression == 'lz4':
-        from lz4 import frame
-
-        return frame.LZ4FrameDecompressor
-    return {'zstd': zstd().ZstdDecompressor, 'bz2': bz2.BZ2Decompressor}[compression]
+        return _lz4().LZ4FrameDecompressor
+    if compression == 'bz2':
+        return bz2.BZ2Decompressor
+    return {'zstd': zstd}[compression]().ZstdDecompressor
 
 
 def decompression_errors() -> tuple[type[Exception], ...]:
     """Return the errors of `decompress` for damaged data."""
-    return zstd().ZstdError, RuntimeError, EOFError, OSError, ValueError
+    errors = (RuntimeError, EOFError, OSError, ValueError)
+    return (zstd().ZstdError, *errors) if all_installed() else errors
 
 
 def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:
@@ -159,7 +193,5 @@ def compressor(name: str) -> Callable | type:
     if name == 'zstd':
         return zstd().compress
     if name == 'lz4':
-        from lz4.frame import compress
-
-        return compress
+        return _lz4().compress
     return bytes

@@ -2,14 +2,16 @@
 Message definitions: the standard ones, and whether a bag's own definition is the standard one.
 """
 
+import re
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from imu_calibration.core.errors import InputError
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
-from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, standard_store
+from msg_adapters.joint_state import JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE
 
 SEPARATOR = '=' * 80
 MAX_DEFINITION_CHARACTERS, MAX_ELEMENTS = 100_000, 10_000
@@ -22,7 +24,61 @@ DEFAULT_TOPICS = {
     TEMPERATURE_TYPE: '/imu/temperature',
 }
 
-STANDARD_TYPES = (IMU_TYPE, JOINT_STATE_TYPE, JOINT_TRAJECTORY_TYPE, TEMPERATURE_TYPE)
+FIELDS = {
+    IMU_TYPE: """\
+std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance
+""",
+    JOINT_STATE_TYPE: """\
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+""",
+    JOINT_TRAJECTORY_TYPE: """\
+std_msgs/Header header
+string[] joint_names
+trajectory_msgs/JointTrajectoryPoint[] points
+""",
+    TEMPERATURE_TYPE: """\
+std_msgs/Header header
+float64 temperature
+float64 variance
+""",
+    'std_msgs/msg/Header': 'builtin_interfaces/Time stamp\nstring frame_id\n',
+    'builtin_interfaces/msg/Time': 'int32 sec\nuint32 nanosec\n',
+    'builtin_interfaces/msg/Duration': 'int32 sec\nuint32 nanosec\n',
+    'geometry_msgs/msg/Quaternion': 'float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n',
+    'geometry_msgs/msg/Vector3': 'float64 x\nfloat64 y\nfloat64 z\n',
+    'trajectory_msgs/msg/JointTrajectoryPoint': """\
+float64[] positions
+float64[] velocities
+float64[] accelerations
+float64[] effort
+builtin_interfaces/Duration time_from_start
+""",
+}
+"""
+Message type -> its fields, equal in Humble and Jazzy; a test compares them with those of rosbags.
+
+They are here because rosbags may be absent, and because it needs a third of a second for them.
+"""
+DIGESTS = {
+    IMU_TYPE: 'RIHS01_7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b',
+    JOINT_STATE_TYPE: 'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e',
+    JOINT_TRAJECTORY_TYPE: (
+        'RIHS01_179b33eba59d676f6d967ac71fe35e7ca2f64b2f3928f4a018cec115e213796e'
+    ),
+    TEMPERATURE_TYPE: 'RIHS01_72514a14126ab9f8a9abec974c78e5610a367b59db5da355ff1fb982d5bad4b8',
+}
+"""Message type -> hash of its description in ROS 2 Jazzy (REP 2016)."""
+STANDARD_TYPES = tuple(DIGESTS)
 
 
 class TypeDefinition(NamedTuple):
@@ -41,12 +97,29 @@ class TypeDefinition(NamedTuple):
 @cache
 def standard_definition(message_type: str) -> TypeDefinition:
     """Return the TypeDefinition of a type that this package supports, as in ROS 2 Jazzy."""
-    store = standard_store()
-    return TypeDefinition(
-        message_type,
-        'ros2msg',
-        store.generate_msgdef(message_type, ros_version=2)[0],
-        store.hash_rihs01(message_type),
+    text = FIELDS[message_type]
+    for nested in _nested_types(message_type):
+        text += f'{SEPARATOR}\nMSG: {nested.replace("/msg/", "/")}\n{FIELDS[nested]}'
+    return TypeDefinition(message_type, 'ros2msg', text, DIGESTS[message_type])
+
+
+def _nested_types(message_type):
+    """Return the types of the fields and of their fields, each once, in the order of the fields."""
+    nested = {}
+    for kind, _ in _fields(FIELDS[message_type], message_type)[message_type]:
+        name = kind.partition('[')[0]
+        if name in FIELDS:
+            nested[name] = None
+            nested.update(dict.fromkeys(_nested_types(name)))
+    return list(nested)
+
+
+def rosbags_missing(subject: str) -> InputError:
+    """Return the error for input that only rosbags reads, where it is not installed."""
+    return InputError(
+        f'{subject} needs the Python package rosbags, which is not installed; run'
+        " 'pip install rosbags'",
+        code='rosbags_missing',
     )
 
 
@@ -64,19 +137,59 @@ def is_standard(message_type: str, encoding: str, text: str) -> bool:
         return _fields(text, message_type) == _fields(
             standard_definition(message_type).text, message_type
         )
-    except Exception:  # rosbags' parser raises many kinds
+    except ValueError:
         return False
+
+
+COMMENT, FIELD = re.compile(r'#.*'), re.compile(r'(\S+)\s+(\w+)(?!\w)\s*(=?)')
+"""A comment, and one line: type, name, and the sign of a constant."""
 
 
 def _fields(text, message_type):
     """
-    Return the types of a ros2msg definition with their fields.
+    Return {type: ((type, name) of each field)} of a ros2msg definition with its nested types.
 
-    Without constants and default values.
+    Without comments, constants and default values. ValueError for another text.
     """
-    from rosbags.typesys import get_types_from_msg
+    found = {}
+    for part in re.split(r'^={10,}$', text, flags=re.MULTILINE):
+        lines = [COMMENT.sub('', line).strip() for line in part.splitlines()]
+        lines = [line for line in lines if line]
+        name = message_type
+        if found:
+            if not lines or not lines[0].startswith('MSG: '):
+                raise ValueError('a part of a definition must begin with MSG')
+            name = _full_name(lines.pop(0).removeprefix('MSG: ').strip(), message_type)
+        fields = []
+        for line in lines:
+            match = FIELD.match(line)
+            if match is None:
+                raise ValueError(f'not a field: {line}')
+            if not match[3]:
+                fields.append((_full_name(match[1], name), match[2]))
+        found[name] = tuple(fields)
+    return found
 
-    return {name: fields for name, (_, fields) in get_types_from_msg(text, message_type).items()}
+
+def _full_name(kind, owner):
+    """Return a type with its package; a name without one is basic or of the owner's package."""
+    name, bracket, size = kind.partition('[')
+    if '/' in name:
+        package, _, short = name.rpartition('/')
+        name = f'{package.removesuffix("/msg")}/msg/{short}'
+    elif name == 'Header':
+        name = 'std_msgs/msg/Header'
+    elif name[:1].isupper():
+        name = f'{owner.partition("/")[0]}/msg/{name}'
+    return name + bracket + size
+
+
+@cache
+def standard_store() -> Any:
+    """Return rosbags' standard types; the first call takes a third of a second."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def deserializer(

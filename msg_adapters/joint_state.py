@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -127,34 +126,56 @@ JOINT_TRAJECTORY_TYPE = 'trajectory_msgs/msg/JointTrajectory'
 _FIELDS = {'position': 'positions', 'rate': 'velocities', 'acceleration': 'accelerations'}
 
 
-@cache
-def standard_store() -> Any:
-    """Return rosbags' standard types; the first call takes a third of a second."""
-    from rosbags.typesys import Stores, get_typestore
+class CdrWriter:
+    """Plain little-endian CDR; numbers are aligned to their size, behind four bytes in front."""
 
-    return get_typestore(Stores.ROS2_JAZZY)
+    def __init__(self) -> None:
+        self.data = bytearray(b'\x00\x01\x00\x00')
+
+    def integer(self, value: int, signed: bool = False) -> None:
+        """Append an integer of four bytes."""
+        self._align(4)
+        self.data += value.to_bytes(4, 'little', signed=signed)
+
+    def string(self, text: str) -> None:
+        """Append a string with its length."""
+        encoded = text.encode() + b'\0'
+        self.integer(len(encoded))
+        self.data += encoded
+
+    def doubles(self, values: np.ndarray) -> None:
+        """Append a sequence of doubles, shape (n,)."""
+        self.integer(len(values))
+        if len(values):
+            self._align(8)
+            self.data += np.asarray(values, '<f8').tobytes()
+
+    def _align(self, size):
+        self.data += bytes(-(len(self.data) - 4) % size)
 
 
 def encode_trajectory(points: TrajectoryPoints) -> bytes:
     """
     Return TrajectoryPoints as plain little-endian CDR, without a frame, to begin at their arrival.
     """
-    types, none = standard_store().types, np.zeros(0)
-    columns = {
-        name: np.ascontiguousarray(values) for name, values in points.columns().items()
-    }  # each row is serialized as its bytes
-    duration = types['builtin_interfaces/msg/Duration']
-    listed = [
-        types['trajectory_msgs/msg/JointTrajectoryPoint'](
-            *(columns[name][k] if name in columns else none for name in _FIELDS),
-            none,
-            duration(*divmod(round(time * NS_PER_S), NS_PER_S)),
-        )
-        for k, time in enumerate(points.time)
-    ]
-    header = types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](0, 0), '')
-    message = types[JOINT_TRAJECTORY_TYPE](header, list(points.joint_names), listed)
-    return bytes(standard_store().serialize_cdr(message, JOINT_TRAJECTORY_TYPE))
+    columns = points.columns()
+    message = CdrWriter()
+    # std_msgs/Header: no stamp, no frame.
+    message.integer(0)
+    message.integer(0)
+    message.string('')
+    message.integer(len(points.joint_names))
+    for name in points.joint_names:
+        message.string(name)
+    message.integer(len(points.time))
+    for k, time in enumerate(points.time):
+        for name in _FIELDS:
+            message.doubles(columns[name][k] if name in columns else np.zeros(0))
+        message.doubles(np.zeros(0))  # effort
+        seconds, nanoseconds = divmod(round(time * NS_PER_S), NS_PER_S)
+        message.integer(seconds, signed=True)
+        message.integer(nanoseconds)
+    return bytes(message.data)
 
 
 def trajectory_from_message(message: Any) -> TrajectoryPoints:

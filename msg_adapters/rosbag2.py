@@ -25,7 +25,20 @@ from msg_adapters.layout import clean_name
 from msg_adapters.storage import RawMessages
 from msg_adapters.storages import STORAGES, suffixes
 
-QOS_POLICIES = ('history', 'reliability', 'durability', 'liveliness')
+QOS_POLICIES = {
+    'history': ('system_default', 'keep_last', 'keep_all'),
+    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
+    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
+    'liveliness': (
+        'system_default',
+        'automatic',
+        'manual_by_node',
+        'manual_by_topic',
+        'unknown',
+        'best_available',
+    ),
+}
+"""Policy -> names of its numbers, as in rmw/types.h."""
 
 
 def spelled_out(profiles: Sequence) -> list:
@@ -47,16 +60,8 @@ def spelled_out(profiles: Sequence) -> list:
 def _name(key, value):
     if key not in QOS_POLICIES or not isinstance(value, int):
         return value
-    from rosbags import interfaces
-
-    return next(
-        (
-            policy.name.lower()
-            for policy in getattr(interfaces, f'Qos{key.title()}')
-            if policy.value == value
-        ),
-        'unknown',
-    )
+    names = QOS_POLICIES[key]
+    return names[value] if 0 <= value < len(names) else 'unknown'
 
 
 COMPRESSED = ('.zstd', '.zst')
@@ -153,6 +158,8 @@ class Rosbag2:
                 for raw in file.stretches(topics):
                     n_read += len(raw.topic)
                     yield raw
+            except InputError:  # no damage: something is not installed
+                raise
             except Exception as error:  # readers raise various errors on hostile or damaged files
                 file.lost[
                     f'rest of {file.path.name} after damage'

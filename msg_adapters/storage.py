@@ -1,7 +1,7 @@
 """Common part of the readers of storage files: from stretches of rows to messages by topic."""
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -44,6 +44,31 @@ class RawMessages(NamedTuple):
         """
         mine = np.flatnonzero(self.topic == number)
         return self.packed.select(mine), lambda: self.received_ns()[mine]
+
+
+STRETCH_MESSAGES = 8192
+"""Messages per stretch where they arrive one by one."""
+
+
+def grouped(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[RawMessages]:
+    """Yield RawMessages of (index of the topic, receive time, message) that arrive one by one."""
+    pending, n_bytes = [], 0
+    for message in messages:
+        pending.append(message)
+        n_bytes += len(message[2])
+        if len(pending) == STRETCH_MESSAGES or n_bytes >= LARGEST_STRETCH:
+            yield _raw(pending)
+            pending, n_bytes = [], 0
+    if pending:
+        yield _raw(pending)
+
+
+def _raw(pending):
+    """Return the RawMessages of a list of (index of the topic, receive time, message)."""
+    numbers, times, messages = zip(*pending, strict=True)
+    return RawMessages(
+        np.array(numbers), partial(np.array, times, dtype=np.int64), Packed.join(messages)
+    )
 
 
 class StorageFile:

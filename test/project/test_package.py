@@ -43,52 +43,13 @@ ROSDEP_KEYS = {
     'jinja2': 'python3-jinja2',
     'matplotlib': 'python3-matplotlib',
     'tqdm': 'python3-tqdm',
-    'rosbags': 'python3-rosbags-pip',
     'urdf_parser_py': 'urdfdom_py',
-    # installed with those that need them; compression is in the standard library from Python 3.14
-    # on
+    # installed with its user
     'markupsafe': 'python3-jinja2',
-    'lz4': 'python3-rosbags-pip',
-    'backports': 'python3-rosbags-pip',
-    'compression': 'python3-rosbags-pip',
 }
-NOBLE = {
-    'python3-numpy': 'python3-numpy',
-    'python3-scipy': 'python3-scipy',
-    'python3-yaml': 'python3-yaml',
-    'python3-jinja2': 'python3-jinja2',
-    'python3-matplotlib': 'python3-matplotlib',
-    'python3-tqdm': 'python3-tqdm',
-    'python3-rosbags-pip': 'rosbags',
-    'python3-hypothesis': 'python3-hypothesis',
-    'python3-jsonschema': 'python3-jsonschema',
-    'python3-pytest': 'python3-pytest',
-    'python3-pytest-xdist': 'python3-pytest-xdist',
-    'urdfdom_py': 'ros-jazzy-urdfdom-py',
-    'xacro': 'ros-jazzy-xacro',
-    'ament_index_python': 'ros-jazzy-ament-index-python',
-    'launch': 'ros-jazzy-launch',
-    'launch_ros': 'ros-jazzy-launch-ros',
-    'rclpy': 'ros-jazzy-rclpy',
-    'ros2cli': 'ros-jazzy-ros2cli',
-    'ros2doctor': 'ros-jazzy-ros2doctor',
-    'ros2launch': 'ros-jazzy-ros2launch',
-    'diagnostic_msgs': 'ros-jazzy-diagnostic-msgs',
-    'rcl_interfaces': 'ros-jazzy-rcl-interfaces',
-    'rosgraph_msgs': 'ros-jazzy-rosgraph-msgs',
-    'sensor_msgs': 'ros-jazzy-sensor-msgs',
-    'std_msgs': 'ros-jazzy-std-msgs',
-    'std_srvs': 'ros-jazzy-std-srvs',
-    'geometry_msgs': 'ros-jazzy-geometry-msgs',
-    'nav_msgs': 'ros-jazzy-nav-msgs',
-    'tf2_msgs': 'ros-jazzy-tf2-msgs',
-    'action_msgs': 'ros-jazzy-action-msgs',
-    'builtin_interfaces': 'ros-jazzy-builtin-interfaces',
-    'control_msgs': 'ros-jazzy-control-msgs',
-    'trajectory_msgs': 'ros-jazzy-trajectory-msgs',
-    'visualization_msgs': 'ros-jazzy-visualization-msgs',
-}
-"""Key -> the package of Ubuntu 24.04, ROS Jazzy or PyPI that rosdep installs for it."""
+INDEX = ROOT / 'test/project/rosdep_noble.yaml'
+NOBLE = {key: rule['ubuntu']['noble'][0] for key, rule in yaml.safe_load(INDEX.read_text()).items()}
+"""Key -> the package of Ubuntu 24.04 or of ROS Jazzy that rosdep installs for it."""
 EXTRAS = {'dask', 'foxglove'}
 """Installed by those who ask for the extra of that name; the code goes without."""
 READ_SETUP = """
@@ -194,6 +155,8 @@ def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
         for dependency in (*manifest.exec_depends, *manifest.test_depends, *manifest.build_depends)
     }
     assert keys <= set(NOBLE), keys - set(NOBLE)
+    # A Debian package depends on Debian packages; pip installs none.
+    assert [key for key in keys if not NOBLE[key].startswith(('python3-', 'ros-jazzy-'))] == []
     rosdep = shutil.which('rosdep')
     known = rosdep and subprocess.run(
         [rosdep, 'resolve', 'python3-numpy', '--os=ubuntu:noble'],
@@ -217,8 +180,11 @@ def test_every_key_of_the_manifest_is_one_that_rosdep_knows(manifest):
         )
 
 
-OPTIONAL = {'dask', 'distributed', 'foxglove', 'typing_extensions'}
-"""Extras of setup.py that only their own option needs; a module for type checkers only."""
+OPTIONAL = {'dask', 'distributed', 'foxglove', 'lz4', 'rosbags', 'typing_extensions'}
+"""
+Extras of setup.py that only their own option needs; readers of bags that rosbag2_py replaces; a
+module for type checkers only.
+"""
 
 
 def test_the_manifest_declares_what_the_code_imports(manifest):
@@ -322,6 +288,21 @@ def test_every_file_that_a_make_target_runs_exists():
     scripts = set(re.findall(r'\$\(PY\) (\w+/\w+\.py)', makefile))
     assert {'examples/demo.py', 'examples/live_demo.py', 'benchmarks/run.py'} <= scripts
     assert {script for script in scripts if not (ROOT / script).is_file()} == set()
+
+
+def test_workflows_call_targets_of_the_makefile_and_every_supported_python():
+    targets = set(re.findall(r'^([a-z-]+):', (ROOT / 'Makefile').read_text(), re.MULTILINE))
+    called, versions = [], []
+    for path in sorted((ROOT / '.github/workflows').glob('*.yml')):
+        for job in yaml.safe_load(path.read_text())['jobs'].values():
+            versions += job.get('strategy', {}).get('matrix', {}).get('python', [])
+            called += [step['run'] for step in job['steps'] if 'run' in step]
+    assert [line for line in called if not line.startswith('make ')] == []
+    goals = {goal for line in called for goal in line.split()[1:]}
+    assert goals <= targets
+    assert {'lint', 'test-fast', 'test-live', 'test-long', 'docs', 'readme-check'} <= goals
+    declared = re.findall(r'Python :: (3\.\d+)', (ROOT / 'setup.py').read_text())
+    assert versions == declared
 
 
 @pytest.mark.parametrize(
