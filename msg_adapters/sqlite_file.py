@@ -8,6 +8,7 @@ the file, and the instructions of SQLite are proportional to the size of the fil
 
 import os
 import sqlite3
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -34,6 +35,8 @@ SMALL_BYTES = 16384
 STRETCH_ROWS = 8192
 STRETCH_BYTES = 16 << 20
 """Rows, or bytes of messages, that complete a stretch."""
+CAN_LIMIT = sys.version_info >= (3, 11)
+"""Whether the bytes of one result can be limited; without it all rows are read one by one."""
 FIRST_ID, LAST_ID = -(2**63), 2**63 - 1
 STEP_IDS = 16
 MOST_STEPS = 2000
@@ -91,7 +94,6 @@ class SqliteFile(StorageFile):
     def _open(self):
         connection = _connect(self.path, self.logged)
         connection.set_progress_handler(self._count_call, INSTRUCTIONS_PER_CALL)
-        self._longest = connection.getlimit(sqlite3.SQLITE_LIMIT_LENGTH)
         self._is_utf8 = connection.execute('PRAGMA encoding').fetchone() == ('UTF-8',)
         return connection
 
@@ -210,7 +212,7 @@ class SqliteFile(StorageFile):
         after = FIRST_ID
         if not wanted:
             after = None
-        elif len(wanted) == 1 and self._is_utf8 and self._cut_page is None:
+        elif len(wanted) == 1 and self._is_utf8 and self._cut_page is None and CAN_LIMIT:
             after = yield from self._equal_messages(min(wanted))
         known = {number for numbers in self.topic_ids.values() for number in numbers}
         others = known - wanted
@@ -247,7 +249,7 @@ class SqliteFile(StorageFile):
             "SELECT max(id), count(*), min(size), max(size), CAST(group_concat(data, '') AS BLOB)"
             f' FROM (SELECT _rowid_ AS id, length(data) AS size, data {rows})'
         )
-        self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, STRETCH_BYTES)
+        longest = self._limit_length(STRETCH_BYTES)
         try:
             while True:
                 found = self.connection.execute(statement, (after,)).fetchone()
@@ -262,7 +264,13 @@ class SqliteFile(StorageFile):
         except sqlite3.Error:
             return after
         finally:
-            self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, self._longest)
+            self._limit_length(longest)
+
+    def _limit_length(self, n_bytes):
+        """Limit the bytes of one result of SQLite; return the limit before."""
+        if sys.version_info >= (3, 11):  # CAN_LIMIT, in the form that type checkers know
+            return self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, n_bytes)
+        return n_bytes
 
     def _times(self, statement, after):
         return [value for (value,) in self.connection.execute(statement, (after,))]
