@@ -138,13 +138,14 @@ def test_standard_deviations_hold_when_biases_differ(motion):
     """
     Errors against the mean of all possible recordings, in reported sd.
 
-    They are over 16 sets of four recordings.
+    They are over eight sets of four recordings.
 
-    The square of a t-distributed error has a heavy tail (nine degrees of freedom): 96 of them have
-    a mean of 1 with a standard deviation of 0.2 at most, 400 of a normal distribution one of 0.07.
+    The square of a t-distributed error has a heavy tail (nine degrees of freedom): 48 of them have
+    a mean of 1 with a standard deviation of 0.3 at most, 200 of a normal distribution one of 0.1.
+    Without a value of the bias for each recording the first mean is 2.5 with these seeds.
     """
     sds, errors = bias_sds(motion), []
-    for seed in range(16):
+    for seed in range(8):
         rng, values = np.random.default_rng([seed, 2]), random_values(MODEL, 'industrial', seed)
         steps = [{s: rng.normal(0, 5 * sds[s].mean(), 3) for s in SENSORS} for _ in range(4)]
         solution = solve(recordings(motion, values, steps, rng), MODEL)
@@ -153,8 +154,8 @@ def test_standard_deviations_hold_when_biases_differ(motion):
     biases = np.concatenate(
         [np.arange(len(MODEL.param_names))[MODEL.slices[s, 'bias']] for s in SENSORS]
     )
-    assert 0.6 < square[:, biases].mean() < 1.5
-    assert 0.8 < np.delete(square, biases, axis=1).mean() < 1.2
+    assert 0.4 < square[:, biases].mean() < 1.9
+    assert 0.7 < np.delete(square, biases, axis=1).mean() < 1.3
 
 
 @pytest.mark.long
