@@ -12,8 +12,8 @@ import pytest
 import yaml
 from test_by_hand import GRAVITY, simulate
 
-from imu_calibration.calibration.by_evidence import calibrate_by_evidence
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
@@ -60,6 +60,7 @@ def bags(tmp_path_factory):
 
 
 def test_a_bag_through_both_nodes(bags, tmp_path):
+    """Without a search for effects, which the next test has."""
     with Station() as station:
         documents = station.watch_documents()
         corrected, residuals = (
@@ -67,7 +68,7 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
             station.watch_imu('imu/residual'),
         )
         station.watch_diagnostics()
-        station.calibration_node(tmp_path, resume=True, diagnosis_period=60.0)
+        station.calibration_node(tmp_path, resume=True, model_as_asked=True)
         compensator = station.start('compensator_node')
         for part in ('beginning', 'ending'):
             player = station.play(bags / part, RATE, subscribers=1)
@@ -79,9 +80,9 @@ def test_a_bag_through_both_nodes(bags, tmp_path):
         assert answer.success, answer.message
         live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bags / 'session') as recording:
-            expected = calibrate_by_evidence(
+            expected = calibrate_on_table(
                 [lambda: recording.blocks(TABLE.joint_names)], TABLE, OPTIONS
-            ).result.calibration
+            ).calibration
         check_the_answer(station, live, expected)
         assert sorted(path.name for path in tmp_path.iterdir()) == [
             'calibration.accumulator.npz',
@@ -224,34 +225,22 @@ def test_a_hidden_effect_is_named_live(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.real_data
-def test_a_recording_by_hand_through_the_node_is_the_recording_offline(recordings, tmp_path):
+def test_poses_by_hand_through_the_node(tmp_path):
     """
     No table, no joint states.
 
     Poses are counted, the direction that is missing is named, the document is that of the offline
-    tool.
+    tool. `LiveByHand` has a real recording (test_live_by_hand.py).
     """
-    check_by_hand(recordings / 'mpu9150_0', tmp_path, rate=8.0)
-
-
-@pytest.mark.long
-def test_poses_by_hand_through_the_node(tmp_path):
-    """The same with a made-up recording."""
-    imu, _, _ = simulate(1)
-    write_session(tmp_path / 'bag', imu)
-    check_by_hand(tmp_path / 'bag', tmp_path, rate=8.0, gravity=GRAVITY)
-
-
-def check_by_hand(bag, folder, rate, gravity=None):
-    """Play a bag to a node without a table."""
     from sensor_msgs.msg import Imu
 
-    options = {'table_file': '', 'gravity': gravity or 0.0}
+    bag, rate = tmp_path / 'bag', 8.0
+    write_session(bag, simulate(1)[0])
+    options = {'table_file': '', 'gravity': GRAVITY}
     with Station() as station:
         documents, residuals = station.watch_documents(), station.watch_imu('imu/residual')
         station.watch_diagnostics()
-        node = station.calibration_node(folder, **options)
+        node = station.calibration_node(tmp_path, **options)
         station.start('compensator_node')
         station.until(lambda: 'calibration_node: poses' in station.status, 'the first diagnostics')
         assert 'JointState' not in station.status['calibration_node: streams'].message
@@ -259,10 +248,10 @@ def check_by_hand(bag, folder, rate, gravity=None):
         station.until(lambda: player.poll() is not None, 'the end of the recording')
         answer = station.call('/calibration_node/save')
         assert answer.success, answer.message
-        live = calibration_from_text((folder / 'calibration.yaml').read_text())
+        live = calibration_from_text((tmp_path / 'calibration.yaml').read_text())
         with open_recording(bag, want_joints=False) as recording:
             expected = calibrate_without_table(
-                [recording.blocks], replace(OPTIONS, gravity=gravity)
+                [recording.blocks], replace(OPTIONS, gravity=GRAVITY)
             ).calibration
         assert (
             live.statistics['samples_used'] == expected.statistics['samples_used']
@@ -273,7 +262,7 @@ def check_by_hand(bag, folder, rate, gravity=None):
         assert np.max(np.abs(live.values - expected.values)[free] / expected.sd[free]) < 1e-6
         check_the_poses(station, expected)
         assert documents and len(taken(residuals)) >= 1
-        resumed(station, node, folder, options, live)
+        resumed(station, node, tmp_path, options, live)
         # On a busy machine the recording is over before the compensator has a document: it is
         # played again.
         corrected = []
