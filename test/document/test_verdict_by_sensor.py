@@ -27,6 +27,8 @@ from worlds.compensation_cases import random_calibration
 from worlds.misfit_worlds import SHAFT, sweeps
 from worlds.physics import make_session
 
+pytestmark = pytest.mark.usefixtures('few_candidates')
+
 VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
 PROOF = {
     'accelerometer': {

@@ -83,6 +83,7 @@ def test_the_same_is_planned_again():
     ]
 
 
+@pytest.mark.usefixtures('few_candidates')
 def test_what_is_promised_is_what_a_calibration_of_the_motion_comes_to(plan, table):
     profile = Profile(
         'plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names)
@@ -159,6 +160,7 @@ def test_spins_in_both_senses_follow_from_the_criterion_where_the_bias_wanders()
     assert {1.0, -1.0} <= senses
 
 
+@pytest.mark.usefixtures('few_candidates')
 def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_diagnosed(table):
     """
     It needed 8 s with two windows, of which no proof can hold out any.
@@ -174,7 +176,7 @@ def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_di
         'plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names)
     )
     model = SensorModel(NAMED_MODELS['size_effect'], joint_names=table.joint_names)
-    for seed in range(4):
+    for seed in range(2):
         samples = simulate_session(
             model, random_values(model, 'industrial', seed), table, profile=profile, seed=seed
         )

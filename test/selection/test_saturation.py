@@ -87,6 +87,7 @@ def test_samples_at_a_limit_and_those_predicted_near_it_are_left_out():
 
 @pytest.mark.real_data
 @pytest.mark.long
+@pytest.mark.usefixtures('few_candidates')
 def test_a_coarse_accelerometer_on_a_vertical_shaft_is_diagnosed(recordings):
     folder = recordings / 'shaft_yaw_slow_later'
     found = diagnose(folder, folder / 'table.yaml')
