@@ -704,12 +704,12 @@ def test_ferraris_sections_agree_with_the_closed_form(recordings):
 @pytest.mark.real_data
 def test_two_recordings_of_one_board_give_the_same_matrices(recordings):
     """
-    Four IMUs calibrated by hand twice: differences in units of their combined sd.
+    Two of the four IMUs calibrated by hand twice: differences in units of their combined sd.
 
     Biases wander and are left out.
     """
     scores = []
-    for topic in (1, 3, 5, 7):
+    for topic in (1, 5):
         pair = []
         for name in ('array_2', 'array_5'):
             imu = load(recordings, name, f'/imu_{topic}/data_raw')
