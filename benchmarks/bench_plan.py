@@ -53,6 +53,7 @@ from imu_calibration.simulation.session import (
     simulate_session,
 )  # noqa: E402
 from imu_calibration.use_cases.calibrate import calibrate_recordings  # noqa: E402
+from tools.smallest import add_smallest  # noqa: E402
 
 from worlds.random_tables import random_table  # noqa: E402
 from worlds.stands import STANDS, quarter_tolerances, stand  # noqa: E402
@@ -237,6 +238,7 @@ def main():
         help='print the targets of the six stands with so many sessions instead',
     )
     parser.add_argument('--stands', nargs='*', choices=STANDS, default=STANDS)
+    add_smallest(parser, tables=1, seeds=1)
     options = parser.parse_args()
     if options.sessions:
         return stands(options.sessions, options.first, options.stands)

@@ -36,6 +36,7 @@ from imu_calibration.allan.terms import (
 )  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
 from imu_calibration.simulation.sensor_noise import GRADES  # noqa: E402
+from tools.smallest import add_smallest  # noqa: E402
 
 from worlds.noise_worlds import FORMS, RATE, draw_truth, overlapping_allan_variance  # noqa: E402
 
@@ -215,18 +216,18 @@ def _spectrum(process, frequency, period):
     }[process.name]
 
 
-def run(records, seed, progress=print):
+def run(records, seed, *, lengths=tuple(LENGTHS), grades=tuple(GRADES), progress=print):
     """
     Return the results of all axes: length -> list of `judged`; `records` for each grade and length.
     """
     found = {}
-    for label, length in LENGTHS.items():
+    for label in lengths:
         start = time.monotonic()
         found[label] = [
             judged(truth, moments)
-            for grade in GRADES
+            for grade in grades
             for number in range(records)
-            for truth, moments in record_axes(length, grade, number, seed)
+            for truth, moments in record_axes(LENGTHS[label], grade, number, seed)
         ]
         progress(f'{label}: {len(found[label])} axes in {time.monotonic() - start:.0f} s')
     return found
@@ -378,9 +379,18 @@ def main():
     parser.add_argument(
         '--seed', type=int, default=int(time.time()), help='default the time: unused seeds'
     )
+    parser.add_argument('--lengths', nargs='+', choices=LENGTHS, default=list(LENGTHS))
+    parser.add_argument('--grades', nargs='+', choices=GRADES, default=list(GRADES))
     parser.add_argument('--write', action='store_true', help='write the tables into docs/noise.md')
+    add_smallest(parser, records=1, seed=1, lengths=['10 min'], grades=['tactical'])
     options = parser.parse_args()
-    found = run(options.records, options.seed, lambda line: print(line, flush=True))
+    found = run(
+        options.records,
+        options.seed,
+        lengths=options.lengths,
+        grades=options.grades,
+        progress=lambda line: print(line, flush=True),
+    )
     text = tables(found)
     print(text)
     if options.write:

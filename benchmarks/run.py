@@ -12,11 +12,11 @@ FOLDER = Path(__file__).resolve().parent
 
 
 def main():
-    """Run bench_*.py in order of their names, each in a process of its own."""
+    """Run bench_*.py in order of their names, each in its own process with the same options."""
     failed = []
     for path in sorted(FOLDER.glob('bench_*.py')):
         print(f'--- {path.stem}', flush=True)
-        if subprocess.run([sys.executable, str(path)], cwd=FOLDER.parent).returncode:
+        if subprocess.run([sys.executable, str(path), *sys.argv[1:]], cwd=FOLDER.parent).returncode:
             failed.append(path.stem)
     if failed:
         print('targets missed: ' + ', '.join(failed))

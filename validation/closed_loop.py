@@ -25,6 +25,7 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.choices import catalogue_of
 from imu_calibration.use_cases.diagnose import diagnose
 from imu_calibration.use_cases.simulate import replay, simulate
+from tools.smallest import add_smallest
 from validation.section import markdown_table
 
 TEMPLATES = {
@@ -59,7 +60,7 @@ SIZE = 1.0
 """Hidden size of a catalogue effect as a share of its largest plausible one."""
 
 
-def measured_sessions(names):
+def measured_sessions(names, profile):
     """Yield (name, function of a seed that simulates the session) of each cause."""
     for effect in catalogue_of(None).effects().values():
         if (
@@ -70,7 +71,7 @@ def measured_sessions(names):
             yield (
                 effect.name,
                 lambda seed, name=effect.name: simulate(
-                    'random', effects=[name], size=SIZE, grade='tactical', seed=seed
+                    profile, effects=[name], size=SIZE, grade='tactical', seed=seed
                 ),
             )
     for template, (sensor, column, unit, size) in TEMPLATES.items():
@@ -87,7 +88,7 @@ def measured_sessions(names):
         yield (
             template,
             lambda seed, definition=definition, template=template: simulate(
-                'random',
+                profile,
                 effects=['hidden_formula'],
                 size=1.0,
                 grade='tactical',
@@ -212,10 +213,10 @@ def exchanged(calibration, finding, mate, measured):
     return other if 'held' not in np.array(other.status)[other.model.slices[sensor, mate]] else None
 
 
-def run(names, seed):
+def run(names, seed, profile='random'):
     """Print a line for each loop and return the rows."""
     rows = []
-    for seed, (name, make) in enumerate(measured_sessions(names), seed):
+    for seed, (name, make) in enumerate(measured_sessions(names, profile), seed):
         start, found = time.process_time(), []
         try:
             measured = make(seed)
@@ -302,8 +303,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--only', nargs='+', default=())
+    parser.add_argument('--profile', default='random', help='motion of the sessions')
+    add_smallest(parser, only=['gyro_g_sensitivity'], profile='quick')
     options = parser.parse_args()
-    print(table_of_rows(run(set(options.only), options.seed)))
+    print(table_of_rows(run(set(options.only), options.seed, options.profile)))
 
 
 if __name__ == '__main__':

@@ -21,6 +21,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.compensate import compensate_recording
 from imu_calibration.use_cases.diagnose import diagnose
+from tools.smallest import add_smallest
 from validation import foreign_worlds
 from validation.foreign_worlds import PLACED, TABLE, UNPLACED, make_world
 from validation.section import markdown_table
@@ -251,6 +252,7 @@ def main():
         action='store_false',
         help='without the second sessions, which take half of the time',
     )
+    add_smallest(parser, kinds=[], empty=1, second=False)
     options, rows = parser.parse_args(), []
     tasks = [
         (kind, options.seed + number) for number, kind in enumerate(KINDS) if kind in options.kinds

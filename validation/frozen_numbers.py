@@ -27,6 +27,7 @@ if __name__ == '__main__':
     sys.path.insert(0, str(ROOT))
 
 from imu_calibration.cli.main import main  # noqa: E402
+from tools.smallest import add_smallest  # noqa: E402
 from validation.recordings import VARIABLE, data_folder, reference  # noqa: E402
 
 SAMPLE = ROOT / 'bags/sample_session'
@@ -233,6 +234,7 @@ if __name__ == '__main__':
     writing.add_argument('--recordings', nargs='*', default=[])
     writing.add_argument('--sessions', type=int, default=0)
     writing.add_argument('--without-plan', action='store_true')
+    add_smallest(writing, without_plan=True)
     comparing = verbs.add_parser('compare')
     comparing.add_argument('before', type=Path)
     comparing.add_argument('after', type=Path)

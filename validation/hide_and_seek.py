@@ -20,6 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
+from tools.smallest import add_smallest  # noqa: E402
 from validation.hide_and_seek_figures import write_figures  # noqa: E402
 from validation.hide_and_seek_report import report  # noqa: E402
 
@@ -79,6 +80,14 @@ def main(arguments=None):
     )
     parser.add_argument(
         '--keep', action='store_true', help='take the rows into the record of the repository'
+    )
+    add_smallest(
+        parser,
+        parts=('effects',),
+        effects='gyro_quadratic',
+        grades=('tactical',),
+        noise=('white',),
+        processes=1,
     )
     options = parser.parse_args(arguments)
     part_of_it = (

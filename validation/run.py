@@ -5,6 +5,7 @@ Exit code 1 if a section failed.
 """
 
 import argparse
+import contextlib
 import importlib
 import platform
 import sys
@@ -13,6 +14,7 @@ import traceback
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from unittest.mock import patch
 
 ROOT = Path(__file__).resolve().parents[1]
 if __name__ == '__main__':
@@ -20,6 +22,7 @@ if __name__ == '__main__':
 
 from imu_calibration import __version__  # noqa: E402
 from imu_calibration.core.errors import ImuCalibrationError  # noqa: E402
+from tools.smallest import add_smallest  # noqa: E402
 from validation.recordings import VARIABLE, data_folder  # noqa: E402
 from validation.section import Section, claims_table, text  # noqa: E402
 
@@ -41,6 +44,28 @@ SECTIONS = (
     'inspecting',
     'diagnosing',
 )
+SMALLEST = {
+    'arm_live.STRETCH_S': 10,
+    'boards.BOARD': 2,
+    'cross.ONE_UNIT': 0,
+    'cross.RECORDINGS': 1,
+    'decisions.BY_HAND': 1,
+    'decisions.KINDS': 1,
+    'decisions.SEEDS': 1,
+    'diagnosing.ALL': 1,
+    'held_out.BY_HAND': 1,
+    'inspecting.ALL': 1,
+    'misfit.ON_A_SHAFT': 1,
+    'mpu9150.TURNS': 1,
+    'noise.RESTING': 1,
+    'peers.MOST_KINDS': 1,
+    'peers.ON_A_TABLE': 1,
+    'peers.SEEDS': 1,
+    'peers.TRIAL_SEEDS': 1,
+    'scatter.SESSIONS': 2,
+    'shaft.SHAFT': 1,
+}
+"""Constant of a section -> entries, sessions or seconds that remain with `--smallest`."""
 PACKAGES = ('numpy', 'scipy', 'rosbags', 'imucal', 'python-ins')
 
 
@@ -57,6 +82,24 @@ def versions():
         except PackageNotFoundError:
             found.append((name, 'not installed'))
     return found
+
+
+@contextlib.contextmanager
+def reduced_to_smallest():
+    """Keep only the first entries of the recordings, kinds and seeds in `SMALLEST`."""
+    with contextlib.ExitStack() as stack:
+        for place, size in SMALLEST.items():
+            module_name, constant = place.split('.')
+            module = importlib.import_module(f'validation.{module_name}')
+            entries = getattr(module, constant)
+            if isinstance(entries, (int, float)):
+                reduced = size
+            elif isinstance(entries, dict):
+                reduced = dict(list(entries.items())[:size])
+            else:
+                reduced = entries[:size]
+            stack.enter_context(patch.object(module, constant, reduced))
+        yield
 
 
 def run_section(name, folder, plots):
@@ -114,7 +157,7 @@ def claims(sections):
     )
 
 
-def main():
+def main(arguments=None):
     """Run the sections and write the pages."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
@@ -129,7 +172,8 @@ def main():
         default=ROOT / 'docs',
         help='folder for validation.md, claims.md and validation/, default docs',
     )
-    options = parser.parse_args()
+    add_smallest(parser, output=Path('out/validation'))
+    options = parser.parse_args(arguments)
     folder = data_folder()
     if folder is None:
         print(
@@ -140,7 +184,9 @@ def main():
         return 1
     plots = options.output / 'validation'
     plots.mkdir(parents=True, exist_ok=True)
-    results = [run_section(name, folder, plots) for name in options.only or SECTIONS]
+    reduction = reduced_to_smallest() if options.smallest else contextlib.nullcontext()
+    with reduction:
+        results = [run_section(name, folder, plots) for name in options.only or SECTIONS]
     sections = [section for section, _ in results]
     if options.only:
         print('\n\n'.join(section.markdown() for section in sections))

@@ -39,6 +39,7 @@ from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.motion_primitives import FACES, pose, pose_deg, swing
 from imu_calibration.use_cases.diagnose import Diagnosed, diagnose
 from imu_calibration.use_cases.plan import LONGEST_SEPARATION, plan
+from tools.smallest import add_smallest
 
 from worlds.hiding import Recording, Sizes
 from worlds.physics import Session, make_session
@@ -229,6 +230,7 @@ def main() -> None:
     parser.add_argument('--first-seed', type=int, default=0)
     parser.add_argument('--effects', type=lambda text: text.split(','), default=HIDDEN)
     parser.add_argument('--most', type=int, default=400, help='worlds that are tried at most')
+    add_smallest(parser, worlds=1, most=1)
     options = parser.parse_args()
     rows, tried = [], 0
     for world in islice(worlds(options.first_seed, options.effects), options.most):

@@ -1,0 +1,120 @@
+"""
+Each script of the repository runs once at its smallest size.
+
+The scripts run in a copy of the tree, because some of them write pages.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from validation import run
+from validation.recordings import VARIABLE
+
+pytestmark = pytest.mark.live
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ('examples', 'benchmarks', 'tools', 'validation')
+FEW = ()
+"""The sections are run without the candidates of the search for effects."""
+RUN = {
+    'benchmarks/noise_records.py': ('--smallest',),
+    'benchmarks/run.py': ('--smallest',),
+    'tools/exports_page.py': (),
+    'tools/tolerance_file.py': (),
+    'validation/closed_loop.py': ('--smallest',),
+    'validation/foreign_physics.py': ('--seed', '1', '--smallest'),
+    'validation/frozen_numbers.py': ('write', 'out_frozen', '--smallest'),
+    'validation/hide_and_seek.py': ('--smallest',),
+    'validation/separating_worlds.py': ('--smallest',),
+}
+"""Script -> arguments of its smallest size."""
+RUN_ELSEWHERE = {
+    'benchmarks/bench_calibrate.py': 'benchmarks/run.py',
+    'benchmarks/bench_compensator.py': 'benchmarks/run.py',
+    'benchmarks/bench_decode.py': 'benchmarks/run.py',
+    'benchmarks/bench_plan.py': 'benchmarks/run.py',
+    'benchmarks/bench_verbs.py': 'benchmarks/run.py',
+    'benchmarks/relay_ends.py': 'benchmarks/bench_compensator.py starts it',
+    'examples/answers.py': 'test/cli/test_answers.py runs every command of every page',
+    'examples/coverage_picture.py': 'test/calibration/test_coverage.py draws the picture',
+    'examples/demo.py': 'make demo-check',
+    'examples/downstream_nav.py': 'test/papers/test_reproduce_examples.py',
+    'examples/live_demo.py': 'test/nodes/test_live_demo.py',
+    'examples/notebook.py': 'test/use_cases/test_front_door.py runs its cells',
+    'examples/reproduce_avrutov2017.py': 'test/papers/test_reproduce_examples.py',
+    'examples/reproduce_zhang2017.py': 'test/papers/test_reproduce_examples.py',
+    'tools/demo_figures.py': 'make demo-check',
+    'tools/parameter_files.py': 'test/nodes/test_node_parameters.py runs its main function',
+    'tools/plain.py': 'make lint-words',
+    'tools/weigh.py': 'make lint-size',
+    'validation/decisions.py': 'a section of validation/run.py',
+    'validation/run.py': 'the sections below',
+}
+"""Script -> command, script or test of `.ci/run` that runs it; not run a second time here."""
+
+
+def is_script(path):
+    """Return whether a file does more than change the path of imports when it is started."""
+    text = path.read_text()
+    _, guard, body = text.rpartition("\nif __name__ == '__main__':\n")
+    starts = bool(guard) and not body.lstrip().startswith('sys.path')
+    return starts or text.startswith('# %%')
+
+
+def test_every_script_is_listed():
+    scripts = set()
+    for folder in FOLDERS:
+        for path in (ROOT / folder).glob('*.py'):
+            if is_script(path):
+                scripts.add(str(path.relative_to(ROOT)))
+    assert scripts == RUN.keys() | RUN_ELSEWHERE.keys()
+    assert not RUN.keys() & RUN_ELSEWHERE.keys()
+
+
+@pytest.fixture(scope='module')
+def tree(tmp_path_factory):
+    """Return a copy of the folders and pages that the scripts read and write."""
+    folder = tmp_path_factory.mktemp('scripts') / 'tree'
+    ignored = shutil.ignore_patterns('.*', '__pycache__', 'out', 'site', 'build', 'demo')
+    shutil.copytree(ROOT, folder, ignore=ignored)
+    return folder
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('script', RUN)
+def test_a_script_runs(tree, script):
+    if script == 'benchmarks/run.py':
+        pytest.importorskip('rclpy')
+    environment = os.environ | {'PYTHONPATH': f'{tree}{os.pathsep}{tree / "test"}'}
+    environment |= {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MPLBACKEND': 'agg'}
+    done = subprocess.run(
+        [sys.executable, '-m', script.removesuffix('.py').replace('/', '.'), *RUN[script]],
+        cwd=tree,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert 'Traceback' not in done.stdout + done.stderr, done.stdout + done.stderr
+
+
+@pytest.mark.long
+@pytest.mark.real_data
+@pytest.mark.usefixtures('few_candidates')
+@pytest.mark.filterwarnings('default')  # figures of one recording have no spread
+@pytest.mark.parametrize('section', run.SECTIONS)
+def test_a_section_of_the_validation_runs(section, recordings, tmp_path, monkeypatch, capsys):
+    """At its smallest size, and without candidates in the search for effects."""
+    monkeypatch.setenv(VARIABLE, str(recordings))
+    code = run.main(['--smallest', '--only', section, '--output', str(tmp_path)])
+    shown = capsys.readouterr()
+    assert code == 0 and 'Traceback' not in shown.err, shown.out + shown.err
+    for line in shown.out.splitlines():
+        if line.startswith('Skipped: '):
+            pytest.skip(f'{section}: {line}')
