@@ -51,6 +51,7 @@ RUN_ELSEWHERE = {
     'tools/demo_figures.py': 'make demo-check',
     'tools/parameter_files.py': 'test/nodes/test_node_parameters.py runs its main function',
     'tools/plain.py': 'make lint-words',
+    'tools/quoted_names.py': 'make lint-words',
     'tools/weigh.py': 'make lint-size',
     'validation/decisions.py': 'a section of validation/run.py',
     'validation/run.py': 'the sections below',
