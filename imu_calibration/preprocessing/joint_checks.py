@@ -14,8 +14,10 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import nearest_rotation, rpy_from_rotation
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse, span_words
+from imu_calibration.preprocessing.joint_geometry import description_error
 from imu_calibration.preprocessing.on_table import (
     TESTED_RATE,
+    a_period_late,
     exchanged,
     find_exchange,
     match_axes,
@@ -52,8 +54,10 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
     Return the part that is frozen for a second or more while the remaining parts turn, or None.
 
     A joint is frozen when its state is constant while the gyroscope measures a rate about its axis
-    that the other joints do not explain. A gyroscope with steps coarser than its noise may repeat a
-    reading while the reference rate stays within one step.
+    that the other joints do not explain; a delay between the clocks or a wrong zero or axis in the
+    table description that explains the rates of all windows is reported instead. A gyroscope with
+    steps coarser than its noise may repeat a reading while the reference rate stays within one
+    step.
 
     Parameters
     ----------
@@ -100,7 +104,8 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
             for span in _frozen(window, table, rate + bias, joint=k)
         )
         if spans:
-            return CheckFinding(
+            other_cause = a_period_late(windows, table) or description_error(windows, table)
+            return other_cause or CheckFinding(
                 'frozen',
                 REFUSE,
                 f'joint states must follow the table, {name} is constant {span_words(spans)} while'

@@ -289,7 +289,7 @@ MIN_RATE_GAIN = 0.05
 """
 Smallest gain of the measured rates with respect to the rates of the table for an IMU on the table.
 """
-LARGEST_SHIFT = 5.0
+LARGEST_SHIFT = 60.0
 """Largest delay between the streams that is tested, s."""
 LEAST_SHIFT = 0.05
 """Smaller delays are estimated as a lag, s."""
@@ -324,7 +324,7 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
         explained >= SAME and gain > 0.1 * MIN_RATE_GAIN
     ):  # other checks report units, signs and axes
         return (
-            _a_period_late(windows, table)
+            a_period_late(windows, table)
             if table is not None and explained < 1.0 - SHARE_TIE
             else None
         )
@@ -388,27 +388,28 @@ def _cause(windows, table):
     return _late(shift.seconds) if late else ''
 
 
-def _a_period_late(windows, table):
+def a_period_late(windows: Sequence[Window], table: Table) -> CheckFinding | None:
     """
-    Return the finding for streams shifted by a period, or None.
+    Return the finding for streams that agree clearly better with a delay, or None.
 
-    The streams are of a repeating motion and agree clearly better a period earlier or later.
+    Beyond the range of a lag: clocks that differ, or streams of a repeating motion that are a
+    period apart.
     """
     shift, share, unshifted, ambiguous = _best_shift(windows, table)
     # opposite rates: a wrong sign, or half a period
     if (
         ambiguous
         or abs(shift) <= LEAST_SHIFT
-        or unshifted < 0
+        or unshifted < -SAME
         or share < max(LEAST_SHARE_EXPLAINED, unshifted + SHARE_TIE)
     ):
         return None
     return CheckFinding(
         'on_table',
         REFUSE,
-        f'both streams must share one clock, the joints explain {100 * unshifted:.0f} % of the'
-        f' rates with a delay up to {LEAST_SHIFT} s and {100 * share:.0f} % with a larger one:'
-        f' {_late(shift)}',
+        'both streams must share one clock, the joints explain'
+        f' {100 * max(unshifted, 0.0):.0f} % of the rates with a delay up to {LEAST_SHIFT} s and'
+        f' {100 * share:.0f} % with a larger one: {_late(shift)}',
     )
 
 
@@ -468,7 +469,7 @@ def signs_or_delay(windows: list[Window], table: Table) -> Delay | None:
     return Delay(_late(shift), share > -unshifted + SHARE_TIE)
 
 
-def _best_shift(windows, table):
+def _best_shift(windows: Sequence[Window], table: Table) -> _Shift:
     """
     Return the `_Shift` that explains the rates best; of equally good ones, the smallest.
 

@@ -15,7 +15,7 @@ from imu_calibration.calibration.hand_workflow import (
     hand_result,
     read_by_hand,
 )
-from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.table_errors import calibrate_with_table_errors
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
@@ -205,14 +205,17 @@ def _look(bag, topics, table, *, options, exclude):
         recording.close()
     preflight, calibrated = Preflight(table and table.gravity_value, strict=table is not None), None
     by_hand = None
+    error_findings: tuple[CheckFinding, ...] = ()
     if table is not None:
         try:
-            calibrated = calibrate_on_table(
+            table_errors = calibrate_with_table_errors(
                 sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude),
                 table,
                 options,
                 mapper=_watched_by(preflight),
             )
+            calibrated = table_errors.result
+            error_findings = table_errors.findings
         except ImuCalibrationError as error:
             calibrated = error
     if not preflight.streams:  # not read to its end: no data to calibrate from
@@ -220,7 +223,7 @@ def _look(bag, topics, table, *, options, exclude):
         source = source_of(bag, topics, want_joints='optional', want_temperature='optional')
         (source,) = sources_without([source], [bag], exclude)
         by_hand = _by_hand(source, options, preflight)
-    findings = (*preflight.findings, *_axes_question(bag, options))
+    findings = (*preflight.findings, *error_findings, *_axes_question(bag, options))
     look = RecordingSummary(
         recording, preflight.streams, findings, preflight.lost, calibrated, by_hand
     )

@@ -1,0 +1,110 @@
+"""Delay of the clocks and zeros of the encoders, fitted where a residual is not noise."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.solution import Status
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.references.options import CalibrationOptions
+
+SIGNIFICANT = 5.0
+"""An error of table or clock is reported from this many standard deviations on."""
+
+
+@dataclass(frozen=True, eq=False)
+class TableErrors:
+    """A calibration on a table with the errors of clocks and zeros that its recording shows."""
+
+    result: TableResult
+    """The calibration; with these errors in its model where they are significant."""
+    findings: tuple[CheckFinding, ...]
+    """The errors with their values, or a residual that is not noise."""
+
+
+def calibrate_with_table_errors(
+    sources: Sequence[Callable], table: Table, options: CalibrationOptions, *, mapper: Callable
+) -> TableErrors:
+    """
+    Return the calibration without a search for effects, but for a delay and zeros of encoders.
+
+    Both are common, and each makes many parameters weak that more motions do not improve. They are
+    added where the residual of the requested model is not noise, and kept if significant.
+
+    Parameters
+    ----------
+    sources, table, options, mapper
+        As for `calibrate_on_table`.
+
+    """
+    result = calibrate_on_table(sources, table, options, mapper=mapper)
+    if options.as_asked or not _unlike_noise(result):
+        return TableErrors(result, ())
+    added = [('reference', 'time_offset')]
+    if table.joint_names.zeros:
+        added.append(('reference', 'encoder_zero'))
+    extended = calibrate_on_table(
+        sources, table, replace(options, added=(*options.added, *added)), mapper=mapper
+    )
+    findings = _table_error_findings(extended)
+    if findings:
+        result = extended
+    if _unlike_noise(result):
+        findings.append(
+            CheckFinding(
+                'residual',
+                WARNING,
+                'the residual must be noise, parts of the recording differ by more: a cause is not'
+                ' in the model, and more motions do not help; diagnose the recording',
+            )
+        )
+    return TableErrors(result, tuple(findings))
+
+
+def _unlike_noise(result: TableResult) -> bool:
+    """Return whether moving windows scatter clearly more than the noise at rest."""
+    for sensor in SENSORS:
+        for ratio in misfit_ratios(result.calibration, sensor).values():
+            if ratio > NOTED_MISFIT:
+                return True
+    return False
+
+
+def _table_error_findings(result: TableResult) -> list[CheckFinding]:
+    """Return a finding for a significant delay and for each zero that is significantly off."""
+    calibration = result.calibration
+    significant = np.abs(calibration.values) > SIGNIFICANT * calibration.sd
+    findings = []
+    for index, name in enumerate(calibration.param_names):
+        value, sd = calibration.values[index], calibration.sd[index]
+        if not significant[index] or calibration.status[index] is Status.HELD:
+            continue
+        if name == 'reference.time_offset.offset':
+            side = 'behind' if value > 0 else 'ahead of'
+            findings.append(
+                CheckFinding(
+                    'time_offset',
+                    WARNING,
+                    f'both streams must share one clock, the stamps of the IMU are'
+                    f' {1e3 * abs(value):.3g} +- {1e3 * sd:.2g} ms {side} those of the joints; set'
+                    ' both clocks by one source, or let calibrate estimate the delay',
+                )
+            )
+        if name.startswith('reference.encoder_zero.'):
+            joint = name.rpartition('.')[2]
+            findings.append(
+                CheckFinding(
+                    'encoder_zero',
+                    WARNING,
+                    f'zeros of the joints must be those of the table description, {joint} reads'
+                    f' {np.degrees(-value):.3g} +- {np.degrees(sd):.2g} deg too much; correct the'
+                    ' zero in its driver, or let calibrate estimate it',
+                )
+            )
+    return findings

@@ -1,0 +1,102 @@
+"""`inspect` on a table fits a delay and zeros of encoders, or reports a residual unlike noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import DETERMINED
+from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.simulation.profiles import make_profile
+from imu_calibration.simulation.session import (
+    SimulationOptions,
+    random_values,
+    simulate_session,
+)
+from imu_calibration.use_cases.inspect import inspect_recording
+from imu_calibration.use_cases.recordings import Topics
+
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'outer', 'axis': [0, 0, 1]},
+            {'name': 'middle', 'axis': [1, 0, 0]},
+            {'name': 'inner', 'axis': [0, 1, 0]},
+        ],
+        'gravity': 9.81,
+    }
+)
+
+
+@pytest.fixture(scope='module')
+def session():
+    """Return two minutes on the table."""
+    model = SensorModel(joint_names=TABLE.joint_names)
+    return SampleBlock(
+        *simulate_session(
+            model,
+            random_values(model, seed=4),
+            TABLE,
+            profile=make_profile('quick', 3, TABLE),
+            options=SimulationOptions(50.0, 50.0),
+            seed=9,
+        )
+    )
+
+
+def inspected(block, options=CalibrationOptions()):
+    """Return the summary of a recording on the table."""
+    (summary,) = inspect_recording(block, [Topics()], TABLE, options=options)
+    return summary
+
+
+def named(summary):
+    """Return check -> text of the findings about the table and the residual."""
+    checks = ('time_offset', 'encoder_zero', 'residual')
+    return {each.check: each.text for each in summary.findings if each.check in checks}
+
+
+def fitted(summary):
+    """Return the values of the calibration by name."""
+    calibration = summary.calibrated.calibration
+    return dict(zip(calibration.param_names, calibration.values, strict=True))
+
+
+def test_a_session_without_errors_has_no_finding(session):
+    summary = inspected(session)
+    assert named(summary) == {}
+    assert not any('time_offset' in name for name in fitted(summary))
+
+
+@pytest.mark.parametrize('delay', [0.006, -0.011])
+def test_a_delay_is_fitted_and_named_with_its_value(session, delay):
+    stamps = session.imu.stamp_ns + round(1e9 * delay)
+    summary = inspected(replace(session, imu=replace(session.imu, stamp_ns=stamps)))
+    assert list(named(summary)) == ['time_offset']
+    assert f' {1e3 * abs(delay):.0f} +- ' in named(summary)['time_offset'].replace('.0 +-', ' +-')
+    assert abs(fitted(summary)['reference.time_offset.offset'] - delay) < 1e-4
+    status = summary.calibrated.calibration.status_by_name
+    assert [name for name in status if 'matrix' in name and status[name] is not DETERMINED] == []
+
+
+def test_a_zero_is_fitted_and_named_with_its_value(session):
+    position = session.joints.position + np.radians([0.0, 0.7, 0.0])
+    summary = inspected(replace(session, joints=replace(session.joints, position=position)))
+    assert list(named(summary)) == ['encoder_zero']
+    value = fitted(summary)['reference.encoder_zero.middle']
+    assert abs(np.degrees(value) + 0.7) < 5e-3  # 0.5 % of it, several standard deviations
+
+
+def test_another_cause_is_a_residual_that_is_not_noise(session):
+    """The gyroscope reads 3 deg/s more about x above 20 deg/s about z."""
+    rate = session.imu.rate_s.copy()
+    rate[:, 0] += np.radians(3.0) * (np.abs(rate[:, 2]) > np.radians(20.0))
+    summary = inspected(replace(session, imu=replace(session.imu, rate_s=rate)))
+    assert 'residual' in named(summary)
+    plain = inspected(
+        replace(session, imu=replace(session.imu, rate_s=rate)), CalibrationOptions(as_asked=True)
+    )
+    assert named(plain) == {}

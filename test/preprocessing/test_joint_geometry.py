@@ -1,0 +1,93 @@
+"""Wrong zeros, axes and clocks of a table are named; a joint that is frozen is still frozen."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from imu_calibration.kinematics.chain import reference_motion
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.joint_checks import standing_still
+from imu_calibration.preprocessing.joint_geometry import description_error, with_axis
+from imu_calibration.preprocessing.window import Window
+
+PERIOD, SECONDS = 0.02, 240.0
+TABLE = Table.from_mapping(
+    {
+        'joints': [
+            {'name': 'a', 'axis': [0, 0, 1]},
+            {'name': 'b', 'axis': [1, 0, 0]},
+            {'name': 'c', 'axis': [0, 1, 0]},
+        ],
+        'gravity': 9.81,
+    }
+)
+
+
+def motion_of_steps(seed):
+    """Return joints that turn one or two at a time, with smooth random rates."""
+    rng, time = np.random.default_rng(seed), np.arange(0, SECONDS, PERIOD)
+    rate = np.zeros((len(time), 3))
+    for start in range(0, int(SECONDS), 6):
+        inside = (time >= start) & (time < start + 6)
+        shape = np.sin(np.pi * (time[inside] - start) / 6) ** 2
+        for joint in rng.choice(3, rng.integers(1, 3), replace=False):
+            rate[inside, joint] = rng.uniform(-1.2, 1.2) * shape
+    acceleration = np.gradient(rate, PERIOD, axis=0)
+    return JointMotion(
+        time, PERIOD * np.cumsum(rate, axis=0), rate, acceleration, np.zeros_like(rate)
+    )
+
+
+def window_of(true_table, motion, stated_motion, seed=3):
+    """Return a window: readings of an IMU on the true table, and the joints as stated."""
+    rng = np.random.default_rng([seed, 1])
+    reference = reference_motion(true_table, motion)
+    matrix = np.eye(3) + rng.normal(0, 0.01, (3, 3))
+    rate = reference.rate_s @ matrix.T + 0.004 + rng.normal(0, 5e-4, (len(motion), 3))
+    force = reference.force_s @ matrix.T + 0.1 + rng.normal(0, 0.01, (len(motion), 3))
+    stamps = (1e9 * stated_motion.time).astype(np.int64)
+    return Window('dynamic', stamps, stated_motion.time, force, rate, stated_motion)
+
+
+@pytest.mark.parametrize('degrees', [10.0, -17.0, 32.0])
+def test_a_zero_that_is_off_is_named_with_its_value(degrees):
+    motion = motion_of_steps(11)
+    position = motion.position + np.radians([0.0, degrees, 0.0])
+    finding = standing_still([window_of(TABLE, motion, replace(motion, position=position))], TABLE)
+    assert finding.check == 'on_table' and finding.key == 'table'
+    shown = float(re.search(r'b reads (-?[\d.]+) deg', finding.text)[1])
+    assert abs(shown - degrees) < 0.1  # the noise of 0.03 deg/s leaves less than 0.01 deg
+
+
+@pytest.mark.parametrize('joint', [0, 1, 2])
+def test_a_wrong_axis_is_named(joint):
+    motion = motion_of_steps(12)
+    stated = with_axis(TABLE, joint, np.roll(TABLE.joints[joint].axis, 1))
+    finding = description_error([window_of(TABLE, motion, motion)], stated)
+    axis = ', '.join(f'{value:.0f}' for value in TABLE.joints[joint].axis)
+    assert finding.check == 'on_table'
+    assert f'{TABLE.joint_names[joint]} is [{axis}]' in finding.text
+
+
+def test_a_clock_that_is_off_by_many_seconds_is_named_with_its_value():
+    motion = motion_of_steps(13)
+    n_late = round(41.0 / PERIOD)
+    measured = motion.select(slice(0, len(motion) - n_late))
+    stated = motion.select(slice(n_late, None))
+    finding = standing_still([window_of(TABLE, measured, stated)], TABLE)
+    assert finding.check == 'on_table' and '41.0 s' in finding.text
+
+
+def test_a_joint_that_is_frozen_for_a_time_is_no_error_of_the_description():
+    motion = motion_of_steps(14)
+    start = int(np.argmax(np.abs(motion.rate[:, 1]) > 0.1))
+    part = slice(start, start + 200)
+    position, rate = motion.position.copy(), motion.rate.copy()
+    position[part, 1] = position[start, 1]
+    rate[part, 1] = 0.0
+    stated = replace(motion, position=position, rate=rate)
+    assert description_error([window_of(TABLE, motion, stated)], TABLE) is None
+    assert description_error([window_of(TABLE, motion, motion)], TABLE) is None
