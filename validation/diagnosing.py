@@ -111,9 +111,11 @@ def run(folder, plots):
             + ', '.join(stories)
             + '.'
         )
-    _xsens(section, documents['xsens_counts', None])
+    if ('xsens_counts', None) in documents:
+        _xsens(section, documents['xsens_counts', None])
     for name in SHAFT:
-        _shaft(section, name, documents[name, '/imu/data_raw'])
+        if (name, '/imu/data_raw') in documents:
+            _shaft(section, name, documents[name, '/imu/data_raw'])
     section.table(
         (
             'recording',
