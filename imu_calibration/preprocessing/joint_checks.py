@@ -344,11 +344,10 @@ def _cause(match, matrix, seen, table):
         )
     fits = ''
     if table is not None and np.trace(seen) > 2.5:
-        fits = (
-            ', ['
-            + ', '.join(f'{angle:z.0f}' for angle in _mount_rpy_deg(matrix, table))
-            + '] would fit'
-        )
+        # Rounded, then plus zero: no -0.
+        angles_deg = np.round(_mount_rpy_deg(matrix, table)) + 0.0
+        listed = ', '.join(f'{angle:.0f}' for angle in angles_deg)
+        fits = f', [{listed}] would fit'
     return f'the sensor is turned against the table; correct mount.rpy_deg in the table{fits}'
 
 

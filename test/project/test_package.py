@@ -278,6 +278,18 @@ def test_one_oldest_python_is_declared_linted_and_stated(installed):
     assert versions[0] == f'{major}.{minor}'
 
 
+def test_no_format_needs_a_later_python_than_the_oldest():
+    """Neither ruff nor mypy knows that the sign option z came with Python 3.11."""
+    found = []
+    for package in ('imu_calibration', 'msg_adapters', 'launch'):
+        for path in (ROOT / package).rglob('*.py'):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.FormattedValue) and node.format_spec is not None:
+                    if re.match(r"f'.?[-+ ]?z", ast.unparse(node.format_spec)):
+                        found.append(f'{path.name}:{node.lineno}')
+    assert found == []
+
+
 def test_the_readme_has_the_equation():
     text = (ROOT / 'README.md').read_text()
     assert 'measured = bias + matrix @ (true + lever-arm terms) + further effects' in text
