@@ -76,7 +76,7 @@ explains the terms.
 ================  ==================================================================================
 """
 
-# The name that type checkers take for true; ``typing`` would take most of the time of this import
+# The name that type checkers regard as true; ``typing`` would need most of the time of this import
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from imu_calibration.use_cases.notebook import (

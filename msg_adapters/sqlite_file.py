@@ -268,7 +268,7 @@ class SqliteFile(StorageFile):
 
     def _limit_length(self, n_bytes):
         """Limit the bytes of one result of SQLite; return the limit before."""
-        if sys.version_info >= (3, 11):  # CAN_LIMIT, in the form that type checkers know
+        if sys.version_info >= (3, 11):  # CAN_LIMIT, in the form of type checkers
             return self.connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, n_bytes)
         return n_bytes
 

@@ -241,7 +241,7 @@ def _compared(first, second, common, notes, *, angle=0.0):
         for name, i, j, s, h, d in zip(common, a, b, sd, held, difference)
     )
     groups = _groups(common, difference, covariance, held) if len(parts) == 2 else []
-    # Table and clock are judged apart: they are no property of the IMU.
+    # Table and clock are judged separately: they are no property of the IMU.
     keys_of_reference = set()
     for effect in first.model.effects:
         if effect.section == 'reference':

@@ -171,7 +171,7 @@ def read_noise(path: str | os.PathLike) -> 'NoiseFigures':
     """Return the noise in a file that the verb `noise` wrote; an error names the file."""
     from imu_calibration.allan.document import (
         noise_from_text,
-    )  # here, because its import takes 1 MB of the compensator node
+    )  # here, because its import needs 1 MB of the compensator node
 
     try:
         return noise_from_text(read_text(path, 'noise document'))

@@ -25,7 +25,7 @@ from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.rotations import Reference
 
-if TYPE_CHECKING:  # the import takes 1 MB of the compensator node
+if TYPE_CHECKING:  # the import needs 1 MB of the compensator node
     from imu_calibration.allan.figures import NoiseFigures
 
 END, MEAN = 'end of the recording', 'mean of the recording'

@@ -194,7 +194,7 @@ def up_at(table: Table, position: np.ndarray) -> np.ndarray:
 
 def candidates(limits: MotionLimits) -> np.ndarray:
     """Return positions to choose from, the first that nearest to zero, shape (n, n_joints)."""
-    from scipy.stats import qmc  # here, because it takes long to import
+    from scipy.stats import qmc  # here, because its import is slow
 
     lower, upper = reachable(limits)
     home = np.clip(np.zeros(len(limits)), lower, upper)

@@ -234,7 +234,7 @@ class Cells:
         self._period, self._size = period, max(1, min(int(_GRID / period), n))
         self.edges = np.append(
             np.arange(0, n - self._size + 1, self._size), n
-        )  # the last cell takes the remainder
+        )  # the last cell has the remainder
         self.least = np.array([least_variance(values) for values in (force_s, rate_s)])
         """Of force and rate."""
         self._sums = []

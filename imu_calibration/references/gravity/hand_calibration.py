@@ -363,7 +363,7 @@ def _solved(data, options, point, *, untested=()):
     for effect in model.extras:
         if effect.time_constant and effect.name not in (
             point or {}
-        ):  # a time constant far from the prior does not converge from there
+        ):  # a time constant distant from the prior does not converge from there
             trials = [
                 replace(model, model=each)
                 for each in at_time_constants(model.model, effect, float(poses.time[-1]))
