@@ -45,9 +45,24 @@ class Errors:
     """Sum of squared errors without an estimate of the delay."""
 
 
-def prove_solution(
-    held_out: HeldOut, solution: Solution, gathered_model: SensorModel, *, centre: Centre
-) -> dict:
+def applied_folds(held_out: HeldOut, solution: Solution, *, centre: Centre) -> list[np.ndarray]:
+    """
+    Return the parameters of a solution without each fold, as compensation applies them.
+
+    Parameters
+    ----------
+    held_out : HeldOut
+        The windows of the solution in folds, with the columns of its model.
+    solution : Solution
+    centre : mapping
+        Operating point at which effects that compensation cannot undo are applied.
+
+    """
+    folds = held_out.values_without(solution)
+    return [applied_values(solution.model, values, centre) for values in folds]
+
+
+def prove_solution(held_out: HeldOut, solution: Solution, folds: Sequence[np.ndarray]) -> dict:
     """
     Return the proof of a solution on held-out windows: sensor -> entry of a document (see `prove`).
 
@@ -59,24 +74,21 @@ def prove_solution(
     Parameters
     ----------
     held_out : HeldOut
-        The windows of the solution in folds.
+        The windows of the solution in folds, with the columns of its model.
     solution : Solution
-    gathered_model : SensorModel
-        The model of the gathered columns.
-    centre : mapping
-        Operating point at which effects that compensation cannot undo are applied.
+    folds : sequence of ndarray, shape (n_params,)
+        Parameters without each fold (`applied_folds`).
 
     """
-    dealt, model = held_out.restricted(gathered_model, solution.model), solution.model
+    model = solution.model
     nominal = nominal_values(model)
-    folds = [applied_values(model, values, centre) for values in dealt.values_without(solution)]
     described = [with_reference(model, values, nominal) for values in folds]
     proof = prove(
         model,
-        before=(dealt, ([nominal], [with_reference(model, nominal, solution.values)])),
-        after=(dealt, (folds, described)),
+        before=(held_out, ([nominal], [with_reference(model, nominal, solution.values)])),
+        after=(held_out, (folds, described)),
     )
-    if proof and one_attitude([block.accumulator for block in dealt.blocks], model):
+    if proof and one_attitude([block.accumulator for block in held_out.blocks], model):
         proof['accelerometer']['one_attitude'] = True
     return proof
 
@@ -112,16 +124,17 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
         compared with the table as it was estimated or as it was described.
 
     """
-    blocks = before[0].blocks
-    regimes = [name for name in Regime if any(name in block.counts for block in blocks)]
-    counts = np.array([[block.counts.get(name, 0) for name in regimes] for block in blocks])
-    if (counts.sum(axis=1) > 0).sum() < MIN_REGIME_BLOCKS:
+    regimes, counts = judged_regimes(before[0])
+    if not regimes:
         return {}
     proof = {}
     for sensor in SENSORS:
         was, now = (
             min(
-                (_errors(dealt, model, sensor, each, regimes) for each in candidates),
+                (
+                    errors_of(dealt, model, sensor, folds=each, regimes=regimes)
+                    for each in candidates
+                ),
                 key=lambda errors: errors.squares.sum(),
             )
             for dealt, candidates in (before, after)
@@ -145,6 +158,20 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
     return proof
 
 
+def judged_regimes(held_out: HeldOut) -> tuple[list[Regime], np.ndarray]:
+    """
+    Return (regimes with pieces, their numbers in each block); no regime with too few blocks.
+
+    The numbers have the shape (n_blocks, n_regimes).
+    """
+    blocks = held_out.blocks
+    regimes = [name for name in Regime if any(name in block.counts for block in blocks)]
+    counts = np.array([[block.counts.get(name, 0) for name in regimes] for block in blocks])
+    if (counts.sum(axis=1) > 0).sum() < MIN_REGIME_BLOCKS:
+        return [], counts
+    return regimes, counts
+
+
 def nominal_values(model: SensorModel) -> np.ndarray:
     """Return the parameters of a sensor as its data sheet has it on a table as described."""
     values = model.prior()[0]
@@ -163,7 +190,9 @@ def reference_model(calibration: Calibration, table: Table) -> SensorModel:
             effect.name
             for effect in known.effects
             if effect.sensor == sensor
-            and (effect.role in (Role.OFFSET, Role.LINEAR) or same_joints and _of_reference(effect))
+            and (
+                effect.role in (Role.OFFSET, Role.LINEAR) or same_joints and is_of_reference(effect)
+            )
         )
         for sensor in SENSORS
     }
@@ -192,7 +221,7 @@ def reference_values(model: SensorModel, calibration: Calibration) -> np.ndarray
     """
     values = nominal_values(model)
     for effect in calibration.model.effects:
-        if effect.key in model.slices and _of_reference(effect):
+        if effect.key in model.slices and is_of_reference(effect):
             values[model.slices[effect.key]] = calibration.values[
                 calibration.model.slices[effect.key]
             ]
@@ -205,16 +234,24 @@ def with_reference(model: SensorModel, values: np.ndarray, reference: np.ndarray
     """
     values = values.copy()
     for effect in model.effects:
-        if _of_reference(effect):
+        if is_of_reference(effect):
             values[model.slices[effect.key]] = reference[model.slices[effect.key]]
     return values
 
 
-def _of_reference(effect: Effect) -> bool:
+def is_of_reference(effect: Effect) -> bool:
+    """Return whether an effect is of the table or the clock: compensation does not correct it."""
     return effect.in_reference or effect.sensor == 'reference' or effect.warp is not None
 
 
-def _errors(held_out, model, sensor, folds, regimes):
+def errors_of(
+    held_out: HeldOut,
+    model: SensorModel,
+    sensor: str,
+    *,
+    folds: Sequence[np.ndarray],
+    regimes: Sequence[Regime],
+) -> Errors:
     """
     Return the Errors of parameters (one set for each fold in turn).
 

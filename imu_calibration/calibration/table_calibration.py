@@ -18,7 +18,14 @@ from imu_calibration.calibration.from_solution import (
     with_gravity_uncertainty,
 )
 from imu_calibration.calibration.latitude_check import with_latitude_findings
+from imu_calibration.calibration.plain_fit import (
+    better_plain_fits,
+    changes_with,
+    plain_entries,
+    with_plain_fits,
+)
 from imu_calibration.calibration.proof import (
+    applied_folds,
     prove_readings,
     prove_solution,
     reference_model,
@@ -276,18 +283,29 @@ def conclude(
     uncorrected = uncorrected_on_table(
         solution.model.at(solution.values), solution.values, gathered.accumulator, gathered=model
     )
-    proof = prove_solution(gathered.held_out, solution, model, centre=uncorrected.centre)
+    held_out = gathered.held_out.restricted(model, solution.model)
+    folds = applied_folds(held_out, solution, centre=uncorrected.centre)
+    plain = better_plain_fits(held_out, solution, folds, unexplained=changes.unexplained)
+    applied = with_plain_fits(solution, plain)
+    for fit in plain:
+        folds = fit.merged(folds)
+    if plain:
+        # Of the effects that a plain fit replaces nothing remains uncorrected.
+        uncorrected = uncorrected_on_table(
+            applied.model.at(applied.values), applied.values, gathered.accumulator, gathered=model
+        )
+    proof = prove_solution(held_out, applied, folds)
     calibration = document(
-        solution,
+        applied,
         tolerances,
         gathered,
         gravity=table.gravity_value,
         gauge=gauge_of(solution.model),
         undetermined=weak_on_table(solution, tolerances, needed),
-        statistics=statistics(solution, gathered),
+        statistics=statistics(solution, gathered) | plain_entries(plain),
         provenance=provenance,
         proof=proof,
-        changes=changes,
+        changes=changes_with(changes, plain),
         uncorrected=uncorrected,
         readings=options.nominal,
     )

@@ -187,6 +187,27 @@ def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
     )
 
 
+def _least_squares(calibration):
+    """Return a note for each sensor with values by plain least squares."""
+    reasons = []
+    for sensor, entry in (calibration.statistics.get('least_squares') or {}).items():
+        error, of_model = (
+            error_text(entry[name], UNITS[sensor]) for name in ('error', 'error_of_model')
+        )
+        reasons.append(
+            Reason(
+                NOTE,
+                f'{sensor}: bias and matrix are those of plain least squares without other effects,'
+                f' because the residual is unexplained (held-out error {error}, {of_model} with the'
+                ' model)',
+                'find the cause',
+                key='diagnose',
+                sensors=(sensor,),
+            )
+        )
+    return reasons
+
+
 def _jitter(calibration):
     """Return a note on independent errors of the stamps."""
     found = calibration.statistics.get('stamp_jitter')
@@ -399,6 +420,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     reasons += (
         _adopted(calibration)
         + _unexplained(calibration)
+        + _least_squares(calibration)
         + _jitter(calibration)
         + unsteady(calibration, tolerances)
     )

@@ -1,6 +1,6 @@
 """Diagnosis as plain functions, on a table and by hand, and its result as lines of text."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -25,11 +25,13 @@ from imu_calibration.calibration.diagnosis.findings import (
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
+from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.decision import HARM
 from imu_calibration.document.verdict import motion_misfits, unsteady
-from imu_calibration.effects.base import SENSORS, UNITS, Role
+from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
 from imu_calibration.estimation.window_statistics import reduce_window
@@ -83,7 +85,12 @@ class DiagnosisResult:
     The calibration with the formulas proposed for the unexplained residual; None without a formula.
     """
     transferable: Calibration | None = None
-    """As `proposed`, with only those formulas that compensation undoes; None without such one."""
+    """
+    As `proposed`, with only those formulas that compensation undoes and that lower the error on
+    held-out windows; None without such one.
+    """
+    unhelpful: tuple[str, ...] = ()
+    """Formulas that compensation undoes, but that do not lower that error."""
 
     @property
     def document(self) -> dict[str, Any]:
@@ -110,7 +117,7 @@ class DiagnosisResult:
 
     @property
     def session_terms(self) -> list[str]:
-        """Proposed formulas that apply to this session only, a line each."""
+        """Proposed formulas that are not in extended.yaml, a line each."""
         lines = []
         for effect in _proposed_effects(self.diagnosis):
             if not _is_transferable(effect):
@@ -119,6 +126,11 @@ class DiagnosisResult:
                     ' compensation of other recordings cannot undo it, it is left out of'
                     ' extended.yaml'
                 )
+        for formula in self.unhelpful:
+            lines.append(
+                f'{formula} does not lower the error on held-out windows in every regime: it is'
+                ' left out of extended.yaml'
+            )
         return lines
 
     @property
@@ -230,6 +242,10 @@ def diagnose_recording(
     transferable_effects = [effect for effect in effects if _is_transferable(effect)]
     if len(transferable_effects) < len(effects):
         transferable = calibrate_with(effects=transferable_effects)
+    helpful = helpful_formulas(transferable_effects, transferable, result.calibration)
+    if len(helpful) < len(transferable_effects):
+        transferable = calibrate_with(effects=helpful)
+    unhelpful = [effect for effect in transferable_effects if effect not in helpful]
     traces = residual_traces(
         reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution
     )
@@ -243,7 +259,45 @@ def diagnose_recording(
         baseline_options(options),
         proposed,
         transferable,
+        tuple(effect.groups[0].text[0] for effect in unhelpful),
     )
+
+
+def helpful_formulas(
+    effects: Sequence[Effect], extended: Calibration | None, calibration: Calibration
+) -> list[Effect]:
+    """
+    Return the formulas with which the error of their sensor on held-out windows is smaller.
+
+    It has to be clearly smaller in total, and not larger in a regime of motion.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        Formulas of the extended model.
+    extended, calibration : Calibration
+        With the formulas, and without them; None without formulas.
+
+    """
+    helpful: list[Effect] = []
+    if extended is None:
+        return helpful
+    for effect in effects:
+        before = calibration.proof.get(effect.sensor)
+        after = extended.proof.get(effect.sensor)
+        if before is None or after is None:
+            continue
+        if after['after'] > CLEARLY_BETTER * before['after']:
+            continue
+        known = before['regimes']
+        grown = [
+            name
+            for name, entry in after['regimes'].items()
+            if name in known and entry['after'] > HARM * known[name]['after']
+        ]
+        if not grown:
+            helpful.append(effect)
+    return helpful
 
 
 def _is_transferable(effect):

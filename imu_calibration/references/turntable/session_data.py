@@ -144,21 +144,21 @@ class HeldOutBlock:
     counts: dict[str, int] = field(default_factory=dict)
     """Regime -> number of pieces."""
     judged: int = 0
-    """Windows with kept pieces."""
+    """Windows with pieces for judging."""
+    earlier: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    """As `pieces`, of the windows that are not judged."""
 
     def add(self, window: WindowStatistics, judged: bool = True) -> None:
         """Add a window, and its pieces if it is judged."""
         self.accumulator.add(window)
+        pieces = self.pieces if judged else self.earlier
+        for sensor in SENSORS:
+            for regime, rows in window.pieces[sensor].items():
+                factor = rows if len(rows) <= rows.shape[1] else triangular(rows)
+                stack(pieces, (sensor, regime), factor)
         if not judged:
             return
         self.judged += 1
-        for sensor in SENSORS:
-            for regime, rows in window.pieces[sensor].items():
-                stack(
-                    self.pieces,
-                    (sensor, regime),
-                    rows if len(rows) <= rows.shape[1] else triangular(rows),
-                )
         for regime, rows in window.pieces[SENSORS[0]].items():
             count = count_pieces(window.duration) if window.kind == 'static' else len(rows)
             self.counts[regime] = self.counts.get(regime, 0) + count
@@ -168,6 +168,8 @@ class HeldOutBlock:
         self.accumulator.merge(other.accumulator)
         for key, factor in other.pieces.items():
             stack(self.pieces, key, factor)
+        for key, factor in other.earlier.items():
+            stack(self.earlier, key, factor)
         for regime, count in other.counts.items():
             self.counts[regime] = self.counts.get(regime, 0) + count
         self.judged += other.judged
@@ -175,7 +177,11 @@ class HeldOutBlock:
     def copy(self) -> 'HeldOutBlock':
         """Return an independent copy."""
         return HeldOutBlock(
-            self.accumulator.copy(), dict(self.pieces), dict(self.counts), self.judged
+            self.accumulator.copy(),
+            dict(self.pieces),
+            dict(self.counts),
+            self.judged,
+            dict(self.earlier),
         )
 
     def restricted(self, wide: SensorModel, narrow: SensorModel) -> 'HeldOutBlock':
@@ -189,6 +195,7 @@ class HeldOutBlock:
             {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
             self.counts,
             self.judged,
+            {key: rows[:, chosen[key[0]]] for key, rows in self.earlier.items()},
         )
 
 

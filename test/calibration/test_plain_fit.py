@@ -1,0 +1,194 @@
+"""
+Bias and matrix by plain least squares, where the model does not predict held-out data better.
+
+The worlds have a cause that no effect of the catalogue describes; a second session of the same unit
+has another motion.
+"""
+
+from dataclasses import replace
+from functools import lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import helpful_formulas
+from imu_calibration.calibration.from_solution import ModelChanges
+from imu_calibration.calibration.table_calibration import (
+    check_on_table,
+    conclude,
+    solve_recordings,
+)
+from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.window_statistics import reduce_window
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.options import CalibrationOptions
+
+from worlds import misfit_worlds
+from worlds.physics_cause import Cause
+from worlds.physics_draw import DEG
+
+UNEXPLAINED = {name: {'rms': 1.0, 'axes': [], 'unit': None} for name in SENSORS}
+
+
+class HiddenHeat(Cause):
+    """Motors warm the sensor by their speed with a lag of 70 s; no temperature shows it."""
+
+    def added(self, world, temperature_c, force_s, rate_s, alpha_s):
+        """Return biases that follow the heat."""
+        speed = np.abs(np.gradient(world.joints, world.time, axis=0)).sum(axis=1)
+        decay = np.exp(-(world.time[1] - world.time[0]) / 70.0)
+        heat = lfilter([1 - decay], [1, -decay], speed**2 / (1 + speed**2))
+        return 0.02 * np.outer(heat, [1, -0.6, 0.4]), 0.3 * DEG * np.outer(heat, [0.5, 1, -0.7])
+
+
+class CableTwist(Cause):
+    """A cable pulls at the sensor in proportion to the angle of the outer joint."""
+
+    def added(self, world, temperature_c, force_s, rate_s, alpha_s):
+        """Return biases in proportion to the angle."""
+        twist = world.joints[:, 0] / np.pi
+        return 0.012 * np.outer(twist, [1, 0.3, -0.5]), 0.15 * DEG * np.outer(twist, [-0.4, 0.3, 1])
+
+
+class LateWithLosses(Cause):
+    """A bus is late and loses messages in bursts, the more the faster the sensor turns."""
+
+    GRID = 0.01
+
+    def added(self, world, temperature_c, force_s, rate_s, alpha_s):
+        """Return nothing; the speed is remembered for the stamps."""
+        grid = np.arange(0.0, world.time[-1], self.GRID)
+        self.speed = np.interp(grid, world.time, np.linalg.norm(rate_s, axis=1))
+        return 0.0, 0.0
+
+    def stamped(self, time, rng):
+        """Return a lateness of 1 ms at rest, and 2 ms more per rad/s, in the order of arrival."""
+        speed = np.interp(time, np.arange(len(self.speed)) * self.GRID, self.speed)
+        late = (1e-3 + 2e-3 * np.minimum(speed, 3.0)) * rng.gamma(2.0, 0.5, len(time))
+        return np.maximum.accumulate(time + late) - time
+
+
+def with_losses(session, seed):
+    """Return the session without bursts of up to 39 samples, which begin while it turns."""
+    rng = np.random.default_rng(seed)
+    speed = np.linalg.norm(session.imu.rate_s, axis=1)
+    begins = rng.random(len(speed)) < 0.002 + 0.02 * np.minimum(speed, 2.0)
+    kept = np.ones(len(speed), bool)
+    for start in np.flatnonzero(begins):
+        kept[start : start + rng.integers(1, 40)] = False
+    return replace(session, imu=session.imu.select(kept))
+
+
+CAUSES = {'heat': HiddenHeat, 'cable': CableTwist, 'losses': LateWithLosses}
+
+
+@lru_cache(maxsize=None)
+def world(kind, seed, gyroscope_model='bias+matrix'):
+    """Return (pair of sessions, Table, solution of the first one, options)."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(misfit_worlds, 'CAUSES', CAUSES)
+        pair = misfit_worlds.make_pair(kind, seed, imu_rate=50.0, joint_rate=50.0)
+    if kind == 'losses':
+        first, second = with_losses(pair.first, seed), with_losses(pair.second, seed + 1)
+        pair = replace(pair, first=first, second=second)
+    table = Table.from_mapping(pair.table)
+    options = CalibrationOptions(
+        accelerometer_model='bias+matrix',
+        gyroscope_model=gyroscope_model,
+        reference_model='none',
+    )
+    return pair, table, solve_recordings([source(pair.first)], table, options), options
+
+
+def source(session):
+    return lambda: iter([session.block])
+
+
+def calibrated(kind, seed, **changes):
+    _, table, solved, options = world(kind, seed)
+    return conclude(
+        *solved, table=table, options=options, changes=ModelChanges(**changes)
+    ).calibration
+
+
+def plain_values(session, table):
+    """Return bias and matrix of both sensors by least squares over pieces of 0.25 s."""
+    model = SensorModel(joint_names=table.joint_names)
+    gatherer = MotionGatherer(table)
+    windows = [*gatherer.push(session.block), *gatherer.finish()]
+    values = model.prior()[0]
+    for sensor in SENSORS:
+        rows = []
+        for window in windows:
+            if window.kind != 'unused' and len(window) > 1:
+                rows += reduce_window(window, model, table).pieces[sensor].values()
+        rows = np.concatenate(rows)
+        of_bias = model.columns_of(sensor, Role.OFFSET)
+        of_matrix = model.columns_of(sensor, Role.LINEAR)
+        columns = np.column_stack([rows[:, of_bias], rows[:, of_matrix]])
+        fit = np.linalg.lstsq(columns, rows[:, -3:], rcond=None)[0]
+        values[model.part(sensor, Role.OFFSET)] = fit[0]
+        values[model.part(sensor, Role.LINEAR)] = fit[1:].T.ravel()
+    return model, values
+
+
+def errors_on_second(kind, seed, calibration):
+    pair, table, *_ = world(kind, seed)
+    proof = check_on_table([source(pair.second)], table, calibration).proof
+    return np.array([proof[sensor]['after'] for sensor in SENSORS])
+
+
+def with_plain_values(calibration, kind, seed):
+    """Return the calibration with the values of `plain_values`."""
+    pair, table, *_ = world(kind, seed)
+    model, values = plain_values(pair.first, table)
+    count = len(values)
+    return replace(
+        calibration,
+        model=model,
+        values=values,
+        covariance=1e-12 * np.eye(count),
+        status=('determined',) * count,
+        covariance_terms={},
+        held_reason={},
+        judgement=None,
+        proof={},
+        statistics={},
+    )
+
+
+@pytest.mark.parametrize(('kind', 'seed'), [('losses', 615), ('heat', 501), ('cable', 604)])
+def test_applied_values_are_no_worse_than_least_squares_in_a_second_session(kind, seed):
+    calibration = calibrated(kind, seed, unexplained=UNEXPLAINED)
+    plain = with_plain_values(calibration, kind, seed)
+    ratio = errors_on_second(kind, seed, calibration) / errors_on_second(kind, seed, plain)
+    assert calibration.statistics['least_squares']
+    assert np.all(ratio < 1.05)
+
+
+def test_the_solution_is_applied_unless_a_residual_is_unexplained():
+    solution = calibrated('cable', 604)
+    assert 'least_squares' not in solution.statistics
+    fitted = calibrated('cable', 604, unexplained=UNEXPLAINED)
+    gyroscope = fitted.statistics['least_squares']['gyroscope']
+    assert gyroscope['error'] < 0.95 * gyroscope['error_of_model']
+    assert fitted.proof['gyroscope']['after'] < solution.proof['gyroscope']['after']
+    assert np.all(fitted.sd >= 0.0) and not np.array_equal(fitted.values, solution.values)
+
+
+def formula_proof(after, *, fast):
+    return {'gyroscope': {'after': after, 'regimes': {'fast turns': {'after': fast}}}}
+
+
+@pytest.mark.parametrize(
+    ('after', 'fast', 'helps'), [(0.5, 1.0, True), (0.99, 1.0, False), (0.5, 1.1, False)]
+)
+def test_a_formula_has_to_lower_the_held_out_error_in_each_regime(after, fast, helps):
+    effect = SimpleNamespace(sensor='gyroscope')
+    extended = SimpleNamespace(proof=formula_proof(after, fast=fast))
+    calibration = SimpleNamespace(proof=formula_proof(1.0, fast=1.0))
+    assert helpful_formulas([effect], extended, calibration) == [effect] * helps
