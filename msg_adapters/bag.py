@@ -413,9 +413,15 @@ def _open_source(path, raw=(), where=()):
         ) from error
 
 
-def list_topics(path: str | PathLike[str], where: Sequence[str] = ()) -> tuple[Topic, ...]:
-    """Return the topics of a recording in order of name; `where` and errors: `open_recording`."""
-    source = _open_source(Path(path), where=tuple(where))
+def list_topics(
+    path: str | PathLike[str], where: Sequence[str] = (), raw: Sequence[str] = ()
+) -> tuple[Topic, ...]:
+    """
+    Return the topics of a recording in order of name.
+
+    `where`, `raw` and errors: `open_recording`.
+    """
+    source = _open_source(Path(path), tuple(raw), where=tuple(where))
     try:
         return _listed(source)
     finally:

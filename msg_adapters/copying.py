@@ -34,6 +34,7 @@ def copy_with_corrected(
     raw: Sequence[str] = (),
     where: Sequence[str] = (),
     check: Callable[[], None] | None = None,
+    keep: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> dict[str, int]:
     """
     Write a bag with all topics of another one, and the corrected Imu messages.
@@ -68,6 +69,8 @@ def copy_with_corrected(
         As for `msg_adapters.bag.open_recording`.
     check : callable, optional
         Called after the last block; an error that it raises removes the bag.
+    keep : callable, optional
+        Stamps of the next messages, shape (n,) -> which of them are corrected, bool, shape (n,).
 
     Returns
     -------
@@ -88,7 +91,7 @@ def copy_with_corrected(
         _check(recording, corrected_topic)
         topics = [topic.name for topic in recording.topics]
         choice = FrameChoice(recording.imu_topic, source_frame_id)
-        patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns, choice)
+        patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns, choice, keep=keep)
         with BagWriter(destination, bag.storage) as writer:
             ids = np.array(
                 [writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics]
@@ -150,7 +153,7 @@ def _write(writer, topic_ids, raw, measured, corrected_id, patch):
 class _Patch:
     """Makes corrected messages from measured ones."""
 
-    def __init__(self, correct, propagate, frame_id, mat_ts, late_ns, choice):
+    def __init__(self, correct, propagate, frame_id, mat_ts, late_ns, choice, *, keep=None):
         self.correct, self.propagate, self.late_ns, self.choice = (
             correct,
             propagate,
@@ -159,6 +162,7 @@ class _Patch:
         )
         self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
+        self.keep = keep
 
     def __call__(self, packed, received_ns):
         """
@@ -172,16 +176,21 @@ class _Patch:
         groups = [group for group in groups if self.choice.wants(group[0].names[0], len(group[1]))]
         if not groups:
             return np.zeros(0, dtype=int), []
-        found = np.concatenate([index for _, index, _ in groups])
-        order = np.argsort(found)
-        done = found[order]
+        done = np.sort(np.concatenate([index for _, index, _ in groups]))
         samples = in_order([(index, decode_imu(layout, group)) for layout, index, group in groups])
-        corrected = self.correct(
-            replace(
-                samples,
-                stamp_ns=np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns),
-            )
-        )
+        stamp_ns = np.where(samples.stamp_ns == 0, received_ns[done], samples.stamp_ns)
+        samples = replace(samples, stamp_ns=stamp_ns)
+        if self.keep is not None:
+            kept = self.keep(stamp_ns)
+            if not kept.any():
+                return np.zeros(0, dtype=int), []
+            groups = [
+                _selected(layout, index, group, kept[np.searchsorted(done, index)])
+                for layout, index, group in groups
+            ]
+            done, samples = done[kept], samples.select(kept)
+        order = np.argsort(np.concatenate([index for _, index, _ in groups]))
+        corrected = self.correct(samples)
         tables = []
         for layout, index, group in groups:
             place = np.searchsorted(done, index)
@@ -246,6 +255,11 @@ class _Patch:
                 Rotation.from_quat(quaternion[given]) * Rotation.from_matrix(self.mat_st)
             ).as_quat()
         return turned
+
+
+def _selected(layout, index, group, mask):
+    """Return the messages of a group of one layout that a mask selects."""
+    return layout, index[mask], group.select(np.flatnonzero(mask))
 
 
 def _propagated(propagate, pairs):

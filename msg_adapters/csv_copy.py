@@ -10,15 +10,16 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import SI_UNITS
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.files import write_whole
-from msg_adapters.csv_log import SENSOR_OF, CsvLog, name_with_unit, split_cells
+from msg_adapters.csv_log import CORRECTED, SENSOR_OF, CsvLog, name_with_unit, split_cells
 
 
 def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSamples) -> None:
     """
     Write a text log with the columns of another one and its readings corrected.
 
-    The first line is the header, which states the units; force and rate are in SI, and empty where
-    a reading could not be corrected. Time and all other columns are copied as text.
+    The first line is the header, which states the units and that the readings are corrected; force
+    and rate are in SI, and empty where a reading could not be corrected. Time and all other columns
+    are copied as text.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
         for place in text.places.get(columns.quantity, ()):
             unit = columns.unit
             if columns.quantity in SENSOR_OF:
-                unit = SI_UNITS[SENSOR_OF[columns.quantity]]
+                unit = f'{SI_UNITS[SENSOR_OF[columns.quantity]]} {CORRECTED}'
             # A date or a time of day has no unit.
             if unit is not None and (columns.quantity != 'time' or _is_number(text, place)):
                 names[place] = name_with_unit(names[place], columns.quantity, unit)

@@ -34,6 +34,7 @@ from imu_calibration.preprocessing.sensor_join import (
     join_sensors,
 )
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
+from imu_calibration.preprocessing.value_checks import force_error, samples_per_second
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.write import write_session
 
@@ -70,6 +71,8 @@ SPELLINGS = {
 }
 """Quantity -> spelling in headers -> unit."""
 SENSOR_OF = {'force': 'accelerometer', 'rate': 'gyroscope'}
+CORRECTED = 'corrected'
+"""Word after the unit in the header of a log that holds corrected readings."""
 RAW_UNIT = 'raw'
 """Unit of columns that are read without conversion."""
 COLUMN_PATTERNS = (
@@ -83,13 +86,14 @@ COLUMN_PATTERNS = (
         'force',
         r'(a|ac|acc|acc smooth|accel|accelerometer|acceleration|f|specific force|a rs'
         r' s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
-        r'(.* )?linear acceleration)',
+        r'(.* )?linear acceleration|d ?vel|(delta|d) ?v|delta ?vel(ocity)?|'
+        r'vel(ocity)? ?inc(rement)?s?)',
     ),
     (
         'rate',
         r'(g|w|gy|gyr|gyro|gyro adc|gyroscope|omega|rate|w rs s|'
         r'(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
-        r'(.* )?angular velocity)',
+        r'(.* )?angular velocity|(d|delta) ?(theta|ang|angle)|(ang|angle|theta) ?inc(rement)?s?)',
     ),
     (
         'temperature',
@@ -349,7 +353,11 @@ def _sensors(table, by_quantity, stamp_ns):
         rate_s = table.values(rate.names) * _size_of(rate)
         return _Readings((rate,), ImuSamples(stamp_ns, nothing, rate_s, 'imu_link'))
     raw_force = table.values(by_quantity['force'].names)
-    force = _with_unit(by_quantity['force'], lambda: _force_unit(raw_force), table.path)
+    force = _with_unit(
+        by_quantity['force'],
+        lambda: _force_unit(raw_force) or _refuse_increments(raw_force, stamp_ns),
+        table.path,
+    )
     force_s = raw_force * _size_of(force)
     if 'rate' not in by_quantity:
         return _Readings((force,), ImuSamples(stamp_ns, force_s, nothing, 'imu_link'))
@@ -500,6 +508,11 @@ def autopilot_of(path: str | PathLike[str]) -> str:
     return ''
 
 
+def has_corrected_readings(path: str | PathLike[str]) -> bool:
+    """Return whether the header of a text log states that its readings are corrected."""
+    return any(_words(name)[1].endswith(CORRECTED) for name in _Table(Path(path)).names)
+
+
 def _require_one_imu(imu):
     """Raise where the rows are those of two IMUs; units of force and rate do not matter."""
     sources = TwoSourceSearch()
@@ -526,9 +539,10 @@ def _parse(text):
     """Return the Columns of one assignment of `columns`."""
     label, _, rest = text.partition('=')
     quantity, _, joint = label.partition('.')
-    counts = re.fullmatch(r'(.*?):(counts:.*)', rest)
-    if counts:
-        names, colon, unit = counts[1], ':', counts[2]
+    # units with a colon of their own
+    scaled = re.fullmatch(r'(.*?):((counts|increments):.*)', rest)
+    if scaled:
+        names, colon, unit = scaled[1], ':', scaled[2]
     else:
         names, colon, unit = rest.rpartition(':')
     if not colon:
@@ -546,7 +560,7 @@ def _parse(text):
             f' rate, got {text!r}; {REMEDY}',
             key='columns',
         )
-    if unit is not None and unit.startswith('counts:') and quantity in SENSOR_OF:
+    if unit is not None and scaled and quantity in SENSOR_OF:
         unit = unit_of(SENSOR_OF[quantity], unit).unit
     elif unit is not None and unit not in units:
         raise InputError(
@@ -941,7 +955,7 @@ def _without_unit(name):
 
 def _unit(quantity, text):
     """Return the unit of a quantity by its spelling in a header, or None."""
-    text = text.strip().replace(' ', '')
+    text = text.strip().removesuffix(CORRECTED).replace(' ', '')
     known = {unit.lower(): unit for unit in COLUMN_UNITS[quantity]} | SPELLINGS[quantity]
     return known.get(text)
 
@@ -989,6 +1003,14 @@ def _force_unit(force):
         ),
         None,
     )
+
+
+def _refuse_increments(force, stamp_ns):
+    """Raise for readings that are increments over one sample."""
+    length = float(np.nanmedian(np.linalg.norm(force, axis=1)))
+    error = force_error(length, 'in the log', per_second=samples_per_second(stamp_ns))
+    if error is not None and error.code == 'increments':
+        raise error
 
 
 def _rate_unit(stamp_ns, force_s, rate):

@@ -432,7 +432,7 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
         'longest_part': float(max(part.seconds for part in record.parts)),
         'left_out': record.left_out,
         'dropped': dropped,
-        'faults': _fault_entries(record.curve.faults),
+        'faults': _fault_entries(record.curve.faults, result.sensors),
         'intervals_hold_for': 'this recording; the slow noise of another one can be outside',
     }
     if record.unusable:
@@ -448,10 +448,12 @@ def figures_of(result: NoiseIdentification, provenance: dict | None = None) -> N
     )
 
 
-def _fault_entries(faults):
-    """Return the doubtful readings for noise.yaml: name of a sensor or axis -> figures."""
+def _fault_entries(faults, sensors):
+    """Return the doubtful readings of the sensors for noise.yaml: sensor or axis -> figures."""
     entries = {}
     for k, sensor in enumerate(SENSORS):
+        if sensor not in sensors:
+            continue
         if faults.repeated[k] > 0:
             entries[sensor] = {
                 'repeated': float(faults.repeated[k]),

@@ -4,7 +4,7 @@ A calibration by hand.
 With the effects that it supports, and with the document and result of a calibration on a table.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -42,7 +42,8 @@ from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.absent_sensor import without_sensor
 from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_force
-from imu_calibration.preprocessing.recording_evidence import CheckFinding
+from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.preprocessing.sensor_join import GyroscopeDelay, delay_of
 from imu_calibration.preprocessing.stream_cleaning import BlockCleaner, ContinuedStamps, outside
 from imu_calibration.preprocessing.window import Window, WindowKind
 from imu_calibration.references.gravity.bias_movement import notes
@@ -280,6 +281,8 @@ class HandRecording:
     """Reason -> number of unusable samples."""
     findings: tuple[CheckFinding, ...] = ()
     """Findings of the checks of the recording."""
+    delay: GyroscopeDelay | None = None
+    """Delay of the gyroscope's stamps; None where the motion does not determine it."""
     unusable: dict[str, str] = field(default_factory=dict)
     """Sensor with readings that cannot be used -> why; `imu` marks it as absent."""
 
@@ -334,11 +337,14 @@ def read_by_hand(
     findings: tuple[CheckFinding, ...] = ()
     unusable_sensors: dict[str, str] = {}
     if preflight is not None:
-        findings = tuple(preflight.findings)
         unusable_sensors = preflight.unusable
         imu = _readings_only(imu, preflight.without_readings)
         for sensor in unusable_sensors:
             imu = without_sensor(imu, sensor)
+    delay = delay_of(imu)
+    if preflight is not None:
+        preflight.findings += tuple(late_gyroscope(delay))
+        findings = tuple(preflight.findings)
     warm = None
     if temperatures:
         moved = [
@@ -360,8 +366,21 @@ def read_by_hand(
         warm,
         {reason: count for reason, count in counts.items() if count},
         findings,
+        delay,
         unusable_sensors,
     )
+
+
+def late_gyroscope(delay: GyroscopeDelay | None) -> Iterator[CheckFinding]:
+    """Both sensors have the stamps of one moment."""
+    if delay is not None and delay.is_large:
+        yield CheckFinding(
+            'gyroscope_delay',
+            WARNING,
+            'accelerometer and gyroscope must be stamped together, the gyroscope is'
+            f' {delay.text} relative to the accelerometer; correct the stamps or the filters'
+            ' in the driver (a calibration by hand does not suffer, navigation does)',
+        )
 
 
 def _readings_only(imu, ranges):
@@ -457,6 +476,8 @@ def hand_result(
     statistics = _statistics(hand, gathered.counts, len(recording.imu))
     if recording.unusable:
         statistics['unusable_sensors'] = dict(recording.unusable)
+    if recording.delay is not None:
+        statistics['gyroscope_delay'] = recording.delay.to_mapping()
     calibration = document(
         hand,
         hand.tolerances,

@@ -31,7 +31,12 @@ from imu_calibration.calibration.coverage import (
     group_states,
     waiting_groups,
 )
-from imu_calibration.calibration.hand_workflow import HandRecording, HandResult, evident_result
+from imu_calibration.calibration.hand_workflow import (
+    HandRecording,
+    HandResult,
+    evident_result,
+    late_gyroscope,
+)
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings, SolvePacer
 from imu_calibration.core.errors import InputError, NotObservableError, with_hint
 from imu_calibration.core.progress import LiveState
@@ -43,6 +48,7 @@ from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import COMMON_SCALE, LACKING, tolerances_of
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.rest_detection import find_still
+from imu_calibration.preprocessing.sensor_join import delay_of
 from imu_calibration.preprocessing.stamping import StampLine
 from imu_calibration.preprocessing.stream_cleaning import StreamCheck
 from imu_calibration.preprocessing.window import WindowSettings
@@ -448,7 +454,8 @@ class LiveByHand:
             )
         self._check.sources.require_one()
         self._search(store)
-        recording = HandRecording(imu, None, self.counts)
+        delay = delay_of(imu)
+        recording = HandRecording(imu, None, self.counts, tuple(late_gyroscope(delay)), delay)
         self.result = evident_result(recording, self.options, provenance, stills=self.found.rests)[
             0
         ]

@@ -26,6 +26,8 @@ def add_arguments(parser: OneLineParser) -> None:
         default=[],
         help='frame_id of A, then of B; for a topic with several',
     )
+    parser.add_readings()
+    parser.add_rows()
 
 
 def run(options: Options) -> VerbResult:
@@ -35,6 +37,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.show import warn
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, warnings
+    from imu_calibration.use_cases.choices import raw_columns, readings_of
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
 
     if len(options.imu_topic) != 2:
@@ -48,7 +51,13 @@ def run(options: Options) -> VerbResult:
             f'--frame-id must be given twice, for A and B, or omitted, got {len(frames)}; name both'
             ' frames'
         )
-    topics = [Topics(imu=topic, frame=frame) for topic, frame in zip(options.imu_topic, frames)]
+    choices = options.choices()
+    readings = readings_of(choices)
+    raw = raw_columns(readings, choices)
+    topics = [
+        Topics(imu=topic, frame=frame, raw=raw, where=tuple(options.where))
+        for topic, frame in zip(options.imu_topic, frames)
+    ]
     if len({(topic.lstrip('/'), frame) for topic, frame in zip(options.imu_topic, frames)}) == 1:
         raise InputError(
             f'A and B must be two IMUs, got {options.imu_topic[0]} twice; name another topic, or a'
@@ -60,7 +69,7 @@ def run(options: Options) -> VerbResult:
     for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
         blocks = source_of(options.bag, topic)()
-        recording = read_by_hand(blocks, preflight=Preflight())
+        recording = read_by_hand(blocks, readings, Preflight())
         imus.append(recording.imu)
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(recording.findings))
     first, second = imus

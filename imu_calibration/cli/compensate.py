@@ -68,6 +68,7 @@ def add_arguments(parser: OneLineParser) -> None:
     )
     parser.add_topics(joints=False)
     parser.add_readings()
+    parser.add_exclusion()
     parser.add_rows()
 
 

@@ -48,9 +48,11 @@ def add_arguments(parser: OneLineParser) -> None:
 
 def joined_document(joined: JoinedSensors) -> dict:
     """Return how two sensors were joined as data."""
-    from imu_calibration.core.documents import finite
-
-    return {'slower': joined.slower, 'delay': joined.delay, 'delay_sd': finite(joined.delay_sd)}
+    delay = joined.delay
+    known = {'delay': None, 'delay_sd': None}
+    if delay is not None:
+        known = {'delay': delay.delay, 'delay_sd': delay.sd}
+    return {'slower': joined.slower, **known}
 
 
 def run(options: Options) -> VerbResult:

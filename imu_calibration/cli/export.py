@@ -41,6 +41,9 @@ def add_arguments(parser: OneLineParser) -> None:
         help='of the readings, where calibration.yaml states none: flu, frd or --axes=-x,y,-z',
     )
     parser.add_recording('motion of --bag; without it: from its readings')
+    parser.add_gyroscope_topic()
+    parser.add_exclusion()
+    parser.add_rows()
 
 
 def run(options: Options) -> VerbResult:

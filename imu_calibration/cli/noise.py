@@ -35,6 +35,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.common('--no-report', action='store_true', help='write noise.yaml only')
     parser.add_force('overwrite the noise of other inputs')
     parser.add_topics(joints=False)
+    parser.add_gyroscope_topic()
     parser.add_readings()
     parser.add_exclusion()
     parser.add_rows()

@@ -311,6 +311,12 @@ class OneLineParser(argparse.ArgumentParser):
             metavar='UNIT',
             help='rad/s, deg/s, urad/s, ..., counts:16.4/(deg/s)',
         )
+        self.common(
+            '--increments',
+            metavar='HZ',
+            type=float,
+            help='readings are increments over one of HZ samples per second',
+        )
         self.common('--axes', metavar='AXES', help='flu, frd, or forward, left, up: --axes=-x,y,-z')
         self.expert(
             '--nominal', metavar='FILE', help='units, scales and offsets of the readings, in a file'

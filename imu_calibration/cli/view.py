@@ -21,6 +21,9 @@ def add_arguments(parser: OneLineParser) -> None:
         help='local gravity, m/s^2, by hand or with --urdf; default 9.80665',
     )
     parser.add_recording('without it: by hand, gravity is the reference')
+    parser.add_gyroscope_topic()
+    parser.add_exclusion()
+    parser.add_rows()
     parser.add_model()
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import SensorUnit
+from imu_calibration.core.scales import USUAL, scale_range
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing.value_checks import force_error
 
@@ -25,8 +26,8 @@ class UnitGate:
     """
     Withholds the output while the specific force is not in the stated unit.
 
-    The gate opens with the first reading or window of readings that can be gravity, and then stays
-    open: a later motion or another publisher does not stop the output.
+    The gate opens with a first reading of usual length, or the first window of readings that can be
+    gravity, and then stays open: a later motion or another publisher does not stop the output.
 
     Parameters
     ----------
@@ -63,8 +64,9 @@ class UnitGate:
             return True
         if self._start_ns is None or stamp_ns < self._start_ns:
             self._start_ns, self._lengths = stamp_ns, []
-            # Only the very first reading opens alone: a shaken IMU in g reaches any length.
-            if not self._judged and force_error(length) is None:
+            # Only the very first reading opens by itself, where its length is usual: a shaken IMU
+            # in g reaches any length.
+            if not self._judged and scale_range(length / STANDARD_GRAVITY) is USUAL:
                 self._open()
                 return True
         self._lengths.append(length)
@@ -72,18 +74,19 @@ class UnitGate:
         is_complete = is_long and len(self._lengths) >= LEAST_READINGS
         if not is_complete and len(self._lengths) < MOST_READINGS:
             return False
-        self._judge()
+        self._judge(1e-9 * (stamp_ns - self._start_ns))
         return self.is_open
 
-    def _judge(self):
+    def _judge(self, seconds):
         """Open, or set the error of a window at rest; begin the next window."""
         median = float(np.median(self._lengths))
-        error = force_error(median, 'at rest', self._stated)
+        per_second = (len(self._lengths) - 1) / seconds if seconds > 0 else 0.0
+        error = force_error(median, 'at rest', self._stated, per_second=per_second)
         moves = np.std(self._lengths) > REST_SPREAD * median
         # A motion may exceed gravity, as no reading in g does; a motion must not stop the output.
         if error is None or (moves and STANDARD_GRAVITY < median < MOST_IN_MOTION):
             self._open()
-        elif not moves or error.code == 'without_gravity':
+        elif not moves or error.code in ('without_gravity', 'increments'):
             self.error = error
         self._start_ns, self._lengths, self._judged = None, [], True
 

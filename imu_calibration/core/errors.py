@@ -24,6 +24,7 @@ ERROR_KEYS = (
     'gyroscope_unit',
     'imu_link',
     'imu_topic',
+    'increments',
     'inspect',
     'jobs',
     'joint_topic',

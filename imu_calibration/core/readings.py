@@ -66,6 +66,12 @@ SPELLINGS = {
 COUNTS = 'counts'
 """Unit of readings with a scale in a file; as an option it needs the scale, counts:16384/g."""
 COUNTS_PATTERN = re.compile(r'counts:([-+.\deE]+)/\(?([^()]+)\)?')
+INCREMENTS_PATTERN = re.compile(r'increments:([-+.\deE]+)\*(.+)')
+"""Increments over one sample, increments:200*m/s^2: 200 times the reading is in m/s^2."""
+INCREMENTS_KEY = 'increments'
+"""Key of `errors.ERROR_KEYS`, and name of the option, of the samples per second of increments."""
+MOST_PER_SECOND = 1e5
+"""Samples per second; no inertial sensor gives more."""
 UNIT_AGREEMENT = 1e-4
 """Relative difference up to which the scale of a file may differ from that of its unit."""
 LARGEST = 1e12
@@ -77,6 +83,8 @@ UNIT_KEYS = {'accelerometer': 'accelerometer_unit', 'gyroscope': 'gyroscope_unit
 """Sensor -> key of `errors.ERROR_KEYS`, and name of the option, of its unit."""
 AXES_KEY = 'axes'
 """Key of `errors.ERROR_KEYS`, and name of the option, of the axes."""
+STATED_KEYS = (*UNIT_KEYS.values(), INCREMENTS_KEY)
+"""Names of the options that state units."""
 Number = float | tuple[float, float, float]
 
 
@@ -90,6 +98,12 @@ class SensorUnit:
     """Reading per m/s^2 or rad/s, one number or one per axis."""
     offset: Number = 0.0
     """Reading at zero specific force or rate, one number or one per axis."""
+
+    @property
+    def per_second(self) -> float:
+        """Samples per second of readings that are increments over a sample; 0 for rates."""
+        increments = INCREMENTS_PATTERN.fullmatch(self.unit)
+        return float(increments[1]) if increments else 0.0
 
     @property
     def is_si(self) -> bool:
@@ -236,7 +250,7 @@ def unit_of(sensor: str, text: str) -> SensorUnit:
         'accelerometer' or 'gyroscope'.
     text : str
         'm/s^2', 'g', 'mg', 'rad/s', 'deg/s', 'counts:16384/g', 'counts:16.4/(deg/s)',
-        'counts:16.4/dps', ...
+        'counts:16.4/dps', ..., or increments of one of them as in 'increments:200*rad/s'.
 
     Raises
     ------
@@ -248,13 +262,13 @@ def unit_of(sensor: str, text: str) -> SensorUnit:
     sizes = UNIT_SIZES[sensor]
     if unit in sizes:
         return SensorUnit(unit, 1.0 / sizes[unit])
+    increments = INCREMENTS_PATTERN.fullmatch(unit)
+    if increments is not None:
+        return incremented(unit_of(sensor, increments[2]), _positive(increments[1]))
     counts = COUNTS_PATTERN.fullmatch(unit)
     if counts is not None:
         per = _spelled(sensor, counts[2])
-        try:
-            number = float(counts[1])
-        except ValueError:
-            number = math.nan
+        number = _positive(counts[1])
         if per in sizes and 0.0 < number < LARGEST:
             label = per if per.isalpha() or sensor == 'accelerometer' else f'({per})'
             return SensorUnit(f'counts:{counts[1]}/{label}', number / sizes[per])
@@ -264,6 +278,33 @@ def unit_of(sensor: str, text: str) -> SensorUnit:
         key=UNIT_KEYS[sensor],
         code='unit_unknown',
     )
+
+
+def incremented(unit: SensorUnit, per_second: float) -> SensorUnit:
+    """
+    Return the unit of increments over one sample, of readings that a unit describes.
+
+    ``SI = per_second (reading - offset) / scale``. The rate of a unit that is one of increments
+    already is replaced.
+
+    Raises
+    ------
+    InputError
+        When no sensor has so many samples per second.
+
+    """
+    if not 0.0 < per_second <= MOST_PER_SECOND:
+        raise InputError(
+            f'increments need the samples per second, above 0 and at most {MOST_PER_SECOND:g},'
+            f' got {per_second:g}; correct the number',
+            key='increments',
+            code='increments_rate',
+        )
+    of_one_sample = INCREMENTS_PATTERN.fullmatch(unit.unit)
+    label = of_one_sample[2] if of_one_sample else unit.unit
+    factor = (unit.per_second or 1.0) / per_second
+    scale = _number(np.asarray(unit.scale, float) * factor)
+    return replace(unit, unit=f'increments:{per_second:.12g}*{label}', scale=scale)
 
 
 def parse_axes(text: str) -> str:
@@ -297,13 +338,24 @@ def combined(
     *,
     accelerometer_unit: str | None = None,
     gyroscope_unit: str | None = None,
+    increments: float | None = None,
     axes: str | None = None,
 ) -> RawReadings:
-    """Return a description with the units and axes that options state in place of its own."""
+    """
+    Return a description with the units and axes that options state in place of its own.
+
+    `increments`: samples per second of readings that are increments over a sample.
+    """
     if accelerometer_unit:
         base = replace(base, accelerometer=unit_of('accelerometer', accelerometer_unit))
     if gyroscope_unit:
         base = replace(base, gyroscope=unit_of('gyroscope', gyroscope_unit))
+    if increments is not None:
+        base = replace(
+            base,
+            accelerometer=incremented(base.accelerometer, increments),
+            gyroscope=incremented(base.gyroscope, increments),
+        )
     if axes:
         base = replace(base, axes=parse_axes(axes))
     return base
@@ -340,6 +392,15 @@ def _spelled(sensor, text):
     return SPELLINGS[sensor].get(text.lower(), text)
 
 
+def _positive(text):
+    """Return a number above zero; NaN for another text."""
+    try:
+        number = float(text)
+    except ValueError:
+        return math.nan
+    return number if number > 0.0 else math.nan
+
+
 def _of_scale(sensor, scale, offset):
     """Return the unit of readings that a scale describes; SI where it is 1 without an offset."""
     known = SensorUnit(COUNTS, _number(scale), _number(offset))
@@ -367,14 +428,15 @@ def _sensor_unit(sensor, entry, place):
             key=UNIT_KEYS[sensor],
             code='unit_unknown',
         )
-    if unit == COUNTS:
+    increments = INCREMENTS_PATTERN.fullmatch(unit)
+    if unit == COUNTS or (increments and increments[2] == COUNTS):
         if scale is None:
             raise InputError(
                 f"'{place}' must have a scale with the unit counts, it has none; add the reading"
                 f' per {SI_UNITS[sensor]}, or write counts:NUMBER/UNIT',
                 code='scale_missing',
             )
-        known = SensorUnit(COUNTS, scale)
+        known = SensorUnit(unit, scale)
     else:
         known = unit_of(sensor, unit)
         if scale is not None and not np.allclose(scale, known.scale, rtol=UNIT_AGREEMENT, atol=0):

@@ -37,6 +37,7 @@ from imu_calibration.document.decision import (
     worse_regimes,
 )
 from imu_calibration.document.outcome import dropped_of, is_complete, parameter_count
+from imu_calibration.document.rest_noise import moved_at_rest
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, HELD, Status
@@ -411,6 +412,7 @@ def judge(calibration: Calibration, tolerances: np.ndarray) -> Verdict:
     reasons += (
         _undetermined(calibration)
         + _blind(calibration)
+        + _moved(calibration)
         + _implausible(calibration)
         + motion_misfits(calibration)
     )
@@ -490,7 +492,11 @@ def _decisions(calibration):
     found = {}
     for sensor in calibration.sensors:
         word = decide(calibration.proof.get(sensor))
-        doubtful = _periodic(calibration, sensor) or beyond_instruments(calibration, sensor)
+        doubtful = (
+            _periodic(calibration, sensor)
+            or beyond_instruments(calibration, sensor)
+            or _undecided_motion(calibration, sensor)
+        )
         if word is HELPS and doubtful:
             word = UNPROVEN
         found[sensor] = word
@@ -499,12 +505,30 @@ def _decisions(calibration):
     return found
 
 
+def _undecided_motion(calibration, sensor):
+    """
+    Return why a smaller error on held-out data proves nothing; '' where it does.
+
+    A sensor moved where it was held still, or none of its requested parameters is determined:
+    held-out windows then contain the same motions.
+    """
+    if moved := moved_at_rest(calibration, sensor):
+        return moved
+    own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
+    if own and DETERMINED not in own:
+        return f'none of its {len(own)} parameters is determined'
+    return ''
+
+
 def _reason(calibration, sensor):
     more = (
         '; unproven, because stamps that are late by a period of this motion without rests would'
         ' give the same errors'
     )
     reason = reason_of(calibration.proof.get(sensor)) + more * _periodic(calibration, sensor)
+    if decide(calibration.proof.get(sensor)) is HELPS:
+        if why := _undecided_motion(calibration, sensor):
+            reason += f'; unproven, because {why}'
     if why := never_applied(calibration, sensor):
         reason += f'; not applied: {why}'
     return reason
@@ -597,6 +621,16 @@ def _blind(calibration):
                     sensors=(sensor,),
                 )
             )
+    return reasons
+
+
+def _moved(calibration):
+    """Return a warning for each sensor that moved where it was held still."""
+    reasons = []
+    for sensor in calibration.sensors:
+        if text := moved_at_rest(calibration, sensor):
+            step = 'put the IMU down in each attitude, with engines and fans off, and record again'
+            reasons.append(Reason(WARNING, text, step, sensors=(sensor,)))
     return reasons
 
 

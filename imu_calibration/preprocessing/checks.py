@@ -75,11 +75,13 @@ def frozen(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         noisy = evidence.quiet_range[part] > 0
         constant = evidence.n_changed[part] == 0
         if constant.all():
+            zero = not chunks.mean[:, part].any()
+            band = ' (always 0: a dead band, or no sensor)' if zero else ''
             yield CheckFinding(
                 'frozen',
                 REFUSE,
                 f'the {sensor} must measure something, its outputs never change in'
-                f' {evidence.n_samples} samples; check the sensor and its driver',
+                f' {evidence.n_samples} samples{band}; check the sensor and its driver',
                 sensor=sensor,
             )
             continue
@@ -180,6 +182,10 @@ def span_words(spans: Sequence[tuple[float, float]]) -> str:
 WHOLE_MS = 1_000_000
 STAMP_FAULTS = {
     'not finite': 'are not finite: the driver sends them; they are left out',
+    'zero': (
+        'are zero on all axes of both sensors for less than a second: the bus did not answer; they'
+        ' are left out; check its wires and its clock rate'
+    ),
     'repeated stamp': (
         'repeat the stamp before: stamp each sample when it is measured; the second of equal stamps'
         ' is left out'
@@ -355,6 +361,7 @@ def clocks(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 CHECKS = (
     one_source,
     both_sensors,
+    value_checks.increments,
     value_checks.force_unit,
     stamps,
     clocks,
@@ -366,6 +373,7 @@ CHECKS = (
     value_checks.bias,
     value_checks.gravity,
     value_checks.clipping,
+    value_checks.dead_band,
     value_checks.repeated_readings,
     value_checks.resolution,
     value_checks.temperature,

@@ -84,6 +84,42 @@ def exclusions_by_recording(
     ]
 
 
+class ExclusionMask:
+    """Marks the samples of one IMU stream that lie in excluded times."""
+
+    def __init__(self, exclusions: Sequence[Exclusion]):
+        self._exclusions = exclusions
+        self._first_ns: int | None = None
+        self._is_used = np.zeros(len(exclusions), bool)
+        self._last = 0.0
+
+    def kept(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return which of the next samples, shape (n,), lie in no excluded time."""
+        kept = np.ones(len(stamp_ns), bool)
+        if not len(stamp_ns):
+            return kept
+        if self._first_ns is None:
+            self._first_ns = int(stamp_ns[0])
+        time = (stamp_ns - self._first_ns) * 1e-9
+        self._last = max(self._last, float(time.max()))
+        for number, exclusion in enumerate(self._exclusions):
+            inside = (time >= exclusion.start) & (time < exclusion.stop)
+            self._is_used[number] |= inside.any()
+            kept &= ~inside
+        return kept
+
+    def require_used(self) -> None:
+        """Raise where an excluded time has no sample."""
+        for exclusion, found in zip(self._exclusions, self._is_used, strict=True):
+            if not found:
+                raise InputError(
+                    f'an excluded time must lie in the recording, which has {self._last:.1f} s, got'
+                    f" '{exclusion}'; correct it",
+                    key='exclude',
+                    code='exclude_outside',
+                )
+
+
 def without_excluded(
     source: Callable[[], Iterable[SampleBlock]], exclusions: Sequence[Exclusion]
 ) -> Iterator[SampleBlock]:
@@ -96,22 +132,12 @@ def without_excluded(
         At the end, when no sample lies in an excluded time.
 
     """
-    first_ns = None
-    used = np.zeros(len(exclusions), bool)
-    last = 0.0
+    mask = ExclusionMask(exclusions)
     for block in source():
         if block.imu is None or not len(block.imu):
             yield block
             continue
-        if first_ns is None:
-            first_ns = int(block.imu.stamp_ns[0])
-        time = (block.imu.stamp_ns - first_ns) * 1e-9
-        last = max(last, float(time.max()))
-        kept = np.ones(len(time), bool)
-        for number, exclusion in enumerate(exclusions):
-            inside = (time >= exclusion.start) & (time < exclusion.stop)
-            used[number] |= inside.any()
-            kept &= ~inside
+        kept = mask.kept(block.imu.stamp_ns)
         if kept.all():
             yield block
             continue
@@ -119,11 +145,4 @@ def without_excluded(
         dropped[EXCLUDED] = dropped.get(EXCLUDED, 0) + int(np.count_nonzero(~kept))
         imu = block.imu.select(kept) if kept.any() else None
         yield replace(block, imu=imu, dropped=dropped)
-    for exclusion, found in zip(exclusions, used, strict=True):
-        if not found:
-            raise InputError(
-                f'an excluded time must lie in the recording, which has {last:.1f} s, got'
-                f" '{exclusion}'; correct it",
-                key='exclude',
-                code='exclude_outside',
-            )
+    mask.require_used()

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.preprocessing import scan
+from imu_calibration.preprocessing.dead_band import DeadBandSearch
 from imu_calibration.preprocessing.full_scale import (
     Extremes,
     Turning,
@@ -52,6 +54,8 @@ class RecordingEvidence:
     """First and last stamp of each stretch in which no joint position changes, shape (n, 2)."""
     readings: RawReadings = RawReadings()
     """Stated units, from which the readings were converted to SI."""
+    dead_band: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """Threshold below which rates are given as zero, rad/s, shape (3,); 0 without."""
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -150,11 +154,12 @@ class EvidenceGatherer:
         self._resolution = scan.ResolutionSearch()
         self._joints = scan.StandingJoints()
         self._temperature_c: tuple[float, float] | None = None
+        self._dead_band = DeadBandSearch()
 
     def push(self, cleaned: CleanedBlock) -> None:
         """Process a CleanedBlock."""
         for _, imu in cleaned.imu:
-            self._take_imu(imu)
+            self.push_imu(imu)
         for _, joints in cleaned.joints:
             self._joints.push(joints.stamp_ns, joints.position)
         for _, temperature in cleaned.temperature:
@@ -170,24 +175,28 @@ class EvidenceGatherer:
         """Return the RecordingEvidence, with the StreamStatistics of each stream."""
         streams = {name: found for name, found in statistics.items() if found.count}
         chunks, series = self._chunks.chunks(), self._chunks
+        resolution = self._resolution.result()
         return RecordingEvidence(
             streams,
             chunks,
             series.n_samples,
             series.n_changed,
             series.n_repeated,
-            self._resolution.result(),
+            resolution,
             self._ends,
             self._temperature_c,
             self.gravity,
             self._joints.stretches(),
             readings,
+            self._dead_band.bands(resolution[3:]),
         )
 
-    def _take_imu(self, imu):
+    def push_imu(self, imu: ImuSamples) -> None:
+        """Process IMU samples in SI."""
         columns = np.concatenate([imu.force_s.T, imu.rate_s.T])
         self._resolution.push(columns.T)
         self._chunks.push(imu.stamp_ns, columns)
+        self._dead_band.push(columns[3:])
         for column, (upwards, downwards) in zip(columns, self._ends):
             upwards.push(column)
             downwards.push(-column)

@@ -24,6 +24,10 @@ MOST_WINDOWS = 4000
 """Windows that are compared, at most."""
 MIN_DELAY_ROTATION = 0.5
 """Sum of the rotation of gravity that a delay needs, rad."""
+LARGE_DELAY = 0.01
+"""s; smaller delays are not reported as a fault: accelerations in turns imitate some ms."""
+LARGE_DELAY_SDS = 4.0
+"""Standard deviations of a significant delay."""
 MIN_EXPLAINED = 0.5
 """Share of the rotation of gravity that the rates explain, at least."""
 
@@ -43,6 +47,31 @@ class SensorStream:
         return float(np.median(np.diff(self.stamp_ns)))
 
 
+@dataclass(frozen=True)
+class GyroscopeDelay:
+    """By how much the stamps of the gyroscope are late relative to those of the accelerometer."""
+
+    delay: float
+    """s; negative: early."""
+    sd: float
+    """Its standard deviation, s."""
+
+    @property
+    def text(self) -> str:
+        """The delay with its standard deviation, in words."""
+        side = 'late' if self.delay >= 0.0 else 'early'
+        return f'{1e3 * abs(self.delay):.1f} ± {1e3 * self.sd:.1f} ms {side}'
+
+    @property
+    def is_large(self) -> bool:
+        """Whether it is a fault: significant, and more than accelerations in turns imitate."""
+        return abs(self.delay) > max(LARGE_DELAY, LARGE_DELAY_SDS * self.sd)
+
+    def to_mapping(self) -> dict[str, float]:
+        """Return delay and sd as plain data."""
+        return {'delay': self.delay, 'sd': self.sd}
+
+
 @dataclass(frozen=True, eq=False)
 class JoinedSensors:
     """One stream of two sensors."""
@@ -51,13 +80,8 @@ class JoinedSensors:
     """At the stamps of the slower sensor."""
     slower: str
     """Sensor whose stamps are kept."""
-    delay: float | None
-    """
-    By how much the stamps of the gyroscope are late relative to those of the accelerometer, s; None
-    where the motion does not determine it. It is not corrected.
-    """
-    delay_sd: float
-    """Its standard deviation, s."""
+    delay: GyroscopeDelay | None
+    """None where the motion does not determine it. It is not corrected."""
 
     @property
     def text(self) -> str:
@@ -68,8 +92,7 @@ class JoinedSensors:
         line = f'the {faster} is interpolated linearly to the stamps of the {self.slower}'
         if self.delay is None:
             return f'{line}; their delay is not determined by the motion'
-        milliseconds = f'{1e3 * self.delay:.1f} ± {1e3 * self.delay_sd:.1f} ms'
-        return f'{line}; the gyroscope is {milliseconds} late (not corrected)'
+        return f'{line}; the gyroscope is {self.delay.text} (not corrected)'
 
 
 def finite_stream(stamp_ns: np.ndarray, values: np.ndarray) -> SensorStream:
@@ -113,8 +136,7 @@ def join_sensors(
             code='no_overlap',
         )
     imu = ImuSamples(stamp_ns[kept], force[kept], rate[kept], frame_id)
-    delay, sd = gyroscope_delay(accelerometer, gyroscope)
-    return JoinedSensors(imu, slower, delay, sd)
+    return JoinedSensors(imu, slower, gyroscope_delay(accelerometer, gyroscope))
 
 
 def interpolated(stream: SensorStream, stamp_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,11 +159,18 @@ def interpolated(stream: SensorStream, stamp_ns: np.ndarray) -> tuple[np.ndarray
     return values, known
 
 
-def gyroscope_delay(
-    accelerometer: SensorStream, gyroscope: SensorStream
-) -> tuple[float | None, float]:
+def delay_of(imu: ImuSamples) -> GyroscopeDelay | None:
+    """Return the delay of the gyroscope in one stream of both sensors; None if unknown."""
+    if imu.absent:
+        return None
+    return gyroscope_delay(
+        finite_stream(imu.stamp_ns, imu.force_s), finite_stream(imu.stamp_ns, imu.rate_s)
+    )
+
+
+def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> GyroscopeDelay | None:
     """
-    Return (delay of the gyroscope's stamps, its standard deviation), s; (None, inf) if unknown.
+    Return the delay of the gyroscope's stamps; None where the motion does not determine it.
 
     With the direction u of the specific force and the integral theta of the rates over a window,
     shifted by the delay d::
@@ -155,16 +184,16 @@ def gyroscope_delay(
 
     windows = _windows(accelerometer)
     if windows is None:
-        return None, np.inf
+        return None
     start, stop, middle, change = windows
     if np.linalg.norm(change, axis=1).sum() < MIN_DELAY_ROTATION:
-        return None, np.inf
+        return None
     time = (gyroscope.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
     steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
     theta = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     inside = (start > time[0] + MAX_DELAY) & (stop < time[-1] - MAX_DELAY)
     if np.count_nonzero(inside) < 20 * DELAY_PARTS:
-        return None, np.inf
+        return None
     # Windows in which gravity rotates most determine the delay.
     rotation = np.where(inside, np.linalg.norm(change, axis=1), 0.0)
     most = np.sort(np.argsort(rotation)[-MOST_WINDOWS:])
@@ -192,14 +221,14 @@ def gyroscope_delay(
     costs = [residual(candidate, every) for candidate in candidates]
     delay = best(every, candidates[int(np.argmin(costs))])
     if residual(delay, every) > (1.0 - MIN_EXPLAINED) * float(np.sum(change**2)):
-        return None, np.inf
+        return None
     # Jackknife over parts of the recording, because the residuals are correlated in time.
     part = np.arange(len(start)) * DELAY_PARTS // len(start)
     without = np.array([best(part != number, delay) for number in range(DELAY_PARTS)])
     variance = (DELAY_PARTS - 1) / DELAY_PARTS * np.sum((without - without.mean()) ** 2)
     if abs(delay) > MAX_DELAY - DELAY_STEP:
-        return None, np.inf
-    return delay, float(np.sqrt(variance))
+        return None
+    return GyroscopeDelay(delay, float(np.sqrt(variance)))
 
 
 def _windows(accelerometer):

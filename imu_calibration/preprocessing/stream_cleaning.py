@@ -16,6 +16,7 @@ from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from imu_calibration.preprocessing.wrap_filter import WrapFilter
+from imu_calibration.preprocessing.zero_filter import ZeroFilter
 
 _SECOND = 1_000_000_000
 BACKWARD_RESET_NS = _SECOND
@@ -39,10 +40,10 @@ class StreamCheck:
 
     Dropped, and counted in `counts`: 'not finite', 'repeated stamp' (the first of equal stamps is
     kept), 'backward stamp' (a late sample), 'stray stamp' (one sample far from both neighbours), of
-    an IMU also 'spike' (`spike_filter`). 'clock reset' counts the jumps, each of which starts a new
-    epoch; an overflow of the counter from which stamps are made is undone. Where the stamps of an
-    IMU follow a clock only loosely (packets, times of arrival, milliseconds, jitter), the times of
-    its samples are computed first (see `sample_times`).
+    an IMU also 'zero' (`zero_filter`) and 'spike' (`spike_filter`). 'clock reset' counts the jumps,
+    each of which starts a new epoch; an overflow of the counter from which stamps are made is
+    undone. Where the stamps of an IMU follow a clock only loosely (packets, times of arrival,
+    milliseconds, jitter), the times of its samples are computed first (see `sample_times`).
 
     Parameters
     ----------
@@ -71,6 +72,7 @@ class StreamCheck:
         self._times: SampleTimes | None = None
         self._wraps = WrapFilter()
         self._spikes = SpikeFilter()
+        self._zeros = ZeroFilter()
         self._filters = EpochFilters(self._wraps, self._spikes)
 
     @property
@@ -99,6 +101,10 @@ class StreamCheck:
         if not len(samples):
             return []
         samples = self._finite(samples)
+        if isinstance(samples, ImuSamples) and len(samples) and not samples.absent:
+            n_before = self._zeros.n_dropped
+            samples = self._zeros.push(samples)
+            self._count('zero', self._zeros.n_dropped - n_before)
         if len(samples):
             samples = replace(samples, stamp_ns=self._overflows.undone(samples.stamp_ns))
         if isinstance(samples, ImuSamples):
@@ -109,6 +115,7 @@ class StreamCheck:
         """Return the buffered samples, as `push` does."""
         waiting = None if self.presence is None else self.presence.finish()
         accepted = [] if waiting is None else self._checked(waiting)
+        self._count('zero', self._zeros.finish())
         held, self._held = self._held, None
         return accepted + self._without_spikes(
             ([] if held is None else self._accept(held)) + self._end_epoch(), ended=True

@@ -13,6 +13,7 @@ from imu_calibration.core.readings import (
     RawReadings,
     SensorUnit,
 )
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.core.scales import IMPOSSIBLE, USUAL, scale_range
 from imu_calibration.core.units import (
     DEG,
@@ -40,6 +41,13 @@ LINEAR = 0.8
 m/s^2; a shorter specific force at rest is noise and bias of an acceleration without gravity.
 Readings in g have at least 0.8.
 """
+INCREMENT_AGREEMENT = 0.15
+"""
+Readings are increments over one sample where their length times the samples per second differs from
+gravity by less than this share.
+"""
+SAME_PER_SECOND = 0.02
+"""Relative difference up to which the samples per second are those that were stated."""
 MAX_GYRO_RATE = 100.0
 """rad/s, 5700 deg/s: above the range of nearly all gyroscopes."""
 FASTEST_DEG = 5000.0
@@ -65,9 +73,11 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     if length is None or 'accelerometer' in evidence.absent or not evidence.n_changed[:3].any():
         return  # outputs that never change are no unit: see the check of frozen outputs
     where = 'at rest' if evidence.rest is not None else 'in the middle'
-    error = force_error(length, where, evidence.readings.accelerometer)
+    imu = evidence.streams.get('imu')
+    per_second = imu.rate if imu is not None else 0.0
+    error = force_error(length, where, evidence.readings.accelerometer, per_second=per_second)
     if error is not None:
-        yield CheckFinding('force_unit', REFUSE, str(error), key=error.key, value=error.value)
+        yield CheckFinding(error.code, REFUSE, str(error), key=error.key, value=error.value)
     else:
         yield CheckFinding(
             'force_unit', GOOD, f'specific force in m/s^2: its length is {length:.3f}'
@@ -75,7 +85,11 @@ def force_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
 
 
 def force_error(
-    length: float, where: str = 'at rest', stated: SensorUnit = SI_ACCELEROMETER
+    length: float,
+    where: str = 'at rest',
+    stated: SensorUnit = SI_ACCELEROMETER,
+    *,
+    per_second: float = 0.0,
 ) -> InputError | None:
     """
     Return the error for a median length of the specific force that is not gravity in m/s^2.
@@ -90,6 +104,8 @@ def force_error(
         Part of the recording with this length.
     stated : SensorUnit
         Unit of the readings as it was stated.
+    per_second : float
+        Samples per second, for the search of increments; 0: not known.
 
     """
     said = f'specific force must be in m/s^2, its length {where} is {length:.4g}: '
@@ -114,6 +130,15 @@ def force_error(
             code='force_unit',
             value=unit,
         )
+    gravity_ratio = length * per_second / STANDARD_GRAVITY
+    if stated.is_si and abs(gravity_ratio - 1.0) < INCREMENT_AGREEMENT:
+        return InputError(
+            f'{said}increments per sample? Times {per_second:.4g} Hz it is'
+            f' {length * per_second:.4g}; {remedy}',
+            key='increments',
+            code='increments',
+            value=f'{per_second:.4g}',
+        )
     if length < LINEAR:
         return InputError(
             f'{said}it is probably acceleration without gravity, as phones compute it; record the'
@@ -131,19 +156,56 @@ def force_error(
     return None
 
 
-def refuse_force_unit(force: np.ndarray, readings: RawReadings = RawReadings()) -> None:
+def increments(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Increments over one sample have the stated samples per second."""
+    imu = evidence.streams.get('imu')
+    if imu is None or not imu.rate:
+        return
+    error = increments_error(imu.rate, evidence.readings)
+    if error is not None:
+        yield CheckFinding(error.code, REFUSE, str(error), key=error.key, value=error.value)
+
+
+def increments_error(per_second: float, readings: RawReadings) -> InputError | None:
+    """Return the error for increments over samples that are not those of the stream, or None."""
+    for unit in (readings.accelerometer, readings.gyroscope):
+        stated = unit.per_second
+        if stated and abs(per_second / stated - 1.0) > SAME_PER_SECOND:
+            return InputError(
+                f'increments must be over the samples of the recording, {unit.unit} is stated and'
+                f' it has {per_second:.4g} samples per second; give the recording that the unit'
+                ' belongs to, or state its rate',
+                key='increments',
+                code='increments_rate',
+                value=f'{per_second:.4g}',
+            )
+    return None
+
+
+def samples_per_second(stamp_ns: np.ndarray) -> float:
+    """Return the rate of the median step between stamps, shape (n,); 0 where none advances."""
+    steps = np.diff(stamp_ns)
+    steps = steps[steps > 0]
+    return 1e9 / float(np.median(steps)) if len(steps) else 0.0
+
+
+def refuse_units(imu: ImuSamples, readings: RawReadings = RawReadings()) -> None:
     """
-    Raise the error of `force_error` for raw specific forces, (n, 3), that are in another unit.
+    Raise the error of `force_error` for raw readings that are in another unit.
 
     The median length decides, so that a motion in part of them does not. Readings that are zero or
-    not finite are no measurement of gravity.
+    not finite are no measurement of gravity. Increments must be over the samples of this stream.
     """
-    stated = readings.accelerometer
+    stated, force = readings.accelerometer, imu.force_s
+    per_second = samples_per_second(imu.stamp_ns)
+    if per_second and (wrong := increments_error(per_second, readings)) is not None:
+        raise wrong
     measured = np.isfinite(force).all(axis=1) & np.any(force != 0.0, axis=1)
     length = np.linalg.norm(stated.convert(force[measured]), axis=1)
     if len(length) == 0:
         return
-    error = force_error(float(np.median(length)), 'in the recording', stated)
+    median = float(np.median(length))
+    error = force_error(median, 'in the recording', stated, per_second=per_second)
     if error is not None:
         raise error
 
@@ -172,7 +234,7 @@ def rate_unit(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
         unit = _unit_of_ratio(raw_ratio)
         if unit and scale_range(ratio) is IMPOSSIBLE:
             yield wrong_rate_unit(f'{came}probably {unit}; {convert}', unit)
-        elif 0.6 < raw_ratio / DEG < 1.6:
+        elif 0.6 < ratio / DEG < 1.6:
             yield wrong_rate_unit(
                 f'{came}probably converted from deg/s twice; convert them once',
                 f'counts:{DEG:.7g}/(rad/s)',
@@ -395,6 +457,20 @@ def gravity(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     else:
         yield CheckFinding(
             'gravity', GOOD, f'gravity reads {rest.length:.3f} m/s^2, {100 * off:+.1f} % ({what})'
+        )
+
+
+def dead_band(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
+    """Small rates are measured."""
+    bands = evidence.dead_band
+    if bands.any():
+        letters = ', '.join(letter for letter, band in zip('xyz', bands, strict=True) if band > 0)
+        yield CheckFinding(
+            'dead_band',
+            WARNING,
+            f'the gyroscope has a dead band on {letters}, rates below'
+            f' {significant(float(bands.max()) / DEG)} deg/s are given as 0: its bias and noise at'
+            ' rest are not measured; switch it off in the driver or in the sensor',
         )
 
 

@@ -22,7 +22,7 @@ from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
-from imu_calibration.core.readings import UNIT_KEYS
+from imu_calibration.core.readings import STATED_KEYS
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import CHANGE
 from imu_calibration.document import files
@@ -277,7 +277,7 @@ def check_recording(
     calibration = files.given_calibration(calibration)
     # The readings are those of the calibration, unless the choices state others.
     described = {**choices, 'nominal': readings_for(calibration, choices)}
-    for name in UNIT_KEYS.values():
+    for name in STATED_KEYS:
         described.pop(name, None)
     options, table, sources = inputs_of([recording], table, described)
     if table is None:

@@ -13,7 +13,13 @@ from typing import Any, NamedTuple, TypedDict
 from imu_calibration.allan.figures import NoiseFigures
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import ImuCalibrationError, InputError
-from imu_calibration.core.readings import AXES_KEY, UNIT_KEYS, RawReadings, combined
+from imu_calibration.core.readings import (
+    AXES_KEY,
+    STATED_KEYS,
+    UNIT_KEYS,
+    RawReadings,
+    combined,
+)
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import override
 from imu_calibration.document import files
@@ -94,6 +100,8 @@ class Choices(TypedDict, total=False):
     """Unit of the specific force in the recording, such as g or counts:16384/g; default m/s^2."""
     gyroscope_unit: str | None
     """Unit of the angular rate, such as deg/s or counts:16.4/(deg/s); default rad/s."""
+    increments: float | None
+    """Samples per second of readings that are increments over a sample; default rates."""
     axes: str | None
     """
     Axes of the readings: flu, frd, or the axes of the source that point forward, left and up, such
@@ -287,7 +295,7 @@ def readings_for(calibration: Calibration, choices: Mapping[str, Any]) -> RawRea
 
 def _stated(choices):
     """Return the units and axes that options state, as arguments of `readings.combined`."""
-    return {name: choices.get(name) for name in (*UNIT_KEYS.values(), AXES_KEY)}
+    return {name: choices.get(name) for name in (*STATED_KEYS, AXES_KEY)}
 
 
 def raw_columns(readings: RawReadings | None, choices: Mapping[str, Any]) -> tuple[str, ...]:

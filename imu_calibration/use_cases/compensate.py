@@ -19,16 +19,19 @@ from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.progress import counter
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.document.calibration import ABSENT, Calibration
 from imu_calibration.document.trust import caveats, usable, with_measured_noise
-from imu_calibration.preprocessing.checks import frozen_lines
+from imu_calibration.preprocessing.checks import frozen_lines, refuse
+from imu_calibration.preprocessing.exclusion import ExclusionMask, parse_exclusions
+from imu_calibration.preprocessing.recording_evidence import EvidenceGatherer
 from imu_calibration.preprocessing.scan import FrozenSearch
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
-from imu_calibration.preprocessing.value_checks import refuse_force_unit
+from imu_calibration.preprocessing.value_checks import rate_unit, refuse_units
 from imu_calibration.use_cases.choices import noise_of, raw_columns, readings_for
 from imu_calibration.use_cases.recordings import Topics, existing, open_bag, temperatures
-from msg_adapters.csv_log import is_text_log, read_directly
+from msg_adapters.csv_log import has_corrected_readings, is_text_log, read_directly
 
 CORRECTED_TOPIC = '/imu/data_corrected'
 UNIT_READINGS = 20000
@@ -104,7 +107,9 @@ def compensate_recording(
     nominal: str | PathLike | RawReadings | None = None,
     accelerometer_unit: str | None = None,
     gyroscope_unit: str | None = None,
+    increments: float | None = None,
     where: Sequence[str] = (),
+    exclude: str | None = None,
 ) -> Compensated:
     """
     Correct the calibrated errors in a recording.
@@ -135,10 +140,12 @@ def compensate_recording(
         Topics to read.
     frame_id : str, optional
         frame_id of the Imu messages; required if the topic has messages of several.
-    nominal, accelerometer_unit, gyroscope_unit : optional
+    nominal, accelerometer_unit, gyroscope_unit, increments : optional
         Units of these readings where they differ from those of the calibration, see `Choices`.
     where : sequence of str
         Conditions 'COLUMN=VALUE': only these rows of a text log are read.
+    exclude : str, optional
+        Times without corrected readings, 'A:B,...' in s since the first stamp of the IMU.
 
     Raises
     ------
@@ -157,10 +164,14 @@ def compensate_recording(
         'nominal': nominal,
         'accelerometer_unit': accelerometer_unit,
         'gyroscope_unit': gyroscope_unit,
+        'increments': increments,
     }
     readings = readings_for(calibration, units)
+    mask = ExclusionMask(parse_exclusions(exclude) if exclude else ())
     if isinstance(recording, (ImuSamples, SampleBlock)):
-        return _in_memory(recording, calibration, transfer, late=late, used=used, readings=readings)
+        return _in_memory(
+            recording, calibration, transfer, late=late, used=used, readings=readings, mask=mask
+        )
     if output is not None and Path(output).exists():
         raise InputError(
             f'the output {output} must not exist yet; choose another name or remove it',
@@ -178,7 +189,9 @@ def compensate_recording(
             used=used,
             readings=readings,
             topics=topics,
+            mask=mask,
         )
+    _refuse_corrected_log(recording)
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
@@ -187,11 +200,11 @@ def compensate_recording(
         stream = CompensationStream(
             calibration, temperature=temperatures(recording, topics), transfer=transfer
         )
-        search, sources = FrozenSearch(), TwoSourceSearch()
+        search, checks = FrozenSearch(), RawChecks(readings)
 
         def correct(imu):
             advance(len(imu))
-            _search_sources(sources, imu)
+            checks.push(imu)
             search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
             return stream.correct(readings.apply(imu))
 
@@ -204,12 +217,13 @@ def compensate_recording(
             return stream.propagate(force_cov, rate_cov)
 
         if output is None:
-            parts = [
-                _corrected(block.imu, correct(block.imu), transfer, late)
-                for block in bag.blocks()
-                if block.imu is not None
-            ]
-            sources.require_one()
+            parts = []
+            for block in bag.blocks():
+                if block.imu is not None:
+                    imu = block.imu.select(mask.kept(block.imu.stamp_ns))
+                    parts.append(_corrected(imu, correct(imu), transfer, late))
+            mask.require_used()
+            checks.require()
             return _outcome(
                 ImuSamples.concatenate(parts) if parts else None,
                 stream,
@@ -218,6 +232,10 @@ def compensate_recording(
                 search=search,
             )
         from msg_adapters.copying import copy_with_corrected
+
+        def check():
+            mask.require_used()
+            checks.require()
 
         lost = copy_with_corrected(
             recording,
@@ -232,12 +250,13 @@ def compensate_recording(
             source_frame_id=frame_id,
             raw=raw,
             where=topics.where,
-            check=sources.require_one,
+            check=check,
+            keep=mask.kept if exclude else None,
         )
         return _outcome(None, stream, lost, used=used, search=search)
 
 
-def _into_text_log(recording, output, calibration, *, transfer, late, used, readings, topics):
+def _into_text_log(recording, output, calibration, *, transfer, late, used, readings, topics, mask):
     """Correct a text log into another one with the same columns."""
     from msg_adapters.csv_copy import write_corrected_log
 
@@ -253,54 +272,94 @@ def _into_text_log(recording, output, calibration, *, transfer, late, used, read
             ' bag, or leave the stamps as they are',
             code='output_kind',
         )
+    _refuse_corrected_log(recording)
     log = read_directly(existing(recording), topics.raw, topics.where)
     block = SampleBlock(log.imu, None, log.temperature)
-    found = _in_memory(block, calibration, transfer, late=0, used=used, readings=readings)
+    found = _in_memory(
+        block, calibration, transfer, late=0, used=used, readings=readings, mask=mask
+    )
     with files.output_folder(str(Path(output).parent)):
         write_corrected_log(output, log, found.imu)
     return replace(found, imu=None)
 
 
+def _refuse_corrected_log(recording):
+    """Refuse a text log whose header states that its readings are corrected."""
+    if is_text_log(recording) and existing(recording).is_file():
+        if has_corrected_readings(recording):
+            raise InputError(
+                f'the log must hold raw measurements, the header of {recording} states corrected'
+                ' ones; give the raw log',
+                code='corrected_already',
+            )
+
+
 def _refuse_bag_unit(recording, topics, readings):
     """Check the unit at the start of a bag, in a pass of its own: nothing is written before."""
-    forces, count = [], 0
+    parts, count = [], 0
     with open_bag(recording, topics, want_joints=False) as bag:
         for block in bag.blocks():
             if block.imu is None:
                 continue
-            forces.append(block.imu.force_s)
+            parts.append(block.imu)
             count += len(block.imu)
             if count >= UNIT_READINGS:
                 break
-    if forces:
-        refuse_force_unit(np.concatenate(forces), readings)
+    if parts:
+        refuse_units(ImuSamples.concatenate(parts), readings)
 
 
-def _search_sources(sources, imu):
-    """Push the finite samples; an absent sensor has none."""
-    sources.push(
-        imu.select(np.isfinite(imu.force_s).all(axis=1) & np.isfinite(imu.rate_s).all(axis=1))
-    )
+class RawChecks:
+    """
+    Checks of raw readings that need all of them: one sensor, and the unit of the rates.
+
+    Parameters
+    ----------
+    readings : RawReadings
+        Their stated units.
+
+    """
+
+    def __init__(self, readings: RawReadings):
+        self._readings, self._sources = readings, TwoSourceSearch()
+        self._gatherer = EvidenceGatherer(STANDARD_GRAVITY)
+
+    def push(self, imu: ImuSamples) -> None:
+        """Process raw samples; without a reading of each sensor there is nothing to compare."""
+        finite = np.isfinite(imu.force_s).all(axis=1) & np.isfinite(imu.rate_s).all(axis=1)
+        if not finite.any():
+            return
+        measured = imu.select(finite)
+        self._sources.push(measured)
+        self._gatherer.push_imu(self._readings.apply(measured))
+
+    def require(self) -> None:
+        """Raise where there are two sensors, or the rates do not turn gravity in their unit."""
+        self._sources.require_one()
+        evidence = self._gatherer.evidence({}, self._readings)
+        refuse(tuple(rate_unit(evidence)))
 
 
-def _in_memory(recording, calibration, transfer, *, late, used, readings):
+def _in_memory(recording, calibration, transfer, *, late, used, readings, mask):
     block = recording if isinstance(recording, SampleBlock) else SampleBlock(recording)
     # A recording in memory has samples of an IMU.
     assert block.imu is not None
-    refuse_force_unit(block.imu.force_s, readings)
+    kept = mask.kept(block.imu.stamp_ns)
+    mask.require_used()
+    imu = block.imu.select(kept)
+    refuse_units(imu, readings)
     stream = CompensationStream(calibration, temperature=block.temperature, transfer=transfer)
-    search = FrozenSearch()
-    sources = TwoSourceSearch()
-    _search_sources(sources, block.imu)
-    sources.require_one()
-    search.push(block.imu.stamp_ns, block.imu.force_s, block.imu.rate_s)
-    return _outcome(
-        _corrected(block.imu, stream.correct(readings.apply(block.imu)), transfer, late),
-        stream,
-        {},
-        used=used,
-        search=search,
-    )
+    search, checks = FrozenSearch(), RawChecks(readings)
+    checks.push(imu)
+    checks.require()
+    search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
+    corrected = _corrected(imu, stream.correct(readings.apply(imu)), transfer, late)
+    if not kept.all():
+        # one sample for each reading, without values in the excluded times
+        force, rate = np.full((2, len(kept), 3), np.nan)
+        force[kept], rate[kept] = corrected.force_s, corrected.rate_s
+        corrected = ImuSamples(block.imu.stamp_ns - late, force, rate, corrected.frame_id)
+    return _outcome(corrected, stream, {}, used=used, search=search)
 
 
 def _outcome(imu, stream, lost, *, used, search):

@@ -24,6 +24,7 @@ from imu_calibration.use_cases.recordings import (
     Topics,
     name_of,
     source_of,
+    sources_without,
     table_of,
     temperatures,
 )
@@ -39,6 +40,7 @@ def export_calibration(
     bag: str | PathLike | None = None,
     stand: Stand | None = None,
     topics: Topics = Topics(),
+    exclude: str | None = None,
     anyway: bool = False,
     axes: str | None = None,
     force: bool = False,
@@ -63,6 +65,8 @@ def export_calibration(
         Reference of the true motion of the recording; default its compensated readings.
     topics : Topics
         Of the bag.
+    exclude : str, optional
+        Times of the bag that are not used, 'A:B,...' in s since its first stamp.
     anyway : bool
         Also the numbers of a sensor whose decision is `harms`; without it they are nominal.
     axes : str, optional
@@ -85,7 +89,7 @@ def export_calibration(
     motion = None
     if bag is not None:
         topics = topics._replace(raw=raw_columns(known.readings, {}))
-        motion = _motion(known, bag, stand, topics)
+        motion = _motion(known, bag, stand, topics=topics, exclude=exclude)
     found = export(known, target, noise=figures, rate=rate, motion=motion, anyway=anyway)
     if output is not None:
         files.require_new(output, force=force)
@@ -93,11 +97,12 @@ def export_calibration(
     return found
 
 
-def _motion(calibration, bag, stand, topics) -> TrialMotion:
+def _motion(calibration, bag, stand, *, topics, exclude) -> TrialMotion:
     """Return the motion of a recording: from the table, otherwise from its compensated readings."""
     temperature = temperatures(bag, topics)
     if stand is None:
-        blocks = [block.imu for block in source_of(bag, topics)() if block.imu is not None]
+        (source,) = sources_without([source_of(bag, topics)], [bag], exclude)
+        blocks = [block.imu for block in source() if block.imu is not None]
         return recorded_motion(
             calibration,
             calibration.readings.apply(ImuSamples.concatenate(blocks)),
@@ -105,7 +110,8 @@ def _motion(calibration, bag, stand, topics) -> TrialMotion:
             name=name_of(bag),
         )
     table = table_of(stand, [bag], topics)
-    imu, ref = session_truth(source_of(bag, topics, table.joint_names)(), table)
+    (source,) = sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude)
+    imu, ref = session_truth(source(), table)
     warmth = measured_temperature(calibration, temperature, imu.stamp_ns)
     return motion_of(
         ref.force_s,

@@ -116,11 +116,11 @@ def imu_topics_of(bag: str | PathLike, topics: Topics) -> list[Topics]:
         When there are more than `MOST_IMUS`.
 
     """
-    names = (
-        [topics.imu]
-        if topics.imu is not None or topics.gyroscope is not None
-        else [topic.name for topic in list_topics(bag, topics.where) if topic.type == IMU_TYPE]
-    )
+    if topics.imu is not None or topics.gyroscope is not None:
+        names = [topics.imu]
+    else:
+        listed = list_topics(bag, topics.where, topics.raw)
+        names = [topic.name for topic in listed if topic.type == IMU_TYPE]
     _limit_imus(bag, len(names))
     found = []
     for name in names:

@@ -94,11 +94,13 @@ def identify_recording(
     recording: str | PathLike | SampleBlock,
     *,
     imu_topic: str | None = None,
+    gyroscope_topic: str | None = None,
     temperature_topic: str | None = None,
     frame_id: str | None = None,
     nominal: str | PathLike | RawReadings | None = None,
     accelerometer_unit: str | None = None,
     gyroscope_unit: str | None = None,
+    increments: float | None = None,
     horizon: float = HORIZON,
     exclude: str | None = None,
     where: Sequence[str] = (),
@@ -110,11 +112,12 @@ def identify_recording(
     ----------
     recording : path-like or SampleBlock
         Bag, or samples in memory; it is read twice.
-    imu_topic, temperature_topic : str, optional
-        Default /imu/data_raw and /imu/temperature, otherwise the only topics of their types.
+    imu_topic, gyroscope_topic, temperature_topic : str, optional
+        Default /imu/data_raw and /imu/temperature, otherwise the only topics of their types;
+        `gyroscope_topic` where the rates have one of their own.
     frame_id : str, optional
         frame_id of the Imu messages; required if the topic has messages of several.
-    nominal, accelerometer_unit, gyroscope_unit : optional
+    nominal, accelerometer_unit, gyroscope_unit, increments : optional
         Units of the readings, see `Choices`.
     horizon : float
         Averaging time at which a random walk approximates the slow noise, s.
@@ -133,13 +136,16 @@ def identify_recording(
         'nominal': nominal,
         'accelerometer_unit': accelerometer_unit,
         'gyroscope_unit': gyroscope_unit,
+        'increments': increments,
     }
     readings = readings_of(units)
     raw = raw_columns(readings, units)
-    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw, where=tuple(where))
+    topics = Topics(
+        imu_topic, None, temperature_topic, frame_id, raw, gyroscope_topic, tuple(where)
+    )
     (source,) = sources_without([source_of(recording, topics)], [recording], exclude)
     result = identify_noise(source, readings)
-    chosen = topics.chosen() | {'exclude': exclude}
+    chosen = topics.chosen() | {'gyroscope_topic': gyroscope_topic, 'exclude': exclude}
     options = {name: value for name, value in chosen.items() if value}
     if readings is not None:
         options['readings'] = readings.to_mapping()

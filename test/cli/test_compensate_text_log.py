@@ -4,11 +4,14 @@ import json
 
 import numpy as np
 import pytest
+from refusal import refused
 
 from imu_calibration.cli.main import main
+from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.use_cases.compensate import compensate_recording
+from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv
 from msg_adapters.write import write_session
 
@@ -46,26 +49,27 @@ def comma(text):
     return text.replace('.', ',')
 
 
+MS2, RADS = 'm/s^2 corrected', 'rad/s corrected'
 CASES = {
     # name -> header, delimiter, time, unit of force and of rate, header that is expected
     'si without units': (
         't,ax,ay,az,note,gx,gy,gz',
         ',',
         (1.0, 1.0),
-        't (s),ax (m/s^2),ay (m/s^2),az (m/s^2),note,gx (rad/s),gy (rad/s),gz (rad/s)',
+        f't (s),ax ({MS2}),ay ({MS2}),az ({MS2}),note,gx ({RADS}),gy ({RADS}),gz ({RADS})',
     ),
     'g and deg/s': (
         'millis;ax_g;ay_g;az_g;note;gx_dps;gy_dps;gz_dps',
         ';',
         (STANDARD_GRAVITY, DEG),
-        'millis;ax (m/s^2);ay (m/s^2);az (m/s^2);note;gx (rad/s);gy (rad/s);gz (rad/s)',
+        f'millis;ax ({MS2});ay ({MS2});az ({MS2});note;gx ({RADS});gy ({RADS});gz ({RADS})',
     ),
     'time of day': (
         'Time\tAccel[0]\tAccel[1]\tAccel[2]\tnote\tGyro[0]\tGyro[1]\tGyro[2]',
         '\t',
         (1.0, 1.0),
-        'Time\tAccel (m/s^2)[0]\tAccel (m/s^2)[1]\tAccel (m/s^2)[2]\tnote'
-        '\tGyro (rad/s)[0]\tGyro (rad/s)[1]\tGyro (rad/s)[2]',
+        f'Time\tAccel ({MS2})[0]\tAccel ({MS2})[1]\tAccel ({MS2})[2]\tnote'
+        f'\tGyro ({RADS})[0]\tGyro ({RADS})[1]\tGyro ({RADS})[2]',
     ),
 }
 
@@ -175,3 +179,33 @@ def test_refusals_write_nothing(case, code, calibration, tmp_path, monkeypatch, 
     assert json.loads(capsys.readouterr().out)['error']['code'] == code
     assert sorted(path.name for path in tmp_path.iterdir()) == before
     assert case != 'exists' or (tmp_path / 'out.csv').read_text() == 'mine'
+
+
+def test_a_corrected_log_is_not_corrected_again(tmp_path, calibration):
+    write_log(tmp_path / 'log.csv', next(iter(CASES)))
+    first, second = tmp_path / 'first.csv', tmp_path / 'second.csv'
+    compensate_recording(tmp_path / 'log.csv', calibration, output=first)
+    for output in (second, tmp_path / 'bag', None):
+        with refused(InputError, 'corrected_already'):
+            compensate_recording(first, calibration, output=output)
+    assert not second.exists() and not (tmp_path / 'bag').exists()
+    # Other verbs read it: the word after the unit changes nothing.
+    assert [each.unit for each in read_csv(first).columns[1:3]] == ['m/s^2', 'rad/s']
+
+
+def test_excluded_times_have_no_corrected_readings(tmp_path, calibration):
+    write_log(tmp_path / 'log.csv', next(iter(CASES)))
+    whole = compensate_recording(tmp_path / 'log.csv', calibration).imu
+    seconds = (whole.stamp_ns - whole.stamp_ns[0]) * 1e-9
+    inside = (seconds >= 1.0) & (seconds < 2.5)
+    output = tmp_path / 'part.csv'
+    compensate_recording(tmp_path / 'log.csv', calibration, output=output, exclude='1:2.5')
+    empty = np.array([line.count(',,') >= 2 for line in output.read_text().splitlines()[1:]])
+    assert np.array_equal(empty, inside)
+    bag = tmp_path / 'bag'
+    compensate_recording(tmp_path / 'log.csv', calibration, output=bag, exclude='1:2.5')
+    with open_recording(bag, '/imu/data_corrected', want_joints=False) as recording:
+        stamps = np.concatenate([block.imu.stamp_ns for block in recording.blocks() if block.imu])
+    assert np.array_equal(stamps, whole.stamp_ns[~inside])
+    with refused(InputError, 'exclude_outside'):
+        compensate_recording(tmp_path / 'log.csv', calibration, exclude='900:901')

@@ -92,6 +92,8 @@ NAMED = {
 UNREACHABLE = {
     'calibration_node': {
         'exclude': 'of times in a recording',
+        'increments': 'readings are converted in the driver, which the error names',
+        'noise': 'no noise is compared',
         'accelerometer_unit': 'readings are converted in the driver, which the error names',
         'gyroscope_unit': 'readings are converted in the driver, which the error names',
         'anyway': 'no calibration is applied',
@@ -106,6 +108,7 @@ UNREACHABLE = {
         'target_frame': 'no calibration is applied',
     },
     'planner_node': {
+        'increments': 'no readings are compared',
         'force': 'results of verbs',
         'noise': 'no noise is compared',
         'anyway': 'no calibration is applied',
@@ -120,8 +123,13 @@ UNREACHABLE = {
         'up': 'of transforms in a bag',
         'target_frame': 'no calibration is applied',
     },
-    'simulator_node': {'up': 'of transforms in a bag', 'force': 'results of verbs'},
+    'simulator_node': {
+        'up': 'of transforms in a bag',
+        'force': 'results of verbs',
+        'increments': 'no readings are compared',
+    },
     'compensator_node': {
+        'increments': 'the calibration states the unit',
         'force': 'results of verbs',
         'axes': 'no calibration is exported',
         'accelerometer_unit': 'the calibration states the unit',
@@ -131,6 +139,7 @@ UNREACHABLE = {
         'up': 'of transforms in a bag',
     },
     'bag_player_node': {
+        'increments': 'readings are played as they are',
         'allow_xacro': 'no robot description is read',
         'force': 'results of verbs',
     },

@@ -6,6 +6,7 @@ from refusal import refused
 
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import SampleBlock
 from imu_calibration.preprocessing.sensor_join import (
     SensorStream,
     finite_stream,
@@ -13,6 +14,7 @@ from imu_calibration.preprocessing.sensor_join import (
     interpolated,
     join_sensors,
 )
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from msg_adapters.bag import open_recording
 from msg_adapters.csv_log import read_csv, read_logs
 
@@ -39,11 +41,11 @@ def test_the_slower_stamps_are_kept_and_the_delay_is_estimated(streams):
     joined = join_sensors(*streams)
     assert joined.slower == 'accelerometer'
     assert set(joined.imu.stamp_ns) <= set(streams[0].stamp_ns)
-    assert 0 < joined.delay_sd < 5e-3
-    assert abs(joined.delay - LATE) < 4 * joined.delay_sd
+    assert 0 < joined.delay.sd < 5e-3
+    assert abs(joined.delay.delay - LATE) < 4 * joined.delay.sd
     # Exchanged names of the axes and another unit do not change a delay.
     turned = SensorStream(streams[1].stamp_ns, -57.3 * streams[1].values[:, [1, 0, 2]])
-    assert gyroscope_delay(streams[0], turned)[0] == pytest.approx(joined.delay, abs=1e-4)
+    assert gyroscope_delay(streams[0], turned).delay == pytest.approx(joined.delay.delay, abs=1e-4)
 
 
 def test_without_rotation_there_is_no_delay():
@@ -51,7 +53,7 @@ def test_without_rotation_there_is_no_delay():
     stamps = START_NS + np.arange(n) * 10_000_000
     force = np.array([0, 0, 9.8]) + 0.01 * generator.standard_normal((n, 3))
     rate = 0.001 * generator.standard_normal((n, 3))
-    assert gyroscope_delay(SensorStream(stamps, force), SensorStream(stamps, rate))[0] is None
+    assert gyroscope_delay(SensorStream(stamps, force), SensorStream(stamps, rate)) is None
 
 
 def test_nothing_is_interpolated_across_gaps_and_ends():
@@ -98,12 +100,12 @@ def test_two_logs_and_a_folder_are_one_recording(folder, streams):
     # x, y, z by name, although the columns are z, y, x; stamps of 19 digits lose 256 ns
     at = np.searchsorted(streams[0].stamp_ns, pair.imu.stamp_ns[0] - 1000)
     assert np.allclose(pair.imu.force_s[0], streams[0].values[at], atol=1e-8)
-    assert abs(pair.joined.delay - LATE) < 4 * pair.joined.delay_sd
+    assert abs(pair.joined.delay.delay - LATE) < 4 * pair.joined.delay.sd
 
 
 def test_convert_writes_them(folder, tmp_path, capsys):
     assert main(['convert', str(folder), '--output', str(tmp_path / 'bag')]) == 0
-    assert f'{1e3 * read_logs([folder]).joined.delay:.1f}' in capsys.readouterr().out
+    assert f'{1e3 * read_logs([folder]).joined.delay.delay:.1f}' in capsys.readouterr().out
     with open_recording(tmp_path / 'bag', want_joints=False) as recording:
         samples = next(recording.blocks()).imu
     assert np.isfinite(samples.force_s).all() and np.isfinite(samples.rate_s).all()
@@ -154,7 +156,7 @@ def test_a_table_with_empty_cells_is_read_as_two_streams(streams, tmp_path):
     path.write_text('\n'.join(['time (s),ax,ay,az,gx,gy,gz', *lines]) + '\n')
     log = read_csv(path)
     assert log.joined.slower == 'accelerometer'
-    assert abs(log.joined.delay - LATE) < 4 * log.joined.delay_sd
+    assert abs(log.joined.delay.delay - LATE) < 4 * log.joined.delay.sd
     assert np.isfinite(log.imu.rate_s).all()
     assert len(log.imu) > 0.95 * len(streams[0].stamp_ns)
 
@@ -187,3 +189,17 @@ def test_finite_streams_advance():
     values[3] = np.nan
     found = finite_stream(stamps, values)
     assert found.stamp_ns.tolist() == [3, 4, 5]
+
+
+@pytest.mark.parametrize('late_s', [0.0, 0.055, -0.035])
+def test_a_late_gyroscope_of_one_stream_is_named_with_its_value(streams, late_s):
+    """Both sensors in one message, by a driver that filters the rates longer or not at all."""
+    accelerometer, gyroscope = streams
+    shift = round((LATE - late_s) * 1e9)
+    moved = SensorStream(gyroscope.stamp_ns - shift, gyroscope.values)
+    imu = join_sensors(accelerometer, moved).imu
+    found = calibrate_recordings(SampleBlock(imu), gravity=9.81).calibration
+    stored = found.statistics['gyroscope_delay']
+    assert abs(stored['delay'] - late_s) < 4 * stored['sd'] + 1e-3
+    named = [each['check'] for each in found.statistics['preflight']]
+    assert ('gyroscope_delay' in named) == (late_s != 0.0)

@@ -14,6 +14,7 @@ from test_by_hand import GRAVITY, simulate
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.table_calibration import calibrate_on_table
+from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.table import Table
@@ -222,6 +223,36 @@ def test_a_hidden_effect_is_named_live(tmp_path):
         and found['explanation'] == first.explanation
     )
     assert status.level == b'\1'
+
+
+@pytest.mark.parametrize('by_hand', [True, False])
+def test_two_imus_on_one_topic_are_refused(tmp_path, by_hand):
+    """A second driver remapped to the same topic: nothing is saved, and the cause is named."""
+    if by_hand:
+        imu, joints = simulate(2, n_poses=8, still=1.5)[0], None
+    else:
+        imu, joints, _, _ = make_session(3, SAMPLE_RATE)
+        imu = imu.select(slice(0, 1500))
+        joints = joints.select(joints.stamp_ns <= imu.stamp_ns[-1])
+    second = replace(
+        imu,
+        stamp_ns=imu.stamp_ns + 3_000_000,
+        force_s=imu.force_s + [0.31, -0.22, 0.18],
+        rate_s=imu.rate_s + [0.02, -0.03, 0.015],
+    )
+    both = ImuSamples.concatenate([imu, second])
+    both = both.select(np.argsort(both.stamp_ns, kind='stable'))
+    write_session(tmp_path / 'bag', both, joints)
+    options = {'table_file': '', 'gravity': GRAVITY} if by_hand else {}
+    with Station() as station:
+        station.watch_diagnostics()
+        station.calibration_node(tmp_path, **options)
+        player = station.play(tmp_path / 'bag', 8.0, subscribers=1)
+        station.until(lambda: player.poll() is not None, 'the end of the recording')
+        for service in ('solve', 'save'):
+            answer = station.call(f'/calibration_node/{service}')
+            assert not answer.success and 'two' in answer.message, answer.message
+    assert not (tmp_path / 'calibration.yaml').exists()
 
 
 @pytest.mark.long

@@ -253,7 +253,7 @@ FAULTS = (
     (in_mg, 'force_unit', REFUSE, (1000.0, 'mg')),
     (in_counts, 'force_unit', REFUSE, ()),
     (in_counts, 'rate_unit', REFUSE, ()),
-    (without_gravity, 'force_unit', REFUSE, ()),
+    (without_gravity, 'without_gravity', REFUSE, ()),
     (in_degrees, 'rate_unit', REFUSE, (56.1, 'deg')),
     (twice_converted, 'rate_unit', REFUSE, ()),
     (mirrored_gyroscope, 'handedness', REFUSE, ('gyroscope', 'accelerometer', 'y')),

@@ -146,6 +146,24 @@ def test_a_recording_in_another_unit_is_refused_with_the_option_that_states_it(
     np.testing.assert_allclose(lengths_at_rest(stated.imu, ranges), GRAVITY, rtol=1e-3)
 
 
+@pytest.mark.parametrize('rate_unit', ['deg/s', 'counts:65.5/(deg/s)'])
+def test_compensate_refuses_rates_in_another_unit(tmp_path, truth, rate_unit):
+    """The whole recording is needed for it: no turn lies at its beginning."""
+    imu, _, _ = truth
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    raw = in_units(imu, 'm/s^2', rate_unit)
+    with pytest.raises(InputError) as caught:
+        compensate_recording(SampleBlock(raw), found)
+    assert (caught.value.code, caught.value.key) == ('rate_unit', 'gyroscope_unit')
+    write_session(tmp_path / 'raw', raw)
+    (tmp_path / 'calibration.yaml').write_text(calibration_to_text(found))
+    command = ['compensate', str(tmp_path / 'raw'), '--output', str(tmp_path / 'out')]
+    command += ['--calibration', str(tmp_path / 'calibration.yaml')]
+    assert main(command) == 1
+    assert not (tmp_path / 'out').exists()
+    assert main([*command, '--gyroscope-unit', rate_unit]) == 0
+
+
 def test_check_reads_the_unit_from_the_calibration(in_g):
     later, _, _ = session(seed=3)
     found = check_recording(SampleBlock(in_units(later, 'g', 'deg/s')), in_g, gravity=GRAVITY)

@@ -68,11 +68,25 @@ class Poses:
     Angle by which the attitude creeps across gravity from the middle of each interval to its end,
     rad, shape (k, 3); not in `rate`.
     """
+    hidden: 'HiddenRates | None' = None
+    """Errors of `rate` that are the same in all poses."""
 
     @property
     def conditions(self) -> dict[str, Any]:
         """Time and temperature, as the functions of `HandModel` take them."""
         return {'time': self.time, 'temperature_c': self.temperature_c}
+
+
+@dataclass(frozen=True)
+class HiddenRates:
+    """Errors of small rates that no number of rests averages, of each axis of the gyroscope."""
+
+    dead_band: tuple[float, ...]
+    """Largest rate that is given as zero in all poses, rad/s; 0 without a dead band."""
+    rounding_sd: tuple[float, ...]
+    """Standard deviation of the error of a mean of rounded readings, rad/s."""
+    step: tuple[float, ...]
+    """Step of the readings, rad/s; rounding errors of faster motions average."""
 
 
 @dataclass(frozen=True, eq=False)

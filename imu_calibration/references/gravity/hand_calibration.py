@@ -397,6 +397,7 @@ def _solved(data, options, point, *, untested=()):
         DRIFT,
         with_movement(covariance := total(found.terms), model, movements) - covariance,
     )
+    terms = with_term(terms, DRIFT, _hidden_covariance(model, poses))
     used, poses = (
         poses,
         data.poses,
@@ -440,6 +441,20 @@ def _solved(data, options, point, *, untested=()):
         used_poses=used,
         used_turns=turns,
     )
+
+
+def _hidden_covariance(model, poses):
+    """
+    Return the covariance of the biases from errors that are the same at every rest.
+
+    A dead band hides any bias up to its threshold h: ``h^2 / 3``. Rounding errors of slow readings
+    act at rest and at both ends of a turn.
+    """
+    covariance = np.zeros((len(model.model.param_names),) * 2)
+    if poses.hidden is not None:
+        variance = np.square(poses.hidden.dead_band) / 3.0 + np.square(poses.hidden.rounding_sd)
+        covariance[model.gyro_bias, model.gyro_bias] = np.diag(variance)
+    return covariance
 
 
 def _settled(model, found):

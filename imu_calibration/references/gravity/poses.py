@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from imu_calibration.core.samples import ImuSamples, rounding_variance, runs_of
+from imu_calibration.core.samples import ImuSamples, rounding_variance, runs_of, smallest_step
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.strapdown import total_rotation
+from imu_calibration.preprocessing.dead_band import dead_bands
 from imu_calibration.preprocessing.full_scale import LEAST_TURNS, MOST_TURNS, believed_factor
 from imu_calibration.preprocessing.stamping import (
     LAG,
@@ -20,7 +21,7 @@ from imu_calibration.preprocessing.stamping import (
     MOST_LOST,
     WHOLE_STEP_SHARE,
 )
-from imu_calibration.references.gravity.equations import Poses, State, TurnData
+from imu_calibration.references.gravity.equations import HiddenRates, Poses, State, TurnData
 from imu_calibration.references.gravity.hand_parameters import KnownTurn
 
 CREEPS = 3.0
@@ -87,6 +88,7 @@ def average_poses(
         noise=noise,
         half_turn=0.5 * length[:, None] * creep,
         period=float(np.median(np.diff(imu.stamp_ns))) * 1e-9,
+        hidden=_hidden_rates(imu.rate_s, parts['gyroscope'], means[1]),
     )
 
 
@@ -98,6 +100,25 @@ def _with_rounding(variance, parts, rounding):
     """
     within = np.array([part.var(axis=0) for part in parts])
     return np.where(within < DITHER * rounding, np.maximum(variance, rounding), variance)
+
+
+def _hidden_rates(rate_s, parts, means):
+    """
+    Return the `HiddenRates` of poses with the readings `parts` and their means (k, 3).
+
+    A mean of readings with the variance v and the step h has a rounding error of the variance
+    ``h^2 / 12 exp(-4 pi^2 v / h^2)``: noise of half a step averages it. The bias, and with it the
+    error, is the same in all poses.
+    """
+    step = smallest_step(rate_s)
+    step = np.where(np.isfinite(step), step, 0.0)
+    bands = np.where(np.any(means != 0.0, axis=0), 0.0, dead_bands(rate_s, step))
+    scatter = np.mean([part.var(axis=0) for part in parts], axis=0)
+    # Between two steps the readings scatter by up to half a step without any noise: the noise is
+    # that of the calmest axis.
+    in_steps = np.min(scatter[step > 0.0] / step[step > 0.0] ** 2, initial=np.inf)
+    rounding_sd = step / np.sqrt(12.0) * np.exp(-2.0 * np.pi**2 * in_steps)
+    return HiddenRates(tuple(bands.tolist()), tuple(rounding_sd.tolist()), tuple(step.tolist()))
 
 
 def _creep(forces, length, noise):
@@ -218,6 +239,8 @@ def collect_turns(
         if reason:
             dropped[reason] = dropped.get(reason, 0) + 1
             continue
+        noise_variance = density * (time[piece][-1] - time[piece][0])
+        noise_variance += _slow_rounding_variance(time[piece], rate[piece], poses.hidden)
         turns.append(
             TurnData(
                 time[piece],
@@ -225,11 +248,24 @@ def collect_turns(
                 imu.force_s[piece],
                 first,
                 first + 1,
-                density * (time[piece][-1] - time[piece][0]),
+                noise_variance,
                 temperature_c=None if temperature_c is None else temperature_c[piece],
             )
         )
     return turns, dropped
+
+
+def _slow_rounding_variance(time, rate, hidden):
+    """
+    Return the variance of the angle of a turn from rounding at its slow ends, rad^2, axis mean.
+
+    Within a step of zero the rounding error keeps its sign: ``(rounding_sd * slow time)^2``.
+    """
+    if hidden is None:
+        return 0.0
+    slow = np.abs(rate[:-1]) <= hidden.step
+    slow_seconds = np.diff(time) @ slow
+    return float(np.mean(np.square(hidden.rounding_sd * slow_seconds)))
 
 
 def _unusable(time, ended, gap):

@@ -1,0 +1,64 @@
+"""Samples in which all readings are zero: a bus that does not answer for a moment."""
+
+import numpy as np
+
+from imu_calibration.core.samples import ImuSamples, runs_of
+
+LONGEST_NS = 1_000_000_000
+"""ns; longer runs pass and are found as a frozen sensor, with their time."""
+MOST_HELD = 10_000
+"""Samples of a run that are held, at most: stamps may stand still."""
+
+
+class ZeroFilter:
+    """
+    Drops short runs of samples in which all six readings are exactly zero.
+
+    An accelerometer that has measured a force before never reads zero on three axes for a sample.
+    The result does not depend on the division into pieces.
+    """
+
+    def __init__(self) -> None:
+        self.n_dropped = 0
+        self._has_measured = False
+        self._held: ImuSamples | None = None
+        self._in_long_run = False
+
+    def push(self, samples: ImuSamples) -> ImuSamples:
+        """Return the samples that pass; a run at the end is held until its length is known."""
+        if self._held is not None:
+            samples = ImuSamples.concatenate([self._held, samples])
+            self._held = None
+        pulls = np.asarray(samples.force_s.any(axis=1))
+        zero = np.asarray(~pulls & ~samples.rate_s.any(axis=1))
+        if not self._has_measured:
+            # Zeros at the beginning may be an accelerometer that is absent.
+            first = int(np.argmax(pulls)) if pulls.any() else len(samples)
+            zero[:first] = False
+            self._has_measured = first < len(samples)
+        if not zero.any():
+            self._in_long_run = False
+            return samples
+        kept = np.ones(len(samples), bool)
+        continues = self._in_long_run and bool(zero[0])
+        self._in_long_run = False
+        for start, stop in runs_of(zero):
+            is_open = stop == len(samples)
+            length_ns = samples.stamp_ns[stop - 1] - samples.stamp_ns[start]
+            is_long = length_ns >= LONGEST_NS or stop - start >= MOST_HELD
+            if is_long or (start == 0 and continues):
+                self._in_long_run = is_open
+                continue
+            kept[start:stop] = False
+            if is_open:
+                self._held = samples.select(slice(start, stop))
+            else:
+                self.n_dropped += stop - start
+        return samples.select(kept)
+
+    def finish(self) -> int:
+        """Drop the run at the end of the stream; return its number of samples."""
+        n_held = 0 if self._held is None else len(self._held)
+        self.n_dropped += n_held
+        self._held = None
+        return n_held

@@ -1,0 +1,71 @@
+"""An IMU that was never still: hands or an engine move it in every pose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+
+from imu_calibration.core.samples import ImuSamples, SampleBlock
+from imu_calibration.document.rest_noise import MOVED_DENSITY, moved_at_rest, rest_density
+from imu_calibration.document.verdict import judge
+from imu_calibration.use_cases.calibrate import calibrate_recordings
+
+from worlds.hand_sessions import GRAVITY, simulate
+
+pytestmark = pytest.mark.usefixtures('few_candidates')
+PERIOD_S = 0.01
+
+
+def noise_of_motion(rng, n_samples, sd, correlation_s):
+    """Return band-limited noise of three axes, shape (n, 3)."""
+    smooth = gaussian_filter1d(rng.normal(size=(n_samples, 3)), correlation_s / PERIOD_S, axis=0)
+    return sd * smooth / smooth.std()
+
+
+def moved(seed, *, sway, shake, correlation_s):
+    """Return a session by hand in which the IMU sways (rad/s) and shakes (m/s^2) all the time."""
+    imu, _, _ = simulate(seed, n_poses=16, still=2.5, force_sd=0.01, rate_sd=1e-3)
+    rng = np.random.default_rng(seed + 100)
+    rate = noise_of_motion(rng, len(imu), sway, correlation_s)
+    # The sway turns gravity: for small angles the force changes by force x angle.
+    angle = np.cumsum(rate, axis=0) * PERIOD_S
+    angle -= gaussian_filter1d(angle, 1.0 / PERIOD_S, axis=0)
+    force = np.cross(imu.force_s, angle) + noise_of_motion(rng, len(imu), shake, correlation_s)
+    return ImuSamples(imu.stamp_ns, imu.force_s + force, imu.rate_s + rate, imu.frame_id)
+
+
+@pytest.mark.parametrize(
+    ('sway', 'shake', 'correlation_s'), [(0.07, 0.4, 0.015), (0.12, 0.2, 0.02)]
+)
+def test_motion_at_rest_is_named_and_never_helps(sway, shake, correlation_s):
+    imu = moved(4, sway=sway, shake=shake, correlation_s=correlation_s)
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    assert set(found.decisions.values()) <= {'unproven', 'harms'}
+    for sensor in ('accelerometer', 'gyroscope'):
+        text = moved_at_rest(found, sensor)
+        assert text and any(text in note for note in found.notes)
+    # density of band-limited noise: sd^2 times twice the integral of its autocorrelation
+    expected = shake * np.sqrt(2 * np.sqrt(np.pi) * correlation_s)
+    assert rest_density(found, 'accelerometer') == pytest.approx(expected, rel=0.5)
+
+
+def test_a_steady_hand_is_not_named():
+    imu = moved(5, sway=0.002, shake=0.01, correlation_s=0.02)
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    assert set(found.decisions.values()) == {'helps'}
+    for sensor, limit in MOVED_DENSITY.items():
+        assert 0 < rest_density(found, sensor) < 0.3 * limit
+        assert not moved_at_rest(found, sensor)
+
+
+def test_a_sensor_without_a_determined_parameter_is_not_said_to_help():
+    imu, _, _ = simulate(6, n_poses=14, still=2.0, force_sd=0.004, rate_sd=4e-4)
+    found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
+    assert set(found.decisions.values()) == {'helps'}
+    weak = tuple(
+        'weak' if name.startswith('accelerometer') and status == 'determined' else status
+        for name, status in zip(found.param_names, found.status, strict=True)
+    )
+    verdict = judge(replace(found, status=weak), np.ones(len(weak)))
+    assert verdict.decisions == {'accelerometer': 'unproven', 'gyroscope': 'helps'}
