@@ -30,6 +30,14 @@ FLAT_PRIOR_FACTOR = 1e4
 Factor on the prior sds for an estimate from the data: large enough to remove the priors, small
 enough for rounding.
 """
+LEAST_START_VARIANCE = 0.01
+"""Least variance of a component in the second iteration, as a share of its fallback."""
+HELD_RATIO = 0.5
+"""A parameter whose sd exceeds this share of its prior's is fixed at its nominal value."""
+FIRST_STEPS = 2
+"""Steps with errors of linearisation."""
+SMALL_STEP_LENGTH = 1e-3
+"""An iteration ends with a step below this length, in joint standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,27 +125,38 @@ def estimate_rows(
         Parameters to hold at their prior in any case.
 
     """
-    asked, priors = ~reference.fixed, reference.priors
-    held = np.zeros(len(priors), bool) if withheld is None else withheld & asked
-    state, scatter, steps = _iterate(
-        reference, state, asked & ~held, priors, variance=fallback, fallback=fallback
-    )
-    held = _choose_held(_factor(reference.linearise(state), scatter), priors, asked, held=held)
+    asked = ~reference.fixed
+    priors = reference.priors
+    held = np.zeros(len(priors), bool)
+    if withheld is not None:
+        held = withheld & asked
+
+    # With the priors: which parameters do the data determine?
+    first = _iterate(reference, state, asked & ~held, priors, variance=fallback, fallback=fallback)
+    factor = _factor(reference.linearise(first.state), first.scatter)
+    held = _choose_held(factor, priors, asked, held=held)
     free = asked & ~held
-    state = replace(state, values=np.where(held, reference.nominal, state.values))
-    start = np.maximum(scatter.variance, 0.01 * fallback)
-    state, scatter, more = _iterate(
-        reference, state, free, FLAT_PRIOR_FACTOR * priors, variance=start, fallback=fallback
+
+    # From the data alone, with the other parameters at their nominal values.
+    state = replace(first.state, values=np.where(held, reference.nominal, first.state.values))
+    variance = np.maximum(first.scatter.variance, LEAST_START_VARIANCE * fallback)
+    last = _iterate(
+        reference, state, free, FLAT_PRIOR_FACTOR * priors, variance=variance, fallback=fallback
     )
-    rows = reference.linearise(state)
-    factor = _factor(rows, scatter)
+
+    # The covariance as a sum of named terms: C = C_noise + C_scatter + C_held.
+    rows = reference.linearise(last.state)
+    factor = _factor(rows, last.scatter)
     own, of_held = covariance_with_held(factor, free, held, prior_sd=priors)
-    scattered = _of_scatter(rows, scatter, free)
-    terms = {SAMPLE_NOISE: own - scattered, BIAS_PROCESS: scattered, HELD_PRIORS: of_held}
-    return RowEstimate(state, terms, held, free, scatter, factor, steps + more)
+    of_scatter = _covariance_of_scatter(rows, last.scatter, free)
+    terms = {SAMPLE_NOISE: own - of_scatter, BIAS_PROCESS: of_scatter, HELD_PRIORS: of_held}
+    n_steps = first.n_steps + last.n_steps
+    return RowEstimate(last.state, terms, held, free, last.scatter, factor, n_steps)
 
 
-def _choose_held(factor, priors, asked, *, held):
+def _choose_held(
+    factor: np.ndarray, priors: np.ndarray, asked: np.ndarray, *, held: np.ndarray
+) -> np.ndarray:
     """
     Return which of the parameters `asked` (mask) have next to no information from the data.
 
@@ -148,87 +167,109 @@ def _choose_held(factor, priors, asked, *, held):
     """
     held = held.copy()
     while np.any(free := asked & ~held):
+        # Sds in units of the priors, nearly unlimited without information from the data.
+        scaled = factor[:, free] * priors[free]
+        flat_prior = np.eye(free.sum()) / FLAT_PRIOR_FACTOR
         ratio = np.zeros(len(priors))
-        # the sds in units of the priors, nearly unlimited without information from the data
-        ratio[free] = np.sqrt(
-            np.diag(
-                inverse_gram(
-                    np.vstack(
-                        [factor[:, free] * priors[free], np.eye(free.sum()) / FLAT_PRIOR_FACTOR]
-                    )
-                )
-            )
-        )
+        ratio[free] = np.sqrt(np.diag(inverse_gram(np.vstack([scaled, flat_prior]))))
         worst = int(np.argmax(ratio))
-        if ratio[worst] <= 0.5:
+        if ratio[worst] <= HELD_RATIO:
             break
         held[worst] = True
     return held
 
 
-def _iterate(reference, state, free, priors, *, variance, fallback):
+@dataclass(frozen=True, eq=False)
+class _Iterated:
+    """State and scatter after the Gauss-Newton steps."""
+
+    state: Any
+    """Parameters and nuisances."""
+    scatter: GroupVariances
+    """Scatter of the components beyond the noise."""
+    n_steps: int
+    """Number of steps."""
+
+
+def _iterate(
+    reference: RowReference,
+    state: Any,
+    free: np.ndarray,
+    priors: np.ndarray,
+    *,
+    variance: np.ndarray,
+    fallback: np.ndarray,
+) -> _Iterated:
     """Repeat steps and scatter estimates until both converge."""
-    scatter = GroupVariances(
-        np.array(variance, float), np.full(len(fallback), np.inf), np.array(variance, float)
-    )
+    start = np.array(variance, float)
+    scatter = GroupVariances(start, np.full(len(fallback), np.inf), start.copy())
     for number in range(1, MAX_NEWTON_STEPS + 1):
+        # Rows of the reference, of nuisances and free parameters, and rows of the priors.
         rows = reference.linearise(state)
-        n_nuisances, n_free = rows.nuisance.shape[1], int(free.sum())
-        design = np.vstack(
-            [
-                np.hstack([rows.nuisance, rows.main[:, free]]),
-                np.eye(n_nuisances + n_free)[n_nuisances:],
-            ]
-        )
+        n_nuisances = rows.nuisance.shape[1]
+        n_free = int(free.sum())
+        columns = np.hstack([rows.nuisance, rows.main[:, free]])
+        design = np.vstack([columns, np.eye(n_nuisances + n_free)[n_nuisances:]])
         residual = np.concatenate([rows.residual, (reference.nominal - state.values)[free]])
         noise = np.concatenate([rows.noise, priors[free] ** 2])
         group = np.concatenate([rows.component, np.full(n_free, -1)])
+
+        # The residuals of the first steps contain errors of linearisation, which are no scatter.
         before = scatter.variance
-        if (
-            number > 2
-        ):  # after the first steps there are errors of linearisation that are not scatter
+        if number > FIRST_STEPS:
             scatter = estimate_group_variances(
                 design, residual, noise, group=group, start=scatter.variance, fallback=fallback
             )
-        root = np.sqrt(scatter.total(noise, group))
-        factor = triangular_of_band(np.column_stack([design, residual]) / root[:, None])[:-1]
-        reduced = scipy.linalg.solve_triangular(factor[:, :-1], factor[:, -1])
+
+        # Weighted least squares: R x = q, from the triangular factor of [design | residual].
+        sd = np.sqrt(scatter.total(noise, group))
+        factor = triangular_of_band(np.column_stack([design, residual]) / sd[:, None])[:-1]
+        right = factor[:, -1]
         step = np.zeros(n_nuisances + len(free))
-        step[np.append(np.ones(n_nuisances, bool), free)] = reduced
+        moving = np.append(np.ones(n_nuisances, bool), free)
+        step[moving] = scipy.linalg.solve_triangular(factor[:, :-1], right)
         state = reference.moved(state, step)
+
+        # Both have converged; |q| is the length of the step in joint sds.
         settled = np.allclose(scatter.variance, before, rtol=0.01, atol=1e-4 * np.min(fallback))
-        if (
-            number > 3 and settled and np.linalg.norm(factor[:, -1]) < 1e-3
-        ):  # in units of the joint sd
+        if number > FIRST_STEPS + 1 and settled and np.linalg.norm(right) < SMALL_STEP_LENGTH:
             break
-    return state, scatter, number
+    return _Iterated(state, scatter, number)
 
 
-def _factor(rows, scatter):
+def _factor(rows: RowSet, scatter: GroupVariances) -> np.ndarray:
     """
     Return the triangular factor of the parameters with the nuisances eliminated.
 
     The factor is at inflated variances.
     """
-    root, width = (
-        np.sqrt(scatter.total(rows.noise, rows.component, inflated=True)),
-        rows.nuisance.shape[1],
-    )
-    return triangular_of_band(np.hstack([rows.nuisance, rows.main]) / root[:, None])[width:, width:]
+    sd = np.sqrt(scatter.total(rows.noise, rows.component, inflated=True))
+    n_nuisances = rows.nuisance.shape[1]
+    factor = triangular_of_band(np.hstack([rows.nuisance, rows.main]) / sd[:, None])
+    return factor[n_nuisances:, n_nuisances:]
 
 
-def _of_scatter(rows, scatter, free):
+def _covariance_of_scatter(rows: RowSet, scatter: GroupVariances, free: np.ndarray) -> np.ndarray:
     """
     Return the part of the covariance that is due to the scatter of the components beyond the noise.
 
-    Shape (n, n).
+    With the whitened design A of nuisances and free parameters, the variance V of the rows and
+    their noise N::
+
+        G = (A' A)^-1 A' (1 - N / V)^(1/2)        covariance = G G'
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+        Zero for parameters that are not free.
+
     """
     variance = scatter.total(rows.noise, rows.component, inflated=True)
     design = np.hstack([rows.nuisance, rows.main[:, free]]) / np.sqrt(variance)[:, None]
     factor = triangular_of_band(design)
-    gain = scipy.linalg.cho_solve((factor, False), design.T)[rows.nuisance.shape[1] :] * np.sqrt(
-        1 - rows.noise / variance
-    )
+    solved = scipy.linalg.cho_solve((factor, False), design.T)
+    n_nuisances = rows.nuisance.shape[1]
+    gain = solved[n_nuisances:] * np.sqrt(1 - rows.noise / variance)
     found = np.zeros((len(free),) * 2)
     found[np.ix_(free, free)] = gain @ gain.T
     return found

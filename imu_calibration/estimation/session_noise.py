@@ -15,6 +15,7 @@ from imu_calibration.estimation.noise_model import (
 )
 from imu_calibration.estimation.noise_search import estimate_offsets
 from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
+from imu_calibration.estimation.window_statistics import WindowStatistics
 
 MIN_VARIANCE_RATIO = 2.0
 """
@@ -84,13 +85,14 @@ class BandMisfit:
         """
         Return the excess variance of moving windows with this residual over the noise at rest.
         """
-        white, unit = noise.white_variance, noise.low_variance
-        samples, pieces = (
-            np.where(self.apart, self.fast, self.overall),
-            np.where(self.apart, 0.0, self.slow),
-        )
-        factor = np.maximum.reduce([samples / white, pieces / unit, np.ones(3)])
-        slow_factor = np.minimum(np.maximum(self.slow / unit, 1.0), factor)
+        # With separate weights the samples have the variance of the fast part, and only its slow
+        # part counts for the pieces; otherwise the larger excess of both applies to all rows.
+        samples = np.where(self.apart, self.fast, self.overall)
+        pieces = np.where(self.apart, 0.0, self.slow)
+        of_samples = samples / noise.white_variance
+        of_pieces = pieces / noise.low_variance
+        factor = np.maximum.reduce([of_samples, of_pieces, np.ones(3)])
+        slow_factor = np.minimum(np.maximum(self.slow / noise.low_variance, 1.0), factor)
         return MovingFactors(factor, np.where(self.apart, slow_factor, factor))
 
     def without_fast(self) -> 'BandMisfit':
@@ -142,9 +144,9 @@ def own_misfit(rows: np.ndarray) -> np.ndarray:
     columns, output = rows[:, :-3], rows[:, -3:]
     scale = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(scale > 0, scale, 1.0)
-    return (
-        output - columns @ np.linalg.lstsq(columns, output, rcond=1e-10)[0] if len(rows) else output
-    )
+    if not len(rows):
+        return output
+    return output - columns @ np.linalg.lstsq(columns, output, rcond=1e-10)[0]
 
 
 def misfit_along(products: np.ndarray) -> tuple[float, int]:
@@ -168,7 +170,8 @@ def misfit_along(products: np.ndarray) -> tuple[float, int]:
     eigenvalues, vectors = np.linalg.eigh(gram * scale[:, :, None] * scale[:, None, :])
     along = np.einsum('kij,ki->kj', vectors, gradient * scale)
     strong = eigenvalues > DESIGN_EIGENVALUE_SHARE * eigenvalues[:, -1:]
-    return float((along**2 * strong / np.where(strong, eigenvalues, 1.0)).sum()), int(strong.sum())
+    squares = along**2 * strong / np.where(strong, eigenvalues, 1.0)
+    return float(squares.sum()), int(strong.sum())
 
 
 def least_misfit(products: np.ndarray) -> tuple[float, int]:
@@ -182,12 +185,12 @@ def least_misfit(products: np.ndarray) -> tuple[float, int]:
     eigenvalues, vectors = np.linalg.eigh(scaled[:-1, :-1])
     seen = eigenvalues > RESIDUAL_EIGENVALUE_SHARE * max(eigenvalues[-1], 1e-300)
     along = (vectors.T @ scaled[:-1, -1])[seen]
-    return max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0) / scale[-1] ** 2, int(
-        seen.sum()
-    )
+    # |output|^2 less the part along the design, in the scale of the output.
+    remaining = max(scaled[-1, -1] - (along**2 / eigenvalues[seen]).sum(), 0.0)
+    return remaining / scale[-1] ** 2, int(seen.sum())
 
 
-def _scales(squares):
+def _scales(squares: np.ndarray) -> np.ndarray:
     """
     Return the scales that give columns unit length.
 
@@ -208,9 +211,15 @@ stamps in integer ns.
 """
 VIBRATES = 4.0
 """Variance of a window over the quiet level above which the table vibrates."""
+MIN_INFLATION_SAMPLES = 32
+"""Samples of a static window from which its noise at low frequency is estimated."""
+LEAST_MOVING_VARIANCE = 1e-30
+"""Least variance of the noise from moving windows, above zero."""
 
 
-def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
+def white_noise(
+    rows: Sequence[WindowStatistics], sensor: str
+) -> tuple[np.ndarray, np.ndarray] | None:
     """
     Return (white_variance, inflation) pooled over static windows, each shape (3,).
 
@@ -225,38 +234,48 @@ def white_noise(rows: Sequence, sensor: str) -> tuple[np.ndarray, np.ndarray] | 
     rows : sequence of WindowStatistics
 
     """
-    static = [
-        row
-        for row in rows
-        if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))
-    ]
+    static = _rests(rows, sensor)
     if not static:
         return None
-    rounding = np.array(
-        [row.sensors[sensor].noise_variance for row in rows if row.kind != 'static']
-    ).reshape(-1, 3)
-    floor = np.min(
-        np.where(rounding > 0, rounding, np.inf), axis=0, initial=np.inf
-    )  # a code may be constant at rest
-    variances = np.maximum(
-        [row.sensors[sensor].noise_variance for row in static],
-        np.where(np.isfinite(floor), floor, 0.0),
-    )
+
+    # A code may be constant at rest: the noise is at least that of rounding, from moving windows.
+    moving = [row.sensors[sensor].noise_variance for row in rows if row.kind != 'static']
+    rounding = np.array(moving).reshape(-1, 3)
+    rounding = np.where(rounding > 0, rounding, np.inf)
+    floor = np.min(rounding, axis=0, initial=np.inf)
+    floor = np.where(np.isfinite(floor), floor, 0.0)
+    variances = np.maximum([row.sensors[sensor].noise_variance for row in static], floor)
     inflations = np.array([row.sensors[sensor].inflation for row in static])
     counts = np.array([row.count for row in static], float)
-    pooled, factors = np.empty(3), np.empty(3)
+
+    pooled = np.empty(3)
+    factors = np.empty(3)
     for axis in range(3):
         usual, shaken = _usual(variances[:, axis], inflations[:, axis])
         near = (variances[:, axis] <= 2 * usual) & (variances[:, axis] >= 0.5 * usual)
         weight = counts * near
-        pooled[axis] = np.average(variances[:, axis], weights=weight) if weight.sum() else usual
-        weight = (counts >= 32) * near
-        factors[axis] = np.average(inflations[:, axis], weights=weight) if weight.sum() else 1.0
+        pooled[axis] = usual
+        if weight.sum():
+            pooled[axis] = np.average(variances[:, axis], weights=weight)
+        # Short windows have no means of pieces, and hence no inflation.
+        weight = (counts >= MIN_INFLATION_SAMPLES) * near
+        factors[axis] = 1.0
+        if weight.sum():
+            factors[axis] = np.average(inflations[:, axis], weights=weight)
         factors[axis] = max(factors[axis], MIN_SHAKEN_INFLATION if shaken else MIN_INFLATION)
     return np.maximum(pooled, LEAST_NOISE[sensor] ** 2), factors
 
 
-def _usual(variances, inflations):
+def _rests(rows: Sequence[WindowStatistics], sensor: str) -> list[WindowStatistics]:
+    """Return the static windows of which the variance of a sensor is known."""
+    found = []
+    for row in rows:
+        if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance)):
+            found.append(row)
+    return found
+
+
+def _usual(variances: np.ndarray, inflations: np.ndarray) -> tuple[float, bool]:
     """
     Return (the median variance, False).
 
@@ -264,36 +283,36 @@ def _usual(variances, inflations):
     """
     median = float(np.median(variances))
     quiet = float(np.partition(variances, 1)[1]) if len(variances) > 3 else median
+    if not 0.0 < VIBRATES * quiet < median:
+        return median, False
+    # Vibration above the band of the means raises the variance of samples, not that of the means.
     louder = variances > VIBRATES * quiet
-    shaken = (
-        0.0 < VIBRATES * quiet < median and float(np.median(inflations[louder])) < MIN_INFLATION
-    )
-    return (quiet if shaken else median), shaken
+    if float(np.median(inflations[louder])) < MIN_INFLATION:
+        return quiet, True
+    return median, False
 
 
-def shaken_means(rows: Sequence, sensor: str) -> dict[tuple[int, float], np.ndarray]:
+def shaken_means(
+    rows: Sequence[WindowStatistics], sensor: str
+) -> dict[tuple[int, float], np.ndarray]:
     """
     Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level.
     """
-    static = [
-        row
-        for row in rows
-        if row.kind == 'static' and np.all(np.isfinite(row.sensors[sensor].noise_variance))
-    ]
+    static = _rests(rows, sensor)
     if not static:
         return {}
-    variances, inflations = (
-        np.array([getattr(row.sensors[sensor], name) for row in static])
-        for name in ('noise_variance', 'inflation')
-    )
-    own = np.zeros(variances.shape)
+    variances = np.array([row.sensors[sensor].noise_variance for row in static])
+    inflations = np.array([row.sensors[sensor].inflation for row in static])
+    of_means = np.zeros(variances.shape)
     for axis in range(3):
         quiet, shaken = _usual(variances[:, axis], inflations[:, axis])
         loud = (variances[:, axis] > VIBRATES * quiet) & shaken
-        own[loud, axis] = variances[loud, axis] * inflations[loud, axis]
-    return {
-        (row.session, row.time): each / row.count for row, each in zip(static, own) if each.any()
-    }
+        of_means[loud, axis] = variances[loud, axis] * inflations[loud, axis]
+    found = {}
+    for row, variance in zip(static, of_means):
+        if variance.any():
+            found[row.session, row.time] = variance / row.count
+    return found
 
 
 def first_noise(
@@ -304,44 +323,39 @@ def first_noise(
 
     Fast parts have weight zero where slow parts can be fitted better.
     """
-    return {
-        sensor: _with_bands(
-            system, sensor, replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))
-        )
-        for sensor in SENSORS
-    }
+    found = {}
+    for sensor in SENSORS:
+        noise = replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))
+        found[sensor] = _with_bands(system, sensor, noise)
+    return found
 
 
-def _at_rest(system, sensor, values):
-    white = white_noise(system.accumulator.rows, sensor)
-    reference = ReferenceNoise.of_steps(
-        max(row.encoder_step for row in system.accumulator.rows), sensor
-    )
+def _at_rest(system: WeightedSystem, sensor: str, values: np.ndarray) -> NoiseModel:
+    """Return the noise from static windows; without one, from the residuals of moving windows."""
+    rows = system.accumulator.rows
+    largest_step = max(row.encoder_step for row in rows)
+    reference = ReferenceNoise.of_steps(largest_step, sensor)
+    white = white_noise(rows, sensor)
     if white is not None:
-        return NoiseModel(
-            *white, reference=reference, shaken=shaken_means(system.accumulator.rows, sensor)
-        )
-    variance = np.full(3, 1e-30)
+        return NoiseModel(*white, reference=reference, shaken=shaken_means(rows, sensor))
+    variance = np.full(3, LEAST_MOVING_VARIANCE)
     for kind in system.within[sensor]:
         variance = np.maximum(variance, moving_misfit(system, sensor, kind, values=values).noise)
     return NoiseModel(variance, np.ones(3), reference=reference)
 
 
-def _with_bands(system, sensor, noise):
+def _with_bands(system: WeightedSystem, sensor: str, noise: NoiseModel) -> NoiseModel:
     """
     Return the noise with weight zero for the fast parts where slow parts fit better.
 
     The slow parts, fitted separately, have a smaller residual variance there.
     """
-    misfits = {kind: moving_misfit(system, sensor, kind) for kind in system.within[sensor]}
-    return replace(
-        noise,
-        moving={
-            kind: misfit.without_fast().factors(noise)
-            for kind, misfit in misfits.items()
-            if misfit.apart.any()
-        },
-    )
+    moving = {}
+    for kind in system.within[sensor]:
+        misfit = moving_misfit(system, sensor, kind)
+        if misfit.apart.any():
+            moving[kind] = misfit.without_fast().factors(noise)
+    return replace(noise, moving=moving)
 
 
 def updated_noise(
@@ -351,33 +365,31 @@ def updated_noise(
     Return the noise of a sensor estimated from the residuals at `values`, starting from `noise`.
     """
     if white_noise(system.accumulator.rows, sensor) is None:
-        noise = replace(
-            _at_rest(system, sensor, values), known=noise.known, left_out=noise.left_out
-        )
-    noise = replace(
-        noise,
-        moving={
-            kind: _judged(system, sensor, kind, values).factors(noise)
-            for kind in system.within[sensor]
-        },
-    )
+        known, left_out = noise.known, noise.left_out
+        noise = replace(_at_rest(system, sensor, values), known=known, left_out=left_out)
+
+    # Centred rows: the excess over the noise at rest.
+    moving = {}
+    for kind in system.within[sensor]:
+        moving[kind] = _judged(system, sensor, kind, values).factors(noise)
+    noise = replace(noise, moving=moving)
+
+    # Means: offsets of windows and bias processes.
     rows, information = system.linearised(sensor, values, noise)
     white = system.mean_variance(noise, beside_bias=False)
-    return replace(
-        noise,
-        **estimate_offsets(
-            rows,
-            white,
-            system.times,
-            sessions=system.sessions,
-            information=information,
-            known=noise.known,
-            durations=system.durations,
-        ),
+    offsets = estimate_offsets(
+        rows,
+        white,
+        system.times,
+        sessions=system.sessions,
+        information=information,
+        known=noise.known,
+        durations=system.durations,
     )
+    return replace(noise, **offsets)
 
 
-def _judged(system, sensor, kind, values) -> BandMisfit:
+def _judged(system: WeightedSystem, sensor: str, kind: str, values: np.ndarray) -> BandMisfit:
     """
     Return the misfit of the centred rows of a kind.
 
@@ -386,16 +398,22 @@ def _judged(system, sensor, kind, values) -> BandMisfit:
     misfit = moving_misfit(system, sensor, kind, values=values)
     if not misfit.apart.any():
         return misfit
-    dc = coefficient_jacobian(system.model, sensor, values)[:, :, ~fixed_parameters(system.model)]
+    slopes = coefficient_jacobian(system.model, sensor, values)
+    slopes = slopes[:, :, ~fixed_parameters(system.model)]
+
+    def products(rows: np.ndarray, axis: int) -> np.ndarray:
+        """Return the products of ``[design | residual]`` of one axis."""
+        design = rows[:, :-3] @ slopes[:, axis]
+        residual = system.misfit(sensor, rows, values)[:, axis]
+        joined = np.column_stack([design, residual])
+        return joined.T @ joined
+
+    all_rows = system.within[sensor][kind]
+    slow_rows = system.accumulator.slow[sensor, kind]
     along = np.zeros(3)
     for axis in range(3):
-        every, slow = (
-            np.column_stack(
-                [rows[:, :-3] @ dc[:, axis], system.misfit(sensor, rows, values)[:, axis]]
-            )
-            for rows in (system.within[sensor][kind], system.accumulator.slow[sensor, kind])
-        )
-        squares, rank = misfit_along((every.T @ every - slow.T @ slow)[None])
+        of_fast = products(all_rows, axis) - products(slow_rows, axis)
+        squares, rank = misfit_along(of_fast[None])
         along[axis] = squares / max(rank, 1)
     return replace(misfit, fast=np.where(misfit.apart, np.maximum(misfit.fast, along), misfit.fast))
 
@@ -408,14 +426,20 @@ def moving_misfit(
 
     Without them, of each part at its own best fit.
     """
-    rows, n_slow = (
-        system.within[sensor][kind],
-        system.accumulator.slow_rows.get(kind, 0) - system.accumulator.windows[kind],
-    )
-    slow = system.accumulator.slow[sensor, kind] if n_slow > 0 else rows[:0]
-    misfits = [
-        own_misfit(part) if values is None else system.misfit(sensor, part, values)
-        for part in (rows, slow)
-    ]
-    total, of_slow = ((misfit**2).sum(axis=0) for misfit in misfits)
-    return band_misfit(total, system.dof_within[kind], of_slow, dof_slow=n_slow)
+    accumulator = system.accumulator
+    rows = system.within[sensor][kind]
+    # Each window loses one slow row to its mean.
+    n_slow = accumulator.slow_rows.get(kind, 0) - accumulator.windows[kind]
+    slow_rows = rows[:0]
+    if n_slow > 0:
+        slow_rows = accumulator.slow[sensor, kind]
+
+    def squares(part: np.ndarray) -> np.ndarray:
+        """Return the sums of squares of the residuals of a part, shape (3,)."""
+        if values is None:
+            residual = own_misfit(part)
+        else:
+            residual = system.misfit(sensor, part, values)
+        return (residual**2).sum(axis=0)
+
+    return band_misfit(squares(rows), system.dof_within[kind], squares(slow_rows), dof_slow=n_slow)

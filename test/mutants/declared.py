@@ -138,16 +138,16 @@ COVARIANCE = _of(
     ),
     (
         'values that only misfit gives are believed',
-        '_implausible_estimates',
-        '_1 > _limit(_2)',
+        'implausible_parameters',
+        '_1 > limit',
         '_1 < 0',
         'test_believing.py::test_a_scale_that_only_misfit_gives_is_held_and_named',
     ),
     (
         'a wrong full scale is taken for misfit',
-        '_implausible_estimates',
-        '_1[_2] & (_3 > _limit(_4)) & (_3 < _5[_2] * max((_6[_7] for _7 in _8)))',
-        '_1[_2] & (_3 > _limit(_4))',
+        'implausible_parameters',
+        '_1[_2] & (_3 > limit) & (_3 < _4[_2] * _5)',
+        '_1[_2] & (_3 > limit)',
         'test_believing.py::test_a_wrong_full_scale_setting_is_no_misfit',
     ),
     (

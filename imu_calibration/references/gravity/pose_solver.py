@@ -20,7 +20,7 @@ from imu_calibration.estimation.model_error import (
 from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import GRAVITY, UNMODELLED_EARTH_RATE, total
-from imu_calibration.estimation.solver import OUTLIER_P_VALUE
+from imu_calibration.estimation.window_outliers import OUTLIER_P_VALUE
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.kinematics.sphere import fit_sphere
 from imu_calibration.references.gravity.equations import (
