@@ -21,7 +21,7 @@ Factors = dict[str, list[np.ndarray]]
 
 
 def undetermined_parameters(
-    system: WeightedSystem, values: np.ndarray, factors: Factors, free: np.ndarray
+    system: WeightedSystem, values: np.ndarray, factors: Factors, *, free: np.ndarray
 ) -> np.ndarray:
     """
     Return a mask of the parameters whose standard deviation exceeds a share of the prior's.

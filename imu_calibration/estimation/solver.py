@@ -101,7 +101,7 @@ def solve(
     # Parameters that the data do not determine are fixed at their prior.
     factors = _factors(system, noises)
     values = _minimised(system, values, factors, free)
-    held = undetermined_parameters(system, values, factors, free)
+    held = undetermined_parameters(system, values, factors, free=free)
     held |= not_separable(accumulator, model)
     _refuse_held(held, free, model, allow_holding)
 
