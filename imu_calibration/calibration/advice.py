@@ -19,7 +19,8 @@ import numpy as np
 from imu_calibration.calibration.coverage import DIRECTIONS, sd_excess, share_gained
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES, SENSORS
-from imu_calibration.estimation.solution import LACKING
+from imu_calibration.estimation.observability import ALL_MOTIONS
+from imu_calibration.estimation.solution import LACKING, remedy
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses, tangent
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
@@ -180,6 +181,15 @@ gravity.
 """
 WEIGHTS = (0.0, 1.0)
 """Exponents of the seconds of a step in its choice: `foretold` tries both."""
+EXCESS = 3.0
+"""
+Ratio of the scatter of poses or turns to the one that noise and a quiet hand explain, above which
+the model or the mount is in error.
+"""
+UNKNOWN_SHARE = 0.5
+"""Share of its prior sd above which the attitudes do not determine a parameter."""
+WARMING = ('warm_up', 'warm_and_cool', 'shake')
+"""Motions that change time, temperature or vibration, not the attitude."""
 SERVES = 0.5
 """
 Share of the best gain per second for one sensor from which the next step of the common plan is
@@ -317,19 +327,25 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     Return the undetermined parameters and the needs of each undetermined sensor.
 
     The values are {'parameters': {name: sd over tolerance}, 'needs': the step that helps most} for
-    each sensor that is not fully determined.
+    each sensor that is not fully determined. Where no motion helps, it is the remedy for the cause
+    (`_without_motion`).
 
     Recommended is the next step of the common plan, shown in the picture, if it serves the sensor;
     otherwise the best step for the sensor.
     """
     absent = hand.hand_model.absent
     lacking: dict[str, dict[str, float]] = {}
-    for name, status, sd, tolerance in zip(
-        hand.param_names, hand.statuses, hand.judged_sd, hand.tolerances, strict=True
-    ):
+    remedies: dict[tuple[str, str], dict[str, float]] = {}
+    for index, name in enumerate(hand.param_names):
         sensor = name.partition('.')[0]
-        if status in LACKING and sensor not in absent:
-            lacking.setdefault(sensor, {})[name] = float(sd / tolerance)
+        if hand.statuses[index] not in LACKING or sensor in absent:
+            continue
+        in_tolerances = float(hand.judged_sd[index] / hand.tolerances[index])
+        without_motion = '' if 'accelerometer' in absent else _without_motion(hand, index)
+        if without_motion:
+            remedies.setdefault((sensor, without_motion), {})[name] = in_tolerances
+        else:
+            lacking.setdefault(sensor, {})[name] = in_tolerances
     # No motion determines more without gravity in the readings.
     if 'accelerometer' in absent:
         return tuple(
@@ -356,7 +372,50 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
         own = knowledge.best(part)[0]
         best = next((step for step in plan if gain(part, step) >= SERVES * gain(part, own)), own)
         found.append({'parameters': lacking[sensor], 'needs': best.words})
+    found += [{'parameters': names, 'needs': text} for (_, text), names in remedies.items()]
     return tuple(found)
+
+
+def _without_motion(hand, index):
+    """
+    Return what determines a parameter if another attitude does not; '' if it does.
+
+    An effect in time or temperature needs these to change. Otherwise the remedy is that of the
+    cause: the standard deviations follow from the scatter of poses and turns, so that a misfit of
+    the model enlarges them as noise would (`EXCESS`).
+    """
+    model, terms = hand.hand_model, hand.terms
+    for effect in hand.model.effects:
+        own = hand.model.slices[effect.key]
+        if own.start <= index < own.stop and effect.motion[0] in WARMING:
+            return ALL_MOTIONS[effect.motion[0]]
+
+    # A parameter that the attitudes do not determine needs others, whatever the scatter is.
+    if hand.judged_sd[index] > UNKNOWN_SHARE * model.priors[index]:
+        return ''
+    scatter, expected = _scatters(hand)
+    of_pose, of_bias, of_turn = scatter / expected
+    if hand.param_names[index].startswith('accelerometer'):
+        excess = of_pose
+    elif hand.param_names[index].startswith('gyroscope.bias'):
+        excess = of_bias
+    else:
+        # Poses in error also spoil the directions before and after a turn.
+        excess = max(of_pose, of_turn)
+    return remedy(terms, index, hand.tolerances[index], excess=excess if excess > EXCESS else 1.0)
+
+
+def _scatters(hand):
+    """
+    Return (sds of a pose, of the bias in it and of a turn; the sds that noise explains).
+
+    Shape (3,) each, m/s^2, rad/s, rad. A quiet hand adds `TREMBLING` and `CREEPING`.
+    """
+    statistics, poses = hand.statistics, hand.poses
+    of_mean = [np.sqrt(np.mean(sem**2)) for sem in (poses.force_sem, poses.rate_sem)] + [0.0]
+    found = [statistics[f'{name}_scatter_sd'] for name in ('pose', 'drift', 'turn')]
+    quiet = np.hypot(SCATTER_SD, (TREMBLING, CREEPING, 0.0))
+    return np.hypot(found, of_mean), np.hypot(quiet, of_mean)
 
 
 def knowledge_at_first(
@@ -414,7 +473,7 @@ def knowledge_after(hand: HandCalibration) -> HandKnowledge:
     """
     model, statistics, poses = hand.hand_model, hand.statistics, hand.poses
     expected = np.sqrt(np.diag(np.linalg.inv(hand.information + np.diag(1 / model.priors**2))))
-    known = expected < 0.5 * model.priors
+    known = expected < UNKNOWN_SHARE * model.priors
     wider = max(1.0, float(np.max(np.where(known, hand.judged_sd / expected, 0.0))))
     pose_sd = np.hypot(np.sqrt(np.mean(poses.force_sem**2)), statistics['pose_scatter_sd'])
     drift_sd = np.hypot(np.sqrt(np.mean(poses.rate_sem**2)), statistics['drift_scatter_sd'])

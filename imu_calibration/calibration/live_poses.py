@@ -45,7 +45,12 @@ from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.outcome import parameter_count
 from imu_calibration.effects.sensor_model import BASE, SensorModel
-from imu_calibration.estimation.solution import COMMON_SCALE, LACKING, tolerances_of
+from imu_calibration.estimation.solution import (
+    COMMON_SCALE,
+    LACKING,
+    REMEDY_KEYS,
+    tolerances_of,
+)
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.rest_detection import find_still
 from imu_calibration.preprocessing.sensor_join import delay_of
@@ -192,9 +197,13 @@ def _needs(found, not_seen, calibration, *, step, hints):
                 hints,
             )
         ]
-    return Progress.WEAK, (
-        [step] if step else list(dict.fromkeys(item['needs'] for item in calibration.undetermined))
-    )
+    needs = dict.fromkeys(item['needs'] for item in calibration.undetermined)
+    without_motion = [
+        with_hint(need, REMEDY_KEYS[need], hints) for need in needs if need in REMEDY_KEYS
+    ]
+    if len(without_motion) == len(needs) > 0:
+        return Progress.WEAK, without_motion
+    return Progress.WEAK, [step] if step else list(needs)
 
 
 def _plural(count, noun):

@@ -343,6 +343,10 @@ class RateSlope:
         lag = max(round(late + 0.01), 1)
         change = _known(recent[lag:] - recent[:-lag])
         if not len(change):
+            if not len(_known(recent)):
+                # The first slope of a stream shows the size of the motion, with its own noise.
+                slope = np.array(self._slope)
+                return SlopeError(np.outer(slope, slope), float(weights @ weights), weights)
             return replace(self._size_of_all(recent), weights=weights)
         share = (late / lag) ** 2
         apart = np.convolve(self.derivative.weights, [1.0] + [0.0] * (lag - 1) + [-1.0])

@@ -4,6 +4,6 @@ from enum import Enum
 
 
 class StrEnum(str, Enum):
-    """``enum.StrEnum`` of Python 3.11, for Python 3.10 as well: str() and format() give the value."""
+    """``enum.StrEnum`` of Python 3.11, also for Python 3.10: str() and format() give the value."""
 
     __str__ = str.__str__

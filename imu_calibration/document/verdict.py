@@ -40,7 +40,13 @@ from imu_calibration.document.outcome import dropped_of, is_complete, parameter_
 from imu_calibration.document.rest_noise import moved_at_rest
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
-from imu_calibration.estimation.solution import COMMON_SCALE, DETERMINED, HELD, Status
+from imu_calibration.estimation.solution import (
+    COMMON_SCALE,
+    DETERMINED,
+    HELD,
+    REMEDY_KEYS,
+    Status,
+)
 from imu_calibration.preprocessing.window import UnusedReason
 from imu_calibration.selection.stamp_jitter import jitter_text
 
@@ -58,6 +64,11 @@ structure in time (`BandMisfit.slow_over_fast`).
 """
 LOUDER_ONLY = 'without structure in time: noise or vibration that is larger in motion'
 """Description of residuals that are larger in motion, but not correlated."""
+MISFIT_FACTOR = 2.0
+"""
+A scatter of window means up to this factor times an unexplained residual is that residual, not a
+bias that moves.
+"""
 LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
 
@@ -321,15 +332,28 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
     return reasons
 
 
+def _misfit(calibration, sensor):
+    """Return the scatter of window means that the model may cause, in the unit of the sensor."""
+    if any(sensor in reason.sensors for reason in _strange_causes(calibration)):
+        return np.inf
+    left = (calibration.statistics.get('unexplained') or {}).get(sensor)
+    if left is None or left.get('unit', UNITS[sensor]) != UNITS[sensor]:
+        return 0.0
+    return MISFIT_FACTOR * left['rms']
+
+
 def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     """
     Return notes on biases that move from window to window by more than the tolerance on their mean.
+
+    A residual that the model does not explain scatters from window to window as well, although the
+    bias does not move.
     """
     reasons, by_hand = [], calibration.gauge.get('axes') == HAND_AXES
     for sensor in calibration.sensors:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
-        if scatter > tolerances[part][0]:
+        if scatter > tolerances[part][0] and scatter > _misfit(calibration, sensor):
             factor, unit = for_people(UNITS[sensor])
             reasons.append(
                 Reason(
@@ -473,11 +497,7 @@ def _absent(calibration):
 
 
 def _decided(calibration, sensor, word):
-    entry, step, key = calibration.proof.get(sensor), '', None
-    if word is not HELPS and entry and not same_directions(entry):
-        step, key = 'find the cause', 'diagnose'
-    elif word is not HELPS:
-        step = 'record more windows, or hold it still in more attitudes'
+    step, key = ('', None) if word is HELPS else _step_of(calibration, sensor)
     return Reason(
         DECISION,
         f'{sensor} {word}: {_reason(calibration, sensor)}',
@@ -485,6 +505,30 @@ def _decided(calibration, sensor, word):
         key=key,
         sensors=(sensor,),
     )
+
+
+def _step_of(calibration, sensor):
+    """Return (next step, its key) for a sensor that the calibration does not certainly help."""
+    entry, by_hand = calibration.proof.get(sensor), calibration.gauge.get('axes') == HAND_AXES
+    if not entry or not entry['windows']:
+        if not by_hand:
+            return 'record more windows of rest and motion', None
+        more = {
+            'accelerometer': 'hold it still in more attitudes',
+            'gyroscope': 'turn it between more attitudes held still',
+        }
+        return more[sensor], None
+    if entry.get('few_directions'):
+        return 'hold it still between the axes of the sensor as well', None
+    if same_directions(entry):
+        mount = '' if by_hand else ', or mount it at another angle'
+        return f'hold it still in more attitudes{mount}', None
+    if decide(entry) is HELPS and _periodic(calibration, sensor):
+        return 'record rests between the motions', None
+    if decide(entry) is HELPS and not beyond_instruments(calibration, sensor):
+        # The gyroscope follows the accelerometer, which has its own next step.
+        return '', None
+    return 'find the cause', 'diagnose'
 
 
 def _decisions(calibration):
@@ -658,6 +702,7 @@ def _undetermined(calibration):
                     PARAMETERS,
                     f'{listed(members)}: {text}',
                     next_step,
+                    key=REMEDY_KEYS.get(next_step),
                     sensors=_whose(name.partition('.')[0] for name in members),
                 )
             )

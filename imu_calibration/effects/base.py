@@ -293,6 +293,18 @@ class Effect:
         """Return the standard deviations of the prior, shape (size,)."""
         return np.full(self.size, self.prior_sd, float)
 
+    def tolerances(self, amplitude: float) -> np.ndarray:
+        """
+        Return the tolerance of each component from that of an amplitude, shape (size,).
+
+        An error d of the time constant T changes ``a (1 - exp(-t / T))`` by at most ``a d / (e T)``
+        (at t = T), with the prior's sd of a and the prior T.
+        """
+        found = np.full(self.size, amplitude, float)
+        if self.time_constant:
+            found[-1] *= np.e * self.prior_values()[-1] / self.prior_sds()[0]
+        return found
+
     def amplitudes(self, values: Any) -> Any:
         """Return the values without the time constant or the time of a step."""
         return values[: self.n_amplitudes]

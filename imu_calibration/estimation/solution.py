@@ -43,20 +43,43 @@ REMEDIES = {
     (MODEL_ERROR, DRIFT, REJECTED): 'find the cause of the residual: more motions do not help',
 }
 """Terms that more data do not reduce -> what does."""
+EXCESS_REMEDY = 'find the cause of the residual, which exceeds the noise at rest'
+"""Remedy where the data would suffice if the residual were as small as the noise."""
+REMEDY_KEYS = {
+    REMEDIES[GRAVITY,]: 'gravity',
+    REMEDIES[MODEL_ERROR, DRIFT, REJECTED]: 'diagnose',
+    EXCESS_REMEDY: 'diagnose',
+}
+"""Remedy that is no motion -> the key of its input or program (`errors.ERROR_KEYS`)."""
 
 
-def remedy(terms: 'Terms', index: int, tolerance: float) -> str:
+def remedy(terms: 'Terms', index: int, tolerance: float, *, excess: float = 1.0) -> str:
     """
     Return how a parameter gets within its tolerance if more data do not help; '' if they do.
 
     More data reduce noise, bias processes and the uncertainty of held parameters. Where these are
-    within the tolerance, ``sum of their variances <= tolerance^2``, the largest of the other terms
-    decides.
+    within the tolerance, ``sum of their variances <= (excess tolerance)^2``, the largest of the
+    other terms decides.
+
+    Parameters
+    ----------
+    terms : mapping
+        Covariance of the parameters.
+    index : int
+        Of the parameter.
+    tolerance : float
+    excess : float
+        Standard deviation of the residual over that of the noise, where the terms follow from the
+        residual.
+
     """
     variances = {name: float(term[index, index]) for name, term in terms.items()}
     fixed = {names: sum(variances.get(name, 0.0) for name in names) for names in REMEDIES}
-    if sum(variances.values()) - sum(fixed.values()) > tolerance**2:
+    reducible = sum(variances.values()) - sum(fixed.values())
+    if reducible > (excess * tolerance) ** 2:
         return ''
+    if reducible > tolerance**2:
+        return EXCESS_REMEDY
     largest = max(fixed, key=lambda names: fixed[names])
     return REMEDIES[largest] if fixed[largest] > 0 else ''
 
@@ -222,7 +245,7 @@ def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarr
     overrides = overrides or {}
     return np.concatenate(
         [
-            np.full(e.size, float(overrides.get(e.sensor, {}).get(e.name, e.tolerance)))
+            e.tolerances(float(overrides.get(e.sensor, {}).get(e.name, e.tolerance)))
             for e in model.effects
         ]
     )

@@ -132,7 +132,7 @@ def two_clusters(outputs: np.ndarray) -> np.ndarray:
     changes = (upper[:, 1:] != upper[:, :-1]).sum(axis=1)
     separate &= changes >= LEAST_CLUSTER
 
-    # All outputs of a sample belong to one sensor: labels agree with those of the first separate
+    # All outputs of a sample belong to one sensor: labels agree with the ones of the first separate
     # output, except for their sign.
     reference = np.argmax(separate, axis=1)[:, None, None]
     label = np.take_along_axis(

@@ -133,7 +133,7 @@ class Planned:
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
         page = self.report if report else ''
 
-        # The trajectory of another plan must not remain beside this one.
+        # A trajectory of an earlier plan does not belong to this one.
         for name in TRAJECTORIES:
             if (place / name).exists():
                 files.put_aside(place / name)

@@ -11,14 +11,19 @@ import signal
 import subprocess
 import time
 
+import numpy as np
 import pytest
+import yaml
 
+import imu_calibration as imu
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.nodes.lifecycle import UNKNOWN_PARAMETER
 
 from worlds.compensation_cases import random_calibration
 
 pytest.importorskip('rclpy')
+from imu_calibration.nodes.adoption import CompensatorSettings  # noqa: E402
+
 from ros.live_station import STAY_LOCAL, TABLE, free_domain  # noqa: E402
 from ros.workspace import ROOT, sourced  # noqa: E402
 
@@ -246,3 +251,46 @@ def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
     assert 'Traceback' not in terminal.shown() and UNKNOWN_PARAMETER not in terminal.shown(), (
         terminal.shown()
     )
+
+
+def dumped(terminals, node):
+    """Parameters of a node."""
+    answer = answered(terminals, f'ros2 param dump {node}')
+    [(_, found)] = yaml.safe_load(answer.shown()).items()
+    return found['ros__parameters']
+
+
+def test_launch_arguments_are_parameters_of_the_node_which_is_started_again(terminals, home):
+    """With the real launch: an argument that is not given keeps the default of the node."""
+    workspace = home[0] / 'ws'
+    rng = np.random.default_rng(1)
+    still = {
+        'time': 0.01 * np.arange(6000),
+        'force': [0.0, 0.0, 9.81] + 0.01 * rng.normal(size=(6000, 3)),
+        'rate': 1e-3 * rng.normal(size=(6000, 3)),
+    }
+    imu.noise(**still).save(workspace, report=False)
+    noise = str(workspace / 'noise.yaml')
+    launched = terminals(
+        'ros2 launch imu_calibration compensate.launch.py calibration:=$PWD respawn:=true'
+        f' anyway:=true gravity:=9.78 noise_file:={noise}'
+    )
+    launched.wait(r'calibration \w+ from .* adopted')
+    found = dumped(terminals, '/compensator_node')
+    given = {name: found[name] for name in ('anyway', 'gravity', 'noise_file')}
+    assert given == {'anyway': True, 'gravity': 9.78, 'noise_file': noise}
+    assert found['adopt'] == CompensatorSettings().adopt
+
+    # Its end is followed by another start.
+    started = r'process started with pid \[(\d+)\]'
+    os.kill(int(re.search(started, launched.shown())[1]), signal.SIGKILL)
+    launched.wait(f'(?s){started}.*{started}')
+    launched.interrupt()
+
+    launched = terminals(
+        'ros2 launch imu_calibration calibrate.launch.py table:=$PWD/table.yaml latitude:=48.1'
+        f' noise_file:={noise}'
+    )
+    launched.wait(started)
+    found = dumped(terminals, '/calibration_node')
+    assert (found['latitude'], found['noise_file']) == (48.1, noise)
