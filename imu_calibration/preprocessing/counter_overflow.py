@@ -19,6 +19,8 @@ SIZES_NS = tuple(
 """Sizes of the steps back at an overflow, ns: from 4.3 s to 50 days."""
 LOST_PERIODS = 5
 """An overflow may coincide with the loss of so many samples."""
+PERIOD_STEPS = 20
+"""The period is the median of the first steps forward; before, no overflow is undone."""
 LEAST_EQUAL_STEPS = 2
 """Steps back of one size from which on it is the size of a counter, whatever its width and tick."""
 
@@ -36,30 +38,33 @@ def overflow_size(step_ns: int, period_ns: float) -> int:
 
 
 class OverflowSearch:
-    """
-    Undoes overflows in the stamps of one stream; the division into pieces has no influence.
-
-    The period is that of the first piece with three stamps or more.
-    """
+    """Undoes overflows in the stamps of one stream; the division into pieces has no influence."""
 
     def __init__(self) -> None:
         self.count = 0
         """Overflows until now."""
         self._shift_ns = 0
         self._last: int | None = None
-        self._period_ns = 0.0
+        self._first_steps = np.zeros(0, np.int64)
 
     def undone(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return the next stamps without overflows, ns, shape (n,)."""
         stamps = stamp_ns + self._shift_ns
-        if not self._period_ns and len(stamps) >= 3:
-            forward = np.diff(stamps)
-            forward = forward[forward > 0]
-            self._period_ns = float(np.median(forward)) if len(forward) else 0.0
         first = stamps[0] if self._last is None else self._last
         steps = np.diff(stamps, prepend=first)
+
+        # The period from the first steps forward of the stream.
+        is_forward = steps > 0
+        n_before = len(self._first_steps)
+        new_steps = steps[is_forward][: PERIOD_STEPS - n_before]
+        self._first_steps = np.concatenate([self._first_steps, new_steps])
+        period_ns = float(np.median(self._first_steps)) if len(self._first_steps) else 0.0
+
         for place in np.flatnonzero(steps < -LEAST_STEP_NS):
-            size = overflow_size(int(steps[place]), self._period_ns)
+            # A step back within them is no overflow: the period is not known yet.
+            if n_before + np.count_nonzero(is_forward[:place]) < PERIOD_STEPS:
+                continue
+            size = overflow_size(int(steps[place]), period_ns)
             if size:
                 stamps[place:] += size
                 self._shift_ns += size
