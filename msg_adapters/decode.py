@@ -17,7 +17,12 @@ from msg_adapters.imu import (
     find_imu_layout,
     find_temperature_layout,
 )
-from msg_adapters.joint_state import JOINT_STATE_TYPE, decode_joints, find_joint_layout
+from msg_adapters.joint_state import (
+    JOINT_STATE_TYPE,
+    NO_NAMES,
+    decode_joints,
+    find_joint_layout,
+)
 from msg_adapters.layout import MessageLayout, Packed, UnusableMessage, group_by_layout
 
 JOINT_PATIENCE = 1000
@@ -211,6 +216,9 @@ class JointDecoder(Decoder):
             self.seen.append(layout.names)
         if not self.asked and not self.names:
             self.names = layout.names
+        # Joints are those of the first message that names any.
+        if not self.names:
+            raise UnusableMessage(NO_NAMES)
         return decode_joints(layout, packed, self.names)
 
     def check(self) -> None:

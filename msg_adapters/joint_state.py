@@ -29,6 +29,7 @@ Joints of a message and bytes of their names; the time to compare names grows wi
 either.
 """
 MISSING_JOINT = 'JointState without every joint of the table'
+NO_NAMES = 'JointState without names'
 NO_POSITION = 'JointState without a position for every name'
 
 

@@ -11,6 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from test_adapters_bag import make_session
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.samples import JointSamples
 from imu_calibration.kinematics.motion_limits import TrajectoryPoints
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard, standard_definition
@@ -19,6 +20,7 @@ from msg_adapters.joint_state import (
     JOINT_STATE_TYPE,
     JOINT_TRAJECTORY_TYPE,
     MISSING_JOINT,
+    NO_NAMES,
     NO_POSITION,
     encode_trajectory,
     trajectory_from_message,
@@ -167,6 +169,17 @@ def test_joints_in_any_order_give_the_general_path_s_samples(messages):
     first = messages[0][0]
     expected = [first.position[first.name.index(name)] for name in table]
     np.testing.assert_array_equal(JointDecoder(table).decode(packed).position[0], expected)
+
+
+def test_messages_without_names_do_not_choose_the_joints():
+    stamps = np.arange(2)
+    nothing = JointSamples(stamps, np.zeros((2, 0)), np.zeros((2, 0)))
+    named = JointSamples.of_angles(stamps, {'yaw': np.array([0.1, 0.2])})
+    messages = [row.tobytes() for part in (nothing, named) for row in encode_joints(part)]
+    decoder = JointDecoder()
+    samples = decoder.decode(Packed.join(messages))
+    assert samples.names == ('yaw',) and samples.position[:, 0].tolist() == [0.1, 0.2]
+    assert decoder.dropped == {NO_NAMES: 2}
 
 
 @quick

@@ -43,7 +43,7 @@ MESSAGES = [
     for row in encode_imu(
         ImuSamples(
             10**18 + 5_000_000 * np.arange(50),
-            np.full((50, 3), 9.8),
+            np.tile([2.0, 4.0, 8.8], (50, 1)),
             np.full((50, 3), 0.1),
             'imu_link',
         )
