@@ -18,7 +18,7 @@ import numpy as np
 
 from imu_calibration.calibration.coverage import DIRECTIONS, sd_excess, share_gained
 from imu_calibration.core.units import DEG
-from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.estimation.observability import ALL_MOTIONS
 from imu_calibration.estimation.solution import LACKING, remedy
 from imu_calibration.kinematics.rotations import skew, unit_rows
@@ -395,9 +395,10 @@ def _without_motion(hand, index):
         return ''
     scatter, expected = _scatters(hand)
     of_pose, of_bias, of_turn = scatter / expected
+    bias = hand.model.part('gyroscope', Role.OFFSET)
     if hand.param_names[index].startswith('accelerometer'):
         excess = of_pose
-    elif hand.param_names[index].startswith('gyroscope.bias'):
+    elif bias.start <= index < bias.stop:
         excess = of_bias
     else:
         # Poses in error also spoil the directions before and after a turn.

@@ -46,9 +46,12 @@ def calibrate_with_table_errors(
     result = calibrate_on_table(sources, table, options, mapper=mapper)
     if options.as_asked or not _unlike_noise(result):
         return TableErrors(result, ())
-    added = [('reference', 'time_offset')]
-    if table.joint_names.zeros:
-        added.append(('reference', 'encoder_zero'))
+    # Those that the table has: the zero of the first joint is part of the attitude of the base.
+    added = [
+        key
+        for key, effect in result.model.catalogue.effects(table.joint_names).items()
+        if effect.set_up_fault is not None
+    ]
     extended = calibrate_on_table(
         sources, table, replace(options, added=(*options.added, *added)), mapper=mapper
     )
@@ -81,30 +84,14 @@ def _table_error_findings(result: TableResult) -> list[CheckFinding]:
     calibration = result.calibration
     significant = np.abs(calibration.values) > SIGNIFICANT * calibration.sd
     findings = []
-    for index, name in enumerate(calibration.param_names):
-        value, sd = calibration.values[index], calibration.sd[index]
-        if not significant[index] or calibration.status[index] is Status.HELD:
+    for effect in calibration.model.effects:
+        if effect.set_up_fault is None:
             continue
-        if name == 'reference.time_offset.offset':
-            side = 'behind' if value > 0 else 'ahead of'
-            findings.append(
-                CheckFinding(
-                    'time_offset',
-                    WARNING,
-                    f'both streams must share one clock, the stamps of the IMU are'
-                    f' {1e3 * abs(value):.3g} +- {1e3 * sd:.2g} ms {side} those of the joints; set'
-                    ' both clocks by one source, or let calibrate estimate the delay',
-                )
-            )
-        if name.startswith('reference.encoder_zero.'):
-            joint = name.rpartition('.')[2]
-            findings.append(
-                CheckFinding(
-                    'encoder_zero',
-                    WARNING,
-                    f'zeros of the joints must be those of the table description, {joint} reads'
-                    f' {np.degrees(-value):.3g} +- {np.degrees(sd):.2g} deg too much; correct the'
-                    ' zero in its driver, or let calibrate estimate it',
-                )
-            )
+        first = calibration.model.slices[effect.key].start
+        for index, component in enumerate(effect.components, first):
+            if not significant[index] or calibration.status[index] is Status.HELD:
+                continue
+            value, sd = float(calibration.values[index]), float(calibration.sd[index])
+            text = effect.set_up_fault(component, value, sd)
+            findings.append(CheckFinding(effect.name, WARNING, text))
     return findings

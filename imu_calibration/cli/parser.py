@@ -271,10 +271,10 @@ class OneLineParser(argparse.ArgumentParser):
             metavar='MODEL',
             help='joined by +; default bias+matrix, and arms if seen',
         )
-        self.expert('--gyroscope-model', metavar='MODEL', help='likewise; default bias+matrix')
+        self.expert('--gyroscope-model', metavar='M', help='likewise; default bias+matrix')
         self.expert(
             '--reference-model',
-            metavar='MODEL',
+            metavar='M',
             help="of table and clock, or 'none'; default table_tilt",
         )
         self.add_effects(self.expert)
@@ -315,7 +315,7 @@ class OneLineParser(argparse.ArgumentParser):
             '--increments',
             metavar='HZ',
             type=float,
-            help='readings are increments over one of HZ samples per second',
+            help='readings are increments between samples at this rate',
         )
         self.common('--axes', metavar='AXES', help='flu, frd, or forward, left, up: --axes=-x,y,-z')
         self.expert(

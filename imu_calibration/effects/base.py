@@ -189,6 +189,11 @@ class Effect:
     """Whether its value may change at one moment."""
     nonnegative: bool = False
     """Whether the values cannot be negative, e.g. lags."""
+    set_up_fault: Callable[[str, float, float], str] | None = None
+    """
+    ``set_up_fault(component, value, sd) -> text``: how a significant value is reported, where it is
+    a common fault of clocks or zeros that the user can correct; None for others.
+    """
     smooth: bool = False
     """Whether it changes smoothly in time: any other smooth curve resembles it."""
     bias_sums: tuple[tuple[int, ...], ...] = ()

@@ -30,6 +30,26 @@ from imu_calibration.kinematics.chain import (
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.joint_motion import with_encoder_harmonics
 
+
+def _late_stamps(_component: str, delay: float, sd: float) -> str:
+    """Return how a delay of the IMU's stamps, s, is reported."""
+    side = 'behind' if delay > 0 else 'ahead of'
+    return (
+        f'both streams must share one clock, the stamps of the IMU are {1e3 * abs(delay):.3g}'
+        f' +- {1e3 * sd:.2g} ms {side} those of the joints; set both clocks by one source, or let'
+        ' calibrate estimate the delay'
+    )
+
+
+def _wrong_zero(joint: str, zero: float, sd: float) -> str:
+    """Return how the zero of a joint, rad, is reported."""
+    return (
+        f'zeros of the joints must be those of the table description, {joint} reads'
+        f' {np.degrees(-zero):.3g} +- {np.degrees(sd):.2g} deg too much; correct the zero in its'
+        ' driver, or let calibrate estimate it'
+    )
+
+
 FIRST_ORDER = tuple(zip(*reversed(np.polynomial.laguerre.laggauss(5))))
 """
 (weight, delay) pairs that make an exponential lag a weighted mean of delays: int e^-x f(t - tau x)
@@ -326,6 +346,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             **of_table,
             name='encoder_zero',
             sudden=True,
+            set_up_fault=_wrong_zero,
             components=names.zeros,
             shape=(len(names.zeros),),
             explanation='The zero of an inner joint angle differs from the table description.',
@@ -438,6 +459,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
         Effect(
             name='time_offset',
             sudden=True,
+            set_up_fault=_late_stamps,
             sensor='reference',
             role=Role.DELAY,
             components=('offset',),

@@ -291,6 +291,6 @@ def test_launch_arguments_are_parameters_of_the_node_which_is_started_again(term
         'ros2 launch imu_calibration calibrate.launch.py table:=$PWD/table.yaml latitude:=48.1'
         f' noise_file:={noise}'
     )
-    launched.wait(started)
+    launched.wait('calibration_node.*reads ')
     found = dumped(terminals, '/calibration_node')
     assert (found['latitude'], found['noise_file']) == (48.1, noise)
