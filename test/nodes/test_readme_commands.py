@@ -254,8 +254,12 @@ def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
 
 
 def dumped(terminals, node):
-    """Parameters of a node."""
+    """Parameters of a node; a node that has just been started is found after a while."""
+    end = time.monotonic() + PATIENCE
     answer = answered(terminals, f'ros2 param dump {node}')
+    while answer.process.returncode:
+        assert time.monotonic() < end, answer.shown()
+        answer = answered(terminals, f'ros2 param dump {node}')
     [(_, found)] = yaml.safe_load(answer.shown()).items()
     return found['ros__parameters']
 

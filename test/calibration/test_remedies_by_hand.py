@@ -1,0 +1,137 @@
+"""By hand, too, advice follows the cause: motions only where other attitudes help."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import imu_calibration as imu
+from imu_calibration.calibration.advice import _without_motion
+from imu_calibration.calibration.live_poses import _needs
+from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.units import MILLI_G
+from imu_calibration.document.decision import PARAMETERS
+from imu_calibration.document.verdict import _step_of
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.estimation.observability import ALL_MOTIONS
+from imu_calibration.estimation.solution import EXCESS_REMEDY, REMEDY_KEYS
+
+from worlds.compensation_cases import random_calibration
+from worlds.hand_sessions import GRAVITY, simulate
+from worlds.physics_hand import hold_and_turn, warmed_up
+
+SESSION = {'force_sd': 0.01, 'rate_sd': 0.001, 'period': 0.02, 'still': 3.0}
+
+
+def calibrated(samples, **choices):
+    """Calibrate with the model as it is."""
+    return imu.calibrate(SampleBlock(samples), gravity=GRAVITY, model_as_asked=True, **choices)
+
+
+def bends(force, rate, _time, _pose):
+    """Squares of the force, 20 mg at 1 g: no bias and no matrix explain them."""
+    return 0.002 * force**2, 0.0 * rate
+
+
+def steps(force, rate, time, _pose):
+    """Add a step of 5 mg in the x bias at half of the time."""
+    late = (time > 0.5 * time[-1])[:, None]
+    return late * np.array([5 * MILLI_G, 0.0, 0.0]), 0.0 * rate
+
+
+@pytest.mark.parametrize('spoil', (bends, steps))
+def test_a_model_error_needs_its_cause_and_no_motion(spoil):
+    samples, *_ = simulate(21, n_poses=24, spoil=spoil, **SESSION)
+    found = calibrated(samples)
+    assert 'weak' in found.calibration.status_by_name.values()
+    needs = {entry['needs'] for entry in found.calibration.undetermined}
+    assert needs and {REMEDY_KEYS.get(need) for need in needs} == {'diagnose'}
+    named = [r for r in found.result.verdict.reasons if r.word is PARAMETERS and r.next in needs]
+    assert named and {reason.key for reason in named} == {'diagnose'}
+    assert all('imu_calibration diagnose' in reason.advice() for reason in named)
+
+
+def test_too_few_attitudes_need_another_whatever_the_residual():
+    for spoil in (None, bends):
+        samples, *_ = simulate(22, n_poses=6, spoil=spoil, **SESSION)
+        undetermined = calibrated(samples).calibration.undetermined
+        assert any(' up' in entry['needs'] for entry in undetermined)
+        assert spoil or not {entry['needs'] for entry in undetermined} & set(REMEDY_KEYS)
+
+
+def test_a_bias_that_moves_by_errors_of_the_model_is_not_called_unsteady():
+    samples, *_ = simulate(23, n_poses=24, spoil=bends, **SESSION)
+    steady = imu.calibrate(SampleBlock(samples), gravity=GRAVITY)
+    assert steady.calibration.statistics['accelerometer']['between_window_sd'] > 2 * MILLI_G
+    assert not any('window to window' in reason.what for reason in steady.result.verdict.reasons)
+
+
+@pytest.mark.parametrize('name', ('accel_bias_drift', 'gyro_bias_drift'))
+def test_the_tolerance_of_a_time_constant_is_that_of_its_effect_on_the_bias(name):
+    """The curves of two time constants, a tolerance apart, differ by one tolerance of the bias."""
+    effect = next(
+        effect
+        for sensor in SENSORS
+        for effect in [CATALOGUE.effects(()).get((sensor, name))]
+        if effect
+    )
+    *of_bias, of_time = effect.tolerances(effect.tolerance)
+    assert of_bias == [effect.tolerance] * 3
+    constant, size = effect.prior_values()[-1], effect.prior_sds()[0]
+    time = np.linspace(0.0, 5 * constant, 2000)
+    curves = [
+        size * (1 - np.exp(-time / each))
+        for each in (constant - of_time / 2, constant + of_time / 2)
+    ]
+    assert np.max(np.abs(curves[1] - curves[0])) == pytest.approx(effect.tolerance, rel=0.01)
+
+
+def test_a_warm_up_is_determined_and_a_weak_one_needs_no_attitude():
+    samples, *_ = hold_and_turn(3, n_poses=12, rate_hz=50.0)
+    model = 'bias+matrix+gyro_bias_drift'
+    warm, _ = warmed_up(samples, 1, force=0.0, rate=0.01, time_constant=20.0)
+    found = calibrated(warm, gyroscope_model=model)
+    assert (
+        found.calibration.status_by_name['gyroscope.gyro_bias_drift.time_constant'] == 'determined'
+    )
+    hand = found.result.hand
+    index = hand.param_names.index('gyroscope.gyro_bias_drift.x')
+    tight = replace(hand, tolerances=1e-3 * hand.tolerances)
+    assert _without_motion(tight, index) == ALL_MOTIONS['warm_up']
+
+
+def test_live_the_next_step_is_the_cause_where_no_attitude_helps():
+    """The planner would propose poses for ever."""
+    status = {'accelerometer.bias.x': 'weak'}
+    for need, expected in ((EXCESS_REMEDY, 'call ~/diagnose'), ('turn it', 'the planned pose')):
+        calibration = SimpleNamespace(
+            requested=status, undetermined=({'parameters': {}, 'needs': need},)
+        )
+        _, [shown] = _needs(
+            SimpleNamespace(attitudes=20),
+            [],
+            calibration,
+            step='the planned pose',
+            hints={'diagnose': 'call ~/diagnose to {}'},
+        )
+        assert shown.startswith(expected)
+
+
+def test_the_next_step_of_an_unproven_sensor_is_that_of_its_reason():
+    """Attitudes were proposed where the proof lacked rests, turns, or another sensor."""
+    helps = {'before': 1.0, 'after': 0.1, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 9}
+    proven = random_calibration(3, proof={sensor: dict(helps) for sensor in SENSORS}, decision={})
+    by_hand = replace(proven, gauge={'axes': 'accelerometer_lower_triangular'})
+    near_faces = replace(
+        by_hand, proof={**proven.proof, 'accelerometer': {**helps, 'few_directions': True}}
+    )
+    nothing = [replace(each, proof={}) for each in (proven, by_hand)]
+    diagnosed = replace(proven, proof={sensor: {**helps, 'ci95': [0.5, 1.5]} for sensor in SENSORS})
+    of_accelerometer = [
+        _step_of(each, 'accelerometer') for each in (*nothing, near_faces, diagnosed)
+    ]
+    assert len(set(of_accelerometer)) == 4 and of_accelerometer[-1][1] == 'diagnose'
+    assert _step_of(near_faces, 'gyroscope') == ('', None)
+    assert 'turn' in _step_of(nothing[1], 'gyroscope')[0]
