@@ -1,6 +1,7 @@
 """The function made for one calibration equals the catalogue's own compensation."""
 
 import ast
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -124,6 +125,16 @@ def test_own_effects_have_a_limit_of_operations():
     assert np.all(np.isfinite(make_kernel(few)(*[1.0] * 10)))
 
 
+@pytest.fixture
+def usual_recursion():
+    """The limit of a new interpreter; libraries of other tests raise it."""
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(1000)
+    yield
+    sys.setrecursionlimit(limit)
+
+
+@pytest.mark.usefixtures('usual_recursion')
 def test_a_sum_that_cannot_be_compiled_is_refused(monkeypatch):
     """The compiler of Python ends with an error of recursion at some thousand terms."""
     long = 'def kernel(*x):\n    return ' + ' + '.join(['1.5'] * 9000)
