@@ -22,6 +22,7 @@ from imu_calibration.calibration.proof import (
 )
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.solution import MODEL_ERROR, Solution, with_term
 from imu_calibration.estimation.window_statistics import N_AXES
@@ -39,11 +40,9 @@ FITTED = (Role.OFFSET, Role.LINEAR)
 
 
 @dataclass(frozen=True, eq=False)
-class PlainFit:
+class PlainEstimate:
     """Bias and matrix of one sensor by least squares, its further effects at their prior."""
 
-    sensor: str
-    """The sensor."""
     replaced: np.ndarray
     """True for the parameters that the fit replaces in a solution, shape (n_params,)."""
     fitted: np.ndarray
@@ -54,6 +53,16 @@ class PlainFit:
     """Parameters from all pieces, shape (n_params,); of use where `replaced`."""
     folds: list[np.ndarray]
     """The same without the pieces of each fold."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlainFit:
+    """A plain estimate that predicts held-out data better than a solution."""
+
+    sensor: str
+    """The sensor."""
+    estimate: PlainEstimate
+    """Its bias and matrix."""
     error: float
     """Rms error on held-out pieces, SI."""
     error_of_solution: float
@@ -61,8 +70,10 @@ class PlainFit:
 
     def merged(self, folds: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return parameters of folds with those of the fit."""
-        pairs = zip(folds, self.folds, strict=True)
-        return [np.where(self.replaced, fitted, values) for values, fitted in pairs]
+        merged = []
+        for values, fitted in zip(folds, self.estimate.folds, strict=True):
+            merged.append(np.where(self.estimate.replaced, fitted, values))
+        return merged
 
 
 def better_plain_fits(
@@ -94,28 +105,29 @@ def better_plain_fits(
     described = [with_reference(model, values, nominal) for values in folds]
     # The table and the clock as described, and as the solution has them.
     references = (nominal, with_reference(model, nominal, solution.values))
+
+    def squares(sensor: str, candidate: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the squared errors on the held-out pieces of each block."""
+        errors = errors_of(held_out, model, sensor, folds=candidate, regimes=regimes)
+        return errors.squares.sum(axis=1)
+
     better = []
     for sensor in SENSORS:
         if sensor not in unexplained:
             continue
-        squares_of_solution = _least(
-            errors_of(held_out, model, sensor, folds=candidate, regimes=regimes).squares.sum(axis=1)
-            for candidate in (folds, described)
-        )
-        fits = [_plain_fit(held_out, solution, sensor, reference) for reference in references]
-        squares = [
-            errors_of(held_out, model, sensor, folds=fit.folds, regimes=regimes).squares.sum(axis=1)
-            for fit in fits
-        ]
+        of_solution = min(squares(sensor, folds), squares(sensor, described), key=np.sum)
+
         # Estimates of the table and the clock have to pay: the residual may have moved them.
-        described_error, estimated_error = (np.sqrt(each.sum()) for each in squares)
-        best = int(estimated_error < CLEARLY_BETTER * described_error)
-        figures = compared(squares_of_solution, squares[best], counts.sum(axis=1))
-        ratio = figures['after'] / max(figures['before'], 1e-300)
-        if ratio < HARDLY_WORSE:
-            better.append(
-                replace(fits[best], error=figures['after'], error_of_solution=figures['before'])
-            )
+        estimates = [_plain_estimate(held_out, solution, sensor, each) for each in references]
+        with_described, with_estimated = (squares(sensor, each.folds) for each in estimates)
+        chosen, of_plain = estimates[0], with_described
+        if np.sqrt(with_estimated.sum()) < CLEARLY_BETTER * np.sqrt(with_described.sum()):
+            chosen, of_plain = estimates[1], with_estimated
+
+        figures = compared(of_solution, of_plain, counts.sum(axis=1))
+        error, error_of_solution = figures['after'], figures['before']
+        if error / max(error_of_solution, 1e-300) < HARDLY_WORSE:
+            better.append(PlainFit(sensor, chosen, error, error_of_solution))
     return tuple(better)
 
 
@@ -125,17 +137,19 @@ def with_plain_fits(solution: Solution, fits: Sequence[PlainFit]) -> Solution:
 
     The change of each sensor is a part of its covariance: both estimates have errors of that size.
     """
+    names = np.array(solution.param_names)
     for fit in fits:
-        values = np.where(fit.replaced, fit.values, solution.values)
+        estimate = fit.estimate
+        values = np.where(estimate.replaced, estimate.values, solution.values)
         change = values - solution.values
-        at_prior = np.isin(solution.param_names, solution.replaced) & ~fit.fitted
-        at_prior |= fit.replaced & ~fit.fitted & ~solution.held
+        at_prior = np.isin(names, solution.replaced) & ~estimate.fitted
+        at_prior |= estimate.replaced & ~estimate.fitted & ~solution.held
         solution = replace(
             solution,
             values=values,
             terms=with_term(solution.terms, MODEL_ERROR, np.outer(change, change)),
-            held=(solution.held | at_prior) & ~fit.fitted,
-            replaced=tuple(np.array(solution.param_names)[at_prior].tolist()),
+            held=(solution.held | at_prior) & ~estimate.fitted,
+            replaced=tuple(names[at_prior].tolist()),
         )
     return solution
 
@@ -154,33 +168,34 @@ def plain_entries(fits: Sequence[PlainFit]) -> dict[str, dict[str, dict[str, flo
 
 def changes_with(changes: ModelChanges, fits: Sequence[PlainFit]) -> ModelChanges:
     """Return the changes of a model in which effects that plain fits replace are not added."""
-    names = {name for fit in fits for name in fit.dropped}
-    dropped = tuple(name for name in changes.added if name in names)
+    replaced = set()
+    for fit in fits:
+        replaced.update(fit.estimate.dropped)
+    dropped = tuple(name for name in changes.added if name in replaced)
     return replace(
         changes,
-        added=tuple(name for name in changes.added if name not in names),
+        added=tuple(name for name in changes.added if name not in replaced),
         unstable=(*changes.unstable, *dropped),
     )
 
 
-def _least(candidates):
-    return min(candidates, key=lambda squares: squares.sum())
-
-
-def _plain_fit(held_out, solution, sensor, reference):
-    """Return the `PlainFit` of a sensor with the table and the clock of `reference`."""
+def _plain_estimate(
+    held_out: HeldOut, solution: Solution, sensor: str, reference: np.ndarray
+) -> PlainEstimate:
+    """Return the estimate of a sensor with the table and the clock of `reference`."""
     model = solution.model
     replaced = np.zeros(len(reference), bool)
     fitted = np.zeros(len(reference), bool)
     dropped = []
     for effect in model.effects:
-        if effect.sensor == sensor and effect.role in FITTED:
-            fitted[model.slices[effect.key]] = True
-        elif effect.sensor != sensor or effect.role is Role.LIMIT or is_of_reference(effect):
+        part = model.slices[effect.key]
+        if effect.sensor != sensor:
             continue
-        else:
+        if effect.role in FITTED:
+            replaced[part] = fitted[part] = True
+        elif effect.role is not Role.LIMIT and not is_of_reference(effect):
+            replaced[part] = True
             dropped.append(effect.name)
-        replaced[model.slices[effect.key]] = True
     # Entries without information keep their values; weak ones at their prior are estimated.
     uninformed = solution.held & ~np.isin(solution.param_names, solution.replaced)
     fitted &= ~uninformed
@@ -193,10 +208,12 @@ def _plain_fit(held_out, solution, sensor, reference):
         others = [k for k in range(len(rows)) if k % TABLE_FOLDS != fold]
         folds.append(_solved(start, fitted, rows, targets, others))
     values = _solved(start, fitted, rows, targets, range(len(rows)))
-    return PlainFit(sensor, replaced, fitted, tuple(dropped), values, folds, np.nan, np.nan)
+    return PlainEstimate(replaced, fitted, tuple(dropped), values, folds)
 
 
-def _equations(held_out, model, sensor, *, start, fitted):
+def _equations(
+    held_out: HeldOut, model: SensorModel, sensor: str, *, start: np.ndarray, fitted: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """
     Return for each block the rows and right sides of ``output = columns @ coefficients(values)``.
 
@@ -208,26 +225,30 @@ def _equations(held_out, model, sensor, *, start, fitted):
         moved = start.copy()
         moved[index] += 1.0
         slopes.append(coefficients(model, sensor, moved) - total)
-    rows, targets = [], []
+    width = len(total)
+    rows = []
+    targets = []
     for block in held_out.blocks:
-        pieces = [
-            part
-            for kept in (block.pieces, block.earlier)
-            for (name, _), part in kept.items()
-            if name == sensor
-        ]
-        width = len(total)
-        stacked = np.concatenate([*pieces, np.zeros((0, width + 2 * N_AXES))])
+        pieces = [np.zeros((0, width + 2 * N_AXES))]
+        for kept in (block.pieces, block.earlier):
+            pieces += [part for (name, _), part in kept.items() if name == sensor]
+        stacked = np.concatenate(pieces)
         columns, output = stacked[:, :width], stacked[:, -N_AXES:]
         rows.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
         targets.append((output - columns @ total).ravel())
     return rows, targets
 
 
-def _solved(start, fitted, rows, targets, blocks):
-    """Return the parameters that fit the rows of some blocks."""
+def _solved(
+    start: np.ndarray,
+    fitted: np.ndarray,
+    rows: list[np.ndarray],
+    targets: list[np.ndarray],
+    blocks: Sequence[int],
+) -> np.ndarray:
+    """Return the parameters that fit the rows of some blocks, numbers in their list."""
+    design = np.concatenate([rows[k] for k in blocks])
+    target = np.concatenate([targets[k] for k in blocks])
     values = start.copy()
-    values[fitted] += scaled_lstsq(
-        np.concatenate([rows[k] for k in blocks]), np.concatenate([targets[k] for k in blocks])
-    )
+    values[fitted] += scaled_lstsq(design, target)
     return values
