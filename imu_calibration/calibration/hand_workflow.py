@@ -343,8 +343,8 @@ def read_by_hand(
             imu = without_sensor(imu, sensor)
     delay = delay_of(imu)
     if preflight is not None:
-        preflight.findings += tuple(late_gyroscope(delay))
-        findings = tuple(preflight.findings)
+        findings = (*preflight.findings, *late_gyroscope(delay))
+        preflight.findings = findings
     warm = None
     if temperatures:
         moved = [

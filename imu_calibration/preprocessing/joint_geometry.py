@@ -38,7 +38,7 @@ class Correction:
 
 @dataclass(frozen=True, eq=False)
 class MovingReadings:
-    """MovingReadings of moving windows that are compared with descriptions of the table."""
+    """Readings of moving windows that are compared with descriptions of the table."""
 
     motion: JointMotion
     """Joints at n instants."""
@@ -94,11 +94,12 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
     windows = [window for window in windows if 2 < len(window) == len(window.motion)]
     if not windows:
         return None
-    every = slice(None, None, max(1, sum(len(window) for window in windows) // MAX_SAMPLES))
+    n_samples = sum(len(window) for window in windows)
+    thinned = slice(None, None, max(1, n_samples // MAX_SAMPLES))
     readings = MovingReadings(
-        JointMotion.concatenate(window.motion for window in windows).select(every),
-        np.concatenate([window.rate_s for window in windows])[every],
-        np.concatenate([window.force_s for window in windows])[every],
+        JointMotion.concatenate(window.motion for window in windows).select(thinned),
+        np.concatenate([window.rate_s for window in windows])[thinned],
+        np.concatenate([window.force_s for window in windows])[thinned],
     )
     as_described = readings.correction('', table, readings.motion)
     corrections = list(_corrections(readings, table))

@@ -19,13 +19,11 @@ from imu_calibration.simulation.session import (
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics
 
+from worlds.tables import joints_about
+
 TABLE = Table.from_mapping(
     {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [1, 0, 0]},
-            {'name': 'inner', 'axis': [0, 1, 0]},
-        ],
+        'joints': joints_about('zxy'),
         'gravity': 9.81,
     }
 )

@@ -33,6 +33,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.profiles import make_profile
 
 from worlds.compensation_cases import FURTHER, random_calibration, random_motion
+from worlds.tables import Z_Y_X
 
 ALL = FURTHER['accelerometer'], FURTHER['gyroscope']
 EACH = [((name,), ()) for name in ALL[0]] + [((), (name,)) for name in ALL[1]]
@@ -79,11 +80,7 @@ def test_compensation_undoes_the_forward_equations(effects):
 def test_the_whole_way_from_a_table_through_prediction_and_back():
     table = Table.from_mapping(
         {
-            'joints': [
-                {'name': 'outer', 'axis': [0, 0, 1]},
-                {'name': 'middle', 'axis': [0, 1, 0]},
-                {'name': 'inner', 'axis': [1, 0, 0]},
-            ],
+            'joints': Z_Y_X,
             'gravity': 9.81,
             'mount': {'xyz': [0.1, 0.05, -0.02]},
         }

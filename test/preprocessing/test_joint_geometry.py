@@ -13,14 +13,12 @@ from imu_calibration.preprocessing.joint_checks import standing_still
 from imu_calibration.preprocessing.joint_geometry import description_error, with_axis
 from imu_calibration.preprocessing.window import Window
 
+from worlds.tables import joints_about
+
 PERIOD, SECONDS = 0.02, 240.0
 TABLE = Table.from_mapping(
     {
-        'joints': [
-            {'name': 'a', 'axis': [0, 0, 1]},
-            {'name': 'b', 'axis': [1, 0, 0]},
-            {'name': 'c', 'axis': [0, 1, 0]},
-        ],
+        'joints': joints_about('zxy', ('a', 'b', 'c')),
         'gravity': 9.81,
     }
 )

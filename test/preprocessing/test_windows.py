@@ -28,15 +28,13 @@ from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.preprocessing.wrap_filter import WRAP_REACH
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 
+from worlds.tables import Z_Y_X
+
 START = 1_700_000_000 * 10**9
 NAMES = ('outer', 'middle', 'inner')
 TABLE = Table.from_mapping(
     {
-        'joints': [
-            {'name': 'outer', 'axis': [0, 0, 1]},
-            {'name': 'middle', 'axis': [0, 1, 0]},
-            {'name': 'inner', 'axis': [1, 0, 0]},
-        ],
+        'joints': Z_Y_X,
         'gravity': 9.81,
     }
 )

@@ -2,12 +2,17 @@
 
 from imu_calibration.kinematics.table import Table
 
-Z_Y_X = [
-    {'name': 'outer', 'axis': [0, 0, 1]},
-    {'name': 'middle', 'axis': [0, 1, 0]},
-    {'name': 'inner', 'axis': [1, 0, 0]},
-]
+NAMES = ('outer', 'middle', 'inner')
 """Joints from the ground to the sensor."""
+
+
+def joints_about(axes, names=NAMES):
+    """Return the description of joints about coordinate axes, such as 'zyx'."""
+    vectors = {'x': [1, 0, 0], 'y': [0, 1, 0], 'z': [0, 0, 1]}
+    return [{'name': name, 'axis': vectors[axis]} for name, axis in zip(names, axes, strict=True)]
+
+
+Z_Y_X = joints_about('zyx')
 
 
 def three_axis_table(**fields):
