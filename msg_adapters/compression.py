@@ -4,6 +4,7 @@ import bz2
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -109,8 +110,10 @@ def _decompressor(compression: str) -> Callable[[], Any]:
 
 def decompression_errors() -> tuple[type[Exception], ...]:
     """Return the errors of `decompress` for damaged data."""
-    errors = (RuntimeError, EOFError, OSError, ValueError)
-    return (zstd().ZstdError, *errors) if all_installed() else errors
+    errors: tuple[type[Exception], ...] = (RuntimeError, EOFError, OSError, ValueError)
+    with suppress(InputError):
+        errors = (zstd().ZstdError, *errors)
+    return errors
 
 
 def decompress_chunk(compression: str, packed: memoryview, size: int) -> bytes:

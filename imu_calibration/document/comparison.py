@@ -174,11 +174,13 @@ def _turned(model, values):
 
 def _compared_turned(first, second, common, notes):
     """Compare the common parameters of two calibrations in the axes of the accelerometer."""
-    turns = [
-        lower_times_rotation(c.model.value('accelerometer', Role.LINEAR, c.values))[1]
-        for c in (first, second)
-    ]
-    cosine = 0.5 * (np.trace(turns[0] @ turns[1].T) - 1.0)
+    rotations = []
+    for calibration in (first, second):
+        matrix = calibration.model.value('accelerometer', Role.LINEAR, calibration.values)
+        _, rotation = lower_times_rotation(matrix)
+        rotations.append(rotation)
+    # The angle of a rotation R: cos(angle) = (trace(R) - 1) / 2.
+    cosine = 0.5 * (np.trace(rotations[0] @ rotations[1].T) - 1.0)
     angle = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return _compared(
         in_accelerometer_axes(first), in_accelerometer_axes(second), common, notes, angle=angle
