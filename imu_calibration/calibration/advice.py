@@ -336,12 +336,15 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     absent = hand.hand_model.absent
     lacking: dict[str, dict[str, float]] = {}
     remedies: dict[tuple[str, str], dict[str, float]] = {}
+    excesses = None if 'accelerometer' in absent else _Excesses.of(hand)
     for index, name in enumerate(hand.param_names):
         sensor = name.partition('.')[0]
         if hand.statuses[index] not in LACKING or sensor in absent:
             continue
         in_tolerances = float(hand.judged_sd[index] / hand.tolerances[index])
-        without_motion = '' if 'accelerometer' in absent else _without_motion(hand, index)
+        without_motion = ''
+        if excesses is not None:
+            without_motion = _without_motion(hand, index, excesses)
         if without_motion:
             remedies.setdefault((sensor, without_motion), {})[name] = in_tolerances
         else:
@@ -376,7 +379,7 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     return tuple(found)
 
 
-def _without_motion(hand, index):
+def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') -> str:
     """
     Return what determines a parameter if another attitude does not; '' if it does.
 
@@ -393,30 +396,43 @@ def _without_motion(hand, index):
     # A parameter that the attitudes do not determine needs others, whatever the scatter is.
     if hand.judged_sd[index] > UNKNOWN_SHARE * model.priors[index]:
         return ''
-    scatter, expected = _scatters(hand)
-    of_pose, of_bias, of_turn = scatter / expected
     bias = hand.model.part('gyroscope', Role.OFFSET)
     if hand.param_names[index].startswith('accelerometer'):
-        excess = of_pose
+        excess = excesses.pose
     elif bias.start <= index < bias.stop:
-        excess = of_bias
+        excess = excesses.bias
     else:
         # Poses in error also spoil the directions before and after a turn.
-        excess = max(of_pose, of_turn)
+        excess = max(excesses.pose, excesses.turn)
     return remedy(terms, index, hand.tolerances[index], excess=excess if excess > EXCESS else 1.0)
 
 
-def _scatters(hand):
-    """
-    Return (sds of a pose, of the bias in it and of a turn; the sds that noise explains).
+@dataclass(frozen=True)
+class _Excesses:
+    """Scatter of poses and turns over that of noise and a quiet hand (`TREMBLING`, `CREEPING`)."""
 
-    Shape (3,) each, m/s^2, rad/s, rad. A quiet hand adds `TREMBLING` and `CREEPING`.
-    """
-    statistics, poses = hand.statistics, hand.poses
-    of_mean = [np.sqrt(np.mean(sem**2)) for sem in (poses.force_sem, poses.rate_sem)] + [0.0]
-    found = [statistics[f'{name}_scatter_sd'] for name in ('pose', 'drift', 'turn')]
-    quiet = np.hypot(SCATTER_SD, (TREMBLING, CREEPING, 0.0))
-    return np.hypot(found, of_mean), np.hypot(quiet, of_mean)
+    pose: float
+    """Of the specific force of a pose."""
+    bias: float
+    """Of the gyroscope's bias in a pose."""
+    turn: float
+    """Of the angle of a turn."""
+
+    @classmethod
+    def of(cls, hand: HandCalibration) -> '_Excesses':
+        statistics = hand.statistics
+        sd_force, sd_bias, sd_turn = SCATTER_SD
+        force_noise = np.sqrt(np.mean(hand.poses.force_sem**2))
+        rate_noise = np.sqrt(np.mean(hand.poses.rate_sem**2))
+
+        def ratio(scatter: float, quiet: float, noise: float) -> float:
+            return float(np.hypot(scatter, noise) / np.hypot(quiet, noise))
+
+        return cls(
+            ratio(statistics['pose_scatter_sd'], np.hypot(sd_force, TREMBLING), force_noise),
+            ratio(statistics['drift_scatter_sd'], np.hypot(sd_bias, CREEPING), rate_noise),
+            ratio(statistics['turn_scatter_sd'], sd_turn, 0.0),
+        )
 
 
 def knowledge_at_first(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.advice import _without_motion
+from imu_calibration.calibration.advice import _Excesses, _without_motion
 from imu_calibration.calibration.live_poses import _needs
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import MILLI_G
@@ -99,7 +99,7 @@ def test_a_warm_up_is_determined_and_a_weak_one_needs_no_attitude():
     hand = found.result.hand
     index = hand.param_names.index('gyroscope.gyro_bias_drift.x')
     tight = replace(hand, tolerances=1e-3 * hand.tolerances)
-    assert _without_motion(tight, index) == ALL_MOTIONS['warm_up']
+    assert _without_motion(tight, index, _Excesses.of(tight)) == ALL_MOTIONS['warm_up']
 
 
 def test_live_the_next_step_is_the_cause_where_no_attitude_helps():
