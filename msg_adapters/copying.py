@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.preprocessing.sensor_join import OtherSensor
 from msg_adapters.bag import open_recording
 from msg_adapters.bag_writer import BagWriter
 from msg_adapters.decode import FrameChoice, in_order
@@ -35,6 +36,7 @@ def copy_with_corrected(
     where: Sequence[str] = (),
     check: Callable[[], None] | None = None,
     keep: Callable[[np.ndarray], np.ndarray] | None = None,
+    other: OtherSensor | None = None,
 ) -> dict[str, int]:
     """
     Write a bag with all topics of another one, and the corrected Imu messages.
@@ -71,6 +73,9 @@ def copy_with_corrected(
         Called after the last block; an error that it raises removes the bag.
     keep : callable, optional
         Stamps of the next messages, shape (n,) -> which of them are corrected, bool, shape (n,).
+    other : OtherSensor, optional
+        A sensor on another topic, whose readings are added to the messages. Their covariance is
+        unknown.
 
     Returns
     -------
@@ -91,7 +96,9 @@ def copy_with_corrected(
         _check(recording, corrected_topic)
         topics = [topic.name for topic in recording.topics]
         choice = FrameChoice(recording.imu_topic, source_frame_id)
-        patch = _Patch(correct, propagate, frame_id, mat_ts, late_ns, choice, keep=keep)
+        patch = _Patch(
+            correct, propagate, frame_id, mat_ts, late_ns, choice, keep=keep, other=other
+        )
         with BagWriter(destination, bag.storage) as writer:
             ids = np.array(
                 [writer.add_topic(name, bag.definition(name), bag.qos(name)) for name in topics]
@@ -153,7 +160,9 @@ def _write(writer, topic_ids, raw, measured, corrected_id, patch):
 class _Patch:
     """Makes corrected messages from measured ones."""
 
-    def __init__(self, correct, propagate, frame_id, mat_ts, late_ns, choice, *, keep=None):
+    def __init__(
+        self, correct, propagate, frame_id, mat_ts, late_ns, choice, *, keep=None, other=None
+    ):
         self.correct, self.propagate, self.late_ns, self.choice = (
             correct,
             propagate,
@@ -162,7 +171,7 @@ class _Patch:
         )
         self.frame_id, self.mat_st = frame_id, None if mat_ts is None else np.asarray(mat_ts).T
         self.dropped = Counter()
-        self.keep = keep
+        self.keep, self.other = keep, other
 
     def __call__(self, packed, received_ns):
         """
@@ -190,6 +199,8 @@ class _Patch:
             ]
             done, samples = done[kept], samples.select(kept)
         order = np.argsort(np.concatenate([index for _, index, _ in groups]))
+        if self.other is not None:
+            samples = self.other.added_to(samples)
         corrected = self.correct(samples)
         tables = []
         for layout, index, group in groups:
@@ -216,7 +227,12 @@ class _Patch:
 
     def _fields(self, layout, packed, vectors, marks):
         """Return the new fields of one group: field name -> values."""
-        measured = [layout.column(packed, f'{quantity}_cov') for quantity in ('force', 'rate')]
+        measured = []
+        for quantity in ('force', 'rate'):
+            covariance = layout.column(packed, f'{quantity}_cov')
+            if self.other is not None and quantity == self.other.quantity:
+                covariance = np.zeros_like(covariance)  # unknown: the messages lack this sensor
+            measured.append(covariance)
         absent = [covariance[:, :1] == -1.0 for covariance in measured]
         fields = {}
         for quantity, values, missing in zip(('force', 'rate'), vectors, absent, strict=True):

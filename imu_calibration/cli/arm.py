@@ -27,6 +27,7 @@ def add_arguments(parser: OneLineParser) -> None:
         help='frame_id of A, then of B; for a topic with several',
     )
     parser.add_readings()
+    parser.add_exclusion()
     parser.add_rows()
 
 
@@ -38,7 +39,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, warnings
     from imu_calibration.use_cases.choices import raw_columns, readings_of
-    from imu_calibration.use_cases.recordings import Topics, open_bag, source_of
+    from imu_calibration.use_cases.recordings import Topics, open_bag, source_of, sources_without
 
     if len(options.imu_topic) != 2:
         raise InputError(
@@ -68,8 +69,8 @@ def run(options: Options) -> VerbResult:
     imus = []
     for topic in topics:
         open_bag(options.bag, topic, want_joints=False).close()
-        blocks = source_of(options.bag, topic)()
-        recording = read_by_hand(blocks, readings, Preflight())
+        (source,) = sources_without([source_of(options.bag, topic)], [options.bag], options.exclude)
+        recording = read_by_hand(source(), readings, Preflight())
         imus.append(recording.imu)
         warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(recording.findings))
     first, second = imus

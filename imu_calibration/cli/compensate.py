@@ -67,6 +67,7 @@ def add_arguments(parser: OneLineParser) -> None:
         help="move the stamps back by the calibration's time_offset",
     )
     parser.add_topics(joints=False)
+    parser.add_gyroscope_topic()
     parser.add_readings()
     parser.add_exclusion()
     parser.add_rows()

@@ -30,6 +30,8 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.common('--no-report', action='store_true', help='no report.html per unit')
     parser.add_force()
     parser.add_recording('a table or robot is required, the same for all units')
+    parser.add_gyroscope_topic()
+    parser.add_rows()
     parser.add_model()
 
 

@@ -72,12 +72,11 @@ def run(options: Options) -> VerbResult:
         reasons += [*look.reasons, *([reason] if reason else [])]
         if look.by_hand is not None:
             _show_by_hand(out, look.by_hand, hints)
-    split = split_topics(looks)
-    if split is not None:
+    for pair in split_topics(looks):
         out.print()
         out.print(
             'one sensor per topic; to read both: --imu-topic'
-            f' {split.imu} --gyroscope-topic {split.gyroscope}'
+            f' {pair.imu} --gyroscope-topic {pair.gyroscope}'
         )
     if set(codes) == {1}:  # no topic is usable: also one line on standard error, as every refusal
         refuse(looks[0].findings)

@@ -1,7 +1,7 @@
 """Accelerometer and gyroscope with stamps of their own, joined to one stream."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,6 +96,30 @@ class JoinedSensors:
         if self.delay is None:
             return f'{line}; their delay is not determined by the motion'
         return f'{line}; the gyroscope is {self.delay.text} (not corrected)'
+
+
+@dataclass(frozen=True, eq=False)
+class OtherSensor:
+    """The faster one of two sensors, whose readings are added to the messages of the slower one."""
+
+    quantity: str
+    """'force' or 'rate'."""
+    stream: SensorStream
+    """All its readings."""
+    frame_id: str
+    """Frame of the accelerometer, in which both sensors are calibrated."""
+
+    def known(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return at which stamps there is a reading to interpolate, bool, shape (n,)."""
+        return interpolated(self.stream, stamp_ns)[1]
+
+    def added_to(self, imu: ImuSamples) -> ImuSamples:
+        """Return the samples with the readings of this sensor, NaN where there are none."""
+        values, known = interpolated(self.stream, imu.stamp_ns)
+        values[~known] = np.nan
+        if self.quantity == 'force':
+            return replace(imu, force_s=values, frame_id=self.frame_id)
+        return replace(imu, rate_s=values, frame_id=self.frame_id)
 
 
 def finite_stream(stamp_ns: np.ndarray, values: np.ndarray) -> SensorStream:

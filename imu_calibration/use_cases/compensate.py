@@ -30,7 +30,13 @@ from imu_calibration.preprocessing.scan import FrozenSearch
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from imu_calibration.preprocessing.value_checks import rate_unit, refuse_units
 from imu_calibration.use_cases.choices import noise_of, raw_columns, readings_for
-from imu_calibration.use_cases.recordings import Topics, existing, open_bag, temperatures
+from imu_calibration.use_cases.recordings import (
+    Topics,
+    existing,
+    open_bag,
+    read_split,
+    temperatures,
+)
 from msg_adapters.csv_log import has_corrected_readings, is_text_log, read_directly
 
 CORRECTED_TOPIC = '/imu/data_corrected'
@@ -102,6 +108,7 @@ def compensate_recording(
     anyway: bool = False,
     noise: NoiseFigures | str | PathLike | None = None,
     imu_topic: str | None = None,
+    gyroscope_topic: str | None = None,
     temperature_topic: str | None = None,
     frame_id: str | None = None,
     nominal: str | PathLike | RawReadings | None = None,
@@ -136,8 +143,9 @@ def compensate_recording(
     noise : NoiseFigures or path-like, optional
         noise.yaml of this IMU: the covariances of the corrected readings follow from it where the
         messages bring none.
-    imu_topic, temperature_topic : str, optional
-        Topics to read.
+    imu_topic, gyroscope_topic, temperature_topic : str, optional
+        Topics to read; `gyroscope_topic` where the rates have one of their own. The corrected topic
+        then follows the messages of the slower sensor.
     frame_id : str, optional
         frame_id of the Imu messages; required if the topic has messages of several.
     nominal, accelerometer_unit, gyroscope_unit, increments : optional
@@ -178,7 +186,9 @@ def compensate_recording(
             code='exists_already',
         )
     raw = raw_columns(readings, units)
-    topics = Topics(imu_topic, None, temperature_topic, frame_id, raw, where=tuple(where))
+    topics = Topics(
+        imu_topic, None, temperature_topic, frame_id, raw, gyroscope_topic, tuple(where)
+    )
     if output is not None and is_text_log(output):
         return _into_text_log(
             recording,
@@ -192,11 +202,27 @@ def compensate_recording(
             mask=mask,
         )
     _refuse_corrected_log(recording)
+    other, frame = None, target_frame
+    if gyroscope_topic is not None:
+        split = read_split(recording, topics)
+        joined = split.joined.imu
+        if output is None:
+            block = SampleBlock(joined, None, temperatures(recording, topics))
+            return _in_memory(
+                block, calibration, transfer, late=late, used=used, readings=readings, mask=mask
+            )
+        # The messages of the slower sensor are corrected, in the frame of the accelerometer.
+        refuse_units(joined.select(slice(UNIT_READINGS)), readings)
+        refuse_corrected(gyroscope_topic)
+        other, frame = split.other, target_frame or joined.frame_id
+        if split.topic == gyroscope_topic:
+            topics = topics._replace(imu=gyroscope_topic, frame=None)
     bag = open_bag(recording, topics, want_joints=False)
     advance = counter('compensating', bag.message_counts.get(bag.imu_topic, 0))
     with bag:
         refuse_corrected(bag.imu_topic)
-        _refuse_bag_unit(recording, topics, readings)
+        if other is None:
+            _refuse_bag_unit(recording, topics, readings)
         stream = CompensationStream(
             calibration, temperature=temperatures(recording, topics), transfer=transfer
         )
@@ -207,6 +233,10 @@ def compensate_recording(
             checks.push(imu)
             search.push(imu.stamp_ns, imu.force_s, imu.rate_s)
             return stream.correct(readings.apply(imu))
+
+        def keep(stamp_ns):
+            kept = mask.kept(stamp_ns)
+            return kept if other is None else kept & other.known(stamp_ns)
 
         def propagate(force_cov, rate_cov):
             # Measured covariances are in the units of the readings.
@@ -244,14 +274,15 @@ def compensate_recording(
             corrected_topic=corrected_topic,
             correct=correct,
             propagate=propagate,
-            frame_id=target_frame or None,
+            frame_id=frame or None,
             mat_ts=None if transfer is None else transfer.mat_ts,
             late_ns=late,
-            source_frame_id=frame_id,
+            source_frame_id=topics.frame,
             raw=raw,
             where=topics.where,
             check=check,
-            keep=mask.kept if exclude else None,
+            keep=keep if exclude or other is not None else None,
+            other=other,
         )
         return _outcome(None, stream, lost, used=used, search=search)
 

@@ -4,6 +4,8 @@ Inspect: content of the topics of a recording, their faults, and the parameters 
 Each is read once.
 """
 
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -161,29 +163,30 @@ def inspect_recording(
     `exclude`: times that are not used, as in `Choices`.
     """
     looks = [_look(bag, each, table, options=options, exclude=exclude) for each in topics]
-    split = split_topics(looks)
-    if split is None:
-        return looks
-    note = CheckFinding(
-        'split',
-        NOTE,
-        f'{split.imu} has the accelerometer only and {split.gyroscope} the gyroscope only: read'
-        ' both together as one IMU',
-    )
-    names = (split.imu, split.gyroscope)
-    return [
-        replace(look, findings=(*look.findings, note))
-        if look.recording is not None and look.recording.imu_topic in names
-        else look
-        for look in looks
-    ]
+    notes = {}
+    for pair in split_topics(looks):
+        note = CheckFinding(
+            'split',
+            NOTE,
+            f'{pair.imu} has the accelerometer only and {pair.gyroscope} the gyroscope only: read'
+            ' both together as one IMU',
+        )
+        notes[pair.imu] = notes[pair.gyroscope] = note
+    noted = []
+    for look in looks:
+        topic = None if look.recording is None else look.recording.imu_topic
+        if topic in notes:
+            look = replace(look, findings=(*look.findings, notes[topic]))
+        noted.append(look)
+    return noted
 
 
-def split_topics(looks: Sequence[RecordingSummary]) -> Topics | None:
+def split_topics(looks: Sequence[RecordingSummary]) -> list[Topics]:
     """
-    Return the Imu topics of the two sensors where each has one of its own, as `Topics`.
+    Return the pairs of Imu topics with one sensor each, as `Topics`.
 
-    None where a topic has both sensors, or several topics have the same one alone.
+    Several pairs are told apart by their names: each topic of a pair has more words in common with
+    the other one than with the other topics of that sensor.
     """
     alone: dict[str, list[str]] = {'accelerometer': [], 'gyroscope': []}
     for look in looks:
@@ -193,9 +196,26 @@ def split_topics(looks: Sequence[RecordingSummary]) -> Topics | None:
         present = [sensor for sensor in alone if sensor not in lacking]
         if len(present) == 1 and look.recording is not None:
             alone[present[0]].append(look.recording.imu_topic)
-    if any(len(set(topics)) != 1 for topics in alone.values()):
-        return None
-    return Topics(imu=alone['accelerometer'][0], gyroscope=alone['gyroscope'][0])
+    pairs = []
+    for accelerometer in sorted(set(alone['accelerometer'])):
+        gyroscope = _closest_name(accelerometer, alone['gyroscope'])
+        if gyroscope is None:
+            continue
+        if _closest_name(gyroscope, alone['accelerometer']) == accelerometer:
+            pairs.append(Topics(imu=accelerometer, gyroscope=gyroscope))
+    return pairs
+
+
+def _closest_name(name, candidates):
+    """Return the topic that has most words in common with a name; None without a single one."""
+    words = Counter(re.findall('[a-z]+|[0-9]+', name.lower()))
+    common = {}
+    for candidate in candidates:
+        other_words = Counter(re.findall('[a-z]+|[0-9]+', candidate.lower()))
+        common[candidate] = (words & other_words).total()
+    most = max(common.values(), default=0)
+    closest = [candidate for candidate, count in common.items() if count == most]
+    return closest[0] if len(closest) == 1 else None
 
 
 def _look(bag, topics, table, *, options, exclude):

@@ -33,7 +33,12 @@ from imu_calibration.preprocessing.exclusion import (
     parse_exclusions,
     without_excluded,
 )
-from imu_calibration.preprocessing.sensor_join import finite_stream, join_sensors
+from imu_calibration.preprocessing.sensor_join import (
+    JoinedSensors,
+    OtherSensor,
+    finite_stream,
+    join_sensors,
+)
 from msg_adapters.bag import Recording, description_in, frame_of, open_recording, static_transforms
 from msg_adapters.storage import read_ahead
 
@@ -146,14 +151,8 @@ def read_blocks(
 
 def _with_gyroscope(blocks, path, topic):
     """Return one block: those of a recording, with the rates of another Imu topic."""
-    of_rates = Topics(imu=topic)
-    rates = []
-    with open_bag(path, of_rates, want_joints=False, want_temperature=False) as recording:
-        for block in recording.blocks():
-            if block.imu is not None:
-                rates.append(block.imu)
     parts: dict[str, list] = {'imu': [], 'joints': [], 'temperature': []}
-    dropped: Counter[str] = Counter(recording.lost)
+    dropped: Counter[str] = Counter()
     notes: Counter[str] = Counter()
     for block in blocks:
         for name, samples in parts.items():
@@ -161,14 +160,11 @@ def _with_gyroscope(blocks, path, topic):
                 samples.append(getattr(block, name))
         dropped.update(block.dropped or {})
         notes.update(block.notes or {})
-    if not rates or not parts['imu']:
-        raise InputError(
-            f'both topics must hold Imu messages, {topic} or the other one holds none; check the'
-            ' topics',
-            key='imu_topic',
-            code='no_samples',
-        )
-    imu, gyroscope = ImuSamples.concatenate(parts['imu']), ImuSamples.concatenate(rates)
+    gyroscope, lost = _imu_samples(path, Topics(imu=topic))
+    dropped.update(lost)
+    if not parts['imu']:
+        raise _no_samples('the topic of the accelerometer')
+    imu = ImuSamples.concatenate(parts['imu'])
     joined = join_sensors(
         finite_stream(imu.stamp_ns, imu.force_s),
         finite_stream(gyroscope.stamp_ns, gyroscope.rate_s),
@@ -181,6 +177,64 @@ def _with_gyroscope(blocks, path, topic):
     if parts['temperature']:
         temperature = TemperatureSamples.concatenate(parts['temperature'])
     return SampleBlock(joined.imu, joints, temperature, dict(dropped), dict(notes))
+
+
+def _imu_samples(path, topics):
+    """Return (all samples of an Imu topic, reason -> lost messages)."""
+    parts = []
+    with open_bag(path, topics, want_joints=False, want_temperature=False) as recording:
+        for block in recording.blocks():
+            if block.imu is not None:
+                parts.append(block.imu)
+    if not parts:
+        raise _no_samples(recording.imu_topic)
+    return ImuSamples.concatenate(parts), recording.lost
+
+
+def _no_samples(topic):
+    return InputError(
+        f'both topics must hold Imu messages, {topic} holds none; check the topics',
+        key='imu_topic',
+        code='no_samples',
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SplitRecording:
+    """A recording with accelerometer and gyroscope on two Imu topics."""
+
+    joined: JoinedSensors
+    """Both sensors as one stream."""
+    topic: str
+    """Topic of the slower sensor, whose messages the stream follows."""
+    other: OtherSensor
+    """The sensor on the other topic."""
+
+
+def read_split(path: str | PathLike, topics: Topics) -> SplitRecording:
+    """
+    Return both sensors of a recording with one Imu topic for each, and report their delay.
+
+    Raises
+    ------
+    InputError
+        When a topic is missing or empty, or the two hardly overlap in time.
+
+    """
+    # The delay needs all readings of both sensors.
+    of_force = topics._replace(gyroscope=None)
+    with open_bag(path, of_force, want_joints=False, want_temperature=False) as recording:
+        force_topic = recording.imu_topic
+    imu, _ = _imu_samples(path, of_force)
+    gyroscope, _ = _imu_samples(path, Topics(imu=topics.gyroscope))
+    force = finite_stream(imu.stamp_ns, imu.force_s)
+    rate = finite_stream(gyroscope.stamp_ns, gyroscope.rate_s)
+    joined = join_sensors(force, rate, imu.frame_id)
+    remark(joined.text)
+    if joined.slower == 'accelerometer':
+        return SplitRecording(joined, force_topic, OtherSensor('rate', rate, imu.frame_id))
+    assert topics.gyroscope is not None  # by the caller
+    return SplitRecording(joined, topics.gyroscope, OtherSensor('force', force, imu.frame_id))
 
 
 def source_of(

@@ -53,6 +53,30 @@ def test_help_imports_no_heavy_module(verb):
     assert found <= HELP_NEEDS.get(verb, set())
 
 
+@pytest.mark.parametrize(
+    ('verb', 'lacking'),
+    [
+        ('inspect', set()),
+        ('calibrate', set()),
+        ('compensate', set()),
+        ('check', set()),
+        ('diagnose', set()),
+        ('noise', set()),
+        ('view', set()),
+        ('arm', {'--gyroscope-topic'}),  # its two topics have both sensors each
+        ('fleet', {'--exclude'}),  # times differ between the units
+    ],
+)
+def test_verbs_that_read_readings_share_their_options(verb, lacking):
+    made = parser.make_parser(verb)
+    (verbs,) = (action.choices for action in made._actions if action.dest == 'verb')
+    options = {
+        *('--accelerometer-unit', '--gyroscope-unit', '--increments', '--axes', '--nominal'),
+        *('--gyroscope-topic', '--exclude', '--where'),
+    }
+    assert options - set(verbs[verb].get_default('verb_options')) == lacking
+
+
 @pytest.mark.live
 def test_an_inspection_imports_neither_the_search_nor_slow_libraries():
     program = (

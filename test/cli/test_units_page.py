@@ -27,17 +27,30 @@ def test_the_commands_of_the_page_run_in_its_order(tmp_path, monkeypatch):
     header = 't (s),ax (g),ay (g),az (g),gx (deg/s),gy (deg/s),gz (deg/s)'
     columns = np.column_stack([seconds, raw.force_s, raw.rate_s])
     np.savetxt(tmp_path / 'log.csv', columns, delimiter=',', header=header, comments='')
+    for name, used in (('accelerometer', [0, 1, 2, 3]), ('gyroscope', [0, 4, 5, 6])):
+        names = ','.join(np.array(header.split(','))[used])
+        np.savetxt(
+            tmp_path / f'{name}.csv', columns[:, used], delimiter=',', header=names, comments=''
+        )
     monkeypatch.chdir(tmp_path)
     parts = re.split(r'^```\w*\n?', PAGE.read_text(), flags=re.MULTILINE)
     lines = [line for block in parts[1::2] for line in block.splitlines()]
     lines = [line for line in lines if line.startswith('imu_calibration ')]
-    assert len(lines) == 5
+    assert len(lines) == 6
     for line in lines:
         program, *arguments = shlex.split(line)
         assert program == 'imu_calibration'
         assert main(arguments) in (0, 3), line
-    for name in ('corrected', 'corrected_si', 'corrected.csv', 'flu.params'):
+    for name in ('corrected', 'corrected_si', 'corrected.csv', 'flu.params', 'joined'):
         assert (tmp_path / name).exists()
+
+
+def test_the_page_names_each_option_of_the_readings():
+    options = ('accelerometer-unit', 'gyroscope-unit', 'increments', 'nominal', 'axes', 'where')
+    text = PAGE.read_text()
+    assert len(text.split()) <= 600
+    for option in (*options, 'exclude', 'gyroscope-topic', 'columns'):
+        assert f'--{option}' in text
 
 
 def test_the_file_on_the_page_is_valid():
