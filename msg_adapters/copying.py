@@ -8,7 +8,6 @@ from dataclasses import replace
 from os import PathLike
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.preprocessing.sensor_join import OtherSensor
@@ -264,6 +263,8 @@ class _Patch:
 
     def _turned(self, quaternion, first_cov):
         """Return the orientation of the target frame: ``mat_wt = mat_ws @ mat_st``."""
+        from scipy.spatial.transform import Rotation  # here, because its import is slow
+
         given = (first_cov != -1.0) & np.isfinite(quaternion).all(axis=1) & quaternion.any(axis=1)
         turned = quaternion.copy()
         if given.any():

@@ -16,10 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from imu_calibration.calibration.coverage import DIRECTIONS, sd_excess, share_gained
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES, SENSORS, Role
-from imu_calibration.estimation.observability import ALL_MOTIONS
+from imu_calibration.estimation.observability import (
+    ALL_MOTIONS,
+    DIRECTIONS,
+    sd_excess,
+    share_gained,
+)
 from imu_calibration.estimation.solution import LACKING, remedy
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses, tangent

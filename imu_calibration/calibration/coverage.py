@@ -17,6 +17,8 @@ from imu_calibration.estimation.observability import (
     MOTIONS,
     added_information,
     rest_with_up,
+    sd_excess,
+    share_gained,
 )
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DETERMINED, LACKING
@@ -174,20 +176,6 @@ NOTHING_SEEN = Coverage(
     np.ones(len(DIRECTIONS)), np.zeros((0, 3)), None, Step('move the table'), float('nan')
 )
 """Before anything is known."""
-
-
-def sd_excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
-    """
-    Return the excess of standard deviations over their tolerances.
-
-    ``sum log max(sd / tolerance, 1)``; leading axes are kept.
-    """
-    return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
-
-
-def share_gained(before: float, after: np.ndarray) -> np.ndarray:
-    """Return the share of the excess that is removed, 0 to 1."""
-    return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
 
 
 def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:

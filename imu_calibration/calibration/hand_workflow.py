@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from imu_calibration.calibration.advice import missing_motion
+from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.from_solution import ModelChanges, document
 from imu_calibration.calibration.hand_proof import (
     TURN_ANGLE_UNIT,
@@ -27,7 +28,6 @@ from imu_calibration.calibration.result import (
     ErrorBudget,
     WindowErrors,
 )
-from imu_calibration.calibration.table_calibration import CheckResult
 from imu_calibration.compensation.stream import compensate_samples
 from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.exit_codes import dropped_text

@@ -1,12 +1,12 @@
 """Calibration on a table, and the check of a calibration on another recording."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
+from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.collector import GatherStep, from_bytes
 from imu_calibration.calibration.from_solution import (
     ModelChanges,
@@ -35,22 +35,11 @@ from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.compensation.compensate import invertible
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
-from imu_calibration.core.exit_codes import dropped_text, exit_code_of
+from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import TemperatureSamples
-from imu_calibration.core.settings import CHANGE
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.change import RegimeChange
-from imu_calibration.document.decision import (
-    HELPS,
-    UNPROVEN,
-    SensorDecision,
-    decide,
-    most_cautious,
-    reason_of,
-    worse_regimes,
-)
 from imu_calibration.document.trust import end_of, judged_from_of, uncorrected_on_table
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
@@ -354,124 +343,6 @@ def _size_effect_unseen(solution):
     return len(arms) > 0 and bool(
         arms.all() and arm.all()
     )  # an arm that is seen would bias the bias if left out
-
-
-@dataclass(frozen=True, eq=False)
-class CheckResult:
-    """The errors of a calibration on a recording."""
-
-    proof: dict
-    """
-    Sensor -> error before and after, interval and amount of data, by regime (see `proof.prove`);
-    {}: not determined.
-    """
-    findings: tuple = ()
-    """Findings of the checks of the recording."""
-    why: str = 'fewer than three windows of rest or motion were found; record for longer'
-    """Why there is no proof, where there is none."""
-    notes: tuple[str, ...] = ()
-    """Notes on the result."""
-    refused: dict[str, str] = field(default_factory=dict)
-    """Sensor of which compensation refuses the values -> why."""
-    changes: tuple[RegimeChange, ...] = ()
-    """Error now against the held-out error in the file of the calibration, by regime."""
-    change_limit: float = CHANGE
-    """Factor of the error from which a significant change counts."""
-    dropped: str = ''
-    """Why dropped samples make the result incomplete; '' where they do not."""
-
-    @property
-    def changed(self) -> tuple[RegimeChange, ...]:
-        """The changes that are significantly larger than the limit."""
-        return tuple(each for each in self.changes if each.exceeds(self.change_limit))
-
-    @property
-    def helps(self) -> bool:
-        """Whether the decision on each sensor is `helps`."""
-        return bool(self.proof) and len(self.helped) == len(self.proof)
-
-    @property
-    def exit_code(self) -> int:
-        """0 where each sensor `helps`, no error changed and few samples were dropped, else 3."""
-        return exit_code_of(self.reasons)
-
-    @property
-    def reasons(self) -> list[str]:
-        """Why the exit code is 3, a line each."""
-        if not self.proof:
-            return self.lines
-        lines = [
-            self._line(sensor, entry)
-            for sensor, entry in self.proof.items()
-            if sensor not in self.helped
-        ]
-        changed = {each.sensor for each in self.changed}
-        lines += [line for sensor, line in self._change_lines().items() if sensor in changed]
-        if self.dropped:
-            lines.append(self.dropped)
-        return lines
-
-    def _change_lines(self):
-        """Return sensor -> how its error compares with that on the day of the calibration."""
-        lines = {}
-        for sensor in dict.fromkeys(each.sensor for each in self.changes):
-            changed = [each for each in self.changed if each.sensor == sensor]
-            if changed:
-                parts = ', '.join(f'{each.regime}: {each.text}' for each in changed)
-                lines[sensor] = f'{sensor}: the error has changed since the calibration, {parts}'
-                continue
-            of_sensor = [each for each in self.changes if each.sensor == sensor]
-            largest = max(of_sensor, key=lambda each: each.factor)
-            lines[sensor] = (
-                f'{sensor}: the error is as on the day of the calibration, at most'
-                f' {largest.text} in {largest.regime}'
-            )
-        return lines
-
-    def decision(self, sensor: str) -> SensorDecision:
-        """Return the decision on a sensor; at best UNPROVEN where compensation refuses it."""
-        found = decide(self.proof.get(sensor))
-        return most_cautious([found, UNPROVEN]) if sensor in self.refused else found
-
-    def _line(self, sensor, entry):
-        why = f'; not applied: {self.refused[sensor]}' if sensor in self.refused else ''
-        return f'{sensor} {self.decision(sensor)}: {reason_of(entry)}{why}'
-
-    @property
-    def helped(self) -> dict[str, Any]:
-        """The entries of the proof of the sensors that it helps."""
-        return {
-            sensor: entry for sensor, entry in self.proof.items() if self.decision(sensor) is HELPS
-        }
-
-    @property
-    def lines(self) -> list[str]:
-        """The decision on each sensor with its reason, then the regimes with a larger error."""
-        if not self.proof:
-            return [f'unproven: {self.why}']
-        return [
-            *(self._line(sensor, entry) for sensor, entry in self.proof.items()),
-            *(
-                f'{sensor}: {line}'
-                for sensor, entry in self.proof.items()
-                for line in worse_regimes(entry)
-            ),
-            *self._change_lines().values(),
-        ]
-
-    def __str__(self):
-        helped = ', '.join(self.helped)
-        answer = (
-            'the calibration helps'
-            if self.helps
-            else 'it helps ' + (f'the {helped} only' if helped else 'no sensor')
-        )
-        below = [*self.lines, *self.notes]
-        if self.dropped:
-            below.append(self.dropped)
-        return '\n'.join([answer, *(f'  {line}' for line in below)])
-
-    __repr__ = __str__
 
 
 def check_on_table(

@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.base import SENSORS, Role
@@ -150,6 +149,8 @@ class Transfer:
 
     @cached_property
     def _quaternion_st(self):
+        from scipy.spatial.transform import Rotation  # here, because its import is slow
+
         return tuple(Rotation.from_matrix(self.mat_ts.T).as_quat().tolist())
 
     def turned_quaternion(self, quaternion: Sequence[float]) -> tuple[float, ...]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.base import SENSORS
@@ -16,7 +15,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.kinematics.rotations import Reference
+from imu_calibration.kinematics.rotations import Reference, rotation
 from imu_calibration.kinematics.signal_history import ThermalBranch
 
 REST, WAY = 5.0, 3.0
@@ -28,6 +27,20 @@ OTHER_MOUNT = (
     ' to this recording'
 )
 """Advice when further motions of a single joint do not help."""
+
+
+def sd_excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
+    """
+    Return the excess of standard deviations over their tolerances.
+
+    ``sum log max(sd / tolerance, 1)``; leading axes are kept.
+    """
+    return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
+
+
+def share_gained(before: float, after: np.ndarray) -> np.ndarray:
+    """Return the share of the excess that is removed, 0 to 1."""
+    return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
 
 
 @dataclass(frozen=True)
@@ -74,7 +87,7 @@ def _turn(
         np.asarray(axis, float) / np.linalg.norm(axis),
         np.asarray(up, float) / np.linalg.norm(up),
     )
-    up_s = Rotation.from_rotvec(-angle[:, None] * axis).apply(up)
+    up_s = rotation(-angle[:, None] * axis) @ up
     rate_s, alpha_s = rate[:, None] * axis, alpha[:, None] * axis
     force = gravity * up_s
     if arm is not None:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import AlignedArrays
@@ -121,16 +120,42 @@ def lever_matrix(rate_s: np.ndarray, alpha_s: np.ndarray) -> np.ndarray:
     return skew(alpha_s) + across @ across
 
 
+def quaternions_from_vectors(vectors: np.ndarray) -> np.ndarray:
+    """
+    Return the unit quaternions (x, y, z, w) of rotation vectors, rad, shape (..., 3) to (..., 4).
+
+    ``(v sin(a / 2) / a, cos(a / 2))`` with the angle ``a = |v|``. These three functions are not
+    those of `scipy.spatial`, as its import needs more time than a short recording.
+    """
+    angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    # np.sinc(x) is sin(pi x) / (pi x), and 1 at zero.
+    return np.concatenate(
+        [0.5 * np.sinc(0.5 * angle / np.pi) * vectors, np.cos(0.5 * angle)], axis=-1
+    )
+
+
+def rotations_from_quaternions(quaternions: np.ndarray) -> np.ndarray:
+    """
+    Return the rotation matrices of quaternions (x, y, z, w), shape (..., 4) to (..., 3, 3).
+
+    ``1 + 2 w [u x] + 2 [u x]^2`` with the vector part u; the length of a quaternion is made 1.
+    """
+    unit = quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    across = skew(unit[..., :3])
+    return np.eye(3) + 2.0 * unit[..., 3, None, None] * across + 2.0 * across @ across
+
+
 def rotation(vector: np.ndarray) -> np.ndarray:
-    """Return ``exp(vector x)``, shape (3, 3): the turn by a rotation vector, rad."""
-    return Rotation.from_rotvec(vector).as_matrix()
+    """Return ``exp(vector x)``, shape (..., 3, 3): turns by rotation vectors, rad."""
+    return rotations_from_quaternions(quaternions_from_vectors(np.asarray(vector, float)))
 
 
 def rotation_from_rpy(rpy: np.ndarray) -> np.ndarray:
     """
     Return ``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3): turns about fixed axes as in URDF, rad.
     """
-    return Rotation.from_euler('xyz', rpy).as_matrix()
+    roll, pitch, yaw = np.diag(np.asarray(rpy, float))
+    return rotation(yaw) @ rotation(pitch) @ rotation(roll)
 
 
 def rpy_from_rotation(matrix: np.ndarray) -> np.ndarray:

@@ -11,10 +11,15 @@ that are compared. All sums over samples are array operations.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.kinematics.rotations import Reference, cross, skew
+from imu_calibration.kinematics.rotations import (
+    Reference,
+    cross,
+    quaternions_from_vectors,
+    rotations_from_quaternions,
+    skew,
+)
 
 MAGNUS_SECOND = 1.0 / 12.0
 """
@@ -85,7 +90,7 @@ def integrate_turn(
     ).T.copy()
     rate, step, slopes = inverse @ centred, np.diff(time), _slope_weights(time)
     vectors = _rotation_vectors(rate, step, slopes)
-    mat_ik = Rotation.from_quat(_prefix_product(vectors).T).as_matrix()
+    mat_ik = rotations_from_quaternions(_prefix_product(vectors).T)
     mat_ji = mat_ik[-1].T.copy()
     to_last = (mat_ji @ mat_ik.transpose(1, 2, 0).reshape(3, -1)).reshape(3, 3, -1)
     weight = _per_sample(_times_jacobian(to_last, vectors), step, rate, slopes)
@@ -117,7 +122,7 @@ def total_rotation(time: np.ndarray, rate: np.ndarray) -> np.ndarray:
     Without the derivatives, which take most of the time.
     """
     vectors = _rotation_vectors(rate.T.copy(), np.diff(time), _slope_weights(time))
-    return Rotation.from_quat(_prefix_product(vectors)[:, -1]).inv().as_matrix()
+    return rotations_from_quaternions(_prefix_product(vectors)[:, -1]).T
 
 
 def _rotation_vectors(rate, step, slopes):
@@ -198,7 +203,7 @@ def _prefix_product(vectors):
 
     Shape (4, n).
     """
-    x, y, z, w = Rotation.from_rotvec(vectors.T).as_quat().T
+    x, y, z, w = quaternions_from_vectors(vectors.T).T
     u, v = _running_quaternion(np.stack([w + 1j * x, y + 1j * z]))
     return np.stack([u.imag, v.real, v.imag, u.real])
 
@@ -259,7 +264,7 @@ def integrate_attitude(
     )
     start = np.eye(3) if mat_ns0 is None else mat_ns0
     return np.concatenate(
-        [start[None], start @ Rotation.from_quat(_prefix_product(turns.T).T).as_matrix()]
+        [start[None], start @ rotations_from_quaternions(_prefix_product(turns.T).T)]
     )
 
 

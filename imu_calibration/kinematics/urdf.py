@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.documents import MAX_DOCUMENT_CHARACTERS
 from imu_calibration.core.errors import InputError, printable, shortened
@@ -26,7 +25,11 @@ from imu_calibration.kinematics.joint import (
     require_keys,
     several_numbers,
 )
-from imu_calibration.kinematics.rotations import rotation_from_rpy, rpy_from_rotation
+from imu_calibration.kinematics.rotations import (
+    rotation_from_rpy,
+    rotations_from_quaternions,
+    rpy_from_rotation,
+)
 from imu_calibration.kinematics.table import Table, joint_entries, site_from_mapping
 
 NAMED = 6
@@ -66,7 +69,7 @@ class StaticTransforms:
             or parent == child
         ):
             return False
-        self._parents[child] = (parent, xyz, Rotation.from_quat(quaternion).as_matrix())
+        self._parents[child] = (parent, xyz, rotations_from_quaternions(quaternion))
         return True
 
     def pose(self, target: str, source: str) -> tuple[np.ndarray, np.ndarray] | None:

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from imu_calibration.kinematics.rotations import skew, unit_rows
+from imu_calibration.kinematics.rotations import rotation, skew, unit_rows
 from imu_calibration.preprocessing.scan import Chunks, Rest
 
 MIN_MISSED_ANGLE = 0.25
@@ -103,10 +102,9 @@ def factor_between_rests(chunks: Chunks, rest: Rest | None) -> float | None:
 
 
 def _missed(vectors, before, after):
+    # Gravity turns the other way in the sensor's axes.
     turned = before
-    for step in Rotation.from_rotvec(
-        -vectors
-    ).as_matrix():  # gravity turns the other way in the sensor's axes
+    for step in rotation(-vectors):
         turned = step @ turned
     return np.arccos(np.clip(turned @ after, -1.0, 1.0))
 

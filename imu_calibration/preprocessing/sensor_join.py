@@ -1,6 +1,5 @@
 """Accelerometer and gyroscope with stamps of their own, joined to one stream."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,8 +16,10 @@ MAX_DELAY = 0.25
 """s; larger delays are not searched."""
 DELAY_STEP = 0.01
 """s; distance of the delays among which the search begins: short against turns by hand."""
-DELAY_ACCURACY = 1e-5
-"""s; the search for a delay ends with an interval of this length."""
+FINE_DELAY_STEP = 0.001
+"""s; distance of the delays near the best one; the residual is a parabola between them."""
+MIN_EIGENVALUE = 1e-10
+"""Of normal equations with a diagonal of ones: a smaller one is an undetermined direction."""
 DELAY_WINDOW = 0.1
 """s; rotation of gravity and integral of the rates are compared over this time."""
 DELAY_PARTS = 8
@@ -214,69 +215,123 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
     if np.linalg.norm(change, axis=1).sum() < MIN_DELAY_ROTATION:
         return None
     time = (gyroscope.stamp_ns - accelerometer.stamp_ns[0]) * 1e-9
-    steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
-    theta = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     inside = (start > time[0] + MAX_DELAY) & (stop < time[-1] - MAX_DELAY)
     if np.count_nonzero(inside) < 20 * DELAY_PARTS:
         return None
     # Windows in which gravity rotates most determine the delay.
     rotation = np.where(inside, np.linalg.norm(change, axis=1), 0.0)
     most = np.sort(np.argsort(rotation)[-MOST_WINDOWS:])
-    used_windows = most[rotation[most] > 0.0]
-    start, stop = start[used_windows], stop[used_windows]
-    lever, change = skew(middle[used_windows]), change[used_windows]
+    used = most[rotation[most] > 0.0]
+    cost = _DelayCost(
+        gyroscope,
+        time,
+        start=start[used],
+        stop=stop[used],
+        middle=middle[used],
+        change=change[used],
+    )
 
-    def residual(delay, used):
-        turned = np.empty((len(start), 4))
-        for axis in range(3):
-            turned[:, axis] = np.interp(stop + delay, time, theta[:, axis])
-            turned[:, axis] -= np.interp(start + delay, time, theta[:, axis])
-        turned[:, 3] = stop - start
-        design = (lever[:, :, :, None] * turned[:, None, None, :]).reshape(-1, 12)
-        rows = np.repeat(used, 3)
-        left = np.linalg.lstsq(design[rows], change.reshape(-1)[rows], rcond=None)[0]
-        return float(np.sum((change.reshape(-1)[rows] - design[rows] @ left) ** 2))
-
-    def best(used, near):
-        return _least_between(
-            lambda delay: residual(delay, used), near - DELAY_STEP, near + DELAY_STEP
-        )
-
-    every = np.ones(len(start), bool)
-    candidates = np.arange(-MAX_DELAY, MAX_DELAY + DELAY_STEP / 2, DELAY_STEP)
-    costs = [residual(candidate, every) for candidate in candidates]
-    delay = best(every, candidates[int(np.argmin(costs))])
-    if residual(delay, every) > (1.0 - MIN_EXPLAINED) * float(np.sum(change**2)):
+    # The least residual, first among delays far apart, then near the best of them.
+    coarse = np.arange(-MAX_DELAY, MAX_DELAY + DELAY_STEP / 2, DELAY_STEP)
+    near = coarse[int(np.argmin([cost.residuals(delay)[0] for delay in coarse]))]
+    fine = near + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)
+    residuals = np.array([cost.residuals(delay) for delay in fine])
+    if residuals[:, 0].min() > (1.0 - MIN_EXPLAINED) * float(np.sum(change[used] ** 2)):
         return None
-    # Jackknife over parts of the recording, because the residuals are correlated in time.
-    part = np.arange(len(start)) * DELAY_PARTS // len(start)
-    without = np.array([best(part != number, delay) for number in range(DELAY_PARTS)])
-    variance = (DELAY_PARTS - 1) / DELAY_PARTS * np.sum((without - without.mean()) ** 2)
+    delay = _least_place(fine, residuals[:, 0])
     if abs(delay) > MAX_DELAY - DELAY_STEP:
         return None
+
+    # Jackknife over parts of the recording, because the residuals are correlated in time.
+    without = np.array([_least_place(fine, left_out) for left_out in residuals[:, 1:].T])
+    variance = (DELAY_PARTS - 1) / DELAY_PARTS * np.sum((without - without.mean()) ** 2)
     return GyroscopeDelay(delay, float(np.sqrt(variance)))
 
 
-def _least_between(cost: Callable[[float], float], low: float, high: float) -> float:
+class _DelayCost:
     """
-    Return the place of the least cost between two delays, to `DELAY_ACCURACY`.
+    Squared residuals of the windows for a delay, with A and b of `gyroscope_delay` fitted.
 
-    By golden sections: of the two inner places of an interval, one is an inner place of the next.
-    The function of scipy would need 0.4 s for its import, in each inspection.
+    A row of the fit is ``u x (A turned)``: linear in the 12 numbers of (A, b), with the products of
+    `lever` = [u x] and `turned` as coefficients. The normal equations therefore need only the
+    products of ``lever.T lever`` and ``turned turned.T``, summed over the windows of each part.
     """
-    share = 0.5 * (np.sqrt(5.0) - 1.0)
-    left, right = high - share * (high - low), low + share * (high - low)
-    left_cost, right_cost = cost(left), cost(right)
-    while high - low > DELAY_ACCURACY:
-        if left_cost < right_cost:
-            high, right, right_cost = right, left, left_cost
-            left = high - share * (high - low)
-            left_cost = cost(left)
-        else:
-            low, left, left_cost = left, right, right_cost
-            right = low + share * (high - low)
-            right_cost = cost(right)
-    return 0.5 * (low + high)
+
+    def __init__(
+        self,
+        gyroscope: SensorStream,
+        time: np.ndarray,
+        *,
+        start: np.ndarray,
+        stop: np.ndarray,
+        middle: np.ndarray,
+        change: np.ndarray,
+    ):
+        self._time, self._start, self._stop = time, start, stop
+        steps = np.diff(time)[:, None] * 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1])
+        self._theta = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        lever = skew(middle)
+        squared = np.einsum('nij,nik->njk', lever, lever).reshape(-1, 9)
+        applied = np.einsum('nij,ni->nj', lever, change)
+        # Sums over the parts are products with the windows of one part after another.
+        first = np.arange(DELAY_PARTS + 1) * len(start) // DELAY_PARTS
+        self._parts = [slice(a, b) for a, b in zip(first[:-1], first[1:], strict=True)]
+        self._squared = [squared[part].T for part in self._parts]
+        self._applied = [applied[part].T for part in self._parts]
+        self._observed = np.array([np.sum(change[part] ** 2) for part in self._parts])
+
+    def residuals(self, delay: float) -> np.ndarray:
+        """Return the least sums of squares of all windows, then without each part in turn."""
+        turned = np.empty((len(self._start), 4))
+        for axis in range(3):
+            turned[:, axis] = np.interp(self._stop + delay, self._time, self._theta[:, axis])
+            turned[:, axis] -= np.interp(self._start + delay, self._time, self._theta[:, axis])
+        turned[:, 3] = self._stop - self._start
+        products = (turned[:, :, None] * turned[:, None, :]).reshape(-1, 16)
+        normal = np.empty((DELAY_PARTS, 12, 12))
+        applied = np.empty((DELAY_PARTS, 12))
+        for number, part in enumerate(self._parts):
+            blocks = (self._squared[number] @ products[part]).reshape(3, 3, 4, 4)
+            normal[number] = blocks.transpose(0, 2, 1, 3).reshape(12, 12)
+            applied[number] = (self._applied[number] @ turned[part]).reshape(12)
+
+        return np.concatenate(
+            [
+                _least_squares_residual(
+                    normal.sum(axis=0), applied.sum(axis=0), self._observed.sum()
+                )[None],
+                _least_squares_residual(
+                    normal.sum(axis=0) - normal,
+                    applied.sum(axis=0) - applied,
+                    self._observed.sum() - self._observed,
+                ),
+            ]
+        )
+
+
+def _least_squares_residual(normal, applied, observed):
+    """
+    Return ``y.T y - b.T N^-1 b`` of normal equations ``N x = b``, shapes (..., n, n), (..., n).
+
+    Directions that the windows do not determine are left out.
+    """
+    scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=-2, axis2=-1), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(normal / (scale[..., :, None] * scale[..., None, :]))
+    along = np.einsum('...ij,...i->...j', vectors, applied / scale)
+    determined = values > MIN_EIGENVALUE
+    explained = np.where(determined, along**2 / np.where(determined, values, 1.0), 0.0)
+    return observed - explained.sum(axis=-1)
+
+
+def _least_place(places: np.ndarray, costs: np.ndarray) -> float:
+    """Return the place of the least cost: the vertex of the parabola through its neighbours."""
+    least = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
+    before, here, after = costs[least - 1 : least + 2]
+    curvature = before - 2.0 * here + after
+    if curvature <= 0.0:
+        return float(places[int(np.argmin(costs))])
+    step = places[least] - places[least - 1]
+    return float(places[least] + np.clip(0.5 * (before - after) / curvature, -1.0, 1.0) * step)
 
 
 def _windows(accelerometer):

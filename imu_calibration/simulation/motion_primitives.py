@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
+from imu_calibration.kinematics.rotations import rotation, rpy_from_rotation
 from imu_calibration.simulation.motion_builder import MotionBuilder
 
 GOLDEN_ANGLE_DEG = 137.50776
@@ -260,9 +260,9 @@ def _zhang_mixed(builder, _rng):
         task(builder)
 
 
-SKEW_60_RPY_DEG = (
-    Rotation.from_rotvec(np.pi / 3 * np.ones(3) / np.sqrt(3)).as_euler('xyz', degrees=True).tolist()
-)
+SKEW_60_RPY_DEG = np.degrees(
+    rpy_from_rotation(rotation(np.pi / 3 * np.ones(3) / np.sqrt(3)))
+).tolist()
 """
 A fixture that turns the sensor by 60 deg about (1, 1, 1): every spin axis then meets all three
 sensor axes.

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
+from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.hand_workflow import (
     calibrate_without_table,
     check_by_hand,
     gravity_of,
 )
 from imu_calibration.calibration.result import CalibrationResult, summary
-from imu_calibration.calibration.table_calibration import CheckResult, check_on_table
+from imu_calibration.calibration.table_calibration import check_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.readings import STATED_KEYS

@@ -4,11 +4,14 @@ Inspect: content of the topics of a recording, their faults, and the parameters 
 Each is read once.
 """
 
+from __future__ import annotations
+
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
+from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.hand_workflow import (
@@ -17,8 +20,6 @@ from imu_calibration.calibration.hand_workflow import (
     hand_result,
     read_by_hand,
 )
-from imu_calibration.calibration.table_errors import calibrate_with_table_errors
-from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock
@@ -41,6 +42,9 @@ from imu_calibration.use_cases.recordings import (
 from msg_adapters.bag import Recording, list_topics
 from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
+
+if TYPE_CHECKING:
+    from imu_calibration.calibration.table_result import TableResult
 
 MOST_IMUS = 64
 """Imu topics and frames of a recording that are inspected at most; each needs a few scans."""
@@ -227,6 +231,9 @@ def _look(bag, topics, table, *, options, exclude):
     by_hand = None
     error_findings: tuple[CheckFinding, ...] = ()
     if table is not None:
+        # here, because a recording by hand does not need its import
+        from imu_calibration.calibration.table_errors import calibrate_with_table_errors
+
         try:
             table_errors = calibrate_with_table_errors(
                 sources_without([source_of(bag, topics, table.joint_names)], [bag], exclude),

@@ -13,7 +13,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 from numpy.typing import ArrayLike
 
-from imu_calibration.calibration.table_calibration import CheckResult
+from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document import files

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.table_calibration import CheckResult
+from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.cli.main import main
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import InputError

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from imu_calibration.calibration.table_calibration import CheckResult
+from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.core.errors import InputError, with_hint
 from imu_calibration.document import trust
 from imu_calibration.document.calibration_text import calibration_from_text

@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings
@@ -19,7 +18,7 @@ from imu_calibration.effects import base
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.expressions import ColumnGroup
-from imu_calibration.kinematics.rotations import lever_matrix
+from imu_calibration.kinematics.rotations import lever_matrix, rotations_from_quaternions
 
 
 @dataclass(frozen=True)
@@ -235,6 +234,8 @@ UNNAMED = 'sensor_frame'
 
 def pose_line(placement: Placement, parent: str, child: str) -> str:
     """Return the transform with the arguments of the program of tf2_ros, with all digits."""
+    from scipy.spatial.transform import Rotation  # here, because its import is slow
+
     values = [*placement.origin_s, *Rotation.from_matrix(placement.mat_ts.T).as_quat()]
     pose: dict[str, str] = {name: repr(float(value)) for name, value in zip(POSE_NUMBERS, values)}
     return ' '.join(
@@ -268,7 +269,7 @@ def find_pose(content: bytes) -> tuple[Placement, str] | None:
         return None
     if not np.all(np.isfinite(values)) or not 0.99 < np.linalg.norm(values[3:]) < 1.01:
         return None
-    return Placement(mat_ts=Rotation.from_quat(values[3:]).as_matrix().T, origin_s=values[:3]), (
+    return Placement(mat_ts=rotations_from_quaternions(values[3:]).T, origin_s=values[:3]), (
         '' if parent == UNNAMED else parent
     )
 
