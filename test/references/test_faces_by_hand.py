@@ -3,6 +3,7 @@ Six faces by hand: cross terms of the accelerometer that no attitude tests.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from imu_calibration.calibration.hand_proof import prove_by_hand
 from imu_calibration.document.decision import HELPS, UNPROVEN, decide
+from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.references.gravity.hand_calibration import calibrate_by_hand
-from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandOptions
+from imu_calibration.references.gravity.hand_parameters import (
+    CROSS_TERMS,
+    HandModel,
+    HandOptions,
+)
+from imu_calibration.references.gravity.tested_directions import fit_placements, placements_demand
 
 from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
 from worlds.physics_hand import clipped, hold_and_turn
@@ -80,3 +87,49 @@ def test_turns_between_faces_test_the_cross_terms():
     values, sd, proof = calibrated(*board(2, placements=14, rests=1, shared=0.002, turns=True))
     np.testing.assert_allclose(values, 0.0, atol=4 * sd.max())
     assert sd.max() < 0.003 and 'few_directions' not in proof.get('accelerometer', {})
+
+
+def test_errors_of_placements_do_not_demand_cross_terms():
+    # Twelve placements with an error each: as 36 independent rests they gave 3.8 sd, and `helps`.
+    faces = board(722, placements=12, rests=3, shared=0.01, cross=-0.0231)
+    values, sd, proof = calibrated(*faces)
+    assert np.all(np.abs(values + 0.0231) < 3 * sd) and decide(proof['accelerometer']) is UNPROVEN
+
+
+@pytest.mark.parametrize('wrong', [0.0, 0.4])
+def test_one_wrong_placement_demands_no_cross_terms(wrong):
+    model, held, poses, up = placed(7440, count=16, cross=0.0, wrong=wrong)
+    used = np.ones(len(up), bool)
+    assert not placements_demand(model, held, poses, up=up, used=used)
+
+
+def test_placements_demand_a_cross_term_of_three_degrees_and_state_their_error():
+    normalised = []
+    for seed in range(7441, 7445):
+        model, held, poses, up = placed(seed, count=20, cross=0.05)
+        used = np.ones(len(up), bool)
+        assert placements_demand(model, held, poses, up=up, used=used)
+        fit = fit_placements(model, model.nominal, poses, up=up, used=used)
+        is_cross = np.isin(np.array(model.model.param_names)[fit.index], CROSS_TERMS)
+        sd = np.sqrt(np.diag(fit.covariance)[is_cross])
+        normalised.append((fit.values[fit.index][is_cross] - 0.05) / sd)
+    # Student's t widens the sd of few placements
+    assert np.max(np.abs(normalised)) < 3.5 and 0.4 < np.std(normalised) < 1.3
+
+
+def placed(seed, *, count, cross, wrong=0.0):
+    """Return models with free and held cross terms, and mean readings on faces, with directions."""
+    rng = np.random.default_rng(seed)
+    model = HandModel(SensorModel(BASE, BASE), GRAVITY)
+    matrix = np.eye(3) + np.diag(rng.normal(0, 0.01, 3)) + cross * np.tri(3, k=-1)
+    force = []
+    for k in range(count):
+        tilt, along = np.radians(rng.uniform(1, 3)), rng.uniform(0, 2 * np.pi)
+        up = Rotation.from_rotvec(tilt * np.array([np.cos(along), np.sin(along), 0])).as_matrix()[2]
+        up = np.sign(0.5 - k // 3 % 2) * np.roll(up, k % 3)
+        force.append(GRAVITY * matrix @ up + rng.normal(0, 0.003, 3))
+    force = np.array(force)
+    force[-1] += wrong * force[-1] / GRAVITY
+    poses = SimpleNamespace(force=force, conditions={})
+    directions = force / np.linalg.norm(force, axis=1)[:, None]
+    return model, replace(model, untested=CROSS_TERMS), poses, directions

@@ -18,6 +18,7 @@ from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
 from imu_calibration.estimation.solution import (
     DRIFT,
     GRAVITY,
+    SAMPLE_NOISE,
     Solution,
     Status,
     statuses,
@@ -63,9 +64,10 @@ from imu_calibration.references.gravity.poses import (
 from imu_calibration.references.gravity.tested_directions import (
     TESTING_TURNS,
     contradicted_by_turns,
-    demanded_by_placements,
     directions,
+    fit_placements,
     off_axis_lacking,
+    placements_demand,
     turns_between,
 )
 from imu_calibration.selection.questions import at_time_constants
@@ -314,10 +316,15 @@ def solve_by_hand(
     if not names:
         return free
     testing = turns_between(up, free.used_turns)
-    if len(testing) < TESTING_TURNS:
-        demanded = demanded_by_placements(model, free.values, poses, up=up, names=names)
-        return free if demanded else _solved(data, options, point, untested=names)
     held = _solved(data, options, point, untested=names)
+    if len(testing) < TESTING_TURNS:
+        # Norms decide, with one error for all rests of a placement.
+        used = np.all(poses.force_sem <= data.poses.force_sem, axis=1)
+        demanded = placements_demand(model, held.hand_model, poses, up=up, used=used)
+        chosen = free if demanded else held
+        fit = fit_placements(chosen.hand_model, chosen.values, poses, up=up, used=used)
+        excess = fit.excess(total(chosen.terms))
+        return replace(chosen, terms=with_term(chosen.terms, SAMPLE_NOISE, excess))
     errors = [np.array([_missed_by(hand, turn) for turn in testing]) for hand in (free, held)]
     return held if contradicted_by_turns(*errors) else free
 
