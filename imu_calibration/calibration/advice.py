@@ -24,11 +24,12 @@ from imu_calibration.estimation.observability import (
     sd_excess,
     share_gained,
 )
-from imu_calibration.estimation.solution import LACKING, remedy
+from imu_calibration.estimation.solution import LACKING, TURNS_REMEDY, remedy
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses, tangent
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
+from imu_calibration.references.gravity.pose_solver import CONTRADICTED_TURNS
 
 HOLD_TIME = 3.0
 """s; hold time after which a pose certainly counts."""
@@ -397,17 +398,25 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
         if own.start <= index < own.stop and effect.motion[0] in WARMING:
             return ALL_MOTIONS[effect.motion[0]]
 
+    bias = hand.model.part('gyroscope', Role.OFFSET)
+    of_turns = hand.param_names[index].startswith('gyroscope') and index not in range(
+        bias.start, bias.stop
+    )
+    # More turns are left out as well where most of them contradict gravity.
+    contradicted = hand.statistics['left_out'].get(CONTRADICTED_TURNS, 0)
+    if of_turns and contradicted > hand.statistics['turns']:
+        return TURNS_REMEDY
+
     # A parameter that the attitudes do not determine needs others, whatever the scatter is.
     if hand.judged_sd[index] > UNKNOWN_SHARE * model.priors[index]:
         return ''
-    bias = hand.model.part('gyroscope', Role.OFFSET)
     if hand.param_names[index].startswith('accelerometer'):
         excess = excesses.pose
-    elif bias.start <= index < bias.stop:
-        excess = excesses.bias
-    else:
+    elif of_turns:
         # Poses in error also spoil the directions before and after a turn.
         excess = max(excesses.pose, excesses.turn)
+    else:
+        excess = excesses.bias
     return remedy(terms, index, hand.tolerances[index], excess=excess if excess > EXCESS else 1.0)
 
 

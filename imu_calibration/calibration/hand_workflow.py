@@ -515,13 +515,14 @@ def hand_result(
 def _statistics(hand, counts, n_samples):
     found = hand.statistics
     keys = {
-        'accelerometer': ('force_noise_sd', 'pose_scatter_sd'),
-        'gyroscope': ('rate_noise_sd', 'drift_scatter_sd'),
+        'accelerometer': ('force_noise_sd', 'pose_scatter_sd', 'pose_dof'),
+        'gyroscope': ('rate_noise_sd', 'drift_scatter_sd', 'drift_dof'),
     }
     per_sensor = {
         s: {
             'noise_sd': [float(v) for v in found[keys[s][0]]],
             'between_window_sd': float(found[keys[s][1]]),
+            'between_window_dof': float(found[keys[s][2]]),
             'wander_sd': 0.0,
         }
         for s in SENSORS

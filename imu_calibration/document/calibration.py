@@ -444,6 +444,8 @@ OFF_DIAGONAL = 0.5
 Largest off-diagonal element: axes 30 degrees from orthogonal; the mount is part of the table
 description.
 """
+CONVERT = 'convert the readings in the driver'
+"""Remedy for a scale factor that is explained by a wrong unit."""
 LARGEST_BIAS = {'accelerometer': 16 * STANDARD_GRAVITY, 'gyroscope': 4000 * DEG}
 """The largest full scales of such sensors, m/s^2 and rad/s."""
 
@@ -490,39 +492,65 @@ def scale_questions(calibration: Calibration) -> dict[str, str]:
     return questions
 
 
-def beyond_instruments(calibration: Calibration, sensor: str) -> str:
-    """
-    Return which value of a sensor's matrix or bias belongs to no instrument, with the limit.
+@dataclass(frozen=True)
+class InstrumentLimit:
+    """A value that belongs to no instrument."""
 
-    '' where none does. A scale factor that is possible but not usual (`core.scales`) needs the
-    support of the data.
+    why: str
+    """The limit and the value."""
+    remedy: str
+    """The next step, which removes the cause."""
+    key: str | None = None
+    """The input needed for it, a key of `errors.ERROR_KEYS`."""
+
+
+def surpassed_limit(calibration: Calibration, sensor: str) -> InstrumentLimit | None:
+    """
+    Return the limit of instruments that a sensor's matrix or bias surpasses; None for none.
+
+    A scale factor that is possible but not usual (`core.scales`) needs the support of the data.
     """
     matrix, bias = (np.asarray(calibration.of(sensor, role)) for role in (Role.LINEAR, Role.OFFSET))
     off = np.abs(matrix - np.diag(np.diag(matrix))).max()
     factor = worst_scale(calibration, sensor)
     if scale_range(factor) is IMPOSSIBLE:
         low, high = POSSIBLE_SCALE
-        return (
+        return InstrumentLimit(
             f'a scale factor must be {low:g} to {high:g}, it is {significant(factor)}; state the'
-            ' unit of the readings'
+            ' unit of the readings',
+            CONVERT,
+            f'{sensor}_unit',
         )
     if scale_range(factor) is DOUBTFUL and not scale_supported(calibration, sensor):
         low, high = USUAL_SCALE
-        return (
+        return InstrumentLimit(
             f'a scale factor outside {low:g} to {high:g} must be determined and help on held-out'
-            f' data, {significant(factor)} is not; state the unit of the readings'
+            f' data, {significant(factor)} is not; state the unit of the readings',
+            CONVERT,
+            f'{sensor}_unit',
         )
     if off > OFF_DIAGONAL:
-        return (
+        axes = 'check in the driver that both sensors have the same axes'
+        if calibration.gauge.get('axes') != HAND_AXES:
+            axes = 'check the axes of the readings, and the mount in the table description'
+        return InstrumentLimit(
             f'off-diagonal elements must be at most {OFF_DIAGONAL:g}, the largest is'
-            f' {significant(off)}'
+            f' {significant(off)}',
+            axes,
         )
     if np.abs(bias).max() > LARGEST_BIAS[sensor]:
-        return (
+        return InstrumentLimit(
             f'a bias must be within full scale ({significant(LARGEST_BIAS[sensor])} SI), it is'
-            f' {significant(np.abs(bias).max())}'
+            f' {significant(np.abs(bias).max())}',
+            'check offsets in the driver, and the supply of the sensor',
         )
-    return ''
+    return None
+
+
+def beyond_instruments(calibration: Calibration, sensor: str) -> str:
+    """Return which value of a sensor belongs to no instrument, with the limit; '' for none."""
+    limit = surpassed_limit(calibration, sensor)
+    return limit.why if limit else ''
 
 
 def needs_accelerometer(calibration: Calibration, decisions: Mapping[str, SensorDecision]) -> bool:

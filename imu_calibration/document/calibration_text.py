@@ -91,6 +91,7 @@ def _is_joint_errors(value):
 _NOISE = {
     'noise_sd': _is_list_of(_is_size, 3),
     'between_window_sd': _is_size,
+    'between_window_dof': _is_size,
     'wander_sd': _is_size,
 }
 _PROOF = {

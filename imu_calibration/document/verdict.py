@@ -5,10 +5,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.units import error_text, for_people, significant
 from imu_calibration.document.calibration import (
+    CONVERT,
     HAND_AXES,
     SHOWN_NAMES,
     Calibration,
@@ -19,6 +21,7 @@ from imu_calibration.document.calibration import (
     needs_accelerometer,
     never_applied,
     scale_questions,
+    surpassed_limit,
 )
 from imu_calibration.document.decision import (
     DECISION,
@@ -69,6 +72,8 @@ MISFIT_FACTOR = 2.0
 A scatter of window means up to this factor times an unexplained residual is that residual, not a
 bias that moves.
 """
+SCATTER_P_VALUE = 0.025
+"""Chance that the scatter of a bias is below its lower limit."""
 LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
 
@@ -79,7 +84,7 @@ def _doubtful_scales(calibration):
         Reason(
             WARNING,
             question,
-            'convert the readings in the driver',
+            CONVERT,
             key=f'{sensor}_unit',
             sensors=(sensor,),
         )
@@ -347,13 +352,16 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     Return notes on biases that move from window to window by more than the tolerance on their mean.
 
     A residual that the model does not explain scatters from window to window as well, although the
-    bias does not move.
+    bias does not move. So does a sensor that moved where it was held still.
     """
     reasons, by_hand = [], calibration.gauge.get('axes') == HAND_AXES
     for sensor in calibration.sensors:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
-        if scatter > tolerances[part][0] and scatter > _misfit(calibration, sensor):
+        certain = scatter * _smallest_share(calibration, sensor)
+        if moved_at_rest(calibration, sensor):
+            continue
+        if certain > tolerances[part][0] and scatter > _misfit(calibration, sensor):
             factor, unit = for_people(UNITS[sensor])
             reasons.append(
                 Reason(
@@ -367,6 +375,20 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
                 )
             )
     return reasons
+
+
+def _smallest_share(calibration, sensor):
+    """
+    Return the lower limit of a scatter as a share of its estimate.
+
+    The estimate s of a standard deviation with k degrees of freedom: ``k s^2 / sd^2`` is chi-square
+    with k degrees of freedom, so that ``sd >= s sqrt(k / q)`` with its quantile q. With
+    k = 3 the share is 0.57.
+    """
+    dof = calibration.statistics.get(sensor, {}).get('between_window_dof')
+    if dof is None:
+        return 1.0
+    return float(np.sqrt(dof / chdtri(dof, SCATTER_P_VALUE))) if dof > 0 else 0.0
 
 
 def _left_out(calibration):
@@ -510,9 +532,14 @@ def _decided(calibration, sensor, word):
 def _step_of(calibration, sensor):
     """Return (next step, its key) for a sensor that the calibration does not certainly help."""
     entry, by_hand = calibration.proof.get(sensor), calibration.gauge.get('axes') == HAND_AXES
+    # Values that are refused have their own cause, and no measurement of their error is missing.
+    if limit := surpassed_limit(calibration, sensor):
+        return limit.remedy, limit.key
     if not entry or not entry['windows']:
         if not by_hand:
             return 'record more windows of rest and motion', None
+        if needs := _needs_of(calibration, sensor):
+            return needs[0], REMEDY_KEYS.get(needs[0])
         more = {
             'accelerometer': 'hold it still in more attitudes',
             'gyroscope': 'turn it between more attitudes held still',
@@ -525,7 +552,7 @@ def _step_of(calibration, sensor):
         return f'hold it still in more attitudes{mount}', None
     if decide(entry) is HELPS and _periodic(calibration, sensor):
         return 'record rests between the motions', None
-    if decide(entry) is HELPS and not beyond_instruments(calibration, sensor):
+    if decide(entry) is HELPS:
         # The gyroscope follows the accelerometer, which has its own next step.
         return '', None
     return 'find the cause', 'diagnose'
@@ -651,21 +678,27 @@ def _blind(calibration):
             for status in calibration.status[calibration.model.part(sensor, Role.LINEAR)]
         )
         if own and matrix_held and DETERMINED not in own:
-            needs = [
-                d['needs']
-                for d in calibration.undetermined
-                if any(name.startswith(sensor) for name in d['parameters'])
-            ]
+            needs = _needs_of(calibration, sensor)
             step = needs[0] if needs else 'record static poses and turns about all three axes'
             reasons.append(
                 Reason(
                     WARNING,
                     f'the recording does not determine the {sensor}',
                     step,
+                    key=REMEDY_KEYS.get(step),
                     sensors=(sensor,),
                 )
             )
     return reasons
+
+
+def _needs_of(calibration, sensor):
+    """Return what the undetermined parameters of a sensor need."""
+    needs = []
+    for direction in calibration.undetermined:
+        if any(name.startswith(sensor) for name in direction['parameters']):
+            needs.append(direction['needs'])
+    return needs
 
 
 def _moved(calibration):

@@ -45,6 +45,10 @@ REMEDIES = {
 """Terms that more data do not reduce -> what does."""
 EXCESS_REMEDY = 'find the cause of the residual, which exceeds the noise at rest'
 """Remedy where the data would suffice if the residual were as small as the noise."""
+TURNS_REMEDY = (
+    'check that both sensors have the same axes, and that the recording contains each complete turn'
+)
+"""Remedy where the rates of most turns by hand contradict gravity before and after them."""
 REMEDY_KEYS = {
     REMEDIES[GRAVITY,]: 'gravity',
     REMEDIES[MODEL_ERROR, DRIFT, REJECTED]: 'diagnose',

@@ -5,18 +5,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import imu_calibration as imu
 from imu_calibration.calibration.advice import _Excesses, _without_motion
 from imu_calibration.calibration.live_poses import _needs
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import MILLI_G
+from imu_calibration.document.calibration import surpassed_limit
 from imu_calibration.document.decision import PARAMETERS
-from imu_calibration.document.verdict import _step_of
+from imu_calibration.document.verdict import _step_of, unsteady
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.estimation.observability import ALL_MOTIONS
-from imu_calibration.estimation.solution import EXCESS_REMEDY, REMEDY_KEYS
+from imu_calibration.estimation.solution import EXCESS_REMEDY, REMEDY_KEYS, TURNS_REMEDY
 
 from worlds.compensation_cases import random_calibration
 from worlds.hand_sessions import GRAVITY, simulate
@@ -135,3 +137,66 @@ def test_the_next_step_of_an_unproven_sensor_is_that_of_its_reason():
     assert len(set(of_accelerometer)) == 4 and of_accelerometer[-1][1] == 'diagnose'
     assert _step_of(near_faces, 'gyroscope') == ('', None)
     assert 'turn' in _step_of(nothing[1], 'gyroscope')[0]
+
+
+def scaled(samples, matrix):
+    """Return the recording with rates ``matrix w``."""
+    return replace(samples, rate_s=samples.rate_s @ np.transpose(matrix))
+
+
+def test_refused_values_have_the_remedy_of_their_cause():
+    """Rates in a wrong unit had the advice to diagnose; axes of another sensor, other turns."""
+    samples, *_ = simulate(24, n_poses=16, **SESSION)
+    wrong_unit = calibrated(scaled(samples, 0.3 * np.eye(3)))
+    [decided] = [r for r in wrong_unit.result.verdict.reasons if 'scale factor must' in r.what]
+    assert decided.key == 'gyroscope_unit' and '--unit' in decided.advice(
+        {'gyroscope_unit': '--unit'}
+    )
+
+    # The gyroscope is turned by 50 degrees to the accelerometer.
+    turned = Rotation.from_euler('z', 50, degrees=True).as_matrix()
+    other_axes = calibrated(scaled(samples, turned))
+    needs = {
+        entry['needs']
+        for entry in other_axes.calibration.undetermined
+        if any(name.startswith('gyroscope.matrix') for name in entry['parameters'])
+    }
+    assert needs == {TURNS_REMEDY}
+    assert _step_of(other_axes.calibration, 'gyroscope') == (TURNS_REMEDY, None)
+
+
+@pytest.mark.parametrize(
+    ('value', 'limit'), (('gyroscope.matrix.xy', 0.6), ('gyroscope.bias.x', 80.0))
+)
+def test_no_measurement_is_missing_where_values_are_refused(value, limit):
+    calibration = random_calibration(3)
+    values = calibration.values.copy()
+    values[calibration.param_names.index(value)] = limit
+    refused = replace(calibration, values=values)
+    found = surpassed_limit(refused, 'gyroscope')
+    assert found is not None and surpassed_limit(calibration, 'gyroscope') is None
+    assert _step_of(refused, 'gyroscope') == (found.remedy, found.key)
+
+
+def test_noise_of_few_poses_is_no_unsteady_bias():
+    """Means of three seconds have 15 mm/s^2 of noise; the tolerance of a bias is 10."""
+    noisy = {**SESSION, 'force_sd': 0.2, 'rate_sd': 0.002, 'period': 0.012}
+    found = calibrated(simulate(7362, n_poses=12, **noisy)[0])
+    assert found.calibration.statistics['accelerometer']['between_window_sd'] > MILLI_G
+    assert not any('window to window' in reason.what for reason in found.result.verdict.reasons)
+
+
+@pytest.mark.parametrize(('freedom', 'certain'), ((3.0, False), (60.0, True)))
+def test_a_scatter_of_few_degrees_of_freedom_is_uncertain(freedom, certain):
+    """Lower limits of 1.5 tolerances at 2.5 %: 0.85 of 3 and 1.27 of 60 degrees of freedom."""
+    calibration = random_calibration(3, proof={}, decision={})
+    tolerances = np.full(len(calibration.values), 0.01)
+    entry = {'between_window_sd': 0.015, 'between_window_dof': freedom}
+    scattered = replace(calibration, statistics={'accelerometer': entry})
+    assert bool(unsteady(scattered, tolerances)) is certain
+
+
+def test_a_bias_that_moves_between_many_poses_is_called_unsteady():
+    """5 mg of scatter from pose to pose, without noise and with a still hand."""
+    found = calibrated(simulate(25, n_poses=24, pose_sd=5 * MILLI_G, **SESSION)[0])
+    assert any('window to window' in reason.what for reason in found.result.verdict.reasons)

@@ -46,6 +46,7 @@ from imu_calibration.references.gravity.hand_parameters import (
     KnownTurn,
 )
 from imu_calibration.references.gravity.pose_solver import (
+    CONTRADICTED_TURNS,
     first_state,
     possible_turns,
     solve_joint,
@@ -365,7 +366,7 @@ def _solved(data, options, point, *, untested=()):
     state = first_state(model, poses)
     model = replace(model, gyro_factor=full_scale_factor(state, poses, turns))
     turns, contradicted = possible_turns(model, state, poses, turns=turns)
-    left = {'contradicted by gravity': contradicted} if contradicted else {}
+    left = {CONTRADICTED_TURNS: contradicted} if contradicted else {}
     solved = partial(solve_joint, gravity_sd=options.gravity_sd)
     for effect in model.extras:
         if effect.time_constant and effect.name not in (

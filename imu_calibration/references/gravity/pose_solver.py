@@ -210,6 +210,8 @@ CONTRADICTED = 0.35
 rad; a larger angle between rotated and observed gravity after a turn is no error of the rates:
 scale errors of a tenth cause less.
 """
+CONTRADICTED_TURNS = 'contradicted by gravity'
+"""Kind of the turns that are left out by CONTRADICTED, in `left_out` of the statistics."""
 LEAST_ERROR_SHARE = 0.05
 """
 A combination of a unit's rows that keeps less than this share of its error after the fit is not
