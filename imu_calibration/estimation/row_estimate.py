@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.estimation.noise_search import GroupVariances, estimate_group_variances
+from imu_calibration.estimation.group_variances import GroupVariances, estimate_group_variances
 from imu_calibration.estimation.scaled_solve import (
     covariance_with_held,
     inverse_gram,

@@ -7,18 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from imu_calibration.effects.base import SENSORS
+from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
 from imu_calibration.estimation.noise_model import (
     BiasProcess,
     MovingFactors,
     NoiseModel,
     ReferenceNoise,
 )
-from imu_calibration.estimation.noise_search import (
-    CORRELATION_TIMES,
-    NATURAL,
-    BiasProcessSearch,
-    NoiseLikelihood,
-)
+from imu_calibration.estimation.noise_search import CORRELATION_TIMES, NATURAL, BiasProcessSearch
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.session_noise import (
     band_misfit,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from imu_calibration.estimation import scaled_solve
+from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, dof_factor
-from imu_calibration.estimation.noise_search import NoiseLikelihood
 from imu_calibration.estimation.scaled_solve import triangular, triangular_of_band
 from imu_calibration.estimation.whitening import (
     RestrictedLikelihood,

@@ -14,8 +14,9 @@ import pytest
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_likelihood import FLICKER_MARK, NoiseLikelihood
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
-from imu_calibration.estimation.noise_search import FLICKER_MARK, BiasProcessSearch, NoiseLikelihood
+from imu_calibration.estimation.noise_search import BiasProcessSearch
 from imu_calibration.selection import gain, investigation
 from imu_calibration.selection import unexplained as rests
 from imu_calibration.selection.evidence import (

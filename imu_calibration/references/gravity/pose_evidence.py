@@ -16,8 +16,9 @@ from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.effects.base import AXES, SENSORS, Effect
 from imu_calibration.effects.sensor_model import BASE
+from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
 from imu_calibration.estimation.noise_model import BiasProcess
-from imu_calibration.estimation.noise_search import NATURAL, NoiseLikelihood
+from imu_calibration.estimation.noise_search import NATURAL
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.kinematics.strapdown import integrate_turn

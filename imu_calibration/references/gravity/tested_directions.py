@@ -13,7 +13,7 @@ import numpy as np
 
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES
-from imu_calibration.estimation.noise_search import student_factor
+from imu_calibration.estimation.group_variances import student_factor
 from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.hand_parameters import CROSS_TERMS, HandModel
 from imu_calibration.references.gravity.pose_solver import first_state
