@@ -8,7 +8,12 @@ import numpy as np
 from imu_calibration.calibration.proof import compared
 from imu_calibration.compensation.compensate import Corrected, compensated_samples
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.trust import Uncorrected, judged_from_of, uncorrected_in_time
+from imu_calibration.document.trust import (
+    Uncorrected,
+    judged_from_of,
+    latest_settling,
+    uncorrected_in_time,
+)
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
 from imu_calibration.estimation.solution import HELD
@@ -65,7 +70,8 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
     """
     poses, model, uncorrected = hand.poses, hand.hand_model, uncorrected_by_hand(hand)
     plain = replace(model, gyro_factor=1.0).nominal
-    judged = poses.time >= judged_from_of(hand.model.at(hand.values), end_by_hand(poses))
+    latest = latest_settling(hand.model, hand.values, hand.sd)
+    judged = poses.time >= judged_from_of(latest, end_by_hand(poses))
     norms, angles = [], []
     for out, without in held_out_values(hand, turns):
         values, part = (
@@ -173,7 +179,11 @@ def end_by_hand(poses: Poses) -> float:
 def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
     """Return the effects in time that compensation replaces by a constant."""
     return uncorrected_in_time(
-        hand.model.at(hand.values), hand.values, hand.poses.time, end=end_by_hand(hand.poses)
+        hand.model.at(hand.values),
+        hand.values,
+        hand.poses.time,
+        end=end_by_hand(hand.poses),
+        latest=latest_settling(hand.model, hand.values, hand.sd),
     )
 
 

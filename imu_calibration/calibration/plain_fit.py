@@ -21,11 +21,18 @@ from imu_calibration.calibration.proof import (
     with_reference,
 )
 from imu_calibration.effects.base import SENSORS, Role
-from imu_calibration.effects.forward_equations import coefficients
+from imu_calibration.effects.forward_equations import (
+    Centre,
+    applied_values,
+    coefficients,
+    not_applied,
+)
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.accumulator import stack
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.solution import MODEL_ERROR, Solution, with_term
-from imu_calibration.estimation.window_statistics import N_AXES
+from imu_calibration.estimation.weighted_system import Prior, fixed_parameters, make_prior
+from imu_calibration.estimation.window_statistics import N_AXES, count_pieces
 from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldOut
 
 HARDLY_WORSE = 1.02
@@ -37,6 +44,8 @@ CLEARLY_BETTER = 0.98
 """Error relative to another one from which an estimate counts as better."""
 FITTED = (Role.OFFSET, Role.LINEAR)
 """Effects of a plain fit."""
+PARTS_OF_TIME = 3
+"""Parts of a session that are held out in turn: an effect in time is applied at one moment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +90,14 @@ def better_plain_fits(
     solution: Solution,
     folds: Sequence[np.ndarray],
     *,
-    unexplained: Collection[str],
+    under_test: Collection[str],
+    centre: Centre,
 ) -> tuple[PlainFit, ...]:
     """
     Return the plain fits to apply: they predict held-out windows better than a solution.
+
+    Windows are held out in turn, and as complete regimes and parts of the session: an effect that
+    stands in for another cause predicts the motions from which it was estimated only.
 
     Parameters
     ----------
@@ -93,14 +106,18 @@ def better_plain_fits(
     solution : Solution
     folds : sequence of ndarray, shape (n_params,)
         Parameters as compensation applies them, estimated without each fold.
-    unexplained : collection of str
-        Sensors with a residual that is neither noise nor an effect of the model.
+    under_test : collection of str
+        Sensors with a residual that is neither noise nor an effect of the catalogue.
+    centre : mapping
+        As for `applied_folds`.
 
     """
     regimes, counts = judged_regimes(held_out)
-    if not regimes or not unexplained:
-        return ()
     model = solution.model
+    # An effect that compensation does not apply is a residual of each other session.
+    replaceable = set(under_test) | {effect.sensor for effect in not_applied(model)}
+    if not regimes or not replaceable:
+        return ()
     nominal = nominal_values(model)
     described = [with_reference(model, values, nominal) for values in folds]
     # The table and the clock as described, and as the solution has them.
@@ -113,7 +130,7 @@ def better_plain_fits(
 
     better = []
     for sensor in SENSORS:
-        if sensor not in unexplained:
+        if sensor not in replaceable:
             continue
         of_solution = min(squares(sensor, folds), squares(sensor, described), key=np.sum)
 
@@ -126,7 +143,10 @@ def better_plain_fits(
 
         figures = compared(of_solution, of_plain, counts.sum(axis=1))
         error, error_of_solution = figures['after'], figures['before']
-        if error / max(error_of_solution, 1e-300) < HARDLY_WORSE:
+        is_close = error / max(error_of_solution, 1e-300) < HARDLY_WORSE
+        if (is_close and sensor in under_test) or _misses_other_regimes(
+            held_out, solution, chosen, sensor, centre=centre
+        ):
             better.append(PlainFit(sensor, chosen, error, error_of_solution))
     return tuple(better)
 
@@ -209,6 +229,133 @@ def _plain_estimate(
         folds.append(_solved(start, fitted, rows, targets, others))
     values = _solved(start, fitted, rows, targets, range(len(rows)))
     return PlainEstimate(replaced, fitted, tuple(dropped), values, folds)
+
+
+def _misses_other_regimes(
+    held_out: HeldOut, solution: Solution, plain: PlainEstimate, sensor: str, *, centre: Centre
+) -> bool:
+    """
+    Return whether the effects of a solution predict regimes worse that they were not fitted to.
+
+    Effects and plain fit are estimated by least squares from the same pieces, so that only the
+    effects differ; the effects have their priors.
+    """
+    model = solution.model
+    free = np.zeros(len(solution.values), bool)
+    for effect in model.effects:
+        amplitudes = model.slices[effect.key].start + np.arange(effect.n_amplitudes)
+        if effect.sensor == sensor and not is_of_reference(effect):
+            free[amplitudes] = True
+    free &= ~fixed_parameters(model) & ~solution.held
+    if not np.any(free & ~plain.fitted):
+        return False
+    prior = make_prior(model)
+    n_pieces = 0
+    for block in held_out.blocks:
+        n_pieces += sum(count_pieces(row.duration) for row in block.accumulator.rows)
+    # Another regime of the same session has its drift; another session has what is applied.
+    trials = (
+        (_groups_by_regime(held_out, sensor), None),
+        (_groups_by_time(held_out, sensor), centre),
+    )
+    for groups, applied_at in trials:
+        if len(groups) < 2:
+            continue
+        of_model = _error_on_groups(
+            groups,
+            model,
+            sensor,
+            values=solution.values,
+            free=free,
+            centre=applied_at,
+            prior=prior,
+            n_pieces=n_pieces,
+        )
+        of_plain = _error_on_groups(groups, model, sensor, values=plain.values, free=plain.fitted)
+        if of_model > HARDLY_WORSE * of_plain:
+            return True
+    return False
+
+
+def _groups_by_regime(held_out: HeldOut, sensor: str) -> list[np.ndarray]:
+    """Return ``[columns | output]`` of the pieces of each regime of motion, as factors."""
+    stacked: dict[tuple[str, str], np.ndarray] = {}
+    for block in held_out.blocks:
+        for kept in (block.pieces, block.earlier):
+            for (name, regime), part in kept.items():
+                if name == sensor:
+                    # without the derivative of the true input
+                    rows = np.delete(part, np.s_[-2 * N_AXES : -N_AXES], axis=1)
+                    stack(stacked, (name, regime), rows)
+    return list(stacked.values())
+
+
+def _groups_by_time(held_out: HeldOut, sensor: str) -> list[np.ndarray]:
+    """Return ``[columns | output]`` of the window means of each part of a session, as factors."""
+    windows = [row for block in held_out.blocks for row in block.accumulator.rows]
+    end = max((row.time for row in windows), default=0.0)
+    stacked: dict[tuple[str, str], np.ndarray] = {}
+    for row in windows:
+        part = min(int(PARTS_OF_TIME * row.time / max(end, 1e-9)), PARTS_OF_TIME - 1)
+        weight = np.sqrt(count_pieces(row.duration))
+        stack(stacked, (sensor, str(part)), weight * row.sensors[sensor].mean[None])
+    return list(stacked.values())
+
+
+def _error_on_groups(
+    groups: Sequence[np.ndarray],
+    model: SensorModel,
+    sensor: str,
+    *,
+    values: np.ndarray,
+    free: np.ndarray,
+    centre: Centre | None = None,
+    prior: Prior | None = None,
+    n_pieces: int = 1,
+) -> float:
+    """
+    Return the root of the sum of squared errors on groups, each predicted from the remaining ones.
+
+    One step from `values`, with parameters as compensation applies them where there is a `centre`.
+    `n_pieces`: number of
+    pieces that the factors stand for, for the weight of the prior.
+    """
+    # Slopes per standard deviation of the prior: the coefficients are linear over it.
+    total = coefficients(model, sensor, values)
+    index = np.flatnonzero(free)
+    sd = model.prior()[1][index]
+    slopes = []
+    for place, step in zip(index, sd, strict=True):
+        moved = values.copy()
+        moved[place] += step
+        slopes.append(coefficients(model, sensor, moved) - total)
+    designs = []
+    targets = []
+    for group in groups:
+        columns, output = group[:, :-N_AXES], group[:, -N_AXES:]
+        designs.append(np.stack([(columns @ slope).ravel() for slope in slopes], axis=1))
+        targets.append((output - columns @ total).ravel())
+
+    # The prior has the weight of its information relative to the residual.
+    known = np.zeros((0, len(index)))
+    known_targets = np.zeros(0)
+    if prior is not None:
+        residual_sd = np.sqrt(np.sum(np.concatenate(targets) ** 2) / (N_AXES * n_pieces))
+        known = residual_sd * prior.root[:, index] * sd
+        known_targets = residual_sd * (prior.root @ (prior.mean - values))
+
+    squares = 0.0
+    for held, group in enumerate(groups):
+        others = [k for k in range(len(groups)) if k != held]
+        design = np.concatenate([known, *(designs[k] for k in others)])
+        target = np.concatenate([known_targets, *(targets[k] for k in others)])
+        fitted = values.copy()
+        fitted[index] += sd * scaled_lstsq(design, target)
+        if centre is not None:
+            fitted = applied_values(model, fitted, centre)
+        error = group[:, -N_AXES:] - group[:, :-N_AXES] @ coefficients(model, sensor, fitted)
+        squares += float(np.sum(error**2))
+    return float(np.sqrt(squares))
 
 
 def _equations(

@@ -1,6 +1,6 @@
 """Calibration on a table, and the check of a calibration on another recording."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -40,7 +40,12 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import TemperatureSamples
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.trust import end_of, judged_from_of, uncorrected_on_table
+from imu_calibration.document.trust import (
+    end_of,
+    judged_from_of,
+    latest_settling,
+    uncorrected_on_table,
+)
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import restrict
@@ -156,9 +161,8 @@ def solve_in_passes(
         model = again
         solution, gathered = solved(model, judged_from)
         again = linearise_again(model, solution)
-        last_third = judged_from_of(
-            solution.model.at(solution.values), end_of(gathered.accumulator)
-        )
+        latest = latest_settling(solution.model, solution.values, solution.sd)
+        last_third = judged_from_of(latest, end_of(gathered.accumulator))
         if again is None and judged_from == last_third:
             break
         again, judged_from = again or model, last_third
@@ -259,30 +263,34 @@ def conclude(
     options: CalibrationOptions = CalibrationOptions(),
     provenance: dict | None = None,
     changes: ModelChanges = ModelChanges(),
+    under_test: Collection[str] = (),
 ) -> TableResult:
     """
     Judge a solution, name the missing motions, and return the TableResult.
 
-    The solution is of data gathered with `model`.
+    The solution is of data gathered with `model`. The effects of sensors in `under_test`, and of
+    sensors with an unexplained residual, have to predict better than plain least squares.
     """
     tolerances = tolerances_of(solution.model, options.tolerances)
     gathered.findings = with_latitude_findings(gathered.findings, solution, table)
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)
-    uncorrected = uncorrected_on_table(
-        solution.model.at(solution.values), solution.values, gathered.accumulator, gathered=model
-    )
+    uncorrected = _uncorrected(solution, gathered, model)
     held_out = gathered.held_out.restricted(model, solution.model)
     folds = applied_folds(held_out, solution, centre=uncorrected.centre)
-    plain = better_plain_fits(held_out, solution, folds, unexplained=changes.unexplained)
+    plain = better_plain_fits(
+        held_out,
+        solution,
+        folds,
+        under_test={*changes.unexplained, *under_test},
+        centre=uncorrected.centre,
+    )
     applied = with_plain_fits(solution, plain)
     for fit in plain:
         folds = fit.merged(folds)
     if plain:
         # Of the effects that a plain fit replaces nothing remains uncorrected.
-        uncorrected = uncorrected_on_table(
-            applied.model.at(applied.values), applied.values, gathered.accumulator, gathered=model
-        )
+        uncorrected = _uncorrected(applied, gathered, model)
     proof = prove_solution(held_out, applied, folds)
     calibration = document(
         applied,
@@ -314,6 +322,18 @@ def conclude(
         table=table,
         model=solution.model,
         gathered_model=model,
+    )
+
+
+def _uncorrected(solution, gathered, model):
+    """Return the errors that a solution of data with the columns of `model` leaves uncorrected."""
+    values = solution.values
+    return uncorrected_on_table(
+        solution.model.at(values),
+        values,
+        gathered.accumulator,
+        gathered=model,
+        latest=latest_settling(solution.model, values, solution.sd),
     )
 
 

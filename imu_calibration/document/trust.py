@@ -42,6 +42,8 @@ SETTLED = 0.1
 An effect in time has settled if a recording of twice the length would change it by at most this
 share more: 2.3 time constants.
 """
+PROBABLE = 2.0
+"""Standard deviations above a time constant with which an effect has to have settled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,12 @@ class Uncorrected:
 
 
 def uncorrected_on_table(
-    model: SensorModel, values: np.ndarray, accumulator: Accumulator, *, gathered: SensorModel
+    model: SensorModel,
+    values: np.ndarray,
+    accumulator: Accumulator,
+    *,
+    gathered: SensorModel,
+    latest: SensorModel | None = None,
 ) -> Uncorrected:
     """
     Return the errors that remain uncorrected by a calibration on a table.
@@ -75,8 +82,11 @@ def uncorrected_on_table(
     accumulator : Accumulator
         Windows with the columns of `gathered`.
     gathered : SensorModel
+    latest : SensorModel, optional
+        `latest_settling`; default: `model`.
 
     """
+    latest = latest or model
     counts, end = np.array([row.count for row in accumulator.rows], float), end_of(accumulator)
     centre, sizes = {}, []
     at_columns = replace(
@@ -85,7 +95,7 @@ def uncorrected_on_table(
         | {e.name: gathered.point_of(e) for e in model.effects if e.time_constant},
     )
     for effect in not_applied(model):
-        squares, at_end = np.zeros(3), has_settled(model, effect, end)
+        squares, at_end = np.zeros(3), has_settled(latest, effect, end)
         for group in effect.groups:
             rows, own = (
                 gathered.layout(effect.sensor).rows[group.name],
@@ -125,14 +135,22 @@ def _moved(effect, columns, change):
 
 
 def uncorrected_in_time(
-    model: SensorModel, values: np.ndarray, times: Sequence[float] | np.ndarray, *, end: float
+    model: SensorModel,
+    values: np.ndarray,
+    times: Sequence[float] | np.ndarray,
+    *,
+    end: float,
+    latest: SensorModel | None = None,
 ) -> Uncorrected:
     """
     Return the uncorrected part of effects in time at `times`, s, of a recording that ends at `end`.
+
+    `latest` as for `uncorrected_on_table`.
     """
+    latest = latest or model
     centre, sizes = {}, []
     for effect in not_applied(model):
-        at_end, at_times = has_settled(model, effect, end), columns_at(model, effect, times)
+        at_end, at_times = has_settled(latest, effect, end), columns_at(model, effect, times)
         applied = columns_at(model, effect, [end]) if at_end else at_times
         centre |= {name: columns.mean(axis=0) for name, columns in applied.items()}
         rows = model.layout(effect.sensor).rows
@@ -147,6 +165,21 @@ def uncorrected_in_time(
 def end_of(accumulator: Accumulator) -> float:
     """Return the end of the longest recording, s since its start."""
     return max(row.time + row.duration / 2 for row in accumulator.rows)
+
+
+def latest_settling(model: SensorModel, values: np.ndarray, sd: np.ndarray) -> SensorModel:
+    """
+    Return the model at the largest probable time constants, to test what has settled.
+
+    A cause that only resembles a warm-up has an uncertain time constant, and its value at the end
+    of a recording is no value of another recording.
+    """
+    longest = values.copy()
+    for effect in model.effects:
+        if effect.time_constant:
+            last = model.slices[effect.key].stop - 1
+            longest[last] += PROBABLE * sd[last]
+    return model.at(longest)
 
 
 def judged_from_of(model: SensorModel, end: float) -> float:

@@ -13,7 +13,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from imu_calibration.calibration.diagnosis.diagnosis_workflow import helpful_formulas
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
+    _with_proposals,
+    helpful_formulas,
+)
 from imu_calibration.calibration.from_solution import ModelChanges
 from imu_calibration.calibration.table_calibration import (
     check_on_table,
@@ -21,6 +24,7 @@ from imu_calibration.calibration.table_calibration import (
     solve_recordings,
 )
 from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
@@ -83,7 +87,16 @@ def with_losses(session, seed):
     return replace(session, imu=session.imu.select(kept))
 
 
-CAUSES = {'heat': HiddenHeat, 'cable': CableTwist, 'losses': LateWithLosses}
+class Bent(Cause):
+    """The rate reads too much in proportion to a product of specific forces."""
+
+    def added(self, world, temperature_c, force_s, rate_s, alpha_s):
+        """Return that rate."""
+        product = force_s[:, 0] * force_s[:, 2] / 96.2
+        return 0.0, 0.3 * DEG * np.outer(product, [1, -0.6, 0.4])
+
+
+CAUSES = {'heat': HiddenHeat, 'cable': CableTwist, 'losses': LateWithLosses, 'bent': Bent}
 
 
 @lru_cache(maxsize=None)
@@ -170,6 +183,52 @@ def test_applied_values_are_no_worse_than_least_squares_in_a_second_session(kind
     assert np.all(ratio < 1.05)
 
 
+def test_a_drift_with_an_uncertain_time_constant_is_applied_at_its_mean():
+    # The hidden heat of motors resembles a warm-up; its value at the end was 13 % worse.
+    _, table, solved, options = world('heat', 611, 'bias+matrix+gyro_bias_drift')
+    calibration = conclude(*solved, table=table, options=options).calibration
+    plain = with_plain_values(calibration, 'heat', 611)
+    ratio = errors_on_second('heat', 611, calibration) / errors_on_second('heat', 611, plain)
+    assert np.all(ratio < 1.05)
+
+
+def formula(name, column, unit):
+    return term(
+        name, sensor='gyroscope', column=column, unit=unit, tolerance=1e-7, text='A formula.'
+    )
+
+
+@pytest.mark.parametrize(
+    ('kind', 'seed', 'column', 'unit', 'helps'),
+    [
+        ('bent', 7450, 'f_x * f_z', 'rad/s/(m/s^2)^2', True),
+        ('cable', 604, 'f_x * f_z', 'rad/s/(m/s^2)^2', False),
+        ('heat', 501, 'abs(w_z)', '1', False),
+    ],
+)
+def test_a_formula_is_applied_where_a_second_session_confirms_it(kind, seed, column, unit, helps):
+    pair, table, solved, options = world(kind, seed)
+    effect = formula('bend', column, unit)
+    result = conclude(
+        *solved, table=table, options=options, changes=ModelChanges(unexplained=UNEXPLAINED)
+    )
+    extended = _with_proposals(
+        source(pair.first),
+        table,
+        options,
+        result,
+        SimpleNamespace(unexplained={}),
+        None,
+        map,
+        effects=[effect],
+    )
+    applied = helpful_formulas([effect], extended, result.calibration)
+    assert applied == [effect] * helps
+    plain = with_plain_values(result.calibration, kind, seed)
+    ratio = errors_on_second(kind, seed, extended) / errors_on_second(kind, seed, plain)
+    assert ratio[1] < (0.5 if helps else 1.05)
+
+
 def test_the_solution_is_applied_unless_a_residual_is_unexplained():
     solution = calibrated('cable', 604)
     assert 'least_squares' not in solution.statistics
@@ -189,6 +248,6 @@ def formula_proof(after, *, fast):
 )
 def test_a_formula_has_to_lower_the_held_out_error_in_each_regime(after, fast, helps):
     effect = SimpleNamespace(sensor='gyroscope')
-    extended = SimpleNamespace(proof=formula_proof(after, fast=fast))
+    extended = SimpleNamespace(proof=formula_proof(after, fast=fast), statistics={})
     calibration = SimpleNamespace(proof=formula_proof(1.0, fast=1.0))
     assert helpful_formulas([effect], extended, calibration) == [effect] * helps

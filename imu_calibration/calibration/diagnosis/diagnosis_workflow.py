@@ -269,7 +269,8 @@ def helpful_formulas(
     """
     Return the formulas with which the error of their sensor on held-out windows is smaller.
 
-    It has to be clearly smaller in total, and not larger in a regime of motion.
+    It has to be clearly smaller in total, and not larger in a regime of motion, also not than that
+    of plain least squares.
 
     Parameters
     ----------
@@ -286,6 +287,8 @@ def helpful_formulas(
         before = calibration.proof.get(effect.sensor)
         after = extended.proof.get(effect.sensor)
         if before is None or after is None:
+            continue
+        if effect.sensor in extended.statistics.get('least_squares', ()):
             continue
         if after['after'] > CLEARLY_BETTER * before['after']:
             continue
@@ -350,6 +353,7 @@ def _with_proposals(source, table, options, result, diagnosis, provenance, reade
         table=table,
         options=chosen,
         provenance=provenance,
+        under_test={effect.sensor for effect in effects},
     ).calibration
 
 
