@@ -186,8 +186,8 @@ ANGLES_PER_TURN = 128
 """Angles per turn at which the residual of a turning joint is sampled."""
 CYCLES_OF_TONE = 3.0
 """Of a tone in a stretch that can show it."""
-MAX_FREQUENCY_SHARE = 0.45
-"""Highest frequency in that of the samples."""
+MAX_ORDER_SHARE = 0.45
+"""Highest order in that of the samples: interpolation to equal angles weakens higher ones."""
 MIN_LINE_POWER, LINE_CHANCE = 4.0, 0.05
 """
 Least power over its surroundings in a stretch, and its probability by noise: e^-4, and more where
@@ -382,9 +382,10 @@ def _stretches(
         if joint is None:
             # Samples that are missing are few: a tone keeps its frequency but for the stretch that
             # they are in.
+            # At half of the rate a wave is real: its power has one degree of freedom.
+            highest = 0.5 / step - FREQUENCY_STEP
             yield from (
-                (piece, step, MAX_FREQUENCY_SHARE / step)
-                for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step)))
+                (piece, step, highest) for piece in _cut(rest, round(1 / (FREQUENCY_STEP * step)))
             )
         elif (
             rate := window.motion.rate[:, joint]
@@ -398,7 +399,7 @@ def _stretches(
                 [np.interp(even, turns[order], axis[order]) for axis in rest.T], axis=1
             )
             fastest = float(np.abs(rate).max()) * step / (2 * np.pi)
-            highest = min(MAX_FREQUENCY_SHARE / fastest, MAX_FREQUENCY_SHARE * ANGLES_PER_TURN)
+            highest = min(MAX_ORDER_SHARE / fastest, MAX_ORDER_SHARE * ANGLES_PER_TURN)
             yield from (
                 (piece, 1 / ANGLES_PER_TURN, highest)
                 for piece in _cut(taken, round(ANGLES_PER_TURN / FREQUENCY_STEP))

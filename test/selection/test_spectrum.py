@@ -13,7 +13,12 @@ from imu_calibration.effects.catalogue import term
 from imu_calibration.kinematics.table import Table
 from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.investigation import investigate
-from imu_calibration.selection.spectrum import _without, find_tones, of_stretches
+from imu_calibration.selection.spectrum import (
+    _stretches,
+    _without,
+    find_tones,
+    of_stretches,
+)
 from imu_calibration.selection.unexplained import IN_MOTION
 
 from worlds.hiding import record
@@ -63,6 +68,31 @@ def test_noise_what_some_motions_do_and_too_few_stretches_are_no_tone(amplitudes
         for tone in of_stretches('gyroscope', stretches(amplitudes), None)
         if tone.share <= 0.5 or tone.p_value * 3 < 1e-4
     ]
+
+
+class TimedWindow(SimpleNamespace):
+    """A window of which the spectrum needs the times only."""
+
+    def __len__(self):
+        """Return the number of samples."""
+        return len(self.time)
+
+
+@pytest.mark.parametrize('frequency', [46.3, 48.9, 49.7])
+@pytest.mark.parametrize('size', [0.8, 0.0])
+def test_a_tone_just_below_half_of_the_rate_is_found(frequency, size):
+    rng, time = np.random.default_rng(7460), STEP * np.arange(40 * 400)
+    rest = rng.normal(size=(len(time), 3))
+    rest[:, 1] += size * np.sin(2 * np.pi * frequency * time)
+    windows = []
+    for part in np.split(np.arange(len(time)), 40):
+        windows.append(TimedWindow(time=time[part], rows=part))
+    parts = [rest[window.rows] for window in windows]
+    tones = list(of_stretches('gyroscope', _stretches(windows, parts, None), None))
+    found = [tone for tone in tones if tone.p_value * 3 < 1e-4]
+    assert len(found) == (size > 0.0)
+    if found:
+        assert found[0].axis == 'y' and found[0].frequency == pytest.approx(frequency, abs=0.11)
 
 
 def test_noise_that_is_not_white_is_no_tone():
