@@ -254,7 +254,7 @@ def continuous_or_discrete(path):
 
 
 def noise_curve(path):
-    identify_recording('rest').plot('gyroscope').save(path.with_suffix('.svg'))
+    identify_recording('rest').plot('gyroscope').save(path.with_suffix('.svg'), force=True)
 
 
 def imu_calib(path):

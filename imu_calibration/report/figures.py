@@ -48,9 +48,21 @@ class Drawn(str):
         """The matplotlib axes; ``axes[0].figure`` is the figure."""
         return self.figure.axes
 
-    def save(self, path: str | PathLike) -> None:
+    def save(self, path: str | PathLike, *, force: bool = False) -> None:
         """
-        Write the figure as PDF, SVG or PNG, by the end of the name; raises InputError for others.
+        Write the figure as PDF, SVG or PNG, by the end of the name.
+
+        Parameters
+        ----------
+        path : path-like
+            An existing file is replaced with `force` only, unless it contains the same figure.
+        force : bool
+
+        Raises
+        ------
+        InputError
+            For another end of the name, and where a file exists or cannot be written.
+
         """
         kind = Path(path).suffix.lower()
         if kind not in ('.pdf', '.svg', '.png'):
@@ -58,10 +70,12 @@ class Drawn(str):
                 f'the name of a figure must end with .pdf, .svg or .png, got {path}; change it',
                 code='figure_suffix',
             )
-        if kind == '.svg':
-            files.write_text(path, str(self))
-        else:
-            files.write_whole(path, self.bytes_as(kind[1:]))
+        content = str(self).encode() if kind == '.svg' else self.bytes_as(kind[1:])
+        # The same input gives the same bytes: a cell of a notebook may run again.
+        if Path(path).is_file() and Path(path).read_bytes() == content:
+            return
+        files.require_new(path, force=force)
+        files.write_whole(path, content, to_disk=kind != '.svg')
 
     def bytes_as(self, kind: str) -> bytes:
         """

@@ -113,6 +113,15 @@ def test_a_figure_is_svg_pdf_axes_and_arrays(result, tmp_path):
         assert (tmp_path / name).read_bytes().startswith(head)
     with refused(InputError, 'figure_suffix', 'p.jpg'):
         drawing.save(tmp_path / 'p.jpg')
+    # The same figure may be written again; a file with other content is not replaced silently.
+    drawing.save(tmp_path / 'p.pdf')
+    other = tmp_path / 'other.svg'
+    other.write_text('notes')
+    with refused(InputError, 'file_exists', 'other.svg'):
+        drawing.save(other)
+    assert other.read_text() == 'notes'
+    drawing.save(other, force=True)
+    assert other.read_bytes().startswith(b'<svg ')
     assert drawing.bytes_as('pdf') == drawing.bytes_as('pdf')
     left, right = drawing.data
     axis, _, values = cause_of(result.diagnosis, 'gyroscope', ('force',))
