@@ -5,7 +5,7 @@ By equal steps or by least squares over the stamps, and its error.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -55,6 +55,8 @@ POSSIBLE = 3.0
 Standard deviation of each component of the angular acceleration before any motion was seen,
 rad/s^2: robots and vehicles that start a turn have 1 to 5 rad/s^2.
 """
+POSSIBLE_RATE = 0.5
+"""Standard deviation of each component of the rate in motion, rad/s, as for POSSIBLE."""
 START_SPAN = 0.01, 0.05
 """
 Seconds between the oldest and the newest reading from which the size of the derivative is estimated
@@ -81,6 +83,50 @@ WITHOUT = (
 
 
 @dataclass(frozen=True, eq=False)
+class MotionEvidence:
+    """Rate and its slopes so far, which show whether the rate changes at all."""
+
+    rate: np.ndarray
+    """Newest rate less the bias of the gyroscope, rad/s, shape (3,)."""
+    moment: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    """Mean of slope times slope, (rad/s^2)^2, shape (3, 3)."""
+    noise_gain: float = 0.0
+    """The noise of a slope is this times the covariance of the rate, 1/s^2."""
+    n_slopes: float = 0.0
+    """Number of independent slopes; 0: one reading only."""
+
+    def chance_of_motion(self, rate_cov: np.ndarray) -> float:
+        """
+        Return the probability that the rate changes, given the readings, from equal priors.
+
+        Hypotheses for the rate w and its slope b, with covariances N and g N of their noise::
+
+            rest            w = 0,               b = 0
+            constant rate   w ~ POSSIBLE_RATE,   b = 0
+            motion          w ~ POSSIBLE_RATE,   b ~ POSSIBLE (standard deviations per component)
+
+        A Gaussian of sd s that is tested with a much smaller noise n loses against zero by
+        ``log(s / n)`` per component, and wins by half the excess of its square over the noise. A
+        square below that of the noise is no further evidence.
+        """
+        if np.min(np.linalg.eigvalsh(rate_cov)) <= 0.0:
+            return 1.0
+        precision = np.linalg.inv(rate_cov)
+        volume = 0.5 * np.linalg.slogdet(rate_cov)[1]
+        for_constant = -np.inf
+        steady = 0.0
+        if self.n_slopes:
+            excess = np.trace(precision @ self.moment) / self.noise_gain - 3.0
+            noise_volume = volume + 1.5 * np.log(self.noise_gain)
+            steady = max(3.0 * np.log(POSSIBLE) - noise_volume, 0.0)
+            steady -= 0.5 * self.n_slopes * max(excess, 0.0)
+            for_constant = steady
+        excess = float(self.rate @ precision @ self.rate) - 3.0
+        for_rest = steady + max(3.0 * np.log(POSSIBLE_RATE) - volume, 0.0) - 0.5 * max(excess, 0.0)
+        return float(np.exp(-np.logaddexp.reduce([0.0, for_constant, for_rest])))
+
+
+@dataclass(frozen=True, eq=False)
 class SlopeError:
     """Error of the derivative in the present motion, in addition to its noise."""
 
@@ -97,15 +143,32 @@ class SlopeError:
     Weights of the newest to the oldest reading in the derivative, 1/s, shape (n,); None: those of
     the full window.
     """
+    evidence: MotionEvidence | None = None
+    """What the readings show of a motion; None: it is certain."""
 
     def covariance(self, rate_cov: np.ndarray) -> np.ndarray:
         """
         Return the covariance of the error without the noise, not negative in any direction.
 
-        Shape (3, 3).
+        Shape (3, 3). Without a motion there is no error: it counts with the chance of a motion.
         """
         sizes, directions = np.linalg.eigh(self.moment - self.noise_gain * rate_cov)
-        return (directions * np.maximum(sizes, 0.0)) @ directions.T
+        covariance = (directions * np.maximum(sizes, 0.0)) @ directions.T
+        if self.evidence is None:
+            return covariance
+        return self.evidence.chance_of_motion(rate_cov) * covariance
+
+
+@dataclass(frozen=True, eq=False)
+class FirstSlope:
+    """Slope of the rate over the first readings."""
+
+    slope: np.ndarray
+    """rad/s^2, shape (3,)."""
+    spread: float
+    """Sum of the squared distances of the stamps from their mean, s^2; 0: no slope."""
+    seconds: float
+    """From the oldest to the newest reading, s."""
 
 
 class RateSlope:
@@ -126,6 +189,8 @@ class RateSlope:
         Returns the CausalDerivative for a period in s.
     changed : callable
         Called when another derivative is in use, or none.
+    bias : sequence of 3 floats
+        Of the readings, rad/s.
 
     """
 
@@ -133,8 +198,10 @@ class RateSlope:
         self,
         choose: Callable[[float], CausalDerivative],
         changed: Callable[[], None] = lambda: None,
+        bias: Sequence[float] = (0.0, 0.0, 0.0),
     ):
         self._choose, self._changed = choose, changed
+        self._bias = np.array(bias)
         self.line: StampLine | None = None
         """Class of the stamps; None while they are too few."""
         self.derivative: CausalDerivative | None = None
@@ -322,8 +389,40 @@ class RateSlope:
         The error of a delayed derivative is the change of the true one in that time, estimated a
         delay later: ``alpha(t + delay) - alpha(t)``. Without one the error is the whole derivative:
         its size before the gap, or from the rate over `ROUGH` seconds; also after a change of the
-        stamps, until there is new motion. Before any motion was seen it is `POSSIBLE`.
+        stamps, until there is new motion. Before any motion was seen it is `POSSIBLE`, unless the
+        rates exclude a motion (`MotionEvidence`).
         """
+        error = self._error()
+        return replace(error, evidence=self._evidence())
+
+    def _evidence(self) -> MotionEvidence | None:
+        """Return what the rate and its slopes show of a motion; None without a derivative."""
+        if self._newest is None:
+            return None
+        rate = np.array(self._reading) - self._bias
+        if self.line is None:
+            # The only slope is the one over all readings.
+            first = self._slope_at_start()
+            if not first.spread:
+                return MotionEvidence(rate)
+            moment = np.outer(first.slope, first.slope)
+            return MotionEvidence(rate, moment, 1.0 / first.spread, 1.0)
+        if self.derivative is None or self._tracker is None:
+            return None
+        slopes = _known(self._recent_slopes(self._tracker))
+        if len(slopes):
+            # Slopes of windows that share no reading are independent.
+            gain = float(self.derivative.weights @ self.derivative.weights)
+            n_slopes = max(len(slopes) / self._tracker.taps, 1.0)
+            return MotionEvidence(rate, _moment(slopes), gain, n_slopes)
+        weights = CausalDerivative(max(self._tracker.n_used, 2), self._tracker.period).weights
+        slope = np.array(self._slope)
+        if self._tracker.n_used < 2 or not slope.any():
+            return None
+        return MotionEvidence(rate, np.outer(slope, slope), float(weights @ weights), 1.0)
+
+    def _error(self) -> SlopeError:
+        """Return the error of the derivative if there is a motion."""
         recent = np.array(list(self._recent)).reshape(-1, 3)
         if self.line is None:
             return self._size_at_start()
@@ -334,9 +433,7 @@ class RateSlope:
         n_used = self._tracker.n_used
         if not n_used:
             return replace(self._size_of_all(recent), weights=np.zeros(1))
-        if n_used == self._tracker.taps:
-            n_present = PRESENT_SPAN / self._tracker.period
-            recent = recent[-int(max(n_present, RECENT_SPAN[1])) :]
+        recent = self._recent_slopes(self._tracker)
         # A window with fewer samples has a shorter delay.
         weights = CausalDerivative(n_used, self._tracker.period).weights
         late = (n_used - 1) / 2
@@ -352,27 +449,45 @@ class RateSlope:
         apart = np.convolve(self.derivative.weights, [1.0] + [0.0] * (lag - 1) + [-1.0])
         return SlopeError(share * _moment(change), share * float(apart @ apart), weights)
 
-    def _size_at_start(self) -> SlopeError:
-        """
-        Return the size of the derivative before the kind of the stamps is known.
+    def _recent_slopes(self, tracker: StampedDerivative | TimedDerivative) -> np.ndarray:
+        """Return the recent derivatives; of a full window the ones in the present motion."""
+        recent = np.array(list(self._recent)).reshape(-1, 3)
+        if tracker.n_used < tracker.taps:
+            return recent
+        n_present = PRESENT_SPAN / tracker.period
+        return recent[-int(max(n_present, RECENT_SPAN[1])) :]
 
-        With the least-squares slope b over stamps t of the last readings, ``E[alpha alpha'] = b b'
-        + N / Sxx``, ``Sxx = sum((t - mean t)^2)``, N the covariance of the rate.
+    def _slope_at_start(self) -> FirstSlope:
+        """
+        Return the least-squares slope b over stamps t of the last readings.
+
+        Its covariance is ``N / Sxx``, ``Sxx = sum((t - mean t)^2)``, N the covariance of the rate.
         """
         n = min(len(self._stamps), len(self._recent))
-        least, most = START_SPAN
+        most = START_SPAN[1]
         stamps = np.array(list(self._stamps)[len(self._stamps) - n :], np.int64)
         readings = np.array(list(self._recent)[len(self._recent) - n :]).reshape(-1, 3)
         if n:
             age = (stamps.max() - stamps) * 1e-9
             stamps, readings = stamps[age <= most], readings[age <= most]
-        if not len(stamps) or np.ptp(stamps) * 1e-9 < least:
-            return SlopeError(POSSIBLE**2 * np.eye(3), weights=np.zeros(1))
+        if not len(stamps) or not np.ptp(stamps):
+            return FirstSlope(np.zeros(3), 0.0, 0.0)
         time = (stamps - stamps[0]) * 1e-9
         time = time - time.mean()
         spread = float(time @ time)
-        slope = time @ readings / spread
-        return SlopeError(np.outer(slope, slope), -1.0 / spread, np.zeros(1))
+        return FirstSlope(time @ readings / spread, spread, np.ptp(stamps) * 1e-9)
+
+    def _size_at_start(self) -> SlopeError:
+        """
+        Return the size of the derivative before the kind of the stamps is known.
+
+        ``E[alpha alpha'] = b b' + N / Sxx`` with the slope b of `_slope_at_start`.
+        """
+        first = self._slope_at_start()
+        if first.seconds < START_SPAN[0]:
+            return SlopeError(POSSIBLE**2 * np.eye(3), weights=np.zeros(1))
+        moment = np.outer(first.slope, first.slope)
+        return SlopeError(moment, -1.0 / first.spread, np.zeros(1))
 
     def _size_of_all(self, rates: np.ndarray) -> SlopeError:
         """Return the size of the derivative, from rates, or from the derivative in use."""

@@ -71,7 +71,10 @@ class CompensationStream:
             )
         self._vibration = BandVariance() if model.uses('vibration') else None
         self.count, self.flagged, self.frame_id = 0, 0, ''
-        self.slope = RateSlope(partial(derivative_for, calibration, transfer=transfer))
+        self.slope = RateSlope(
+            partial(derivative_for, calibration, transfer=transfer),
+            bias=calibration.of('gyroscope', Role.OFFSET),
+        )
         self._uncertainty = Uncertainty(calibration, transfer)
         self._inverse_rate = np.linalg.inv(calibration.of('gyroscope', Role.LINEAR))
         self._fastest, self._temperatures = 0.0, []
@@ -407,7 +410,9 @@ class SampleCompensation:
             self.needs_slope or self._shakes or calibration.knows_density
         )  # the stamps determine the noise of a sample
         self.slope = RateSlope(
-            partial(derivative_for, calibration, transfer=transfer), self._take_derivative
+            partial(derivative_for, calibration, transfer=transfer),
+            self._take_derivative,
+            self.at_zero['gyroscope'],
         )
         self._kernel = make_kernel(calibration, transfer)
         self.last: tuple[Any, ...] = (

@@ -954,9 +954,16 @@ SIGNS = _of(
     ),
     (
         'unknown angular acceleration left out of the published covariance',
-        'RateSlope.error',
+        'RateSlope._error',
         'replace(self._size_of_all(_1), weights=np.zeros(1))',
         'SlopeError()',
+        'test_covariance_of_a_new_slope.py',
+    ),
+    (
+        'motion that the rates exclude kept in the published covariance',
+        'SlopeError.covariance',
+        'self.evidence.chance_of_motion(_1) * _2',
+        '_2',
         'test_covariance_of_a_new_slope.py',
     ),
     (
