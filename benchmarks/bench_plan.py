@@ -238,7 +238,7 @@ def main():
         help='print the targets of the six stands with so many sessions instead',
     )
     parser.add_argument('--stands', nargs='*', choices=STANDS, default=STANDS)
-    add_smallest(parser, tables=1, seeds=1)
+    add_smallest(parser, tables=1, first=5, seeds=1)
     options = parser.parse_args()
     if options.sessions:
         return stands(options.sessions, options.first, options.stands)

@@ -9,6 +9,7 @@ os.environ.setdefault(
 )  # before numpy comes: threads that wait for each other take minutes on a busy machine
 
 import pytest  # noqa: E402
+from few_candidates import FEW, restricted  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The same examples every time, and no failure because the machine is busy.
@@ -31,37 +32,15 @@ def recordings():
     return folder
 
 
-FEW = (
-    'accel_quadratic',
-    'accel_cubic',
-    'accel_bias_drift',
-    'gyro_g_sensitivity',
-    'gyro_bandwidth',
-    'gyro_bias_drift',
-    'time_offset',
-)
-
-
 @pytest.fixture(scope='module')
 def few_candidates(request):
     """
     Restrict the candidates of each search on a table to a few effects.
 
-    These are effects of users and `FEW` of the module or of this file, and this needs a third of
-    the time.
+    These are effects of users and `FEW` of the module or of `few_candidates.py`, and this needs a
+    third of the time.
     """
-    from imu_calibration.effects.catalogue import CATALOGUE
-    from imu_calibration.selection import investigation
-
-    every, few_names = investigation.testable_effects, getattr(request.module, 'FEW', FEW)
-    left_out = {name for _, name in CATALOGUE.effects()} - set(few_names)
-
-    def few(*arguments):
-        effects, not_testable = every(*arguments)
-        return [effect for effect in effects if effect.name not in left_out], not_testable
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(investigation, 'testable_effects', few)
+    with restricted(getattr(request.module, 'FEW', FEW)):
         yield
 
 

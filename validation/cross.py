@@ -27,6 +27,8 @@ RECORDINGS = (
 )
 ONE_UNIT = (('shaft_roll_fast', 'shaft_roll_fast_later'),)
 """Two parts of one trial: one unit, one mounting, one motion."""
+LONGEST = None
+"""Seconds that are used of each recording; None for all."""
 WORSE = 1.05
 """No kind of motion may get worse by more."""
 
@@ -39,7 +41,12 @@ def recording(folder, name):
         field: [getattr(block, field) for block in blocks if getattr(block, field) is not None]
         for field in ('imu', 'joints')
     }
-    return table, SampleBlock(*(type(part[0]).concatenate(part) for part in parts.values()))
+    imu, joints = (type(part[0]).concatenate(part) for part in parts.values())
+    if LONGEST is not None:
+        end = imu.stamp_ns[0] + int(1e9 * LONGEST)
+        imu = imu.select(imu.stamp_ns < end)
+        joints = joints.select(joints.stamp_ns < end)
+    return table, SampleBlock(imu, joints)
 
 
 def halves(block):

@@ -210,7 +210,7 @@ KINDS: dict[str, Callable[..., Any]] = {
 }
 
 
-def simulated(seeds=SEEDS) -> Iterator[Outcome]:
+def simulated(seeds) -> Iterator[Outcome]:
     """Yield the outcomes of simulated sessions of every kind."""
     for name, make in KINDS.items():
         for seed in seeds:
@@ -307,7 +307,7 @@ def run(folder, plots):
         ' counted, which are not independent.'
     )
     add_claims(section, SESSIONS['real'], list(real(folder)))
-    add_claims(section, SESSIONS['simulated'], list(simulated()))
+    add_claims(section, SESSIONS['simulated'], list(simulated(SEEDS)))
     return section
 
 

@@ -84,7 +84,7 @@ def main(arguments=None):
     add_smallest(
         parser,
         parts=('effects',),
-        effects='gyro_quadratic',
+        effects='gyro_g_sensitivity',
         grades=('tactical',),
         noise=('white',),
         processes=1,

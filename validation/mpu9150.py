@@ -27,6 +27,8 @@ from validation.section import Section, listed, text
 NAME = 'mpu9150_0'
 TURNS = ('mpu9150_0', 'mpu9150_3')
 """Recordings whose left-out turns are compared."""
+LEFT_OUT = None
+"""Turns of a recording that are left out, one at a time; None for all."""
 
 
 def figures(folder):
@@ -75,7 +77,8 @@ def left_out_turns(imu, gravity):
     force = np.array([imu.force_s[rest].mean(axis=0) for rest in ranges])
     up, step = fit_norm(force, gravity).directions(force), 1e-9 * np.diff(imu.stamp_ns)
     middle = [(rest.start + rest.stop) // 2 for rest in ranges]
-    for begin, end, before, after in zip(middle, middle[1:], up, up[1:]):
+    turns = list(zip(middle, middle[1:], up, up[1:]))
+    for begin, end, before, after in turns[:LEFT_OUT]:
         for name, method in methods.items():
             gyroscope = method(imu, ranges, gravity, slice(begin, end))[1]
             rotated = (

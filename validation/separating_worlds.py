@@ -230,7 +230,7 @@ def main() -> None:
     parser.add_argument('--first-seed', type=int, default=0)
     parser.add_argument('--effects', type=lambda text: text.split(','), default=HIDDEN)
     parser.add_argument('--most', type=int, default=400, help='worlds that are tried at most')
-    add_smallest(parser, worlds=1, most=1)
+    add_smallest(parser, worlds=1, most=1, first_seed=1)
     options = parser.parse_args()
     rows, tried = [], 0
     for world in islice(worlds(options.first_seed, options.effects), options.most):
@@ -248,13 +248,15 @@ def main() -> None:
         )
         if len(rows) == options.worlds:
             break
-    seconds = [row['seconds'] for row in rows if 'seconds' in row]
+    right = sum(row['right'] for row in rows)
+    one_cause = sum(row.get('one_cause', False) and not row['right'] for row in rows)
     print(
-        f'{tried} worlds, {len(rows)} with a class; a single, right name in'
-        f" {sum(row['right'] for row in rows)}, one cause by the plan's own word in "
-        f'{sum(row.get("one_cause", False) and not row["right"] for row in rows)}; '
-        f'motion median {np.median(seconds):.0f} s, largest {max(seconds):.0f} s'
+        f'{tried} worlds, {len(rows)} with a class; a single, right name in {right}, one cause by'
+        f" the plan's own word in {one_cause}"
     )
+    seconds = [row['seconds'] for row in rows if 'seconds' in row]
+    if seconds:
+        print(f'motion median {np.median(seconds):.0f} s, largest {max(seconds):.0f} s')
 
 
 if __name__ == '__main__':
