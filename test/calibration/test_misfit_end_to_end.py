@@ -19,6 +19,7 @@ WORSE = 1.05
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures('few_candidates')
 @pytest.mark.parametrize(
     ('cause', 'world'),
     [
