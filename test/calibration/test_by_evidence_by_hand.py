@@ -66,11 +66,11 @@ def test_diagnose_hands_over_what_calibrate_does(bent, asked):
 @pytest.mark.long
 def test_live_it_is_in_the_model_as_well(bent, asked):
     live = make_live()
-    run(live, bent[0])
+    poses = run(live, bent[0])
     result = live.solve(pending=True)
     assert result.calibration.statistics['added'] == [QUADRATIC]
     assert_same(result, asked.result)
-    residual = live.residuals(run(make_live(), bent[0]))
+    residual = live.residuals(poses)
     assert (
         np.abs(residual.rate_s).max() < 5e-3
     )  # noise of a mean over two seconds, 2e-4, and the bias of each pose

@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from few_candidates import restricted
 from refusal import refused
 from scipy.stats import chi2
 
@@ -26,6 +27,8 @@ from imu_calibration.selection.residual_analysis import inquire
 from worlds.diagnosing import diagnose
 from worlds.hiding import Sizes, record
 
+FOLLOWING = ('accel_thermal_bias', 'accel_thermal_scale', 'accel_bias_drift', 'gyro_thermal_bias')
+"""Candidates whose columns change with the temperature or the time."""
 SEED, QUICK = 3, {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
 
 
@@ -144,6 +147,7 @@ def test_document_holds_what_the_contract_asks_for(sizes):
 
 
 @pytest.mark.long
+@restricted(FOLLOWING)
 def test_a_bias_that_follows_the_thermometer_is_named_beside_a_wander_and_a_wander_is_noise():
     """
     Fifteen mm/s^2 over eight kelvins in addition to a wander, and the wander by itself.
