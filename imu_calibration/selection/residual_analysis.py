@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.core.progress import report
-from imu_calibration.effects.base import AXES
+from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
@@ -22,7 +22,7 @@ from imu_calibration.selection.proposals import Proposal, find_formulas, propose
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.regimes import RestRegime, find_regimes
 from imu_calibration.selection.residual_blocks import BlockFits, RestBlocks, rest_blocks
-from imu_calibration.selection.spectrum import find_tones
+from imu_calibration.selection.spectrum import find_sway, find_tones
 from imu_calibration.selection.stamp_jitter import StampJitter
 from imu_calibration.selection.unexplained import Unexplained, beyond_noise, unexplained
 
@@ -172,6 +172,9 @@ class ResidualAnalysis(Investigation):
             self.table,
             [proposal for proposal in self.proposals.values() if proposal is not None],
         )
+        sway = find_sway(self.blocks[SENSORS[0]], self.fits(SENSORS[0]))
+        if sway is not None:
+            tones[SENSORS[0]] = (sway, *tones[SENSORS[0]])
         return {
             sensor: self._unexplained(sensor, replace(rest, tones=tones[sensor]))
             for sensor, rest in self.rests.items()

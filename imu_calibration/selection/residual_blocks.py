@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cholesky, solve_triangular, svd
 
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.effects.forward_equations import References
@@ -388,6 +388,8 @@ AMPLITUDE_PRIOR_SD = 1e6
 Prior sd of amplitudes; unit: the amplitude that equals one standard deviation of noise in all
 blocks.
 """
+IMITATED = 1e-6
+"""Least singular value of the scaled columns of the catalogue, relative to the largest one."""
 SHARE_RESAMPLES = 500
 LEAST_OF_AXIS = 0.1
 """Share of the strongest axis' squares from which another axis has an excess too."""
@@ -476,6 +478,32 @@ class BlockFits:
         return BlockFit(
             amplitudes, sds, np.stack(rests, axis=1), self.blocks.window[self.blocks.locked]
         )
+
+    def outside_catalogue(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return (columns, residual) without all that the columns of the catalogue can imitate.
+
+        Whitened, of the selection windows, the three axes one after the other: shape (3 n, k) and
+        (3 n,).
+
+        Parameters
+        ----------
+        columns : array, shape (b, k, 3)
+
+        """
+        left_columns = []
+        left_residual = []
+        for axis in range(3):
+            design = self._design[0][axis]
+            scale = np.linalg.norm(design[:, :-1], axis=0)
+            basis, sizes = svd(design[:, :-1] / np.where(scale > 0, scale, 1), full_matrices=False)[
+                :2
+            ]
+            basis = basis[:, sizes > IMITATED * sizes.max()]
+            rows = self.blocks.white[0](columns[:, :, axis], axis)
+            left_columns.append(rows - basis @ (basis.T @ rows))
+            left_residual.append(design[:, -1] - basis @ (basis.T @ design[:, -1]))
+        return np.concatenate(left_columns), np.concatenate(left_residual)
 
     def axes(self) -> tuple[str, ...]:
         """

@@ -6,13 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.core.distributions import binom_sf, f_sf
-from imu_calibration.core.units import DEG, for_people, significant
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.proposals import Proposal
-from imu_calibration.selection.residual_blocks import residuals
+from imu_calibration.selection.residual_blocks import (
+    BlockFits,
+    RestBlocks,
+    residuals,
+    share_removed,
+)
 
 LOWEST_ORDER, HIGHEST_ORDER = 4, 64
 """Orders under test; lower ones are formulas."""
@@ -225,10 +230,19 @@ class Tone:
     """Mean power of the axis there, over that around it, shape (n,)."""
     rested: bool = False
     """Whether the recording contains rest, so that a fixed frequency is independent of motion."""
+    tilts: bool = False
+    """Whether it is a tilt of the level frame, which turns the direction of gravity."""
 
     @property
     def text(self) -> str:
         """Description."""
+        if self.tilts:
+            angle, unit = for_people('rad')
+            size = f'{significant(self.amplitude / STANDARD_GRAVITY * angle, 2)} {unit}'
+            return (
+                f'the level frame tilts with a period of {significant(1 / self.frequency)} s by'
+                f' {size}, mostly on {self.sensor} {self.axis}: the floor or the table sways'
+            )
         factor, unit = for_people('m/s^2' if self.sensor == SENSORS[0] else 'rad/s')
         where = f'on {self.sensor} {self.axis}, {significant(self.amplitude * factor, 2)} {unit}'
         if self.joint is None:
@@ -483,3 +497,84 @@ def _powers(rest, size, inside):
         else:
             around[rows] = np.maximum(np.median(power[rows], axis=0) / np.log(2), 1e-300)
     return power, around, inside
+
+
+SWAY_CYCLES = 3.0
+"""Least number of cycles of a sway in a recording."""
+FASTEST_SWAY = 0.1
+"""Highest frequency of a sway, Hz: at rest a window is one mean."""
+SWAY_STEPS = 2.0
+"""Frequencies under test, per inverse duration."""
+SWAY_SHARE = 0.2
+"""Least share of the excess that a sway removes from windows that were held out."""
+LIKE_THE_JOINTS = 0.5
+"""Share of a wave that the joints may follow: their motion has the same period then."""
+
+
+def find_sway(blocks: RestBlocks, fits: BlockFits) -> Tone | None:
+    """
+    Return the periodic tilt of the level frame in the residual of the accelerometer, None without.
+
+    A tilt by the small angle ``a(t)`` about horizontal axes changes the specific force at rest by
+    ``a x g``, a horizontal vector of the level frame. Its components are ``A cos(2 pi f t) + B
+    sin(2 pi f t)``; the frequency with the largest gain is tested by an F test, and on windows that
+    were held out.
+    """
+    duration = float(np.ptp(blocks.time))
+    frequencies = np.arange(SWAY_CYCLES / duration, FASTEST_SWAY, 1 / (SWAY_STEPS * duration))
+    if not len(frequencies):
+        return None
+    ref = blocks.ref
+    horizontal = np.moveaxis(ref.mat_sn[:, :, :2], 1, 2)  # (rows, two level axes, axes of s)
+    waves = [np.exp(2j * np.pi * frequency * ref.time) for frequency in frequencies]
+    columns = []
+    for wave in waves:
+        turned = wave[:, None, None] * horizontal
+        columns.append(blocks.means(np.concatenate([turned.real, turned.imag], axis=1)))
+
+    # Fall of the sum of squares by the four amplitudes of each frequency.
+    count = columns[0].shape[1]
+    every, residual = fits.outside_catalogue(np.concatenate(columns, axis=1))
+    falls = []
+    for place in range(len(frequencies)):
+        basis = np.linalg.qr(every[:, place * count : (place + 1) * count])[0]
+        falls.append(float(np.sum((basis.T @ residual) ** 2)))
+    best = int(np.argmax(falls))
+    own = slice(best * count, (best + 1) * count)
+    total = float(residual @ residual)
+    spare = len(residual) - 3 * max(design.shape[1] for design in blocks.design) - count
+    if spare < len(residual) / 2:
+        return None
+    scatter = max(total - falls[best], 1e-300) / spare
+    p_value = float(f_sf(falls[best] / count / scatter, count, spare)) * len(frequencies)
+    if p_value > TONE_P_VALUE or _follows_joints(waves[best], ref.joint_angle):
+        return None
+    share = share_removed(fits.fit(), fits.fit(columns[best]))
+    if share < SWAY_SHARE:
+        return None
+
+    values = np.linalg.lstsq(every[:, own], residual, rcond=None)[0]
+    on_axes = np.sqrt(np.mean(np.einsum('bka,k->ba', columns[best], values) ** 2, axis=0))
+    return Tone(
+        blocks.sensor,
+        AXES[int(np.argmax(on_axes))],
+        None,
+        float(frequencies[best]),
+        float(np.linalg.norm(values)),
+        p_value,
+        share,
+        frequencies,
+        np.array(falls) / count / scatter,
+        tilts=True,
+    )
+
+
+def _follows_joints(wave, angles):
+    """Return whether the joints move with the period of a wave."""
+    if angles is None:
+        return False
+    design = np.column_stack([np.ones(len(wave)), angles, np.cos(angles), np.sin(angles)])
+    target = np.column_stack([wave.real, wave.imag])
+    target = target - target.mean(axis=0)
+    left = target - design @ np.linalg.lstsq(design, target, rcond=None)[0]
+    return bool(1 - np.sum(left**2) / np.sum(target**2) > LIKE_THE_JOINTS)

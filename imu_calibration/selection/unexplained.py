@@ -28,6 +28,8 @@ ALPHA = 1e-4
 """Significance that a correlation must have."""
 IN_MOTION = 'motion (moving windows against windows at rest)'
 """Name of the variable that separates moving windows from windows at rest."""
+TEMPERATURE_LAGS = (15, 30, 45, 60, 90, 120, 180, 300)
+"""Times by which the output may follow the temperature late, s."""
 MUCH_SCATTER = 10.0
 """
 Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of
@@ -247,20 +249,37 @@ def slow_explanations(
     time: np.ndarray, temperature: np.ndarray
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """
-    Yield (name, columns, mask) of time, steps in time, and temperature.
+    Yield (name, columns, mask) of time, steps in time, temperature, its rate and its past.
 
-    Temperature is given where it is known and changes.
+    Temperature is given where it is known and changes: a sensor is warmer or colder than its
+    thermometer as long as heat flows.
+
+    Parameters
+    ----------
+    time, temperature : array, shape (k,)
+        s, in order, and degrees Celsius.
+
     """
     every = np.ones(len(time), bool)
-    time = (time - time.mean()) / max(np.ptp(time), 1e-9)
-    yield 'time', np.stack([time, time**2, time**3], axis=1), every
-    yield (
-        'time',
-        np.stack(
-            [time > level for level in np.quantile(time, (0.2, 0.35, 0.5, 0.65, 0.8))], axis=1
-        ).astype(float),
-        every,
-    )
-    if np.all(np.isfinite(temperature)) and np.ptp(temperature) > 0.5:
-        warm = (temperature - temperature.mean()) / np.ptp(temperature)
-        yield 'temperature', np.stack([warm, warm**2], axis=1), every
+    share = (time - time.mean()) / max(np.ptp(time), 1e-9)
+    yield 'time', np.stack([share, share**2, share**3], axis=1), every
+    levels = np.quantile(share, (0.2, 0.35, 0.5, 0.65, 0.8))
+    steps = np.stack([share > level for level in levels], axis=1)
+    yield 'time', steps.astype(float), every
+    if not np.all(np.isfinite(temperature)) or np.ptp(temperature) <= 0.5:
+        return
+    warm = (temperature - temperature.mean()) / np.ptp(temperature)
+    yield 'temperature', np.stack([warm, warm**2], axis=1), every
+
+    # The rate over twice the shortest lag, so that noise of the thermometer averages.
+    shortest = TEMPERATURE_LAGS[0]
+    later = np.interp(time + shortest, time, warm)
+    rate = (later - np.interp(time - shortest, time, warm)) / (2 * shortest)
+    within = (time - time[0] >= shortest) & (time[-1] - time >= shortest)
+    yield 'temperature rate', rate[:, None], within
+    for lag in TEMPERATURE_LAGS:
+        known = time - time[0] >= lag
+        if 2 * np.count_nonzero(known) < len(time):
+            return
+        earlier = np.interp(time - lag, time, warm)
+        yield f'the temperature {lag} s earlier', earlier[:, None], known

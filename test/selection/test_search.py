@@ -964,3 +964,23 @@ def test_noise_goes_with_nothing():
         rests.correlate(iter(curves), rng.normal(size=(60, 3)) + 1.5 * curves[3][1][:, :1])[0]
         == 'curve 3'
     )
+
+
+@pytest.mark.parametrize('lag', [0, 45, 90])
+def test_a_bias_that_follows_the_temperature_late_is_named(lag):
+    """The thermometer warms up, cools and warms up; the sensor follows it later."""
+    rng = np.random.default_rng(7462)
+    time = np.sort(rng.uniform(0, 900, 200))
+
+    def temperature(t):
+        return 25 + 6 * (1 - np.exp(-t / 200)) + 2 * np.sin(t / 70)
+
+    late = np.outer(temperature(time - lag) - 25, [1.0, -0.5, 0.2])
+    measured = temperature(time) + rng.normal(0, 0.02, len(time))
+    residual = late + rng.normal(0, 0.3, late.shape)
+    name, share = rests.correlate(rests.slow_explanations(time, measured), residual)
+    assert name == (f'the temperature {lag} s earlier' if lag else 'temperature') and share > 0.8
+    # With the temperature itself in the model, its rate is left.
+    beside = residual - np.outer(measured - 25, [1.0, -0.5, 0.2])
+    name, share = rests.correlate(rests.slow_explanations(time, measured), beside)
+    assert {0: None, 45: 'temperature rate'}.get(lag, name) == name

@@ -13,6 +13,7 @@ from imu_calibration.effects.catalogue import term
 from imu_calibration.kinematics.table import Table
 from imu_calibration.report.figures import draw_tones
 from imu_calibration.selection.investigation import investigate
+from imu_calibration.selection.residual_analysis import ResidualAnalysis
 from imu_calibration.selection.spectrum import (
     _stretches,
     _without,
@@ -25,7 +26,7 @@ from worlds.hiding import record
 from worlds.physics import make_session
 from worlds.physics_beyond import Machine
 from worlds.physics_cause import Cause
-from worlds.physics_draw import MG
+from worlds.physics_draw import ARCMIN, MG
 
 STEP = 0.01
 
@@ -230,3 +231,32 @@ def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
         'unexplained'
         not in imu.calibrate(empty.block, Table.from_mapping(empty.table)).calibration.statistics
     )
+
+
+class Sway(Cause):
+    """The floor tilts to and fro by 3 arcmin with a period of 21 s, about a level axis."""
+
+    PERIOD, ANGLE = 21.0, 3.0 * ARCMIN
+
+    def added(self, world, temperature_c, force_s, rate_s, alpha_s):
+        """Return the change of the specific force and the rate of the floor, in s."""
+        phase = 2 * np.pi * world.time / self.PERIOD + 0.7
+        axis = self.size * self.ANGLE * np.array([0.8, -0.6, 0.0])
+        tilt = np.outer(np.sin(phase), axis)
+        rate = np.outer(2 * np.pi / self.PERIOD * np.cos(phase), axis)
+        # the level frame turns by the tilt: its vectors seen from the sensor turn back
+        return -world.to_sensor(np.cross(tilt, world.force_n)), world.to_sensor(rate)
+
+
+@pytest.mark.usefixtures('few_candidates')
+@pytest.mark.parametrize('size', [1.0, 0.0])
+def test_a_sway_of_the_floor_is_named_with_its_period_and_size(size):
+    recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(size))
+    found = investigate(recording.windows, recording.table, recording.model)
+    tones = ResidualAnalysis.of(found, recording.table).unexplained['accelerometer'].tones
+    sways = [tone for tone in tones if tone.tilts]
+    assert len(sways) == size
+    if sways:
+        assert 1 / sways[0].frequency == pytest.approx(Sway.PERIOD, rel=0.03)
+        assert sways[0].amplitude / 9.8 == pytest.approx(Sway.ANGLE, rel=0.2)
+        assert sways[0].p_value < 1e-6
