@@ -10,18 +10,69 @@ from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 LEAST_STEPS = 4.0
 """Steps of the converter within the scatter, at least: below, its quantiles are those of steps."""
-LEAST_EXCESS, EXCESS_SDS = 0.03, 5.0
-"""Least excess of the standard deviation over that of the quartiles, as a share and in its sds."""
-RATIO_SD = 1.2
-"""sd of the ratio of both for Gaussian noise, times the root of the number of differences."""
+LEAST_EXCESS, EXCESS_SDS = 0.015, 4.5
+"""Least excess of the standard deviation over that of a core, as a share and in its sds."""
+CORE_STEPS = 40
+"""Iterations of the scale of a core; each reduces its error by a third or more."""
+HIGH_BYTE = 256
+"""Steps of the converter by which a torn register read differs."""
+SMALLEST_TORN, LARGEST_TORN = 2.5, 10.0
+"""
+Standard deviations of an error by a torn read that tails can have: smaller errors lie in the
+core, and larger ones are outliers, which are excluded before.
+"""
+MEAN_DEVIATION = 0.8
+"""Mean of the absolute value of a standard normal variable."""
+BLOCK = 8
+"""Neighbouring readings whose mean is subtracted: motion and drift are slower."""
 REPEATED = 0.05
 """Share of repeated readings above which they are named."""
 TOGETHER = 0.9
 """Where an axis repeats its reading, the other axes do in at least this share: no chance."""
-LEAST_DIFFERENCES = 1024
-"""Differences that change the reading, at least, for the quartiles."""
-MOST_DIFFERENCES = 200_000
-"""Differences that are kept for the quartiles."""
+LEAST_READINGS = 1024
+"""Readings of the core, at least."""
+MOST_READINGS = 200_000
+"""Readings that are kept."""
+
+
+@dataclass(frozen=True)
+class Core:
+    """Readings about the centre, whose scale does not depend on the tails."""
+
+    limit: float
+    """Standard deviations within which a reading belongs to the core."""
+    mean_square: float
+    """Mean square of a standard normal variable within the limit."""
+    ratio_sd: float
+    """
+    sd of the ratio of both standard deviations for Gaussian noise, times the root of the number of
+    readings.
+    """
+
+    def sd(self, deviation: np.ndarray) -> float:
+        """
+        Return the standard deviation of Gaussian noise from its core, whatever its tails are.
+
+        ``sd^2 = mean(x^2 where |x| < limit sd) / mean_square``, iterated from the quartiles.
+
+        Parameters
+        ----------
+        deviation : ndarray, shape (n,)
+            Readings about their mean.
+
+        """
+        size = np.abs(deviation)
+        sd = float(np.median(size)) / NORMAL_QUARTILE
+        for _ in range(CORE_STEPS):
+            core = size[size < self.limit * sd]
+            if not len(core):
+                break
+            sd = float(np.sqrt(np.mean(core**2) / self.mean_square))
+        return sd
+
+
+CORES = (Core(1.5, 0.5515, 1.65), Core(2.0, 0.7737, 0.95))
+"""The narrow one is free of torn reads with large noise, the wide one detects few of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +80,7 @@ class ReadingFaults:
     """What makes the white noise of readings appear larger than that of the sensor."""
 
     tails: np.ndarray
-    """Standard deviation over that of the quartiles, at least 1, shape (6,); 1: Gaussian."""
+    """By how much tails raise the noise of means, at least 1, shape (6,); 1: Gaussian."""
     repeated: np.ndarray
     """Share of readings that repeat the reading before, accelerometer and gyroscope, shape (2,)."""
     repetition: np.ndarray
@@ -51,8 +102,11 @@ class FaultSearch:
 
     def __init__(self) -> None:
         self._last: np.ndarray | None = None
-        self._differences: list[np.ndarray] = []
+        # Readings of blocks minus the mean of their block, and the readings of the next block.
+        self._deviations: list[np.ndarray] = []
         self._n_kept = 0
+        self._next_block = np.zeros((0, 6))
+        self._smallest_step = np.full(6, np.inf)
         self._n_pairs = 0
         # Pairs of neighbours with one reading: of each axis, and of all axes of a sensor.
         self._n_same_axis = np.zeros(6)
@@ -67,6 +121,7 @@ class FaultSearch:
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
         """Add the next samples of a rest, shape (n, 6)."""
         rows = values[present]
+        self._add_blocks(rows)
         if self._last is not None:
             rows = np.vstack([self._last, rows])
         if not len(rows):
@@ -78,13 +133,24 @@ class FaultSearch:
         same = difference == 0
         self._n_pairs += len(same)
         self._n_same_axis += same.sum(axis=0)
-        if self._n_kept < MOST_DIFFERENCES:
-            self._differences.append(difference)
-            self._n_kept += len(difference)
+        steps = np.where(same, np.inf, np.abs(difference))
+        self._smallest_step = np.minimum(self._smallest_step, steps.min(axis=0))
         for k, sensor in enumerate(SENSORS):
             held = same[:, SENSOR_COLUMNS[sensor]].all(axis=1)
             self._n_same_sensor[k] += held.sum()
             self._add_runs(k, np.flatnonzero(~held), len(held))
+
+    def _add_blocks(self, rows):
+        """Add the deviations of the complete blocks of a rest; the last one is continued."""
+        if self._n_kept >= MOST_READINGS:
+            return
+        rows = np.vstack([self._next_block, rows])
+        n_complete = len(rows) // BLOCK
+        self._next_block = rows[n_complete * BLOCK :].copy()
+        blocks = rows[: n_complete * BLOCK].reshape(n_complete, BLOCK, 6)
+        deviations = blocks - blocks.mean(axis=1, keepdims=True)
+        self._deviations.append(deviations.reshape(-1, 6))
+        self._n_kept += n_complete * BLOCK
 
     def _add_runs(self, k, changes, n_pairs):
         """Add the lengths of the runs that end at `changes`; the last one is continued."""
@@ -101,6 +167,7 @@ class FaultSearch:
     def end_stretch(self) -> None:
         """Begin another rest: its first reading has no reading before."""
         self._last = None
+        self._next_block = np.zeros((0, 6))
         self._run_length = np.ones(2)
 
     def result(self) -> ReadingFaults:
@@ -122,18 +189,44 @@ class FaultSearch:
         )
 
     def _tails(self):
-        """Return the ratio of the standard deviation to that of the quartiles, shape (6,)."""
+        """Return by how much tails raise the noise of means, shape (6,)."""
         tails = np.ones(6)
-        for column, difference in enumerate(np.concatenate(self._differences).T):
-            # Repeated readings are not differences of the noise.
-            difference = difference[difference != 0]
-            if len(difference) < LEAST_DIFFERENCES:
-                continue
-            low, high = np.quantile(difference, (0.25, 0.75))
-            usual = (high - low) / (2 * NORMAL_QUARTILE)
-            if usual < LEAST_STEPS * np.abs(difference).min():
-                continue
-            ratio = float(np.sqrt(np.mean(difference**2))) / usual
-            if ratio > 1.0 + max(LEAST_EXCESS, EXCESS_SDS * RATIO_SD / len(difference) ** 0.5):
-                tails[column] = ratio
+        if self._n_kept < LEAST_READINGS:
+            return tails
+        for column, deviation in enumerate(np.concatenate(self._deviations).T):
+            sd = float(np.sqrt(np.mean(deviation**2)))
+            for core in CORES:
+                core_sd = core.sd(deviation)
+                if core_sd < LEAST_STEPS * self._smallest_step[column]:
+                    continue
+                excess = sd / core_sd - 1.0
+                if excess < max(LEAST_EXCESS, EXCESS_SDS * core.ratio_sd / self._n_kept**0.5):
+                    continue
+                noise_steps = core_sd / self._smallest_step[column]
+                tails[column] = max(tails[column], excess_of_means(1.0 + excess, noise_steps))
         return tails
+
+
+def excess_of_means(ratio: float, noise_steps: float) -> float:
+    """
+    Return by how much tails of readings raise the noise of their means.
+
+    An error that is independent of the noise raises both by the same ratio. A torn register read
+    (high byte of the reading before) has an error e of ``k = 256 / noise_steps`` sd against the
+    deviation x of its reading from the change of the high byte, in a share p of the readings::
+
+        reading:  ratio^2 = 1 + E[e^2] + 2 E[e x] = 1 + p k^2 - 2 p k E|x|,  E|x| = 0.8
+        means:    excess^2 = 1 + p k^2 = 1 + (ratio^2 - 1) k / (k - 1.6)
+
+    Parameters
+    ----------
+    ratio : float
+        Standard deviation over that of the core.
+    noise_steps : float
+        Noise in steps of the converter.
+
+    """
+    torn_error = HIGH_BYTE / noise_steps
+    if not SMALLEST_TORN < torn_error < LARGEST_TORN:
+        return ratio
+    return float(np.sqrt(1.0 + (ratio**2 - 1.0) * torn_error / (torn_error - 2 * MEAN_DEVIATION)))

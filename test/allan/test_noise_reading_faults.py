@@ -23,14 +23,18 @@ def recording(values, rate):
     return lambda: iter([SampleBlock(ImuSamples(stamps, values[:, :3], values[:, 3:], 'imu'))])
 
 
-def torn_readings(seconds, share, level):
-    """Counts near a change of the high byte, a share of them with the high byte of the last one."""
+def torn_readings(seconds, share, level, times=1.0):
+    """
+    Counts near a change of the high byte, a share of them with the high byte of the last one.
+
+    `times`: factor on the noise.
+    """
     rng = np.random.default_rng(4)
     n = int(seconds * RATE)
     columns = []
     for sensor in SENSORS:
         for axis in range(3):
-            spread = DENSITY[sensor] * RATE**0.5 * SCALE[sensor]
+            spread = times * DENSITY[sensor] * RATE**0.5 * SCALE[sensor]
             centre = level[axis] if sensor == 'accelerometer' else 128.0
             count = np.round(rng.normal(centre, spread, n + 1)).astype(np.int64) & 0xFFFF
             torn = (count[:-1] & 0xFF00) | (count[1:] & 0xFF)
@@ -54,6 +58,19 @@ def test_torn_reads_change_neither_the_noise_nor_the_rest():
         assert high / low < 1.25
     assert set(result.record.left_out.values()) == {0.0}
     assert len(result.record.parts) == 1
+
+
+def test_torn_reads_within_the_noise_widen_the_interval():
+    """Noise of 64 steps, errors of 4 sd: too small for outliers, 9 % more noise on x."""
+    times = 64.0 / (DENSITY['accelerometer'] * RATE**0.5 * SCALE['accelerometer'])
+    values = torn_readings(200.0, 0.03, (1030.0, -895.0, 8188.0 + 128.0), times)
+    result = identify_noise(recording(values, RATE))
+    low, high = white_interval(result, 0)
+    density = times * DENSITY['accelerometer']
+    assert low < density < 0.5 * high + 0.5 * density
+    assert high > 1.05 * density
+    faults = figures_of(result).recording['faults']
+    assert 'accelerometer x' in faults and 'accelerometer z' not in faults
 
 
 def test_heavy_tails_widen_the_interval():
