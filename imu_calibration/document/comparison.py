@@ -128,9 +128,9 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
 
     With the accelerometer matrix ``M = L Q``, L lower triangular with positive diagonal, Q a
     rotation, and with the true quantities ``Q f``, ``Q w``: matrices M to ``M Q'``, lever arms r to
-    ``Q (r - mean of r)``, the response K to specific force to ``K Q'``. The covariance follows by
-    differences. Other effects are unchanged; `compare` omits the ones that depend on the axes
-    (`_kept_axes`) where the axes of both files differ too much.
+    ``Q (r - mean of r)``, other effects by the order of their tensor (`Effect.input_order`). The
+    covariance follows by differences. `compare` omits the effects that a rotation mixes with
+    others (`_kept_axes`) where the axes of both files differ too much.
     """
     model = calibration.model
     values = _turned(model, calibration.values)
@@ -163,12 +163,11 @@ def _turned(model, values):
     _, rotation = lower_times_rotation(matrix)
     for effect in model.effects:
         part = model.slices[effect.key]
-        if effect.role in (Role.LINEAR, Role.CROSS) and effect.sensor in SENSORS:
-            matrix = values[part].reshape(3, 3)
-            turned[part] = (matrix @ rotation.T).ravel()
-        elif effect.role is Role.ARMS:
+        if effect.role is Role.ARMS:
             arms = values[part].reshape(3, 3)
             turned[part] = ((arms - arms.mean(axis=0)) @ rotation.T).ravel()
+        else:
+            turned[part] = effect.in_other_axes(values[part], rotation)
     return turned
 
 
@@ -191,12 +190,13 @@ def _kept_axes(calibration):
     """
     Return {name: largest value of its effect} of parameters in the axes of their own file.
 
-    Their columns are products of components of the true motion, which a rotation mixes.
+    A rotation of the true motion mixes their columns with columns of other effects.
     """
     found = {}
     for effect in calibration.model.effects:
         used = set().union(*(group.uses for group in effect.groups)) & MOTION_COLUMNS
-        if effect.role is Role.TERM and effect.sensor in SENSORS and used:
+        is_mixed = effect.role is Role.TERM and effect.input_order is None and bool(used)
+        if is_mixed and effect.sensor in SENSORS:
             largest = float(
                 np.max(np.abs(calibration.values[calibration.model.slices[effect.key]]))
             )

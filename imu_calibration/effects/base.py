@@ -221,6 +221,12 @@ class Effect:
     Whether a document lists an effect of a sensor under `reference`: it belongs to the table and
     the session.
     """
+    input_order: int | None = None
+    """
+    Order of the tensor in the true input that the values of each output form: 0 where they belong
+    to the output, as along its own axis; 1 a vector; 2 a symmetric tensor (xx, yy, zz, xy, yz, xz).
+    None where a rotation of the axes of the true input mixes them with other effects.
+    """
     nuisance: bool = False
     """Whether it is a nuisance parameter, estimated but not requested."""
     definition: dict | None = None
@@ -321,6 +327,28 @@ class Effect:
         A point of linearisation of a bank.
         """
         return np.append(self.prior_values()[:-1], constant)
+
+    def in_other_axes(self, values: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """
+        Return the values for a true input ``rotation v`` in place of v, shape (size,).
+
+        For a row u and a tensor T of one output: ``u rotation'`` and ``rotation T rotation'``.
+        """
+        if self.input_order == 1:
+            return (values.reshape(-1, 3) @ rotation.T).ravel()
+        if self.input_order == 2:
+            turned = []
+            for row in values.reshape(-1, len(PRODUCT_PAIRS)):
+                # A product of two components occurs twice in the tensor.
+                tensor = np.zeros((3, 3), values.dtype)
+                for value, (j, k) in zip(row, PRODUCT_PAIRS, strict=True):
+                    tensor[j, k] += 0.5 * value
+                    tensor[k, j] += 0.5 * value
+                tensor = rotation @ tensor @ rotation.T
+                for j, k in PRODUCT_PAIRS:
+                    turned.append(tensor[j, k] if j == k else 2.0 * tensor[j, k])
+            return np.array(turned)
+        return values
 
     def param_names(self) -> list[str]:
         """Return SENSOR.EFFECT.COMPONENT for each parameter."""

@@ -94,6 +94,7 @@ def _pair(sensor):
             prior_sd=0.1,
             motion=('static_poses',) if accel else ('spin_x', 'spin_y', 'spin_z'),
             groups=(own['TRUE_INPUT'],),
+            input_order=1,
             coefficients=matrix_coefficients,
         ),
         Effect(
@@ -115,6 +116,7 @@ def _pair(sensor):
             ),
             motion=curved,
             groups=(own['SQUARES'],),
+            input_order=0,
             coefficients=partial(
                 along_axis_coefficients,
                 function=partial(base.power_coefficients, products=base.PRODUCT_PAIRS),
@@ -132,6 +134,7 @@ def _pair(sensor):
             plausible=('consumer', 2e-3, 'field catalogue 6.1: 100-200 ppm typical'),
             motion=curved,
             groups=(own['SIGNED'],),
+            input_order=0,
             coefficients=partial(along_axis_coefficients, function=base.signed_coefficients),
         ),
         Effect(
@@ -224,6 +227,7 @@ def _pair(sensor):
             motion=('shake',),
             needs=('vibration',),
             groups=(base.VIBRATION,),
+            input_order=0,
             coefficients=partial(amplitude_coefficients, own_axis=accel),
         ),
         Effect(
@@ -239,6 +243,7 @@ def _pair(sensor):
             motion=('warm_up',),
             needs=('temperature',) if accel else ('temperature', 'rotation'),
             groups=(own['THERMAL'],),
+            input_order=0,
             coefficients=matrix_coefficients,
         ),
         Effect(
@@ -346,6 +351,7 @@ ACCELEROMETER = _pair('accelerometer') + (
         plausible=('consumer', 1e-4 / STANDARD_GRAVITY**2, 'field catalogue 6.1: some 10 ug/g^3'),
         motion=('centrifuge',),
         groups=(base.CUBES['accelerometer'],),
+        input_order=0,
         coefficients=partial(
             along_axis_coefficients,
             function=partial(base.power_coefficients, products=base.TRIPLES),
@@ -435,6 +441,7 @@ GYROSCOPE = _pair('gyroscope') + (
         plausible=('consumer', 0.1 * DEG / STANDARD_GRAVITY, 'ADIS16460 data sheet: 0.01 deg/s/g'),
         motion=('static_poses',),
         groups=(base.TRUE_INPUT['accelerometer'],),
+        input_order=1,
         coefficients=amplitude_coefficients,
     ),
     Effect(
@@ -462,6 +469,7 @@ GYROSCOPE = _pair('gyroscope') + (
         bias_sums=((0, 1, 2), (6, 7, 8), (12, 13, 14)),
         motion=('static_dense', 'centrifuge'),
         groups=(base.SQUARES['accelerometer'],),
+        input_order=2,
         coefficients=amplitude_coefficients,
     ),
     Effect(

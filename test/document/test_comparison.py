@@ -21,9 +21,13 @@ from imu_calibration.document.comparison import (
     compare,
     in_accelerometer_axes,
 )
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.catalogue import CATALOGUE
+from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED, FIXED, HELD
 from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.kinematics.rotations import Reference
 
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 COUNT = len(MODEL.param_names)
@@ -198,12 +202,118 @@ def test_the_encoder_zero_of_another_session_is_no_disagreement_of_the_imu():
     assert next(row for row in found.rows if row.name == name).ratio == pytest.approx(3897)
 
 
+QUADRATIC = SensorModel(
+    accelerometer=('bias', 'matrix', 'accel_quadratic', 'accel_cubic', 'accel_thermal_bias'),
+    gyroscope=('bias', 'matrix', 'gyro_g_sensitivity', 'gyro_force_squared'),
+)
+
+
+def of_tensors(rng, sd):
+    """Return a calibration with squares, cubes, and responses to force of the first two orders."""
+    values = QUADRATIC.start()
+    values += rng.normal(0.0, 1e-3, len(values))
+    return Calibration(
+        QUADRATIC,
+        values + sd * rng.normal(size=len(values)),
+        sd**2 * np.eye(len(values)),
+        (DETERMINED,) * len(values),
+        'imu',
+        {'origin': 'mount', 'axes': 'mount'},
+    )
+
+
+def seen_along(calibration, turn):
+    """Return the same IMU with the true quantities ``turn v``, written out effect by effect."""
+    values = calibration.values.copy()
+    names = list(calibration.param_names)
+    for name in ('accelerometer.matrix', 'gyroscope.matrix', 'gyroscope.gyro_g_sensitivity'):
+        start = names.index(f'{name}.xx')
+        values[start : start + 9] = (values[start : start + 9].reshape(3, 3) @ turn.T).ravel()
+    for axis in 'xyz':
+        start = names.index(f'gyroscope.gyro_force_squared.{axis}_xx')
+        xx, yy, zz, xy, yz, xz = values[start : start + 6]
+        form = np.array([[xx, xy / 2, xz / 2], [xy / 2, yy, yz / 2], [xz / 2, yz / 2, zz]])
+        form = turn @ form @ turn.T
+        values[start : start + 3] = np.diag(form)
+        values[start + 3 : start + 6] = 2 * form[0, 1], 2 * form[1, 2], 2 * form[0, 2]
+    return replace(calibration, values=values)
+
+
+def test_tensors_of_any_order_are_compared_in_one_convention():
+    """Three degrees are 500 sds; a change of one coefficient of each effect is found."""
+    rng, sd = np.random.default_rng(12), 1e-7
+    one = of_tensors(rng, sd)
+    turn = Rotation.from_rotvec(np.radians(3.0) * np.array([0.6, -0.48, 0.64])).as_matrix()
+    other = seen_along(one, turn)
+    by_hand = in_accelerometer_axes(other)
+    for second in (other, by_hand):
+        found = compare(one, second)
+        assert found.agree
+        ratios = {row.name: row.ratio for row in found.rows}
+        for name in ('accel_quadratic.y', 'accel_cubic.z'):
+            assert ratios[f'accelerometer.{name}'] == pytest.approx(0.0, abs=1e-6)
+        assert ratios['gyroscope.gyro_force_squared.y_yz'] < 0.1
+    for name in (
+        'accelerometer.accel_quadratic.y',
+        'gyroscope.gyro_g_sensitivity.zx',
+        'gyroscope.gyro_force_squared.x_yz',
+    ):
+        found = compare(one, moved(by_hand, name, 40 * sd))
+        assert found.agree is False
+        assert any(line.startswith(name.rpartition('.')[0]) for line in found.lines)
+
+
+@pytest.mark.parametrize('order', (0, 1, 2))
+def test_the_output_is_the_same_for_turned_values_and_a_turned_motion(order):
+    """Identity for every effect of the catalogue whose values follow a rotation."""
+    rng = np.random.default_rng(order)
+    turn = Rotation.from_rotvec(0.02 * rng.normal(size=3)).as_matrix()
+    count = 200
+    # No component changes its sign by the rotation: its columns of asymmetry are for small ones.
+    size = rng.uniform(2.0, 10.0, (2, count, 3)) * rng.choice([-1.0, 1.0], (2, count, 3))
+    force, rate = size
+    shared = {
+        'time': np.arange(count) * 0.01,
+        'mat_sn': np.tile(np.eye(3), (count, 1, 1)),
+        'gravity': 9.81,
+        'temperature_c': rng.uniform(10.0, 40.0, count),
+        'shaking': size[0] ** 2,
+    }
+    tested = [
+        effect
+        for sensor in SENSORS
+        for effect in CATALOGUE.effects(()).values()
+        if effect.sensor == sensor and effect.input_order == order and effect.name != 'matrix'
+    ]
+    assert tested
+    for effect in tested:
+        model = SensorModel(**{effect.sensor: ('bias', 'matrix', effect.name)})
+        values = model.start() + rng.normal(0.0, 0.01, len(model.param_names))
+        turned = values.copy()
+        for each in model.effects:
+            part = model.slices[each.key]
+            turned[part] = each.in_other_axes(values[part], turn)
+        outputs = []
+        for matrix, used in ((np.eye(3), values), (turn, turned)):
+            motion = Reference(
+                force_s=force @ matrix.T,
+                rate_s=rate @ matrix.T,
+                alpha_s=np.zeros((count, 3)),
+                **shared,
+            )
+            outputs.append(sensor_output(model, effect.sensor, used, ref=motion))
+        np.testing.assert_allclose(outputs[1], outputs[0], rtol=1e-9, err_msg=effect.name)
+
+
 @pytest.mark.parametrize(('degrees', 'compared'), ((90.0, False), (0.01, True)))
 def test_products_of_components_are_compared_only_in_nearly_the_same_axes(degrees, compared):
-    """A rotation mixes the squares of components: their coefficients belong to the axes."""
-    model = SensorModel(accelerometer=('bias', 'matrix', 'accel_quadratic', 'accel_thermal_bias'))
+    """A rotation mixes products of two components with squares, which the effect does not have."""
+    model = SensorModel(
+        accelerometer=('bias', 'matrix', 'accel_cross_product', 'accel_thermal_bias')
+    )
     count, sd = len(model.param_names), 1e-5
-    at = [model.param_names.index(f'accelerometer.accel_quadratic.{axis}') for axis in 'xyz']
+    products = [f'accelerometer.accel_cross_product.x_{pair}' for pair in ('xy', 'yz', 'xz')]
+    at = [model.param_names.index(name) for name in products]
     values = model.start()
     values[at] = (1e-3, -2e-3, 5e-4)
     one = Calibration(
@@ -226,7 +336,7 @@ def test_products_of_components_are_compared_only_in_nearly_the_same_axes(degree
     found = compare(by_hand, replace(one, values=values))
     ratios = {row.name: row.ratio for row in found.rows}
     assert found.agree is not compared
-    assert (ratios['accelerometer.accel_quadratic.y'] is not None) is compared
+    assert (ratios[products[1]] is not None) is compared
     assert ratios['accelerometer.accel_thermal_bias.x'] == 0
-    named = [line for line in found.lines if 'accel_quadratic' in line and f'{degrees:g}' in line]
+    named = [line for line in found.lines if 'cross_product' in line and f'{degrees:g}' in line]
     assert bool(named) is not compared
