@@ -12,7 +12,7 @@ from imu_calibration.core.documents import finite
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import Uncorrected
-from imu_calibration.document.verdict import judged
+from imu_calibration.document.verdict import MIN_STRUCTURE, NOTED_MISFIT, judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
@@ -145,10 +145,26 @@ def motions_needed(
     )
     for name in needed:
         index = solution.param_names.index(name)
-        text = remedy(solution.terms, index, tolerances[index])
+        text = remedy(
+            solution.terms,
+            index,
+            tolerances[index],
+            is_misfit=_has_misfit(solution, name.partition('.')[0]),
+        )
         if text:
             needed[name] = (text, float('nan'))
     return needed
+
+
+def _has_misfit(solution, sensor):
+    """Return whether the verdict calls the model of a sensor incomplete (`motion_misfits`)."""
+    slow_over_fast = solution.slow_over_fast.get(sensor, {})
+    for kind, ratio in (solution.chi2_per_dof.get(sensor) or {}).items():
+        if kind == 'means' or ratio is None or ratio <= NOTED_MISFIT:
+            continue
+        if slow_over_fast.get(kind, np.inf) > MIN_STRUCTURE:
+            return True
+    return False
 
 
 def possible_motions(table: Table) -> tuple[Motion, ...] | None:

@@ -46,7 +46,11 @@ from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
 from imu_calibration.estimation.solution import (
     COMMON_SCALE,
     DETERMINED,
+    DRIFT,
     HELD,
+    MODEL_ERROR,
+    REJECTED,
+    REMEDIES,
     REMEDY_KEYS,
     Status,
 )
@@ -340,6 +344,9 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
 def _misfit(calibration, sensor):
     """Return the scatter of window means that the model may cause, in the unit of the sensor."""
     if any(sensor in reason.sensors for reason in _strange_causes(calibration)):
+        return np.inf
+    # Parameters that are weak because of an error of the model.
+    if REMEDIES[MODEL_ERROR, DRIFT, REJECTED] in _needs_of(calibration, sensor):
         return np.inf
     left = (calibration.statistics.get('unexplained') or {}).get(sensor)
     if left is None or left.get('unit', UNITS[sensor]) != UNITS[sensor]:

@@ -57,7 +57,14 @@ REMEDY_KEYS = {
 """Remedy that is no motion -> the key of its input or program (`errors.ERROR_KEYS`)."""
 
 
-def remedy(terms: 'Terms', index: int, tolerance: float, *, excess: float = 1.0) -> str:
+def remedy(
+    terms: 'Terms',
+    index: int,
+    tolerance: float,
+    *,
+    excess: float = 1.0,
+    is_misfit: bool = False,
+) -> str:
     """
     Return how a parameter gets within its tolerance if more data do not help; '' if they do.
 
@@ -75,10 +82,15 @@ def remedy(terms: 'Terms', index: int, tolerance: float, *, excess: float = 1.0)
     excess : float
         Standard deviation of the residual over that of the noise, where the terms follow from the
         residual.
+    is_misfit : bool
+        Whether the residual in motion has structure in time: bias processes then describe the
+        error of the model, which more data do not reduce.
 
     """
     variances = {name: float(term[index, index]) for name, term in terms.items()}
     fixed = {names: sum(variances.get(name, 0.0) for name in names) for names in REMEDIES}
+    if is_misfit:
+        fixed[MODEL_ERROR, DRIFT, REJECTED] += variances.get(BIAS_PROCESS, 0.0)
     reducible = sum(variances.values()) - sum(fixed.values())
     if reducible > (excess * tolerance) ** 2:
         return ''

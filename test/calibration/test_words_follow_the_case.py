@@ -12,9 +12,11 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
 from imu_calibration.estimation.observability import MOTIONS, OTHER_MOUNT, motions_about
 from imu_calibration.estimation.solution import (
+    BIAS_PROCESS,
     GRAVITY,
     MODEL_ERROR,
     REMEDIES,
+    REMEDY_KEYS,
     SAMPLE_NOISE,
     remedy,
 )
@@ -109,6 +111,28 @@ def test_the_remedy_of_a_weak_parameter_is_that_of_its_largest_term(noise, misfi
     }
     expected = [text for names, text in REMEDIES.items() if cause in names]
     assert [remedy(terms, 1, 1.0)] == (expected or [''])
+
+
+def test_bias_processes_of_a_misfit_are_its_error():
+    """A residual with structure in motion is described by a bias that moves."""
+    terms = {SAMPLE_NOISE: np.diag([0.25]), BIAS_PROCESS: np.diag([9.0])}
+    assert remedy(terms, 0, 1.0) == ''
+    assert REMEDY_KEYS[remedy(terms, 0, 1.0, is_misfit=True)] == 'diagnose'
+    assert remedy(terms | {SAMPLE_NOISE: np.diag([4.0])}, 0, 1.0, is_misfit=True) == ''
+
+
+def test_a_missing_effect_on_a_table_needs_its_cause_and_no_motions():
+    """Arms of 3 cm that the model does not have: the residual is that of no moving bias."""
+    session = make_session(6, profile='short', noise='realistic', grade='industrial', arms=True)
+    result = calibrate_recordings(
+        SampleBlock(session.imu, session.joints),
+        Table.from_mapping(session.table),
+        accelerometer_model='bias+matrix',
+        model_as_asked=True,
+    ).result
+    needs = {need for need, _ in result.needed.values()}
+    assert needs and {REMEDY_KEYS.get(need) for need in needs} == {'diagnose'}
+    assert not any('window to window' in reason.what for reason in result.verdict.reasons)
 
 
 def test_compare_says_that_off_diagonal_terms_include_the_mounting():
