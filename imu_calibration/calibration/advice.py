@@ -18,13 +18,9 @@ import numpy as np
 
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import AXES, SENSORS, Role
-from imu_calibration.estimation.observability import (
-    ALL_MOTIONS,
-    DIRECTIONS,
-    sd_excess,
-    share_gained,
-)
+from imu_calibration.estimation.observability import sd_excess, share_gained
 from imu_calibration.estimation.solution import LACKING, TURNS_REMEDY, remedy
+from imu_calibration.estimation.standard_motions import ALL_MOTIONS, DIRECTIONS
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses, tangent
 from imu_calibration.references.gravity.hand_calibration import HandCalibration

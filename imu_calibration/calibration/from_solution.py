@@ -17,7 +17,6 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
-from imu_calibration.estimation.observability import Motion, motions_about
 from imu_calibration.estimation.solution import (
     GRAVITY,
     REJECTED,
@@ -27,6 +26,7 @@ from imu_calibration.estimation.solution import (
     statuses,
     with_term,
 )
+from imu_calibration.estimation.standard_motions import Motion, motions_about
 from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import unusable, warnings

@@ -28,27 +28,25 @@ among them.
 """
 
 
-CENTRED_FACTORS = ('within', 'slow')
-"""Fields with the triangular factors of the centred rows, and of their slow parts."""
-
-
 class _CentredRows:
-    """Addition of the centred rows of windows to the `CENTRED_FACTORS`."""
+    """Addition of the centred rows of windows to their triangular factors."""
 
-    within: dict
-    slow: dict
+    within: dict[tuple[str, str], np.ndarray]
+    """(sensor, kind) -> triangular factor of the centred rows."""
+    slow: dict[tuple[str, str], np.ndarray]
+    """(sensor, kind) -> triangular factor of the slow parts of the centred rows."""
 
-    def _stack_window(self, window):
+    def _stack_window(self, window: WindowStatistics) -> None:
         for sensor in SENSORS:
             statistics = window.sensors[sensor]
             stack(self.within, (sensor, window.kind), statistics.within)
-            if statistics.slow_rows:
+            if statistics.slow is not None and statistics.slow_rows:
                 stack(self.slow, (sensor, window.kind), statistics.slow)
 
-    def _stack_all_of(self, other):
-        for name in CENTRED_FACTORS:
-            for key, factor in getattr(other, name).items():
-                stack(getattr(self, name), key, factor)
+    def _stack_all_of(self, other: '_CentredRows') -> None:
+        for mine, its in ((self.within, other.within), (self.slow, other.slow)):
+            for key, factor in its.items():
+                stack(mine, key, factor)
 
 
 @dataclass(eq=False)
@@ -129,7 +127,8 @@ class Accumulator(_CentredRows):
             self._thin()
 
     @property
-    def _capacity(self):
+    def _capacity(self) -> int:
+        """Number of mean rows above which they are thinned."""
         return max(MAX_MEAN_ROWS // self.share, LEAST_ROWS)
 
     def copy(self) -> 'Accumulator':
@@ -168,85 +167,92 @@ class Accumulator(_CentredRows):
         later = (starts[:, :1] > session) | ((starts[:, :1] == session) & (starts[:, 1:] > time))
         return np.maximum((~later).sum(axis=0) - 1, 0)
 
-    def _add_to_blocks(self, window):
+    def _add_to_blocks(self, window: WindowStatistics) -> None:
         last = self.blocks[-1] if self.blocks else None
         if last is None or last.windows >= self.block_length or last.session != window.session:
             self.blocks.append(WindowBlock(window.session, window.time, 0))
         self.blocks[-1].add(window)
         self._join_blocks()
 
-    def _join_blocks(self):
+    def _join_blocks(self) -> None:
+        """Join neighbours in pairs while there are too many blocks."""
         while len(self.blocks) > MAX_ACCUMULATOR_BLOCKS:
-            pairs = [self.blocks[at : at + 2] for at in range(0, len(self.blocks), 2)]
-            self.blocks = [pair[0].joined(pair[1]) if len(pair) == 2 else pair[0] for pair in pairs]
+            joined = []
+            for first, second in zip(self.blocks[::2], self.blocks[1::2], strict=False):
+                joined.append(first.joined(second))
+            if len(self.blocks) % 2:
+                joined.append(self.blocks[-1])
+            self.blocks = joined
             self.block_length *= 2
 
-    def _thin(self):
+    def _thin(self) -> None:
         """
-        Join neighbours of one kind and recording into one row.
+        Join neighbours of one kind and recording in the older half of the rows.
 
-        Their difference joins the centred rows of their kind.
+        Their difference joins the centred rows of their kind. Without such neighbours the oldest
+        row is lost.
         """
-        thinned, index = [], 0
-        while index < len(self.rows):
-            first = self.rows[index]
-            second = self.rows[index + 1] if index + 1 < len(self.rows) else None
-            if (
-                second is None
-                or (first.kind, first.session) != (second.kind, second.session)
-                or index > len(self.rows) // 2
-            ):
+        thinned, index, older = [], 0, len(self.rows) // 2
+        while index <= min(older, len(self.rows) - 2):
+            first, second = self.rows[index : index + 2]
+            if (first.kind, first.session) != (second.kind, second.session):
                 thinned.append(first)
                 index += 1
                 continue
-            parts = [self.within]
-            if self.blocks:
-                parts.append(
-                    self.blocks[
-                        int(self.block_of(np.array([first.session]), np.array([first.time]))[0])
-                    ].within
-                )
-            for sensor in SENSORS:
-                for factors in parts:
-                    stack(factors, (sensor, first.kind), _difference(first, second, sensor))
+            self._stack_difference(first, second)
             thinned.append(_joined(first, second))
             index += 2
+        thinned += self.rows[index:]
         if len(thinned) == len(self.rows):
             del thinned[0]
         self.rows = thinned
+
+    def _stack_difference(self, first: WindowStatistics, second: WindowStatistics) -> None:
+        """Add the difference of two mean rows to the centred rows, and to those of its block."""
+        parts = [self.within]
+        if self.blocks:
+            (block,) = self.block_of(np.array([first.session]), np.array([first.time]))
+            parts.append(self.blocks[int(block)].within)
+        for sensor in SENSORS:
+            for factors in parts:
+                stack(factors, (sensor, first.kind), _difference(first, second, sensor))
 
 
 def stack(factors: dict, key: tuple, factor: np.ndarray) -> None:
     """Add rows to the triangular factor under `key`."""
     known = factors.get(key)
-    factors[key] = (
-        factor
-        if known is None or not len(known)
-        else triangular(np.concatenate([known, factor]))
-        if len(factor)
-        else known
-    )
+    if known is None or not len(known):
+        factors[key] = factor
+    elif len(factor):
+        factors[key] = triangular(np.concatenate([known, factor]))
 
 
-def _difference(first, second, sensor):
+def _difference(first: WindowStatistics, second: WindowStatistics, sensor: str) -> np.ndarray:
     """Return the row of the difference of two windows, scaled to the noise of one sample."""
     scale = 1 / np.sqrt(1 / first.count + 1 / second.count)
     return scale * (first.sensors[sensor].mean - second.sensors[sensor].mean)[None, :]
 
 
-def _joined(first, second):
+def _joined(first: WindowStatistics, second: WindowStatistics) -> WindowStatistics:
+    """Return two windows as one, with means by their numbers of samples."""
     total = first.count + second.count
-    share = np.array([first.count, second.count]) / total
+    share_of_first, share_of_second = first.count / total, second.count / total
+
+    def mean(of_first: np.ndarray, of_second: np.ndarray) -> np.ndarray:
+        return share_of_first * of_first + share_of_second * of_second
+
     sensors = {}
     for sensor in SENSORS:
         a, b = first.sensors[sensor], second.sensors[sensor]
-        pairs = ((a.mean, b.mean), (a.noise_variance, b.noise_variance), (a.inflation, b.inflation))
-        means = [share[0] * x + share[1] * y for x, y in pairs]
-        sensors[sensor] = SensorStatistics(means[0], a.within[:0], means[1], means[2])
-    time = share[0] * first.time + share[1] * second.time
+        sensors[sensor] = SensorStatistics(
+            mean(a.mean, b.mean),
+            a.within[:0],
+            noise_variance=mean(a.noise_variance, b.noise_variance),
+            inflation=mean(a.inflation, b.inflation),
+        )
     return WindowStatistics(
         first.kind,
-        float(time),
+        share_of_first * first.time + share_of_second * second.time,
         first.duration + second.duration,
         total,
         sensors,
@@ -255,15 +261,16 @@ def _joined(first, second):
     )
 
 
-def _without_within(window):
-    if not window.pieces and all(
-        len(s.within) == 0 and s.slow is None for s in window.sensors.values()
-    ):
+def _without_within(window: WindowStatistics) -> WindowStatistics:
+    """Return a window with its mean rows only."""
+    own = window.sensors.values()
+    if not window.pieces and all(len(each.within) == 0 and each.slow is None for each in own):
         return window
-    sensors = {
-        name: replace(s, within=s.within[:0].copy(), slow=None, slow_rows=0)
-        for name, s in window.sensors.items()
-    }
+    sensors = {}
+    for name, statistics in window.sensors.items():
+        sensors[name] = replace(
+            statistics, within=statistics.within[:0].copy(), slow=None, slow_rows=0
+        )
     return replace(window, sensors=sensors, pieces={})
 
 
@@ -288,19 +295,27 @@ def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -
     From one made with the model `wide`.
     """
     chosen = selected_columns(wide, narrow)
-    blocks = [replace(block, **_chosen_factors(block, chosen)) for block in accumulator.blocks]
-    rows = [restricted_window(row, chosen) for row in accumulator.rows]
+    blocks = []
+    for block in accumulator.blocks:
+        within, slow = (_chosen_columns(factors, chosen) for factors in (block.within, block.slow))
+        blocks.append(replace(block, within=within, slow=slow))
     return replace(
-        accumulator.copy(), rows=rows, blocks=blocks, **_chosen_factors(accumulator, chosen)
+        accumulator.copy(),
+        rows=[restricted_window(row, chosen) for row in accumulator.rows],
+        blocks=blocks,
+        within=_chosen_columns(accumulator.within, chosen),
+        slow=_chosen_columns(accumulator.slow, chosen),
     )
 
 
-def _chosen_factors(part, chosen):
-    """Return the `CENTRED_FACTORS` of an accumulator or block with the columns `chosen` only."""
-    return {
-        name: {key: factor[:, chosen[key[0]]] for key, factor in getattr(part, name).items()}
-        for name in CENTRED_FACTORS
-    }
+def _chosen_columns(
+    factors: dict[tuple[str, str], np.ndarray], chosen: dict[str, np.ndarray]
+) -> dict[tuple[str, str], np.ndarray]:
+    """Return (sensor, kind) -> factor with the columns `chosen` of the sensor only."""
+    found = {}
+    for (sensor, kind), factor in factors.items():
+        found[sensor, kind] = factor[:, chosen[sensor]]
+    return found
 
 
 def restricted_window(window: WindowStatistics, chosen: dict[str, np.ndarray]) -> WindowStatistics:
@@ -341,7 +356,8 @@ def one_attitude(accumulators: Iterable[Accumulator], model: SensorModel) -> boo
     part, moment = model.columns_of('accelerometer', Role.LINEAR), np.zeros((3, 3))
     for accumulator in accumulators:
         for row in accumulator.rows:
-            moment += row.count * np.multiply.outer(*[row.sensors['accelerometer'].mean[part]] * 2)
+            force = row.sensors['accelerometer'].mean[part]
+            moment += row.count * np.outer(force, force)
         for (sensor, _), factor in accumulator.within.items():
             if sensor == 'accelerometer':
                 moment += factor[:, part].T @ factor[:, part]

@@ -9,6 +9,7 @@ estimate between parts of the recording. Their covariance under noise is known; 
 exceed it significantly, the covariance grows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,7 +100,7 @@ def model_error(
     return found
 
 
-def _scatter_of_means(noise):
+def _scatter_of_means(noise: NoiseModel) -> float:
     """
     Return the variance of the means between windows.
 
@@ -126,22 +127,28 @@ def errors_of_waves(waves: 'CosineScores', model: SensorModel) -> tuple[ModelErr
     size, misfits = len(model.param_names), set()
     factor, more = np.ones(size), np.zeros(size)
     for sensor in {effect.sensor for effect in model.effects}:
-        shown = [
-            group
-            for effect in model.effects
-            if effect.sensor == sensor and len(group := waves.group(model.slices[effect.key]))
-        ]
-        if shown and _fisher([waves.drift(group)[0] for group in shown]) < CHANCE:
-            for group in shown:
-                more[waves.places[group]] = waves.drift(group)[1]
-        if shown and _fisher([waves.scatter(group)[0] for group in shown]) < CHANCE:
+        # Groups are the parameters of one effect that the recording informs about.
+        groups = []
+        for effect in model.effects:
+            group = waves.group(model.slices[effect.key])
+            if effect.sensor == sensor and len(group):
+                groups.append(group)
+        if not groups:
+            continue
+        # The tests of the groups together decide; then each has its own variance.
+        drifts = [waves.drift(group) for group in groups]
+        if _fisher([chance for chance, _ in drifts]) < CHANCE:
+            for group, (_, variance) in zip(groups, drifts, strict=True):
+                more[waves.places[group]] = variance
+        scatters = [waves.scatter(group) for group in groups]
+        if _fisher([chance for chance, _ in scatters]) < CHANCE:
             misfits.add(sensor)
-            for group in shown:
-                factor[waves.places[group]] = np.sqrt(waves.scatter(group)[1])
+            for group, (_, ratio) in zip(groups, scatters, strict=True):
+                factor[waves.places[group]] = np.sqrt(ratio)
     return ModelError(factor, more, np.zeros(size)), misfits
 
 
-def _fisher(p_values):
+def _fisher(p_values: Sequence[float]) -> float:
     """Return the p-value of several independent ones together (Fisher)."""
     return float(chi2_sf(-2 * np.log(np.maximum(p_values, 1e-300)).sum(), 2 * len(p_values)))
 
@@ -155,30 +162,23 @@ def _block_scores(
     Shape (k, n_params, n_params), and its part of the gradient, shape (k, n_params).
     """
     blocks = system.accumulator.blocks
-    information, gradient = (
-        np.zeros((len(blocks),) + (len(values),) * 2),
-        np.zeros((len(blocks), len(values))),
-    )
+    information = np.zeros((len(blocks), len(values), len(values)))
+    gradient = np.zeros((len(blocks), len(values)))
     block = system.accumulator.block_of(
         np.array([row.session for row in system.accumulator.rows]), system.times
     )
     for sensor in SENSORS:
-        own, slope, noise = (
-            coefficients(system.model, sensor, values),
-            coefficient_jacobian(system.model, sensor, values),
-            noises[sensor],
-        )
+        own = coefficients(system.model, sensor, values)
+        slope = coefficient_jacobian(system.model, sensor, values)
+        noise = noises[sensor]
         white = system.whitened_means(sensor, noise)
         for number, part in enumerate(blocks):
             weighed = list(system.weighed_rows(sensor, noise, part))
             for axis in range(3):
+                # The means of the block's windows, and their centred rows.
                 at = system.columns_and(sensor, axis)
-                rows = np.concatenate(
-                    [
-                        white[block == number, axis],
-                        *(rows[:, at] * weight[axis] for rows, weight in weighed),
-                    ]
-                )
+                centred = [rows[:, at] * weight[axis] for rows, weight in weighed]
+                rows = np.concatenate([white[block == number, axis], *centred])
                 design = rows[:, :-1] @ slope[:, axis]
                 information[number] += design.T @ design
                 gradient[number] += design.T @ (rows[:, -1] - rows[:, :-1] @ own[:, axis])
@@ -207,31 +207,41 @@ def model_error_of_rows(
         Number of each row's block.
 
     """
+    # Rows of unit variance, the design without its part along the nuisances (F F' A).
     root = np.sqrt(found.scatter.total(rows.noise, rows.component))[:, None]
-    fitted, rest = (
-        scipy.linalg.qr(rows.nuisance / root, mode='economic')[0],
-        rows.residual / root[:, 0],
-    )
+    rest = rows.residual / root[:, 0]
+    fitted = scipy.linalg.qr(rows.nuisance / root, mode='economic')[0]
     main = rows.main / root
     main -= fitted @ (fitted.T @ main)
-    parts = [
-        (main[own], rest[own], fitted[own]) for own in block == np.arange(block.max() + 1)[:, None]
-    ]
+
+    information, gradient, shared = [], [], []
+    for number in range(block.max() + 1):
+        own = block == number
+        information.append(main[own].T @ main[own])
+        gradient.append(main[own].T @ rest[own])
+        shared.append(fitted[own].T @ main[own])
     waves = _waves_of_blocks(
-        np.array([part.T @ part for part, *_ in parts]),
-        np.array([part.T @ error for part, error, _ in parts]),
+        np.array(information),
+        np.array(gradient),
         np.zeros((0, len(found.free))),
         found.free,
-        shared=np.array([along.T @ part for part, _, along in parts]),
+        shared=np.array(shared),
     )
     return errors_of_waves(waves, model)[0]
 
 
-def _waves_of_blocks(information, gradient, prior_root, free, shared=None):
+def _waves_of_blocks(
+    information: np.ndarray,
+    gradient: np.ndarray,
+    prior_root: np.ndarray,
+    free: np.ndarray,
+    *,
+    shared: np.ndarray | None = None,
+) -> 'CosineScores':
     """
-    Return the Waves of parts with their own information and gradient.
+    Return the shifts along slow cosines of parts with their own information and gradient.
 
-    `shared`: products of their fitted nuisances with the design.
+    `shared`: products of their fitted nuisances with the design, shape (k, n_nuisances, n_params).
     """
     information, gradient = information[:, free][:, :, free], gradient[:, free]
     covariance = inverse_normal(
@@ -301,15 +311,14 @@ class CosineScores:
         one recording, a third from each.
         """
         p_value, common = self._walked(group)
-        own = [self._walked(at) for at in group[:, None]]
-        return p_value, np.array(
-            [
-                max(common, variance if chance < CHANCE / len(group) else 0.0)
-                for chance, variance in own
-            ]
-        )
+        variances = []
+        for parameter in group:
+            chance, own = self._walked(np.array([parameter]))
+            significant = chance < CHANCE / len(group)
+            variances.append(max(common, own) if significant else common)
+        return p_value, np.array(variances)
 
-    def _walked(self, group):
+    def _walked(self, group: np.ndarray) -> tuple[float, float]:
         """
         Return (p-value, variance to add) by the score test of the variance of a walk.
 
@@ -337,11 +346,11 @@ class CosineScores:
         moved = self.moved[:, group]
         ratio = np.einsum('ki,kij,kj->k', moved, self._inverse(group), moved).sum() / moved.size
         single = (moved**2 / np.einsum('kii->ki', self.expected)[:, group]).mean(axis=0)
-        return float(
-            chi2_sf(ratio * moved.size, moved.size)
-        ), 1.0 + COMMON_ERROR_FACTOR * np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
+        p_value = float(chi2_sf(ratio * moved.size, moved.size))
+        excess = np.maximum(0.5 * (single + ratio) - 1.0, 0.0)
+        return p_value, 1.0 + COMMON_ERROR_FACTOR * excess
 
-    def _inverse(self, group):
-        return np.array(
-            [inverse_normal(expected) for expected in self.expected[:, group][:, :, group]]
-        )
+    def _inverse(self, group: np.ndarray) -> np.ndarray:
+        """Return the inverse of the expected covariance of a group, shape (k, n, n)."""
+        expected = self.expected[:, group][:, :, group]
+        return np.array([inverse_normal(of_wave) for of_wave in expected])

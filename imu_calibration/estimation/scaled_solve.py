@@ -46,18 +46,21 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
     With the elements near a diagonal, and dense columns last, the cost is proportional to the
     number of rows.
     """
-    band, factor, carried = (
-        np.argmax(rows != 0, axis=1) // BAND_COLUMNS,
-        np.zeros((rows.shape[1],) * 2),
-        rows[:0],
-    )
-    for number in range(-(-len(factor) // BAND_COLUMNS)):
+    width = rows.shape[1]
+    band = np.argmax(rows != 0, axis=1) // BAND_COLUMNS
+    factor = np.zeros((width, width))
+    carried = rows[:0]
+    for number in range(-(-width // BAND_COLUMNS)):
+        # The rows that begin in this band, and what remained of the rows before it.
         own = np.concatenate([carried, rows[band == number]])
         used = np.flatnonzero(own.any(axis=0))
-        part, done = triangular(own[:, used]), np.searchsorted(used, (number + 1) * BAND_COLUMNS)
-        carried = np.zeros((len(part), len(factor)))
-        carried[:, used] = part
-        factor[used[: len(part[:done])]], carried = carried[:done], carried[done:]
+        part = triangular(own[:, used])
+        reflected = np.zeros((len(part), width))
+        reflected[:, used] = part
+        # The columns of this band are done; the rows below them are carried on.
+        done = min(int(np.searchsorted(used, (number + 1) * BAND_COLUMNS)), len(part))
+        factor[used[:done]] = reflected[:done]
+        carried = reflected[done:]
     return factor
 
 
@@ -81,12 +84,13 @@ def unpacked(factors: Sequence[np.ndarray], width: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def _places(width):
+def _places(width: int) -> np.ndarray:
     """Return the places of the upper triangle among the elements of a square matrix, row by row."""
     return np.flatnonzero(np.triu(np.ones((width, width), bool)))
 
 
-def _r_factor(stacked):
+def _r_factor(stacked: np.ndarray) -> np.ndarray:
+    """Return the triangular factor of one block, which it overwrites."""
     if not len(stacked):
         return stacked
     raw, _, _, info = lapack.dgeqrf(stacked, overwrite_a=1)
@@ -94,7 +98,8 @@ def _r_factor(stacked):
     return np.triu(raw[: min(raw.shape)])
 
 
-def _require_finite(info, values):
+def _require_finite(info: int, values: np.ndarray) -> None:
+    """Raise FloatingPointError where a factorisation failed."""
     if info != 0 or not np.isfinite(values).all():
         raise FloatingPointError('orthogonal factorisation met values that are not finite')
 

@@ -152,7 +152,8 @@ class WeightedSystem:
         """Return mean rows, shape (n_windows, 3, q), as independent rows of unit variance."""
         return self._whitening(noise)(rows)
 
-    def _whitening(self, noise):
+    def _whitening(self, noise: NoiseModel) -> Whitening:
+        """Return the whitening of the mean rows, offsets of windows included."""
         variance = self.mean_variance(noise) + noise.offset_sd**2
         return Whitening(
             variance,

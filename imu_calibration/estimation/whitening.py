@@ -42,12 +42,10 @@ class Whitening:
         processes: Sequence[BiasProcess] = (),
         session_variance: float = 0.0,
     ):
-        self._variance, self._sessions, self._session_variance = (
-            variance,
-            sessions,
-            session_variance,
-        )
-        self._filter, self._ones = None, None
+        self._variance, self._sessions = variance, sessions
+        self._session_variance = session_variance
+        self._filter: _Filter | None = None
+        self._ones: np.ndarray | None = None
         processes = [process for process in processes if process.sd > 0]
         if processes:
             self._order = np.concatenate(sessions)
@@ -71,7 +69,7 @@ class Whitening:
 
         ``V^-1 values`` with V the covariance.
         """
-        return self._filtered(self._with_session_offsets(white), 'adjoint')
+        return self._filtered(self._with_session_offsets(white), adjoint=True)
 
     @property
     def log_determinant(self) -> float:
@@ -84,7 +82,7 @@ class Whitening:
             )
         return float(logs)
 
-    def _chained(self, values):
+    def _chained(self, values: np.ndarray) -> np.ndarray:
         """
         Return the rows of all axes and sessions one after the other, each session in order of time.
 
@@ -92,15 +90,17 @@ class Whitening:
         """
         return values[self._order].transpose(1, 0, 2).reshape(-1, values.shape[2])
 
-    def _filtered(self, values, direction='forward'):
+    def _filtered(self, values: np.ndarray, *, adjoint: bool = False) -> np.ndarray:
+        """Return rows divided by their noise, bias processes included, without session offsets."""
         if self._filter is None:
             return values / np.sqrt(self._variance)[:, :, None]
-        found = getattr(self._filter, direction)(self._chained(values))
+        chained = self._chained(values)
+        found = self._filter.adjoint(chained) if adjoint else self._filter.forward(chained)
         white = np.empty_like(values)
         white[self._order] = found.reshape(values.shape[1], -1, values.shape[2]).transpose(1, 0, 2)
         return white
 
-    def _with_session_offsets(self, white):
+    def _with_session_offsets(self, white: np.ndarray) -> np.ndarray:
         """Multiply with ``(I + s^2 u u')^(-1/2)`` in each session, in place."""
         if self._ones is None:
             return white
@@ -119,23 +119,32 @@ class _Filter:
     Innovations over their standard deviations of one chain of rows, in place.
 
     An infinite step begins a new series.
+
+    Parameters
+    ----------
+    variance : array, shape (n,)
+        Independent part of the variance of each row.
+    steps : array, shape (n,)
+        Time since the row before, s.
+    processes : sequence of BiasProcess
+
     """
 
-    def __init__(self, variance, steps, processes):
-        power, times = np.array([(process.sd**2, process.time) for process in processes]).T
-        decay, fresh = (
-            np.exp(-steps[:, None] / times),
-            -np.expm1(-2 * steps[:, None] / times) * power,
-        )
-        self.total, gain = (
-            _gains_of_one(variance, decay[:, 0], fresh[:, 0])
-            if len(power) == 1
-            else _gains(variance, decay, fresh)
-        )
-        self._width, self._driven_by = len(power), decay[1:] * gain[:-1]
-        # the states follow s_k = F_k s_(k-1) + u_k with F_k = diag(decay) (I - gain 1'): a banded
-        # system for all of them at once
-        width = self._width
+    def __init__(self, variance: np.ndarray, steps: np.ndarray, processes: Sequence[BiasProcess]):
+        # A process keeps exp(-dt / time) of its value, and gains the variance that it lost.
+        power = np.array([process.sd**2 for process in processes])
+        times = np.array([process.time for process in processes])
+        decay = np.exp(-steps[:, None] / times)
+        fresh = -np.expm1(-2 * steps[:, None] / times) * power
+        if len(power) == 1:
+            self.total, gain = _gains_of_one(variance, decay[:, 0], fresh[:, 0])
+        else:
+            self.total, gain = _gains(variance, decay, fresh)
+
+        # The states follow s_k = F_k s_(k-1) + u_k with F_k = diag(decay) (I - gain 1'): a banded
+        # system for all of them at once.
+        self._width = width = len(power)
+        self._driven_by = decay[1:] * gain[:-1]
         self._bands = np.zeros((2 * width, width * (len(variance) - 1)))
         self._bands[0] = 1.0
         for i in range(width):
@@ -144,21 +153,23 @@ class _Filter:
                     (i == j) - gain[1:-1, i]
                 )
 
-    def forward(self, values):
+    def forward(self, values: np.ndarray) -> np.ndarray:
+        """Return the innovations of rows, shape (n, q), which it overwrites."""
         if len(values) > 1:
-            driven = np.asfortranarray(
-                (self._driven_by[:, :, None] * values[:-1, None, :]).reshape(-1, values.shape[1])
+            driven = (self._driven_by[:, :, None] * values[:-1, None, :]).reshape(
+                -1, values.shape[1]
             )
-            states = lapack.dtbtrs(self._bands, driven, uplo='L', diag='U', overwrite_b=1)[0]
-            values[1:] -= (
-                states
-                if self._width == 1
-                else states.reshape(len(values) - 1, self._width, -1).sum(axis=1)
-            )
+            states = lapack.dtbtrs(
+                self._bands, np.asfortranarray(driven), uplo='L', diag='U', overwrite_b=1
+            )[0]
+            if self._width > 1:
+                states = states.reshape(len(values) - 1, self._width, -1).sum(axis=1)
+            values[1:] -= states
         values /= np.sqrt(self.total)[:, None]
         return values
 
-    def adjoint(self, values):
+    def adjoint(self, values: np.ndarray) -> np.ndarray:
+        """Return the transposed of `forward` times rows, shape (n, q), which it overwrites."""
         values /= np.sqrt(self.total)[:, None]
         if len(values) > 1:
             states = np.asfortranarray(np.repeat(values[1:], self._width, axis=0))
@@ -170,13 +181,12 @@ class _Filter:
         return values
 
 
-def _gains(variance, decay, fresh):
+def _gains(
+    variance: np.ndarray, decay: np.ndarray, fresh: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (variances of the innovations, shape (n,), gains, shape (n, m)) of m processes."""
-    spread, total, gain = (
-        np.zeros((decay.shape[1],) * 2),
-        np.empty(len(variance)),
-        np.empty(decay.shape),
-    )
+    spread = np.zeros((decay.shape[1],) * 2)
+    total, gain = np.empty(len(variance)), np.empty(decay.shape)
     for k, own in enumerate(variance):
         spread = decay[k][:, None] * spread * decay[k] + np.diag(fresh[k])
         reach = spread.sum(axis=1)
@@ -186,7 +196,9 @@ def _gains(variance, decay, fresh):
     return total, gain
 
 
-def _gains_of_one(variance, decay, fresh):
+def _gains_of_one(
+    variance: np.ndarray, decay: np.ndarray, fresh: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the same for one process, the common case (called hundreds of times).
 
@@ -318,14 +330,15 @@ class RestrictedLikelihood:
         white = Whitening(variance, self._times, self._sessions)(self._rows).reshape(
             -1, self._rows.shape[2]
         )
-        some, factor = members.any(axis=0), triangular_of_band(white)
-        white, weighted = (
-            white[some],
-            (members / variance.ravel())[:, some],
-        )  # the cost grows with the square of the rows
+        factor = triangular_of_band(white)
+        # Only the rows of groups: the cost grows with the square of their number.
+        some = members.any(axis=0)
+        white, weighted = white[some], (members / variance.ravel())[:, some]
+        # With A = Q R, `left` is Q of these rows: residuals e = y - Q Q'y, hat matrix H = Q Q'.
         left = solve_triangular(factor[:-1, :-1], white[:, :-1].T, trans='T').T
         rest = white[:, -1] - left @ factor[:-1, -1]
         redundancy = 1 - np.einsum('ij,ij->i', left, left)
+        # Score (e^2 - (1 - h)) / 2 and information (I - H)^2 / 2, summed over the groups.
         spread = left @ left.T
         spread[np.diag_indices_from(spread)] -= 1
         np.square(spread, out=spread)  # in place: the square of the number of rows

@@ -74,23 +74,24 @@ def moving_pieces(
     edges = np.round(np.linspace(0, len(rows), count + 1)).astype(int)
     length = np.diff(edges)[:, None]
     means = np.add.reduceat(rows, edges[:-1], axis=0) / length
-    rate, change = (
-        np.linalg.norm(np.add.reduceat(rate_s, edges[:-1], axis=0) / length, axis=1),
-        _slope(rate_s, time, edges),
-    )
     pieces = np.concatenate(
         [means[:, :-N_AXES], _slope(true_input, time, edges), means[:, -N_AXES:]], axis=1
     )
-    regime = np.select(
-        [np.linalg.norm(change, axis=1) > ACCELERATING, rate > MIN_FAST_RATE, rate > MAX_SLOW_RATE],
-        [3, 2, 1],
-        0,
+
+    rate = np.linalg.norm(np.add.reduceat(rate_s, edges[:-1], axis=0) / length, axis=1)
+    change = np.linalg.norm(_slope(rate_s, time, edges), axis=1)
+    regimes = (Regime.SLOW, Regime.MEDIUM, Regime.FAST, Regime.ACCELERATING)
+    number = np.select(
+        [change > ACCELERATING, rate > MIN_FAST_RATE, rate > MAX_SLOW_RATE], [3, 2, 1]
     )
-    names = (Regime.SLOW, Regime.MEDIUM, Regime.FAST, Regime.ACCELERATING)
-    return {name: pieces[regime == k] for k, name in enumerate(names) if np.any(regime == k)}
+    found: dict[str, np.ndarray] = {}
+    for index, regime in enumerate(regimes):
+        if np.any(number == index):
+            found[regime] = pieces[number == index]
+    return found
 
 
-def _slope(values, time, edges):
+def _slope(values: np.ndarray, time: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return the mean derivative over each piece, from edge to edge."""
     period = (time[-1] - time[0]) / max(len(time) - 1, 1)
     inner = edges[1:-1]
@@ -227,32 +228,46 @@ def reduce_window(
     )
 
 
-def _reduced(window, designs, session, inputs=None):
+def _reduced(
+    window: Window,
+    designs: dict[str, np.ndarray],
+    session: int,
+    inputs: dict[str, slice] | None = None,
+) -> WindowStatistics:
+    """
+    Return a window's statistics.
+
+    Parameters
+    ----------
+    window : Window
+    designs : dict
+        Sensor -> columns, shape (n, n_columns).
+    session : int
+    inputs : dict, optional
+        Sensor -> columns of the true input; with them the short pieces are included.
+
+    """
     outputs = {'accelerometer': window.force_s, 'gyroscope': window.rate_s}
     static, length = window.kind == 'static', _piece_length(window)
-    sensors = {
-        s: (
-            _reduce_static(designs[s], outputs[s])
-            if static
-            else _reduce_moving(designs[s], outputs[s], length)
-        )
-        for s in SENSORS
-    }
     duration = float(window.time[-1] - window.time[0])
-    pieces = {}
-    if inputs and static:
-        pieces = {s: pieces_at_rest(sensors[s].mean, duration) for s in SENSORS}
-    elif inputs:
-        rate_s = designs['gyroscope'][:, inputs['gyroscope']]
-        pieces = {
-            s: moving_pieces(
-                np.concatenate([designs[s], outputs[s]], axis=1),
+    sensors, pieces = {}, {}
+    for sensor in SENSORS:
+        design, output = designs[sensor], outputs[sensor]
+        if static:
+            sensors[sensor] = _reduce_static(design, output)
+        else:
+            sensors[sensor] = _reduce_moving(design, output, length)
+        if inputs is None:
+            continue
+        if static:
+            pieces[sensor] = pieces_at_rest(sensors[sensor].mean, duration)
+        else:
+            pieces[sensor] = moving_pieces(
+                np.concatenate([design, output], axis=1),
                 window.time,
-                designs[s][:, inputs[s]],
-                rate_s=rate_s,
+                design[:, inputs[sensor]],
+                rate_s=designs['gyroscope'][:, inputs['gyroscope']],
             )
-            for s in SENSORS
-        }
     step = 0.0 if window.joint_step is None else float(np.max(window.joint_step, initial=0.0))
     return WindowStatistics(
         window.kind,
@@ -266,7 +281,8 @@ def _reduced(window, designs, session, inputs=None):
     )
 
 
-def _reduce_static(design, output):
+def _reduce_static(design: np.ndarray, output: np.ndarray) -> SensorStatistics:
+    """Return the statistics of one sensor at rest: means, and the noise about them."""
     mean = np.concatenate([design.mean(axis=0), output.mean(axis=0)])
     variance, inflation = batch_statistics(output)
     return SensorStatistics(
@@ -274,17 +290,23 @@ def _reduce_static(design, output):
     )
 
 
-def _reduce_moving(design, output, length):
+def _reduce_moving(design: np.ndarray, output: np.ndarray, length: int) -> SensorStatistics:
+    """Return the statistics of one sensor in motion: mean row, and factors of the centred rows."""
     rows = np.concatenate([design, output], axis=1)
     mean = rows.mean(axis=0)
     rows -= mean
-    unknown, slow = np.full(3, np.nan), slow_part(rows, length)
+    slow = slow_part(rows, length)
     return SensorStatistics(
-        mean, triangular(rows), rounding_variance(output), unknown, triangular(slow), len(slow)
+        mean,
+        triangular(rows),
+        noise_variance=rounding_variance(output),
+        inflation=np.full(N_AXES, np.nan),
+        slow=triangular(slow),
+        slow_rows=len(slow),
     )
 
 
-def _piece_length(window):
+def _piece_length(window: Window) -> int:
     """Return the number of samples in SLOW_TIME, at least one; zero for a static window."""
     if window.kind == 'static':
         return 0
@@ -299,11 +321,9 @@ def slow_part(rows: np.ndarray, length: int) -> np.ndarray:
     There are none when a piece is a single row.
     """
     pieces = len(rows) // length if length > 1 else 0
-    return (
-        rows[: pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(max(length, 1))
-        if pieces
-        else rows[:0]
-    )
+    if not pieces:
+        return rows[:0]
+    return rows[: pieces * length].reshape(pieces, length, -1).sum(axis=1) / np.sqrt(length)
 
 
 def batch_statistics(output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from imu_calibration.calibration.result import CalibrationResult, WindowErrors
 from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.compensation.covariance import Uncertainty
 from imu_calibration.effects.base import Role
-from imu_calibration.estimation.observability import _attitudes
+from imu_calibration.estimation.standard_motions import attitudes_with_vertical
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors, strapdown
@@ -108,7 +108,10 @@ def rest_growth(errors: WindowErrors) -> Growth | None:
         )
         runs.append(
             strapdown(
-                time, *readings, gravity=gravity, mat_ns0=_attitudes(force[None] / gravity)[0].T
+                time,
+                *readings,
+                gravity=gravity,
+                mat_ns0=attitudes_with_vertical(force[None] / gravity)[0].T,
             )
         )
     return Growth(time, *(np.linalg.norm(run, axis=-1) for run in zip(*runs)))

@@ -12,7 +12,7 @@ import numpy as np
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
-from imu_calibration.estimation.observability import ALL_MOTIONS
+from imu_calibration.estimation.standard_motions import ALL_MOTIONS
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
 from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch, grammar
 from imu_calibration.selection.linearised_problem import LinearisedProblem

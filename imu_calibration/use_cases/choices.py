@@ -26,7 +26,7 @@ from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import checked_tolerances
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.estimation.observability import MOTIONS
+from imu_calibration.estimation.standard_motions import MOTIONS
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowSettings

@@ -35,7 +35,7 @@ from imu_calibration.calibration.live_poses import (
 )
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.estimation.observability import MOTIONS, motions_about
+from imu_calibration.estimation.standard_motions import MOTIONS, motions_about
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.calibrate import calibrate_recordings

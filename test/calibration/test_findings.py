@@ -22,8 +22,8 @@ from imu_calibration.calibration.diagnosis.findings import (
 )
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.observability import OTHER_MOUNT
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.standard_motions import OTHER_MOUNT
 from imu_calibration.selection import search as forward
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.questions import Question

@@ -17,8 +17,8 @@ from imu_calibration.document.decision import PARAMETERS
 from imu_calibration.document.verdict import _step_of, unsteady
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.estimation.observability import ALL_MOTIONS
 from imu_calibration.estimation.solution import EXCESS_REMEDY, REMEDY_KEYS, TURNS_REMEDY
+from imu_calibration.estimation.standard_motions import ALL_MOTIONS
 
 from worlds.compensation_cases import random_calibration
 from worlds.hand_sessions import GRAVITY, simulate

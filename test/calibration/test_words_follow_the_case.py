@@ -10,7 +10,6 @@ from imu_calibration.calibration.from_solution import motions_needed
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
-from imu_calibration.estimation.observability import MOTIONS, OTHER_MOUNT, motions_about
 from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
     GRAVITY,
@@ -20,6 +19,7 @@ from imu_calibration.estimation.solution import (
     SAMPLE_NOISE,
     remedy,
 )
+from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
 from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate_recordings

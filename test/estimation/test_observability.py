@@ -9,14 +9,13 @@ from imu_calibration.core.units import DEG
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
 from imu_calibration.estimation.observability import (
-    MOTIONS,
-    TABLE_MOTIONS,
     added_information,
     needed_motions,
     tolerance_scaled_singular_values,
     weak_directions,
 )
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
 from imu_calibration.estimation.weighted_system import make_prior
 
 GRAVITY = 9.81

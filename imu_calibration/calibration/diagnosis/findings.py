@@ -25,15 +25,10 @@ from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import for_people, with_sd
 from imu_calibration.document.calibration import beyond_known
 from imu_calibration.effects.base import SENSORS, Effect, Role
-from imu_calibration.estimation.observability import (
-    ALL_MOTIONS,
-    MOTIONS,
-    ONE_JOINT,
-    OTHER_MOUNT,
-    added_information,
-)
+from imu_calibration.estimation.observability import added_information
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.estimation.standard_motions import ALL_MOTIONS, MOTIONS, ONE_JOINT, OTHER_MOUNT
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.model_selection import HandInvestigation

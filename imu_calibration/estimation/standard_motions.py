@@ -1,0 +1,396 @@
+"""Standard motions of the sensor, for the prediction of their information."""
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.effects.sensor_effects import VIBRATION_VARIANCE
+from imu_calibration.kinematics.rotations import Reference, rotation
+from imu_calibration.kinematics.signal_history import ThermalBranch
+
+REST, WAY = 5.0, 3.0
+"""s; a rest, and the time from one rest to the next."""
+MIN_AXIS_COSINE = 0.98
+"""Cosine of the angle up to which a joint lies along a sensor axis."""
+OTHER_MOUNT = (
+    'mount the IMU at a different angle on the joint and record the same motion again, in addition'
+    ' to this recording'
+)
+"""Advice when further motions of a single joint do not help."""
+Axis = tuple[int, int, int]
+"""A sensor axis."""
+Pieces = Callable[[float], list[Reference]]
+"""Function of gravity, m/s^2, that returns the pieces of a motion."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A standard motion of the sensor, to be carried out on the table or by hand."""
+
+    name: str
+    """Short name."""
+    text: str
+    """Instruction."""
+    make: 'Pieces'
+    """Function of gravity that returns pieces of the motion, each a Reference."""
+    axis: Axis | None = None
+    """The sensor axis of the turn; None: several axes, or several attitudes."""
+
+    @property
+    def seconds(self) -> float:
+        """Duration: rests with the move to the next one, and moving pieces."""
+        seconds = 0.0
+        for piece in self.make(STANDARD_GRAVITY):
+            is_rest = len(piece) == 1
+            seconds += WAY + (REST if is_rest else float(piece.time[-1] - piece.time[0]))
+        return seconds
+
+
+@dataclass(frozen=True, eq=False)
+class _Surroundings:
+    """What a piece of a motion has besides the turn; None: nothing."""
+
+    arm: np.ndarray | None = None
+    """Arm from the axis of the turn, m, shape (3,)."""
+    temperature_c: np.ndarray | None = None
+    """Shape (n,)."""
+    branch: np.ndarray | None = None
+    """Thermal branch, shape (n,)."""
+    shaking: np.ndarray | None = None
+    """Variance of vibration, (m/s^2)^2, shape (3,)."""
+
+
+NOTHING = _Surroundings()
+
+
+def _turn(
+    axis: ArrayLike,
+    time: np.ndarray,
+    *,
+    angle: np.ndarray,
+    rate: np.ndarray,
+    alpha: np.ndarray,
+    gravity: float,
+    up: ArrayLike,
+    surroundings: _Surroundings = NOTHING,
+) -> Reference:
+    """
+    Return the reference of a sensor that turns about its own `axis`.
+
+    Parameters
+    ----------
+    axis : array, shape (3,)
+    time, angle, rate, alpha : array, shape (n,)
+        s, rad, rad/s, rad/s^2.
+    gravity : float
+    up : array, shape (3,)
+        The vertical in the sensor at angle zero, of any length.
+    surroundings : _Surroundings
+
+    """
+    axis = np.asarray(axis, float) / np.linalg.norm(axis)
+    up = np.asarray(up, float) / np.linalg.norm(up)
+    up_s = rotation(-angle[:, None] * axis) @ up
+    rate_s, alpha_s = rate[:, None] * axis, alpha[:, None] * axis
+    # f = g + alpha x r + omega x (omega x r)
+    force = gravity * up_s
+    arm, shaking = surroundings.arm, surroundings.shaking
+    if arm is not None:
+        force = force + np.cross(alpha_s, arm) + np.cross(rate_s, np.cross(rate_s, arm))
+    return Reference(
+        time,
+        attitudes_with_vertical(up_s),
+        force,
+        rate_s,
+        alpha_s,
+        gravity,
+        surroundings.temperature_c,
+        surroundings.branch,
+        None if shaking is None else np.tile(shaking, (len(time), 1)),
+    )
+
+
+def attitudes_with_vertical(up_s: np.ndarray) -> np.ndarray:
+    """
+    Return attitudes whose third column is the vertical, shape (n, 3, 3).
+
+    The heading is arbitrary.
+    """
+    other = np.eye(3)[np.argmin(np.abs(up_s), axis=1)]
+    first = np.cross(other, up_s)
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    return np.stack([first, np.cross(up_s, first), up_s], axis=2)
+
+
+MOTION_TIME = np.arange(0.0, 30.0, 0.02)
+DIRECTIONS = np.array(
+    [np.array(d) / np.linalg.norm(d) for d in itertools.product((-1, 0, 1), repeat=3) if any(d)]
+)
+"""Six faces, twelve edges and eight corners turned up, in the sensor frame, shape (26, 3)."""
+FACES_UP = np.repeat(np.eye(3), 2, axis=0) * np.tile([1.0, -1.0], 3)[:, None]
+"""The six faces turned up, in the sensor frame, shape (6, 3)."""
+OSCILLATION_RATE, OSCILLATION_ANGLE = 2 * np.pi, 30 * DEG
+"""rad/s and rad."""
+OBLIQUE = (0.3, 0.4, 1.0)
+"""The vertical in the sensor in oscillations, where nothing else is wanted."""
+
+
+def _spin(
+    axis: ArrayLike,
+    speeds_deg_s: Sequence[float],
+    up: ArrayLike | None = None,
+    arm: np.ndarray | None = None,
+) -> Pieces:
+    """Return the pieces of spins about an axis, which is horizontal if no vertical is given."""
+    still = np.zeros(len(MOTION_TIME))
+
+    def make(gravity: float) -> list[Reference]:
+        pieces = []
+        for speed in speeds_deg_s:
+            rate = np.full(len(MOTION_TIME), speed * DEG)
+            pieces.append(
+                _turn(
+                    axis,
+                    MOTION_TIME,
+                    angle=speed * DEG * MOTION_TIME,
+                    rate=rate,
+                    alpha=still,
+                    gravity=gravity,
+                    up=np.roll(axis, 1) if up is None else up,
+                    surroundings=_Surroundings(arm=arm),
+                )
+            )
+        return pieces
+
+    return make
+
+
+def _oscillation(axis: ArrayLike, up: ArrayLike | None = None) -> Pieces:
+    """Return the pieces of an oscillation ``a sin(w t)`` about an axis."""
+    w, a = OSCILLATION_RATE, OSCILLATION_ANGLE
+
+    def make(gravity: float) -> list[Reference]:
+        turn = _turn(
+            axis,
+            MOTION_TIME,
+            angle=a * np.sin(w * MOTION_TIME),
+            rate=a * w * np.cos(w * MOTION_TIME),
+            alpha=-a * w**2 * np.sin(w * MOTION_TIME),
+            gravity=gravity,
+            up=OBLIQUE if up is None else up,
+        )
+        return [turn]
+
+    return make
+
+
+def _rest(
+    up: ArrayLike, number: int, gravity: float, surroundings: _Surroundings = NOTHING
+) -> Reference:
+    """Return a rest: one sample, a minute after the rest before it."""
+    zero = np.zeros(1)
+    time = zero + 60.0 * number
+    return _turn(
+        (0, 0, 1),
+        time,
+        angle=zero,
+        rate=zero,
+        alpha=zero,
+        gravity=gravity,
+        up=up,
+        surroundings=surroundings,
+    )
+
+
+def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ()) -> Pieces:
+    """Return the pieces of rests with each direction up, once or at each temperature."""
+
+    def make(gravity: float) -> list[Reference]:
+        if not temperatures:
+            return [_rest(up, number, gravity) for number, up in enumerate(directions)]
+        pieces, branch = [], ThermalBranch()
+        for temperature_c in temperatures:
+            temperature = np.full(1, temperature_c)
+            warmth = _Surroundings(temperature_c=temperature, branch=branch.of(temperature))
+            pieces += [_rest(up, number, gravity, warmth) for number, up in enumerate(directions)]
+        return pieces
+
+    return make
+
+
+def _shaken(gravity: float) -> list[Reference]:
+    """Rest in six faces, quiet and while the sensor is shaken along each axis."""
+    pieces = []
+    for shaking in (np.zeros(3), *VIBRATION_VARIANCE * np.eye(3)):
+        shaken = _Surroundings(shaking=shaking)
+        pieces += [_rest(up, number, gravity, shaken) for number, up in enumerate(FACES_UP)]
+    return pieces
+
+
+def rest_with_up(up: np.ndarray) -> Motion:
+    """Return the motion of a rest with one direction of the sensor up."""
+    return Motion('rest', 'rest', _poses([up]))
+
+
+def _two_axis(gravity: float) -> list[Reference]:
+    """
+    Turn about an axis that itself turns.
+
+    Rates about two axes at once, with the cross term in the angular acceleration.
+    """
+    pieces = []
+    w = 200 * DEG
+    cos, sin = np.cos(w * MOTION_TIME), np.sin(w * MOTION_TIME)
+    for inner, outer in ((0, 1), (1, 2), (2, 0)):
+        third = 3 - inner - outer
+        rate, alpha, up = np.zeros((3, len(MOTION_TIME), 3))
+        rate[:, inner] = w
+        rate[:, outer], rate[:, third] = w * cos, -w * sin
+        alpha[:, outer], alpha[:, third] = -w * w * sin, -w * w * cos
+        up[:, outer], up[:, third] = cos, -sin
+        pieces.append(
+            Reference(MOTION_TIME, attitudes_with_vertical(up), gravity * up, rate, alpha, gravity)
+        )
+    return pieces
+
+
+def _three_speeds(gravity: float) -> list[Reference]:
+    """Spins about skewed axes and about the axes of the sensor."""
+    pieces = []
+    for axis in ((1, 1, 0), (0, 1, 1), (1, 0, 1), *AXIS_DIRECTIONS):
+        pieces += _spin(axis, (-200, -100, -50, 50, 100, 200))(gravity)
+    return pieces
+
+
+def _centrifuge(gravity: float) -> list[Reference]:
+    """Fast spins about each axis, the sensor on an arm across it."""
+    pieces = []
+    for axis in np.eye(3):
+        pieces += _spin(axis, (-300, 300), arm=0.3 * np.roll(axis, 1))(gravity)
+    return pieces
+
+
+def _rings() -> np.ndarray:
+    """Return directions every 15 degrees on the three coordinate circles, shape (72, 3)."""
+    angle = np.arange(0, 2 * np.pi, np.pi / 12)
+    circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return np.concatenate([np.roll(circle, axis, axis=1) for axis in range(3)])
+
+
+SPINS = (-200, -100, 100, 200)
+"""Speeds of a spin, deg/s."""
+AXIS_DIRECTIONS: tuple[Axis, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+
+
+def _spins_about(axis: Axis, up: ArrayLike | None = None) -> Motion:
+    name = 'xyz'[axis.index(1)]
+    return Motion(
+        f'spin_{name}',
+        f"spin about the sensor's {name} axis at 100 and 200 deg/s in both senses",
+        _spin(axis, SPINS, up),
+        axis,
+    )
+
+
+def _oscillates_about(axis: Axis, up: ArrayLike | None = None) -> Motion:
+    name = 'xyz'[axis.index(1)]
+    return Motion(
+        f'oscillate_{name}',
+        f"oscillate about the sensor's {name} axis, 30 deg at 1 Hz",
+        _oscillation(axis, up),
+        axis,
+    )
+
+
+MOTIONS = (
+    Motion(
+        'static_poses',
+        'rest in six faces and twelve edge positions, at several headings',
+        _poses(DIRECTIONS),
+    ),
+    Motion('static_dense', 'rest every 15 degrees on three rings', _poses(_rings())),
+    *(_spins_about(axis) for axis in AXIS_DIRECTIONS),
+    Motion(
+        'three_speeds',
+        'spin about skewed axes at 50, 100 and 200 deg/s in both senses',
+        _three_speeds,
+    ),
+    *(_oscillates_about(axis) for axis in AXIS_DIRECTIONS),
+    Motion(
+        'two_axis', 'turn about two axes at once at 200 deg/s, for each pair of axes', _two_axis
+    ),
+    Motion(
+        'centrifuge',
+        'spin at 300 deg/s on an arm of 0.3 m, about each axis',
+        _centrifuge,
+    ),
+    Motion('warm_up', 'rest in six faces, cold and warm', _poses(FACES_UP, (15.0, 25.0, 35.0))),
+    Motion(
+        'warm_and_cool',
+        'rest in six faces while it warms up by ten kelvins, and again while it cools',
+        _poses(FACES_UP, (20.0, 25.0, 30.0, 25.0, 20.0)),
+    ),
+    Motion(
+        'shake',
+        'rest in six faces, quiet and while a machine shakes the sensor along each axis',
+        _shaken,
+    ),
+)
+"""
+Standard motions of the sensor; motions of table joints are named by the effects that need them.
+"""
+
+
+def motions_about(axis_s: np.ndarray, up_s: np.ndarray) -> tuple[Motion, ...]:
+    """
+    Return the motions of a table that turns the sensor about one axis only.
+
+    None where that is no axis of the sensor.
+
+    Gravity has the same direction relative to the axis as on the table: for a vertical axis it is
+    constant in the sensor frame.
+
+    Parameters
+    ----------
+    axis_s, up_s : array, shape (3,)
+        Unit vectors of the axis and of the vertical, sensor frame, at any angle of the joint.
+
+    """
+    along = [axis for axis in AXIS_DIRECTIONS if abs(float(np.dot(axis, axis_s))) > MIN_AXIS_COSINE]
+    if not along:
+        return ()
+    share = float(np.clip(np.dot(axis_s, up_s) * np.sign(np.dot(along[0], axis_s)), -1.0, 1.0))
+    up = share * np.array(along[0], float) + np.sqrt(1.0 - share**2) * np.roll(along[0], 1)
+    return _spins_about(along[0], tuple(up)), _oscillates_about(along[0], tuple(up))
+
+
+TABLE_MOTIONS = {
+    'turn_about_vertical': (
+        'turn slowly through a full circle about the vertical, resting at several headings'
+    ),
+    'slow_turn': (
+        'turn each joint slowly through full circles, with the sensor mounted at two attitudes'
+    ),
+    'oscillate_fast': 'oscillate at 1, 2 and 4 Hz about two axes, in both phases',
+    'fast_spin': 'spin slowly up to the fastest rate in both senses',
+}
+"""
+Motions that concern the table or the clock; their gain depends on the table and is not predicted.
+"""
+ALL_MOTIONS = {motion.name: motion.text for motion in MOTIONS} | TABLE_MOTIONS
+"""Name -> instruction."""
+ONE_JOINT = {
+    'oscillate_fast': 'oscillate at 1, 2 and 4 Hz',
+    'fast_spin': TABLE_MOTIONS['fast_spin'],
+    'slow_turn': 'turn the joint slowly through full circles',
+    'warm_up': 'rest in several places, cold and warm',
+    'warm_and_cool': (
+        'rest in several places while it warms up by ten kelvins, and again while it cools'
+    ),
+    'shake': 'rest in several places, quiet and while a machine shakes the table',
+}
+"""The motions that a table of one joint can do; the other ones require a remounted IMU."""
