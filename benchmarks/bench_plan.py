@@ -19,9 +19,8 @@ import sys
 import time
 from pathlib import Path
 
-os.environ.setdefault(
-    'OPENBLAS_NUM_THREADS', '1'
-)  # small matrices: a second thread only waits for the first
+# Small matrices: a second thread only waits for the first.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np  # noqa: E402
 

@@ -67,9 +67,8 @@ def drive(seed, seconds):
     force = np.stack(
         [np.gradient(speed, 1 / RATE), speed * turn, np.full(len(time_), GRAVITY)], axis=1
     )
-    floor = moving[:, None] * rng.normal(
-        0, 0.8, (len(time_), 3)
-    )  # vibration that distinguishes a slow drive from rest
+    # Vibration that distinguishes a slow drive from rest.
+    floor = moving[:, None] * rng.normal(0, 0.8, (len(time_), 3))
     return time_, np.stack([0 * turn, 0 * turn, turn], axis=1), force + floor, path
 
 
@@ -202,9 +201,8 @@ def navigate(bag, calibration, domain_id):
                         'the compensator did not start within the time limit; run it again on an'
                         ' idle machine'
                     )
-                executor.spin_once(
-                    timeout_sec=0.1
-                )  # a subscriber that misses the first rest is levelled at the second
+                # A subscriber that misses the first rest is levelled at the second.
+                executor.spin_once(timeout_sec=0.1)
             player = processes.start(
                 'bag_player_node', {'bag': bag, 'rate': FACTOR, 'wait_for_subscribers': 2}
             )

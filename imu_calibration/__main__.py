@@ -38,9 +38,8 @@ class Interruption:
         if importing or (numerical and self._left >= 0):
             signal.setitimer(signal.ITIMER_REAL, RETRY_SECONDS)
         else:
-            signal.signal(
-                signal.SIGINT, signal.SIG_DFL
-            )  # a second one ends the process at once, without a traceback
+            # A second one ends the process at once, without a traceback.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             raise KeyboardInterrupt
 
 

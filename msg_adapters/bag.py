@@ -328,9 +328,8 @@ class Recording:
 
         [] without messages.
         """
-        decoder = self._decoders(None, '')[
-            self.imu_topic
-        ]  # with a chosen frame, several frames are no error
+        # With a chosen frame, several frames are no error.
+        decoder = self._decoders(None, '')[self.imu_topic]
         if (raw := next(iter(self.source.stretches([self.imu_topic])), None)) is not None:
             decoder.decode(*raw.of(0))
         return sorted(

@@ -199,9 +199,8 @@ class CsvLog:
     """The rows, of a log in one file."""
 
 
-@np.errstate(
-    over='ignore', invalid='ignore'
-)  # readings that are not finite are counted where samples are used
+# Readings that are not finite are counted where samples are used.
+@np.errstate(over='ignore', invalid='ignore')
 def read_csv(
     path: str | PathLike[str],
     columns: Sequence[str] = (),
@@ -696,9 +695,8 @@ class _Table:
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                'ignore', UserWarning
-            )  # rows without all columns, which are left out, and files without rows
+            # Rows without all columns, which are left out, and files without rows.
+            warnings.simplefilter('ignore', UserWarning)
             try:
                 data = np.loadtxt(lines, usecols=numbers, ndmin=2, quotechar='"', **options)
             except ValueError:  # empty cells, text such as "nan" in other languages, truncated rows

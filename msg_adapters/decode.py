@@ -261,9 +261,8 @@ def in_order(parts: Sequence[Any]) -> Any:
     """Join (index, samples) pairs in the order of the indices; None when there are none."""
     if len(parts) < 2:
         return parts[0][1] if parts else None
-    parts = sorted(
-        parts, key=lambda part: part[0][0]
-    )  # so that the frame is that of the first message
+    # So that the frame is that of the first message.
+    parts = sorted(parts, key=lambda part: part[0][0])
     joined = type(parts[0][1]).concatenate(samples for _, samples in parts)
     return joined.select(np.argsort(np.concatenate([index for index, _ in parts]), kind='stable'))
 

@@ -65,9 +65,8 @@ class ImuStream:
         layout = find_imu_layout(data)
         self._use(layout.order)
         self._order, self._body = data[:2], layout.offsets['orientation'][0]
-        self._head_end = (
-            HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]
-        )  # the padding after it is arbitrary
+        # The padding after it is arbitrary.
+        self._head_end = HEAD_AT + 4 + struct.unpack_from(layout.order + 'I', data, HEAD_AT)[0]
         self._head = data[HEAD_AT : self._head_end]
         self._rate_at, self._force_at = layout.offsets['rate_s'][0], layout.offsets['force_s'][0]
         self._head_out = frame_head(

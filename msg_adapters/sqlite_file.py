@@ -179,9 +179,8 @@ class SqliteFile(StorageFile):
         with suppress(sqlite3.Error):
             (first,) = self.connection.execute('SELECT min(timestamp) FROM messages').fetchone()
             (last,) = self.connection.execute('SELECT max(timestamp) FROM messages').fetchone()
-            return (
-                (first, last) if isinstance(first, int) and isinstance(last, int) else None
-            )  # a damaged index has other values
+            # A damaged index has other values.
+            return (first, last) if isinstance(first, int) and isinstance(last, int) else None
         return None
 
     def close(self) -> None:

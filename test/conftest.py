@@ -4,9 +4,8 @@ import os
 from collections import Counter
 from pathlib import Path
 
-os.environ.setdefault(
-    'OPENBLAS_NUM_THREADS', '1'
-)  # before numpy comes: threads that wait for each other take minutes on a busy machine
+# Before numpy comes: threads that wait for each other take minutes on a busy machine.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import pytest  # noqa: E402
 from few_candidates import FEW, restricted  # noqa: E402

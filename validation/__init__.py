@@ -6,8 +6,9 @@ The claims, measured on real recordings.
 
 import os
 
+# Before numpy: threads that wait for each other use processor time.
 for _name in (
     'OMP_NUM_THREADS',
     'OPENBLAS_NUM_THREADS',
-):  # before numpy: threads that wait for each other use processor time
+):
     os.environ.setdefault(_name, '1')

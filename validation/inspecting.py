@@ -27,9 +27,8 @@ def run(folder, plots):
     with TemporaryDirectory() as work:
         for name, topic in ALL:
             options = options_of(folder, name, topic, work)
-            if (
-                '--table' in options
-            ):  # what the motions determine stands in the section of the shaft
+            # What the motions determine stands in the section of the shaft.
+            if '--table' in options:
                 at = options.index('--table')
                 del options[at : at + 2]
             code, lines, error = run_verb('inspect', folder / name, options)

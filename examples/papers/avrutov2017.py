@@ -395,9 +395,8 @@ def encoder_changes(
             gravity_readings(turn(order, np.asarray(angles) + sign * shift), gravity_axis)
             for sign in (1, -1)
         )
-        changes.append(
-            encoder_sd_rad * (later - earlier) / 2
-        )  # exact: every element is affine in the sine and cosine of one angle
+        # Exact: every element is affine in the sine and cosine of one angle.
+        changes.append(encoder_sd_rad * (later - earlier) / 2)
     return np.array(changes)
 
 

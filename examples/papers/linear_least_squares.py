@@ -91,9 +91,8 @@ def solve_linear(
         return ((right.T / singular) @ (left.T @ weighted)).T / norms
 
     values = fit(outputs).T
-    values = (
-        values + fit(outputs - design @ values).T
-    )  # one refinement step: the residual is formed at full precision
+    # One refinement step: the residual is formed at full precision.
+    values = values + fit(outputs - design @ values).T
     inverse = right.T / singular / norms[:, None]
     raw = np.linalg.svd(design * root[:, None], compute_uv=False)
     return LinearSolution(

@@ -199,9 +199,8 @@ class Whitener:
         self._sd = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(self._sd, self._sd)
         self._factor = _cholesky(correlation + RIDGE * np.eye(len(correlation)))
-        self._inverse = dtrtri(self._factor, lower=1)[
-            0
-        ]  # well conditioned with the ridge; a solve of this size waits for threads
+        # Well conditioned with the ridge; a solve of this size waits for threads.
+        self._inverse = dtrtri(self._factor, lower=1)[0]
 
     @property
     def log_determinant(self) -> float:

@@ -226,9 +226,8 @@ class ScaleCovariance:
         Shape (n_pairs, n_lags).
         """
         if process not in self._correlations:
-            for known in [
-                other for other in self._correlations if other.time
-            ]:  # too many to keep for all correlation times
+            # Too many to keep for all correlation times.
+            for known in [other for other in self._correlations if other.time]:
                 del self._correlations[known]
             self._correlations[process] = self._evaluate(process, self._lag)
         return self._correlations[process]
@@ -275,10 +274,11 @@ def _sorted_lengths(lengths):
     lengths = np.sort(np.asarray(lengths, float))
     if len(lengths) <= MOST_LENGTHS:
         return lengths, np.ones(len(lengths))
+    # Only the longest has terms at the longest scales.
     classes = [
         *np.array_split(lengths[:-1], MOST_LENGTHS - 1),
         lengths[-1:],
-    ]  # only the longest has terms at the longest scales
+    ]
     return np.array([part.mean() for part in classes]), np.array(
         [float(len(part)) for part in classes]
     )

@@ -296,9 +296,8 @@ def _period(epochs):
     usual_step = np.median(np.concatenate([chunks.step for chunks in epochs]))
     if np.mean(np.abs(steps / usual_step - 1.0) < SAME_PERIOD) > USUAL_STEP_SHARE:
         middle = usual_step
-    return float(
-        f'{np.mean(steps[np.abs(steps / middle - 1.0) < SAME_PERIOD]):.9g}'
-    )  # without rounding errors in the file
+    # Without rounding errors in the file.
+    return float(f'{np.mean(steps[np.abs(steps / middle - 1.0) < SAME_PERIOD]):.9g}')
 
 
 class _Thinned:

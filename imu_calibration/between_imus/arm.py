@@ -184,9 +184,8 @@ def _robust_fit(design, target, alpha_noise):
         right = flat.T @ (target * weights[:, None]).ravel()
         before, values = values, np.linalg.solve(_normal(design, weights, excess), right)
         size = np.sum((target.ravel() - flat @ values).reshape(-1, 3) ** 2, axis=1)
-        scale = (
-            np.median(size) / 2.366 + 1e-300
-        )  # the median of chi-square with three degrees of freedom
+        # The median of chi-square with three degrees of freedom.
+        scale = np.median(size) / 2.366 + 1e-300
         weights = (TAIL_DOF + 3) / (TAIL_DOF + size / scale)
         weight_fall = 2 * weights**2 / ((TAIL_DOF + 3) * scale)
         if np.all(np.abs(values - before) <= 1e-9 * np.abs(values)):
@@ -413,9 +412,8 @@ def _calibration_covariance(fit, rows, a, b):
                 @ fit.values[:3]
             )
     shift = response(fit, np.stack(columns, axis=2))
-    spread = (
-        sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4
-    )  # the mean of both rates is used
+    # The mean of both rates is used.
+    spread = sum(_matrix_covariance(stream.calibration) for stream in (a, b)) / 4
     return (shift @ spread @ shift.T)[:3, :3]
 
 

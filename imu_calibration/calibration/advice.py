@@ -484,9 +484,10 @@ def knowledge_at_first(
     if poses is None:
         return knowledge
     ups = ups_of(poses)
+    # No turn before the first pose.
     turns = np.array(
         [turn_rows(start, end) for start, end in zip([None, *ups[:-1]], ups, strict=True)]
-    )  # no turn before the first pose
+    )
     rows = knowledge.rows(model.norm_rows(model.nominal, poses.force)[1], turns)
     return replace(knowledge, information=np.einsum('kri,krj->ij', rows, rows), up=ups[-1])
 

@@ -205,9 +205,8 @@ def ask_kept(
         bias_processes=options.bias_processes,
     )
     found = _without_faint(_examined(found), solution)
-    lacking = (
-        [] if found.limits else _beyond(found.adopted, model)
-    )  # after a limit was found, the solution is that of the search
+    # After a limit was found, the solution is that of the search.
+    lacking = [] if found.limits else _beyond(found.adopted, model)
     changes = replace(
         _changes([found], known.added), lacking=tuple(question.name for question in lacking)
     )
@@ -336,9 +335,8 @@ def stands_out(solution: Solution, question: Question) -> bool:
     if not one_significant(far, np.sqrt(np.diag(solution.covariance)[at])):
         return False
     sizes, directions = np.linalg.eigh(solution.covariance[np.ix_(at, at)])
-    known = (
-        sizes > CONVENTION_SHARE * sizes[-1]
-    )  # the lever arms of three sensors sum to zero by convention
+    # The lever arms of three sensors sum to zero by convention.
+    known = sizes > CONVENTION_SHARE * sizes[-1]
     return bool(
         chi2_sf(((directions.T @ far)[known] ** 2 / sizes[known]).sum(), known.sum()) < FAMILY_WISE
     )

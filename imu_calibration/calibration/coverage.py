@@ -66,9 +66,10 @@ def group_states(result: CalibrationResult) -> list[GroupState]:
         part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         status = calibration.status[part]
+        # The worst.
         state = next(
             (word for word in (Progress.HELD, Progress.WEAK) if word in status), Progress.DETERMINED
-        )  # the worst
+        )
         lacking = () if state == Progress.DETERMINED else (names[worst], *names[part])
         known = [result.needed[name] for name in lacking if name in result.needed]
         text, predicted = known[0] if known else ('', float('nan'))

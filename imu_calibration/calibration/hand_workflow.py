@@ -101,10 +101,11 @@ def solve_hand_by_evidence(
         As `solve_by_hand`.
 
     """
+    # Here, because its import is slow.
     from imu_calibration.references.gravity.model_selection import (
         MIN_FOLD_POSES,
         investigate_by_hand,
-    )  # here, because its import is slow
+    )
 
     # The search compares both sensors in poses and turns: with one sensor it has no data.
     if as_asked or data.absent or len(data.poses.start) < MIN_FOLD_POSES:

@@ -62,9 +62,8 @@ def derive(calibration: Calibration, sensor: str) -> Derived:
     linear, offset = (calibration.model.part(sensor, role) for role in (Role.LINEAR, Role.OFFSET))
     covariance = calibration.covariance[linear, linear]
     scale, axes = split(matrix)
-    tangent = (np.eye(3) - axes[:, :, None] * axes[:, None, :]) / scale[
-        :, None, None
-    ]  # d axes_i / d row_i
+    # d axes_i / d row_i.
+    tangent = (np.eye(3) - axes[:, :, None] * axes[:, None, :]) / scale[:, None, None]
     blocks = [covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(3)]
     scale_sd = np.array([np.sqrt(axes[i] @ blocks[i] @ axes[i]) for i in range(3)])
     spread = [tangent[i] @ blocks[i] @ tangent[i] for i in range(3)]

@@ -360,9 +360,8 @@ def _size_effect_unseen(solution):
     arms, arm = (
         solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM)
     )
-    return len(arms) > 0 and bool(
-        arms.all() and arm.all()
-    )  # an arm that is seen would bias the bias if left out
+    # An arm that is seen would bias the bias if left out.
+    return len(arms) > 0 and bool(arms.all() and arm.all())
 
 
 def check_on_table(

@@ -21,9 +21,8 @@ class ImuCommand(CommandExtension):
     ) -> None:
         """Add the verbs; of the one that is called, only its module is imported."""
         self._parser, parser.epilog = parser, EXIT_CODES
-        setattr(
-            parser, 'error', MethodType(OneLineParser.error, parser)
-        )  # one line, and the exit code of the plain command
+        # One line, and the exit code of the plain command.
+        setattr(parser, 'error', MethodType(OneLineParser.error, parser))
         words = list(sys.argv[1:] if argv is None else argv)
         after = (
             words[words.index(cli_name.split()[-1]) + 1 :][:1]

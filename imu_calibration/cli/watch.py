@@ -156,9 +156,10 @@ class NodeWatcher:
                 self.others.add(printable(node))
 
     def _draw(self, array):
+        # The planner adds its own.
         self.picture = next(
             (marker.text for marker in array.markers if marker.ns == 'text'), self.picture
-        )  # the planner adds its own
+        )
 
     def spin(self, seconds: float) -> None:
         """Listen for so long."""

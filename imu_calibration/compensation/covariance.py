@@ -111,9 +111,8 @@ class Uncertainty:
             ]
         )
         self._covariance = calibration.covariance[np.ix_(index, index)]
-        steps = 1e-30j * np.eye(
-            len(self._values)
-        )  # complex steps give d(coefficients) / d(parameters), shape (n_params, n_columns, 3)
+        # Complex steps give d(coefficients) / d(parameters), shape (n_params, n_columns, 3).
+        steps = 1e-30j * np.eye(len(self._values))
         self._slopes = [
             np.stack(
                 [

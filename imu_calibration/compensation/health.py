@@ -232,9 +232,8 @@ class GyroBiasUpdate:
         bias, spread, seen, weight = self._before.after(now, self._time)
         seen, weight = seen + rate**2, weight + 1
         stationary = np.maximum(self._before.stationary, seen / weight)
-        spread = spread + np.maximum(
-            stationary - self._before.stationary, 0
-        )  # it has been as wide before anybody saw it
+        # It has been as wide before anybody saw it.
+        spread = spread + np.maximum(stationary - self._before.stationary, 0)
         gain = spread / (spread + variance)
         self._now = _State(
             bias + gain * (rate - bias), (1 - gain) * spread, stationary, seen, weight, now

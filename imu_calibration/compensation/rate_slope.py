@@ -586,9 +586,8 @@ class RateSlope:
         before = np.array(self._stamps, np.int64)[-CLOCK_BLOCK:]
         stamps = np.concatenate([before, stamp_ns[start:]])
         step = np.diff(stamps)
-        again = np.flatnonzero(
-            step[max(len(before) - 1, 0) :] == 0
-        )  # the counting branch compares their readings
+        # The counting branch compares their readings.
+        again = np.flatnonzero(step[max(len(before) - 1, 0) :] == 0)
         stop = len(values) - start if not len(again) else int(again[0]) + (0 if len(before) else 1)
         due = np.arange(self._due - 1, stop, CLOCK_BLOCK)
         first = due + len(before) - CLOCK_BLOCK

@@ -406,9 +406,8 @@ class SampleCompensation:
         }
         self.levels = tuple(saturation_level(calibration, sensor) for sensor in SENSORS)
         self.needs_slope = uses_slope(calibration, transfer)
-        self._follows = (
-            self.needs_slope or self._shakes or calibration.knows_density
-        )  # the stamps determine the noise of a sample
+        # The stamps determine the noise of a sample.
+        self._follows = self.needs_slope or self._shakes or calibration.knows_density
         self.slope = RateSlope(
             partial(derivative_for, calibration, transfer=transfer),
             self._take_derivative,

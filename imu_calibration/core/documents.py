@@ -265,9 +265,8 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
         When it cannot be opened or is not a regular file.
 
     """
-    descriptor = os.open(
-        path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
-    )  # opening a FIFO would wait for its writer
+    # Opening a FIFO would wait for its writer.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if not S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(EINVAL, 'it is not a regular file', str(path))

@@ -123,9 +123,8 @@ class JoinedParts:
         return replace(self._first, **self._columns)
 
     def _resize(self, name, count):
-        self._columns[name].resize(
-            (count, *self._columns[name].shape[1:]), refcheck=False
-        )  # in place: no view exists
+        # In place: no view exists.
+        self._columns[name].resize((count, *self._columns[name].shape[1:]), refcheck=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -276,9 +276,8 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
             )
         case ast.Call():
             argument = as_text(products(node.args[0], known))
-            inline = (
-                called(node) == 'sign' and argument.isidentifier()
-            )  # a call costs more than all the arithmetic
+            # A call costs more than all the arithmetic.
+            inline = called(node) == 'sign' and argument.isidentifier()
             return {
                 (
                     (

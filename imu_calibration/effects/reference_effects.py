@@ -285,9 +285,8 @@ def _bent(effect, values, point):
     force, rate = np.zeros((6, 3), turn.dtype), np.zeros((9, 3), turn.dtype)
     for i, j, k, sign in EVEN_AND_ODD:
         for m in range(3):
-            force[_PAIR[min(j, m), max(j, m)], i] += (
-                sign * turn[k, m]
-            )  # (f x theta)_i = f_j theta_k
+            # (f x theta)_i = f_j theta_k.
+            force[_PAIR[min(j, m), max(j, m)], i] += sign * turn[k, m]
             rate[3 * m + j, i] += sign * turn[k, m]  # (w x theta)_i = w_j theta_k
             rate[3 * j + k, m] += sign * turn[m, i]  # K (f x w): (f x w)_i = f_j w_k
     return {LOAD['accelerometer'].name: force @ matrix.T, LOAD['gyroscope'].name: rate @ matrix.T}

@@ -441,9 +441,8 @@ def shrunk(solution: Solution, parts: list[slice]) -> Solution:
         known = sizes > CONVENTION_SHARE * sizes[-1]
         far = directions[:, known].T @ ((values[at] - prior[at]) / sd)
         chi2 = float((far**2 / sizes[known]).sum())
-        step = (
-            directions[:, known] @ (far / sizes[known]) / sd
-        )  # inverse covariance times the distance
+        # Inverse covariance times the distance.
+        step = directions[:, known] @ (far / sizes[known]) / sd
         values -= min(1.0, known.sum() / max(chi2, 1e-300)) * np.where(
             solution.held, 0.0, covariance[:, at] @ step
         )

@@ -453,9 +453,8 @@ def _lean(columns, step, angle, rate, acceleration):
         )
     if joint.sag:
         up, spin, alpha = columns[:, -4], columns[:, -3], columns[:, -2]
-        moves = cross(
-            up, spin
-        )  # up is fixed in space; the rotation of the Earth is negligible relative to the sag
+        # Up is fixed in space; the rotation of the Earth is negligible relative to the sag.
+        moves = cross(up, spin)
         axis = np.zeros((3, 1))
         axis[step.third] = step.sense * joint.sag
         vector += np.stack(

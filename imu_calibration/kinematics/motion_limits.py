@@ -15,9 +15,8 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG
 
-if (
-    TYPE_CHECKING
-):  # the help of verbs reads the layout of messages, hence this module; the table imports scipy
+# The help of verbs reads the layout of messages, hence this module; the table imports scipy.
+if TYPE_CHECKING:
     from imu_calibration.kinematics.joint import Joint
     from imu_calibration.kinematics.table import Table
 

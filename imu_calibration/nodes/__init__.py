@@ -59,8 +59,7 @@ def is_node_process() -> bool:
     return bool(sys.argv) and os.path.basename(sys.argv[0]) in NODE_NAMES
 
 
-os.environ.setdefault(
-    'OPENBLAS_NUM_THREADS', '1'
-)  # as the command line does, before numpy is imported
+# As the command line does, before numpy is imported.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 end_quietly_while_importing()
 require_rclpy()

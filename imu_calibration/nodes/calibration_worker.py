@@ -152,10 +152,11 @@ class SessionFiles:
         """
         if not period or time.monotonic() - self.saved_at < period or not self.unsaved(live):
             return False
+        # Not again at once when it fails.
         self.saved_at, n_windows = (
             time.monotonic(),
             live.n_windows,
-        )  # not again at once when it fails
+        )
         files.write_whole(self.accumulator, live.saved(pending=False), to_disk=False)
         self.note_saved(n_windows)
         return True
@@ -284,9 +285,8 @@ class CalibrationWorker(threading.Thread):
 
     def run(self) -> None:
         """Run the steps until `end`."""
-        import_module(
-            'scipy.optimize'
-        )  # 11 MB and 0.2 s, which the first fit of a bias process would need later
+        # 11 MB and 0.2 s, which the first fit of a bias process would need later.
+        import_module('scipy.optimize')
         try:
             while not self._ending:
                 self._wake.wait(MESSAGE_CHECK_SECONDS)

@@ -114,9 +114,8 @@ class _Stream:
     def __init__(self, node, topic):
         self.node, self.topic = node, topic
         self._begin()
-        self.by_wall_clock = not node.count_publishers(
-            '/clock'
-        )  # otherwise stamps are in simulated time
+        # Otherwise stamps are in simulated time.
+        self.by_wall_clock = not node.count_publishers('/clock')
         self.input = BatchInput(node, Imu, topic, add=self._add)
 
     def _begin(self):

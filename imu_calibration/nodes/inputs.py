@@ -161,9 +161,8 @@ class MatchedInput:
             found.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT
             for found in self.publishers
         )
-        if reliable != self.reliable or (
-            self._latched and several and not self.mixed
-        ):  # the last message of the one that remains
+        # The last message of the one that remains.
+        if reliable != self.reliable or (self._latched and several and not self.mixed):
             before, self.reliable = self.subscription, reliable
             self.subscription = self._subscribe()
             self.node.destroy_subscription(before)

@@ -49,9 +49,8 @@ class TopicCommand:
         """Action of the same controller, by the convention of ros2_control."""
         self.goals: set[bytes] = set()
         """Goals of this node; none."""
-        encode_trajectory(
-            TrajectoryPoints.stop(())
-        )  # loads the message types, so that no stop waits for them
+        # Loads the message types, so that no stop waits for them.
+        encode_trajectory(TrajectoryPoints.stop(()))
 
     @property
     def is_heard(self) -> bool:

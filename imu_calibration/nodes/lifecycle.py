@@ -397,9 +397,8 @@ def run_node(
 
     for number in SIGNALS:
         signal.signal(number, asked)
-    report = (
-        sys.unraisablehook
-    )  # incomplete objects of rclpy at the end of the context are not reported either
+    # Incomplete objects of rclpy at the end of the context are not reported either.
+    report = sys.unraisablehook
     sys.unraisablehook = lambda unraisable: None if asked_to_end else report(unraisable)
     # A node with a final message needs the context until it is sent.
     rclpy.init(

@@ -108,9 +108,10 @@ class LiveCompensation(SampleCompensation):
             self.counts[WITHHELD] += 1
             return None
         if self._absent:
+            # Does not disturb the other sensor.
             readings = self._mixed(
                 self.at_zero['gyroscope'] + self.at_zero['accelerometer'], readings
-            )  # does not disturb the other sensor
+            )
         if not stamp_ns:
             self.counts['zero stamp'] += 1
         corrected = self.correct(stamp_ns or sent_ns, *readings)

@@ -548,9 +548,8 @@ class PlannerNode(Node):
             say(self.get_logger(), level, line)
 
     def _statuses(self) -> list:
-        if (
-            self._driven is not None
-        ):  # again, because calibration_node's markers begin with DELETEALL
+        # Again, because calibration_node's markers begin with DELETEALL.
+        if self._driven is not None:
             self._coverage.publish(self._driven)
         driver, worker, campaign = self.driver, self.worker, self.worker.campaign
         name, excess = worker.worst

@@ -181,9 +181,8 @@ class PlannerWorker(threading.Thread):
             self.doing = Activity.AWAITING_REST
             if trouble := self.driver.stamp_fault(time.monotonic()):
                 raise InputError(trouble)
-            if self.driver.awaits_stop and not self.driver.is_silent(
-                time.monotonic()
-            ):  # no other driver need be searched for yet
+            # No other driver need be searched for yet.
+            if self.driver.awaits_stop and not self.driver.is_silent(time.monotonic()):
                 self.doing, end = Activity.AWAITING_STOP, time.monotonic() + patience
             if time.monotonic() > end:
                 raise InputError(

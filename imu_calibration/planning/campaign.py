@@ -343,9 +343,8 @@ class Campaign:
         if elapsed >= self.settings.time_limit:
             return Decision(why=f'{TIME_OVER}{self._outside()}')
         step = None if self._separator is None else self._separator.next_motion(position)
-        if (
-            step is None or step.motion is None
-        ):  # predicted only: a calibration has no information on causes that its model lacks
+        # Predicted only: a calibration has no information on causes that its model lacks.
+        if step is None or step.motion is None:
             has_separated, self._separator = self._separator is not None, None
             if has_separated:
                 return Decision(diagnose=True, why='the causes should be separable now')

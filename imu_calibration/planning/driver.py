@@ -306,17 +306,15 @@ class Driver:
             Seconds of a steady clock.
 
         """
-        if not np.all(
-            np.isfinite(position)
-        ):  # ros2_control publishes NaN until the hardware was read
+        # Ros2_control publishes NaN until the hardware was read.
+        if not np.all(np.isfinite(position)):
             for joint in np.flatnonzero(~np.isfinite(position)):
                 self.ignored[self.joint_names[joint]] = (
                     self.ignored.get(self.joint_names[joint], 0) + 1
                 )
             return False
-        if (
-            self._stopped is not None and time < self._time
-        ):  # after a clock step backwards the wait starts again
+        # After a clock step backwards the wait starts again.
+        if self._stopped is not None and time < self._time:
             self._stopped = time, now
         if time != self._time or self.position is None:
             self._advanced = now

@@ -173,9 +173,8 @@ def reachable(limits: MotionLimits) -> tuple[np.ndarray, np.ndarray]:
     Of joints that turn, at most one turn about the middle of the range.
     """
     wide = limits.turns & (limits.upper - limits.lower > 2 * np.pi)
-    middle = 0.5 * (
-        np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END)
-    )  # 0 without ends
+    # 0 without ends.
+    middle = 0.5 * (np.maximum(limits.lower, -ENDLESS_END) + np.minimum(limits.upper, ENDLESS_END))
     return np.where(wide, middle - np.pi, limits.lower), np.where(
         wide, middle + np.pi, limits.upper
     )
@@ -447,9 +446,8 @@ class MotionLibrary:
             self.limits.acceleration / most[2],
             np.array([MAX_SWING[bool(turning)] for turning in self.limits.turns]),
         ]
-        amplitude = (
-            0.99 * unit * np.minimum.reduce(reach)
-        )  # the largest values are between the instants of `motion`
+        # The largest values are between the instants of `motion`
+        amplitude = 0.99 * unit * np.minimum.reduce(reach)
         middle = np.where(self.limits.endless | (unit == 0), place, 0.5 * (lower + upper))
         far = ', '.join(
             (

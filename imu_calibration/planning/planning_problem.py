@@ -164,9 +164,8 @@ class PlanningProblem:
         """
         rests = [k for k, motion in enumerate(self.motions) if motion.kind is MotionKind.POSE]
         left, chosen = {int(self.library.place_of[k]): None for k in rests}, []
-        left = dict.fromkeys(
-            list(left)[:LEAST_RESTS]
-        )  # places are in the order of their distance in attitude
+        # Places are in the order of their distance in attitude.
+        left = dict.fromkeys(list(left)[:LEAST_RESTS])
         while len(chosen) < LEAST_RESTS and (left or len(chosen) > 1):
             if not left:  # a chain with few attitudes returns to them
                 left = dict.fromkeys(

@@ -81,9 +81,8 @@ def relax(
     for number in range(MAX_WEIGHT_STEPS):
         direction = np.tensordot(share[kept], used, 1).reshape(known.shape)
         scale = _scale(direction, root, rows)
-        covariance = inverse_normal(
-            known + scale * direction
-        )  # nearly singular in unreachable directions
+        # Nearly singular in unreachable directions.
+        covariance = inverse_normal(known + scale * direction)
         x = covariance @ asked.T
         variance = np.einsum('pn,np->p', asked, x)
         prices = (x * weights) @ x.T
@@ -197,9 +196,8 @@ class WindowPredictor:
         cuts = [list(self._cut(segments)) for segments in motions]
         flat = [cut for one in cuts for cut in one]
         blocks = np.cumsum([len(cut[0]) for cut in flat]) // BELIEF_BLOCK_ROWS
-        wander = cache(
-            self._wander
-        )  # many motions last equally long, at least a move and its way back
+        # Many motions last equally long, at least a move and its way back.
+        wander = cache(self._wander)
         windows = iter(
             [
                 window
@@ -366,9 +364,8 @@ class Posterior:
         ndarray, shape (k, m, m)
 
         """
-        steps, motion = np.unique(
-            0.5 * (self._last + seconds), return_inverse=True
-        )  # many motions last equally long
+        # Many motions last equally long.
+        steps, motion = np.unique(0.5 * (self._last + seconds), return_inverse=True)
         return np.linalg.inv(np.linalg.inv(self._forgotten(steps))[motion] + information)
 
     def take(self, information: np.ndarray, seconds: float) -> None:

@@ -136,9 +136,8 @@ def _frozen(window, table, expected, *, joint):
         )
         axis = changed - plain
         slope = np.gradient(expected[start:stop], window.time[start:stop], axis=0)
-        lag = (rest * slope).sum() / max(
-            (slope**2).sum(), 1e-300
-        )  # a late clock turns the rates of the other joints about this axis too
+        # A late clock turns the rates of the other joints about this axis too.
+        lag = (rest * slope).sum() / max((slope**2).sum(), 1e-300)
         rest = rest - lag * slope
         along, measured = (rest * axis).sum(axis=1), (window.rate_s[start:stop] * axis).sum(axis=1)
         square = float(along @ along)

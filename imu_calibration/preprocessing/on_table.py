@@ -320,9 +320,8 @@ def same_motion(moments: tuple, windows: list[Window], table: Table | None) -> C
     matrix = cross @ np.linalg.pinv(reference, rcond=0.01)
     gain = np.sqrt(np.trace(matrix @ reference @ matrix.T) / np.trace(reference))
     explained = np.trace(matrix @ reference @ matrix.T) / max(np.trace(measured), 1e-300)
-    if (
-        explained >= SAME and gain > 0.1 * MIN_RATE_GAIN
-    ):  # other checks report units, signs and axes
+    # Other checks report units, signs and axes.
+    if explained >= SAME and gain > 0.1 * MIN_RATE_GAIN:
         return (
             a_period_late(windows, table)
             if table is not None and explained < 1.0 - SHARE_TIE

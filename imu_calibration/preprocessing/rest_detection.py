@@ -180,9 +180,8 @@ def quiet_samples(
         )
         calm = np.all(variance <= ratio**2 * limit, axis=1)
         quiet &= _covered(calm, width)
-        if (
-            width > 1 and resting is None
-        ):  # a change of attitude between two samples: no quiet span contains it
+        # A change of attitude between two samples: no quiet span contains it.
+        if width > 1 and resting is None:
             across = _covered(calm, width - 1)
             quiet[:-1] &= across
             quiet[1:] &= across
@@ -232,9 +231,8 @@ class Cells:
     def __init__(self, force_s: np.ndarray, rate_s: np.ndarray, period: float):
         n = len(force_s)
         self._period, self._size = period, max(1, min(int(_GRID / period), n))
-        self.edges = np.append(
-            np.arange(0, n - self._size + 1, self._size), n
-        )  # the last cell has the remainder
+        # The last cell has the remainder.
+        self.edges = np.append(np.arange(0, n - self._size + 1, self._size), n)
         self.least = np.array([least_variance(values) for values in (force_s, rate_s)])
         """Of force and rate."""
         self._sums = []
@@ -487,9 +485,8 @@ def _not_turning(rate, found):
     usual = np.median(means, axis=0)
     limit = np.maximum(_TURNING_SD * noise, 0.01 * _farthest(rate, usual))
     keep = np.all(np.abs(means - usual) <= limit, axis=1)
-    if (
-        len(found) >= _ENOUGH
-    ):  # an isolated deviation from both neighbours; the drift of warming biases is smooth
+    # An isolated deviation from both neighbours; the drift of warming biases is smooth.
+    if len(found) >= _ENOUGH:
         step = np.diff(means, axis=0)
         alone = np.minimum(
             np.minimum(np.abs(step[:-1]), np.abs(step[1:])), 0.5 * np.abs(step[1:] - step[:-1])

@@ -97,9 +97,8 @@ class SpikeFilter:
         at = len(self._values) - len(self._held) + np.arange(count)
         spiky = self._spikes(at)
         self.dropped, self._held = self.dropped + int(np.count_nonzero(spiky)), held
-        kept = (
-            max((at[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0) * NOISE_SAMPLES
-        )  # the first kept row has no second difference
+        # The first kept row has no second difference.
+        kept = max((at[-1] + 1 - SPIKE_REACH) // NOISE_SAMPLES - 1, 0) * NOISE_SAMPLES
         self._values, self._first = self._values[kept:], self._first + kept
         self._noise = self._noise[-2 - (len(self._values) + SPIKE_REACH) // NOISE_SAMPLES :]
         return [samples.select(~spiky) if spiky.any() else samples]

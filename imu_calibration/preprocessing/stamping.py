@@ -389,9 +389,8 @@ class CountedClock:
             [np.concatenate([self._before[0], number]), np.concatenate([self._before[1], stamp])]
         )[:, -LOSS_REACH:]
         self._next = number[-1] + 1
-        if (
-            len(number) >= CLOCK_BLOCK // 2 or not self._points
-        ):  # the few samples of a shorter one may all be late
+        # The few samples of a shorter one may all be late.
+        if len(number) >= CLOCK_BLOCK // 2 or not self._points:
             late = stamp - self._period * number
             usual = late.min() if self._arrivals else late.mean()
             self._points.append((float(number.mean()), float(usual + self._period * number.mean())))
@@ -529,9 +528,8 @@ class SampleTimes:
         """
         if self._learning or self._clock is not None or self.line is None or not len(samples):
             return False
-        step = np.diff(
-            np.concatenate([self._history[-self._unseen - 1 :], samples.stamp_ns])
-        )  # the complete block of the next review
+        # The complete block of the next review.
+        step = np.diff(np.concatenate([self._history[-self._unseen - 1 :], samples.stamp_ns]))
         if not np.all(is_regular(step, self.line.period_ns)):
             return False
         if not self._order.passes(samples.stamp_ns):

@@ -258,9 +258,8 @@ def _mean_motion(motion):
     The mean position and, when the slope of a straight line is significant, this slope.
     """
     mean = motion.position.mean(axis=0)
-    some = slice(
-        None, None, max(1, len(motion) // 500)
-    )  # the levels are averages over 0.2 s, so these contain the same information
+    # The levels are averages over 0.2 s, so these contain the same information.
+    some = slice(None, None, max(1, len(motion) // 500))
     time, position = motion.time[some] - motion.time[some].mean(), motion.position[some] - mean
     slope = time @ position / max(time @ time, 1e-12)
     rest = (position - time[:, None] * slope).std(axis=0)

@@ -169,9 +169,8 @@ class MotionGatherer:
                 ]
             windows += self._cut(self._chunks.take())
             if not self._epoch_is_over():
-                queue = self._queue[
-                    'temperature'
-                ]  # of an epoch that the other streams do not begin
+                # Of an epoch that the other streams do not begin.
+                queue = self._queue['temperature']
                 while len(queue) > 1 and _span(queue) > JOINT_WAIT:
                     del queue[0]
                 return windows

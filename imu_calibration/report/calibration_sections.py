@@ -459,9 +459,8 @@ def _windows(figure, errors, sensor):
         axes.axhline(0, color=GREY, lw=0.6)
         axes.set(title=title, ylabel=unit)
     lower.set_xlabel('time, s')
-    axis_legend(
-        upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1
-    )  # visible on a narrow screen without scrolling
+    # Visible on a narrow screen without scrolling.
+    axis_legend(upper, 'lower right', bbox_to_anchor=(0.56, 1.0), borderaxespad=0.1)
 
 
 def _points(axes, time, values, hollow=False):

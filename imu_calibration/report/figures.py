@@ -153,9 +153,8 @@ def draw(
         figure = Figure(figsize=size, layout='constrained')
         paint(figure, *data)
         canvas, text = _laid_out(figure), io.StringIO()
-        figure.dpi = matplotlib.rcParams[
-            'figure.dpi'
-        ]  # of pictures inside, which the canvas lays out at 72
+        # Of pictures inside, which the canvas lays out at 72.
+        figure.dpi = matplotlib.rcParams['figure.dpi']
         canvas.print_svg(
             text, metadata={'Date': None, 'Creator': None, 'Format': None, 'Type': None}
         )

@@ -357,9 +357,8 @@ class WindowEvidence(Evidence):
         sd = np.sqrt(np.diag(covariance)[places])
         moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
         sizes, directions = np.linalg.eigh(moved.T @ moved)
-        observable = (
-            sizes > CONVENTION_SHARE * sizes[-1]
-        )  # without unobservable directions: compliances in no pose, arms that cancel
+        # Without unobservable directions: compliances in no pose, arms that cancel.
+        observable = sizes > CONVENTION_SHARE * sizes[-1]
         n_windows, n_own = len(moved), int(observable.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0

@@ -432,10 +432,11 @@ def _that_help(problem, explained, named):
     ]
     while kept:
         least = [_sure_reduction(problem, kept, each) for each in kept]
+        # Nan is not sure.
         short = [
             not paid > _needed_reduction(problem, explained, kept, each)
             for paid, each in zip(least, kept)
-        ]  # nan is not sure
+        ]
         if not any(short):
             break
         del kept[int(np.argmin(np.where(short, np.nan_to_num(least, nan=-np.inf), np.inf)))]

@@ -114,9 +114,8 @@ class BlockWhitener:
         variance, time = blocks.variance[select], blocks.time[select]
         self.scale = np.sqrt(np.median(variance / variance.mean(axis=1, keepdims=True), axis=0))
         covariance = np.diag(variance.mean(axis=1))
-        for rows in np.array_split(
-            np.arange(len(time)), COVARIANCE_PARTS
-        ):  # intermediate arrays of a part, not of the matrix
+        # Intermediate arrays of a part, not of the matrix.
+        for rows in np.array_split(np.arange(len(time)), COVARIANCE_PARTS):
             apart = np.abs(time[rows, None] - time[None, :])
             for process in blocks.processes:
                 covariance[rows] += process.sd**2 * np.exp(-apart / process.time)
@@ -323,9 +322,8 @@ def residuals(
 
     Rows within blocks would be too coarse.
     """
-    predicted = [
-        predict_windows(group, table, model, values=values) for group in chunks(windows)
-    ]  # columns need much memory
+    # Columns need much memory.
+    predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
     return {
         sensor: (
             np.concatenate([measured(window, sensor) for window in windows])

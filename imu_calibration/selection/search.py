@@ -301,9 +301,8 @@ class Search:
     def _replaced(self, chosen):
         best, cost = None, self.cost(chosen) - MIN_REPLACEMENT_NATS
         for place, question in enumerate(chosen):
-            if (
-                question.name in self.resolved
-            ):  # it could not be added again, and an effect that cancels it may be in the model
+            # It could not be added again, and an effect that cancels it may be in the model.
+            if question.name in self.resolved:
                 continue
             rest = chosen[:place] + chosen[place + 1 :]
             for other in self.others(rest):

@@ -106,9 +106,10 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     )
     scatter = about / (count - 1)[:, None, None, None]
     spread = np.trace(scatter, axis1=-2, axis2=-1)
+    # Repeated data have no scatter.
     known = (spread > REPEATED * (mean**2).sum(axis=-1)) & (
         np.linalg.det(scatter) > REPEATED * spread**2
-    )  # repeated data have no scatter
+    )
     scatter[~known], mean[~known] = np.eye(2), 0.0
     t_squared = count[:, None] * np.einsum(
         'kxi,kxi->kx', mean, np.linalg.solve(scatter, mean[..., None])[..., 0]
@@ -443,9 +444,8 @@ def of_stretches(
         hits[at] += power[at] > MIN_LINE_POWER * around[at]
         ratios[at] += power[at] / around[at]
         plain[at] += power[at] / np.maximum(np.median(power, axis=0), 1e-300)
-        excess[at] += (
-            np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))
-        )  # of a line under a Hann window
+        # Of a line under a Hann window.
+        excess[at] += np.maximum(power[at] - around[at], 0.0) * 4 / (2 / 3 * len(rest))
     if not count.any():
         return
     chance = np.where(

@@ -424,9 +424,8 @@ def _in_order(pool, function, items, done):
         for future in as_completed(futures):
             done(future.result())
     except BaseException:
-        for worker in list(
-            (pool._processes or {}).values()
-        ):  # public from Python 3.14: terminate_workers
+        # Public from Python 3.14: terminate_workers.
+        for worker in list((pool._processes or {}).values()):
             worker.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
         raise

@@ -45,9 +45,8 @@ def test_deviations_are_those_of_allantools(n):
         values[:, 0], rate=1 / PERIOD, data_type='freq', taus=factors * PERIOD
     )
     ours = in_pieces(values, factors, n)
-    assert len(taus) >= len(factors) - 1 and np.all(
-        factors <= FULL
-    )  # theirs leaves out what has a single term
+    # Theirs leaves out what has a single term.
+    assert len(taus) >= len(factors) - 1 and np.all(factors <= FULL)
     deviations = np.sqrt(ours.variance()[: len(taus), 0])
     print(
         f'largest difference from allantools {np.max(np.abs(deviations / theirs - 1)):.1e}, wanted'

@@ -152,9 +152,8 @@ def test_a_knock_is_left_out_and_the_noise_is_as_without_it(quiet):
 
 def test_an_imu_that_was_moved_is_two_stretches(quiet):
     imu, before = quiet
-    tilted = changed(
-        imu, 0, 30_000, np.full(30_000, 0.03)
-    )  # 3 mrad, less than a fifth of a sample's noise
+    # 3 mrad, less than a fifth of a sample's noise.
+    tilted = changed(imu, 0, 30_000, np.full(30_000, 0.03))
     found = read_rest(source(tilted))
     assert len(found.parts) == 2
     # the step would add 0.03^2 / 12 at the longest averages
@@ -185,9 +184,8 @@ def test_the_temperature_is_taken_out_and_said(quiet, accelerometer_x_only):
     (trend,) = found.record.trends[0]
     assert trend.name == 'temperature' and abs(trend.value - 5e-3) < 4 * trend.sd
     assert not any(found.record.trends[1:])
-    assert any(
-        f'{1e6 * trend.value / 9.80665:.0f} ± ' in line for line in lines(figures_of(found))
-    )  # ug/K
+    # Ug/K.
+    assert any(f'{1e6 * trend.value / 9.80665:.0f} ± ' in line for line in lines(figures_of(found)))
     # the curve with the trend is far above at long times, the one without it is not
     curve = found.record.curve
     longest = curve.tau > 100

@@ -271,6 +271,7 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
     text, of_bags, of_nodes = truth.read_text(), [], []
     for file in (noise_file, twice):
         output = tmp_path / file.stem
+        # Nothing proves truth.yaml.
         assert (
             main(
                 [
@@ -286,7 +287,7 @@ def test_the_verb_and_the_node_take_the_noise(noise_file, tmp_path):
                 ]
             )
             == 3
-        )  # nothing proves truth.yaml
+        )
         of_bags.append(
             parse_imu(raw_messages(output, '/imu/data_corrected')[-1][1]).doubles[
                 FIELDS['force_cov']

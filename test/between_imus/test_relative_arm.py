@@ -96,13 +96,11 @@ def test_windows_integrate_by_parts():
     windows = make_windows(time, np.arange(1.0, 6.0, 0.1), 0.15)
     values = np.stack([np.ones_like(time), time, np.sin(20 * time)], axis=1)
     slopes = np.stack([np.zeros_like(time), np.ones_like(time), 20 * np.cos(20 * time)], axis=1)
-    np.testing.assert_allclose(
-        windows.mean(values)[:, 0], 1.0, atol=2e-3
-    )  # quadrature over uneven stamps
+    # Quadrature over uneven stamps.
+    np.testing.assert_allclose(windows.mean(values)[:, 0], 1.0, atol=2e-3)
     np.testing.assert_allclose(windows.slope(values), windows.mean(slopes), atol=0.1)
-    even = make_windows(
-        0.01 * np.arange(1000), np.arange(1.003, 8.0, 0.097), 0.08
-    )  # eight samples, anywhere in the window
+    # Eight samples, anywhere in the window.
+    even = make_windows(0.01 * np.arange(1000), np.arange(1.003, 8.0, 0.097), 0.08)
     np.testing.assert_allclose(even.mean(np.ones((1000, 1))), 1.0, rtol=1e-12)
     np.testing.assert_allclose(even.slope(0.01 * np.arange(1000)[:, None]), 1.0, rtol=2e-3)
 
@@ -205,9 +203,8 @@ def test_sd_are_honest():
         f'mean square z {np.mean(np.square(scores)):.2f}, 95 % intervals hold'
         f' {100 * np.mean(np.abs(scores) < 1.96):.1f} %'
     )
-    assert (
-        0.75 < np.mean(np.square(scores)) < 1.5
-    )  # 1.15 for these seeds: an sd wrong by a factor of 1.3 gives 0.68 or 1.95
+    # 1.15 for these seeds: an sd wrong by a factor of 1.3 gives 0.68 or 1.95.
+    assert 0.75 < np.mean(np.square(scores)) < 1.5
 
 
 @pytest.mark.slow

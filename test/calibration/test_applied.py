@@ -278,9 +278,8 @@ def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
     calibration = imu.calibrate(moved, gravity=GRAVITY).calibration
     step = calibration.value('gyroscope', 'bias') - truth[9:12]
     np.testing.assert_allclose(step, course[-1], atol=0.05 * DEG)
-    assert (
-        'gyroscope.gyro_bias_drift.time_constant' not in calibration.held_reason
-    )  # its columns are taken at a point, not at its prior
+    # Its columns are taken at a point, not at its prior.
+    assert 'gyroscope.gyro_bias_drift.time_constant' not in calibration.held_reason
     assert calibration.statistics['uncorrected'][0]['applied'] == END
     assert calibration.proof['accelerometer']['windows'] < 40 / 2
 

@@ -286,12 +286,10 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
         )
 
     assert stands_out(of([6.0, 1.0], 0.0), pair)
-    assert not stands_out(
-        of([2.5, -2.5], 0.9), pair
-    )  # significant together (chi2 125), but no coefficient is
-    assert not stands_out(
-        of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair
-    )  # a size of no instrument
+    # Significant together (chi2 125), but no coefficient is.
+    assert not stands_out(of([2.5, -2.5], 0.9), pair)
+    # A size of no instrument.
+    assert not stands_out(of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair)
     monkeypatch.undo()
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
     faint = imu.calibrate(late[0].block, late[1]).calibration
@@ -323,9 +321,8 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
 
     With a formula for the cube that name is in no model.
     """
-    monkeypatch.setattr(
-        by_evidence, 'stands_out', lambda *some: True
-    )  # another guard, which sees to it here too
+    # Another guard, which sees to it here too.
+    monkeypatch.setattr(by_evidence, 'stands_out', lambda *some: True)
     session = make_session(141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141))
     found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
     assert not {'added', 'denied'} & set(found.statistics)

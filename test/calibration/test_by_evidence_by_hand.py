@@ -71,9 +71,8 @@ def test_live_it_is_in_the_model_as_well(bent, asked):
     assert result.calibration.statistics['added'] == [QUADRATIC]
     assert_same(result, asked.result)
     residual = live.residuals(poses)
-    assert (
-        np.abs(residual.rate_s).max() < 5e-3
-    )  # noise of a mean over two seconds, 2e-4, and the bias of each pose
+    # Noise of a mean over two seconds, 2e-4, and the bias of each pose.
+    assert np.abs(residual.rate_s).max() < 5e-3
 
 
 def test_what_only_one_half_shows_is_left_out_and_widens():

@@ -38,9 +38,8 @@ def test_a_good_file_helps_at_rest_and_in_turns(second, calibrated):
     found = check_recording(SampleBlock(second), calibrated, gravity=GRAVITY)
     assert found.helps and found.exit_code == 0
     accelerometer, gyroscope = found.proof['accelerometer'], found.proof['gyroscope']
-    assert (
-        accelerometer['after'] < 0.01 < 0.05 < accelerometer['before']
-    )  # scatter of the poses 2 mm/s^2, biases 0.2 m/s^2
+    # Scatter of the poses 2 mm/s^2, biases 0.2 m/s^2.
+    assert accelerometer['after'] < 0.01 < 0.05 < accelerometer['before']
     assert gyroscope['unit'] == 'rad per turn' and gyroscope['after'] < 0.3 * gyroscope['before']
     assert (
         gyroscope['regimes']['rest']['unit'] == 'rad/s'
@@ -50,9 +49,8 @@ def test_a_good_file_helps_at_rest_and_in_turns(second, calibrated):
 
 
 def test_a_bias_that_moved_is_named(second, calibrated):
-    moved = second.rate_s - 3 * calibrated.value(
-        'gyroscope', 'bias'
-    )  # it has passed zero, so that nothing at all would now be better
+    # It has passed zero, so that nothing at all would now be better.
+    moved = second.rate_s - 3 * calibrated.value('gyroscope', 'bias')
     found = check_recording(SampleBlock(replace(second, rate_s=moved)), calibrated, gravity=GRAVITY)
     assert found.exit_code == 3 and found.proof['gyroscope']['regimes']['rest']['ci95'][0] > 1
     assert 'bias' in found.lines[1]

@@ -101,9 +101,8 @@ def test_an_attitude_that_nobody_took_is_worth_nothing_once_everything_is_known(
 def test_what_is_foretold_takes_off_what_is_missing():
     knowledge, steps = knowing((0, 0, 1)), foretold(knowing((0, 0, 1)))
     assert 8 <= len(steps) <= 20
-    hasty = [
-        _rollout(knowing((0, 0, 1)), weight)[0] for weight in WEIGHTS
-    ]  # neither way of choosing is sooner at its end than what is foretold
+    # Neither way of choosing is sooner at its end than what is foretold.
+    hasty = [_rollout(knowing((0, 0, 1)), weight)[0] for weight in WEIGHTS]
     assert (
         sum(step.seconds for step in steps)
         == min(sum(step.seconds for step in plan) for plan in hasty)

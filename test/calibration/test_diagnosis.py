@@ -141,9 +141,8 @@ def test_document_holds_what_the_contract_asks_for(sizes):
     assert set(document['unexplained']['gyroscope']) >= {'significant', 'rms', 'correlates_with'}
     # The extended model is a model like any other: its residual is noise.
     assert ('accelerometer', 'accel_quadratic') in diagnosis.model.slices
-    assert (
-        0.55 < diagnosis.solution.chi2_per_dof['accelerometer']['means'] < 1.45
-    )  # three sd of some 100 degrees of freedom
+    # Three sd of some 100 degrees of freedom.
+    assert 0.55 < diagnosis.solution.chi2_per_dof['accelerometer']['means'] < 1.45
 
 
 @pytest.mark.long

@@ -100,9 +100,8 @@ def test_a_hidden_effect_is_found_and_its_gain_measured(name, responding):
     first = found.findings[0]
     assert name in (first.effect, *first.indistinguishable_from)
     assert first.gain.ci95[0] > 0 and first.gain.windows >= 23
-    assert first.gain.of == (
-        OF_MODEL if name.endswith('drift') else APPLIED
-    )  # a drift is replaced by its value at the end
+    # A drift is replaced by its value at the end.
+    assert first.gain.of == (OF_MODEL if name.endswith('drift') else APPLIED)
     assert len(found.findings) == 1
 
 
@@ -129,9 +128,8 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
     assert any(
         regime.variable in line and 'gyroscope y' in line for line in diagnosis_lines(diagnosis)
     )
-    imu, ranges, _ = simulate(
-        21500, n_poses=24, spoil=spoil
-    )  # calibrate and diagnose use one test of the unexplained residual
+    # Calibrate and diagnose use one test of the unexplained residual.
+    imu, ranges, _ = simulate(21500, n_poses=24, spoil=spoil)
     assert solve_hand_by_evidence(
         gather_by_hand(imu, ranges), HandOptions(GRAVITY)
     ).changes.unexplained == {'gyroscope': rest.entry}
@@ -158,9 +156,8 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
     table = Table.from_mapping(profile.table)
     model = SensorModel(joint_names=table.joint_names)
     imu = simulate_session(model, random_values(model), table, profile=profile)[0]
-    monkeypatch.setattr(
-        HandProblem, 'named', lambda self: []
-    )  # what is asked about is known before the search
+    # What is asked about is known before the search.
+    monkeypatch.setattr(HandProblem, 'named', lambda self: [])
     found = investigate_by_hand(gather_by_hand(imu), HandOptions(GRAVITY))
     assert {'gyro_rate_product', 'gyro_quadratic'} <= {
         entry['effect'] for entry in found.not_testable

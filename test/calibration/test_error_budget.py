@@ -116,9 +116,8 @@ def test_joint_errors_are_drawn_anew_in_every_window(result):
     draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)
     own = budget.causes['joint position']
     large = own > 1e-12
-    assert draws.std(axis=0)[large] == pytest.approx(
-        own[large], rel=0.06
-    )  # 4000 draws: 1.1 % each, five of it
+    # 4000 draws: 1.1 % each, five of it.
+    assert draws.std(axis=0)[large] == pytest.approx(own[large], rel=0.06)
 
 
 def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):

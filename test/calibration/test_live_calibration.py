@@ -184,9 +184,8 @@ def test_a_session_resumed_from_its_state_equals_two_recordings(quick):
     result, expected = second.solve(pending=True), offline(*halves)
     assert_same(result.calibration, expected.calibration)
     assert result.calibration.conditions == expected.calibration.conditions
-    assert_same(
-        second.solve(pending=True).calibration, expected.calibration
-    )  # solving does not add the earlier run again
+    # Solving does not add the earlier run again.
+    assert_same(second.solve(pending=True).calibration, expected.calibration)
 
 
 WARMTH = np.array([0.004, -0.006, 0.0025])

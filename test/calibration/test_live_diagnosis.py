@@ -156,9 +156,8 @@ def test_the_model_as_asked_stays(hidden):
         live.push(block)
     before = live.solve(pending=True).calibration
     answer = question_about(live).answer()
-    assert answer.state.word == 'found' and not live.adopt(
-        answer.extension
-    )  # it is said, and that is all
+    # It is said, and that is all.
+    assert answer.state.word == 'found' and not live.adopt(answer.extension)
     after = live.solve(pending=True).calibration
     assert after.param_names == before.param_names and 'added' not in after.statistics
     np.testing.assert_array_equal(after.sd, before.sd)
@@ -266,9 +265,8 @@ class Slow:
 
 
 def test_the_thread_answers_when_asked_and_once_at_a_time(monkeypatch):
-    monkeypatch.setattr(
-        'imu_calibration.nodes.diagnosis_thread.MAX_DIAGNOSIS_SHARE', 1.0
-    )  # a busy machine makes the first answer long, and the pause after it
+    # A busy machine makes the first answer long, and the pause after it.
+    monkeypatch.setattr('imu_calibration.nodes.diagnosis_thread.MAX_DIAGNOSIS_SHARE', 1.0)
     thread, question = DiagnosisThread(3600.0), Slow('first')
     thread.ask_when_due(question, True)
     assert question.asked == 0 and thread.state.word == 'waiting'  # the period is not over
@@ -281,11 +279,12 @@ def test_the_thread_answers_when_asked_and_once_at_a_time(monkeypatch):
     until(lambda: not thread.is_running, 'the answer', 10.0)
     assert thread.state.message == 'first' and thread.n_answers == 1
     assert question not in vars(thread).values()  # its windows would remain in memory
+    # It was wanted while the first was being answered.
     until(
         lambda: thread.ask_when_due(question, False) or thread.n_answers == 2,
         'the second question',
         10.0,
-    )  # it was wanted while the first was being answered
+    )
 
 
 def test_a_session_started_anew_forgets_the_question_and_an_ending_one_stops_it():

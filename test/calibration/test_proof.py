@@ -84,9 +84,8 @@ def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, t
         and '\n' not in line
         and line == late.calibration.decision_reasons['gyroscope']
     )
-    assert (
-        late.verdict.decisions['accelerometer'] is HELPS
-    )  # its residuals are large, and it helps in every motion
+    # Its residuals are large, and it helps in every motion.
+    assert late.verdict.decisions['accelerometer'] is HELPS
     late.save(tmp_path, report=False)
     assert 'proof:' in (tmp_path / 'calibration.yaml').read_text()
 

@@ -121,9 +121,8 @@ def test_the_corrected_topic_holds_the_true_readings(tmp_path, effects, capsys):
         .at(force[-1], rate[-1], warming=dt)
         .covariances(*Uncertainty(calibration).noise)[1]
     )
-    assert np.diag(cov) == pytest.approx(
-        np.diag(expected), rel=0.05
-    )  # was unknown, so it is the calibration's noise
+    # Was unknown, so it is the calibration's noise.
+    assert np.diag(cov) == pytest.approx(np.diag(expected), rel=0.05)
 
 
 def test_readings_at_another_point_and_frame_of_the_body(tmp_path):

@@ -110,9 +110,8 @@ def test_a_fleet_goes_on_past_a_bad_bag(result, capsys):
     assert '\n' not in units['unit_c']['error']
     assert not (output / 'unit_c').exists()
     page = (output / 'summary.html').read_text()
-    assert (
-        'unit_c' in page and ' of 3 units</p>' in page and '--accent' in page
-    )  # the style of all reports
+    # The style of all reports.
+    assert 'unit_c' in page and ' of 3 units</p>' in page and '--accent' in page
     assert capsys.readouterr().err == ''
 
 

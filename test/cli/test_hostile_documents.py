@@ -101,9 +101,8 @@ def _refusal(load, names):
     try:
         load(target.getvalue())
     except DocumentError as error:
-        return (
-            'refused' if re.findall(r'\d{6,}', str(error)) else str(error)
-        )  # bytes that are needed, bytes that are accepted
+        # Bytes that are needed, bytes that are accepted.
+        return 'refused' if re.findall(r'\d{6,}', str(error)) else str(error)
 
 
 @pytest.mark.parametrize('damage', [b'', b'PK', b'(' * 5000])

@@ -105,9 +105,8 @@ def test_quick_verbs(folder, monkeypatch, capsys):
 def test_other_verbs(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     for verb, arguments in LONG.items():
-        if verb != 'view' or find_spec(
-            'foxglove'
-        ):  # the extra view is not among the oldest versions
+        # The extra view is not among the oldest versions.
+        if verb != 'view' or find_spec('foxglove'):
             document_of([verb, *arguments], capsys)
 
 

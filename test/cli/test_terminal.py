@@ -294,9 +294,8 @@ def test_an_interruption_ends_worker_processes_without_tracebacks(tmp_path):
         start_new_session=True,
     )
     end = time.monotonic() + 60.0
-    while (
-        len(children_of(process)) < 3 and time.monotonic() < end
-    ):  # two workers and the tracker of resources
+    # Two workers and the tracker of resources.
+    while len(children_of(process)) < 3 and time.monotonic() < end:
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGINT)
     error = process.communicate(timeout=60)[1]

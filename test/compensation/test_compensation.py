@@ -70,9 +70,8 @@ def test_compensation_undoes_the_forward_equations(effects):
         alpha_s=alpha,
         temperature_c=temperature,
     )
-    np.testing.assert_allclose(
-        corrected.force, force, atol=1e-12 * 30
-    )  # 12 digits of readings up to 30 m/s^2
+    # 12 digits of readings up to 30 m/s^2.
+    np.testing.assert_allclose(corrected.force, force, atol=1e-12 * 30)
     np.testing.assert_allclose(corrected.rate, rate, atol=1e-12 * 10)
     assert not corrected.flagged.any()
 
@@ -116,9 +115,8 @@ def test_transfer_there_and_back_is_the_identity():
     again = compensated_samples(
         plain, moved.force, moved.rate, alpha_s=alpha @ mat_ts.T, transfer=back
     )
-    np.testing.assert_allclose(
-        again.force, force, atol=1e-13 * 100
-    )  # centripetal terms of 30 m/s^2 come and go
+    # Centripetal terms of 30 m/s^2 come and go.
+    np.testing.assert_allclose(again.force, force, atol=1e-13 * 100)
     np.testing.assert_allclose(again.rate, rate, atol=1e-14)
 
 

@@ -50,9 +50,8 @@ def test_noise_agrees_with_monte_carlo(effects, transfer):
     rng = np.random.default_rng(5)
     kernel = make_kernel(calibration, transfer)
     force = FORCE + rng.multivariate_normal(np.zeros(3), FORCE_COV, N_DRAWS)
-    rates = rng.multivariate_normal(
-        np.zeros(3), RATE_COV, (N_DRAWS, DERIVATIVE.taps)
-    )  # newest first, as the weights
+    # Newest first, as the weights.
+    rates = rng.multivariate_normal(np.zeros(3), RATE_COV, (N_DRAWS, DERIVATIVE.taps))
     slope = SLOPE + np.einsum('k,nki->ni', DERIVATIVE.weights, rates)
     rows = np.column_stack([force, RATE + rates[:, 0], slope, np.full(N_DRAWS, DT)])
     out = np.array([kernel(*row) for row in rows.tolist()])

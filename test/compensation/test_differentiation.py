@@ -34,9 +34,8 @@ def test_noise_is_as_predicted(taps):
         np.sqrt((derivative.weights**2).sum()), derivative.noise_sd(1.0), rtol=1e-12
     )
     slope = slopes(derivative, np.random.default_rng(2).normal(0.0, 0.3, (20_000, 3)))
-    assert slope.std() == pytest.approx(
-        derivative.noise_sd(0.3), rel=0.03
-    )  # 60 000 values, serially correlated over `taps`
+    # 60 000 values, serially correlated over `taps`
+    assert slope.std() == pytest.approx(derivative.noise_sd(0.3), rel=0.03)
 
 
 def test_the_window_is_the_shortest_whose_noise_stays_below_a_third():

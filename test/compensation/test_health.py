@@ -202,9 +202,8 @@ def test_an_update_fades_and_its_uncertainty_grows_back():
     assert bias[0][0] == pytest.approx(0.1 * DEG, rel=0.02) and bias[2][0] == pytest.approx(
         0.1 * DEG * np.exp(-1), rel=0.02
     )
-    assert np.sqrt(variance[-1][0]) == pytest.approx(
-        0.1 * DEG, rel=0.05
-    )  # as wide as what was seen, no longer as the calibration said
+    # As wide as what was seen, no longer as the calibration said.
+    assert np.sqrt(variance[-1][0]) == pytest.approx(0.1 * DEG, rel=0.05)
 
 
 def test_a_stop_that_grows_is_one_measurement():

@@ -71,9 +71,8 @@ def test_messages_come_out_as_blocks_do_offline(effects, transfer):
     live = LiveCompensation(calibration, transfer)
     out = [live(data) for data in messages(imu)]
     offline = CompensationStream(calibration, transfer=transfer).correct(imu)
-    settled = slice(
-        MIN_PERIOD_STEPS + 60, None
-    )  # the window of the derivative starts after the warm-up and is up to 20 ms + 20 ms long
+    # The window of the derivative starts after the warm-up and is up to 20 ms + 20 ms long.
+    settled = slice(MIN_PERIOD_STEPS + 60, None)
     np.testing.assert_allclose(
         [field(d, 'force_s') for d in out[settled]], offline.force[settled], atol=1e-9
     )

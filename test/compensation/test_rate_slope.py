@@ -43,9 +43,8 @@ def stamps_of(kind, true_ns, rng):
         return true_ns + rng.normal(0.0, 0.2 * PERIOD_NS, n).astype(np.int64)
     if kind == 'runaway':  # steps of any length that have nothing to do with the sampling
         return true_ns[0] + np.cumsum(rng.exponential(PERIOD_NS, n)).astype(np.int64)
-    if kind.endswith(
-        ' ms'
-    ):  # 'normal 2.0 ms', 'exponential 3.0 ms': independent, so that stamps overtake each other
+    # 'normal 2.0 ms', 'exponential 3.0 ms': independent, so that stamps overtake each other.
+    if kind.endswith(' ms'):
         law, scatter, _ = kind.split()
         return true_ns + (1e6 * float(scatter) * getattr(rng, f'standard_{law}')(n)).astype(
             np.int64
@@ -102,9 +101,8 @@ def test_blocks_give_the_same_as_samples_however_the_stream_is_cut(stretches, da
     got = np.concatenate(
         [other.push_block(stamps[a:b], values[a:b]) for a, b in zip(cuts, cuts[1:])]
     )
-    np.testing.assert_allclose(
-        got, expected, atol=1e-8
-    )  # values of 1 over 1 ms: rounding of 1e-13 x 1000
+    # Values of 1 over 1 ms: rounding of 1e-13 x 1000.
+    np.testing.assert_allclose(got, expected, atol=1e-8)
     assert (one.line, one.derivative, one.n_without) == (
         other.line,
         other.derivative,
@@ -343,9 +341,8 @@ def test_offline_says_the_same_as_live():
     live, offline = LiveCompensation(calibration), CompensationStream(calibration)
     out = [parse_imu(live(message.tobytes())).doubles for message in encode_imu(imu)]
     force = offline.correct(imu).force
-    np.testing.assert_allclose(
-        [d[FIELDS['force_s']] for d in out[600:]], force[600:], atol=0.1
-    )  # the period from 256 or from all stamps
+    # The period from 256 or from all stamps.
+    np.testing.assert_allclose([d[FIELDS['force_s']] for d in out[600:]], force[600:], atol=0.1)
     live.refresh()
     stated = parse_imu(live(encode_imu(imu)[-1].tobytes())).doubles[FIELDS['force_cov']]
     np.testing.assert_allclose(

@@ -45,9 +45,8 @@ def test_blocks_give_the_same_as_samples_however_the_stream_is_cut(taps, steps, 
             blocks.push_block(stamps[cut:], values[cut:]),
         ]
     )
-    np.testing.assert_allclose(
-        got, one_by_one(tracker(taps), stamps, values), atol=1e-9
-    )  # values of 1 over 5 ms: rounding of 1e-13 x 200
+    # Values of 1 over 5 ms: rounding of 1e-13 x 200.
+    np.testing.assert_allclose(got, one_by_one(tracker(taps), stamps, values), atol=1e-9)
 
 
 @given(st.integers(2, 9), st.lists(st.sampled_from([1, 1, 1, 1, 2, 0]), min_size=20, max_size=60))

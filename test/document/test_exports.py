@@ -189,9 +189,8 @@ def test_arms_in_kalibr_differ_by_what_is_announced(seed):
         gain = np.linalg.norm(calibration.of(sensor, Role.LINEAR), 2)
         assert 0.5 * rms(made - read) < gain * found.loss.left[sensor] < 2.0 * rms(made - read)
     felt = rms(np.einsum('nij,kj->nki', lever_matrix(ref.rate_s, ref.alpha_s), arms))
-    assert (
-        found.loss.left['accelerometer'] < 0.3 * felt
-    )  # of the second order: a matrix 0.02 to 0.05 from the identity
+    # Of the second order: a matrix 0.02 to 0.05 from the identity.
+    assert found.loss.left['accelerometer'] < 0.3 * felt
 
 
 def test_arms_are_exact_in_kalibr_where_the_matrix_is_diagonal():
@@ -421,9 +420,8 @@ def test_who_takes_no_calibration_is_to_be_fed_compensated_readings():
     assert all(
         line in found.content.decode() for line in loss_lines(find_target('vins'), found.loss)
     )
-    assert (
-        found.loss.left['accelerometer'] > 0.01
-    )  # raw readings: scale factors of some percent at 1 g
+    # Raw readings: scale factors of some percent at 1 g.
+    assert found.loss.left['accelerometer'] > 0.01
 
 
 # What is lost
@@ -449,9 +447,8 @@ def test_what_is_left_is_what_was_announced(name, seed):
     calibration = random_calibration(seed, FURTHER['accelerometer'], FURTHER['gyroscope'])
     ref = motion(seed).reference
     found = export(calibration, target, motion=motion(seed))
-    known = replace(
-        calibration, values=calibration.values.copy()
-    )  # what the program estimates is known to it
+    # What the program estimates is known to it.
+    known = replace(calibration, values=calibration.values.copy())
     for effect in calibration.model.effects:
         if capability_of(effect, target.estimates):
             known.values[calibration.model.slices[effect.key]] = effect.prior_values()
@@ -517,9 +514,8 @@ def test_the_standard_motion_is_that_of_the_conditions():
     assert np.abs(ref.rate_s).max() == pytest.approx(3.0, rel=1e-3)
     assert (ref.temperature_c.min(), ref.temperature_c.max()) == (10.0, 40.0)
     slope = np.gradient(ref.rate_s, 1 / 50, axis=0)[1:-1]
-    np.testing.assert_allclose(
-        slope, ref.alpha_s[1:-1], atol=3e-2
-    )  # second order of a step of 20 ms: w^3 dt^2 / 6 at 0.5 Hz
+    # Second order of a step of 20 ms: w^3 dt^2 / 6 at 0.5 Hz.
+    np.testing.assert_allclose(slope, ref.alpha_s[1:-1], atol=3e-2)
     assert isinstance(ref, Reference)
 
 
@@ -546,17 +542,15 @@ def test_a_name_in_a_calibration_adds_no_line_to_the_file_of_another_program(nam
         export(replace(plain, frame_id=frame), find_target(name), rate=200.0).content
         for frame in ('imu', HOSTILE)
     ]
-    if (
-        find_target(name).whole or b'comments' in files[0]
-    ):  # JSON and MATLAB files: strings that escape themselves
+    # JSON and MATLAB files: strings that escape themselves.
+    if find_target(name).whole or b'comments' in files[0]:
         return
     lines = [
         [line for line in file.decode().splitlines() if not line.startswith('#')] for file in files
     ]
     assert lines[0] == lines[1]
-    assert (
-        b"'imu?ARMING" in files[1] or b'static_transform_publisher' not in files[1]
-    )  # quoted for the shell
+    # Quoted for the shell.
+    assert b"'imu?ARMING" in files[1] or b'static_transform_publisher' not in files[1]
 
 
 # There and back
@@ -582,9 +576,8 @@ def test_an_import_of_an_export_is_what_it_was(name, seed):
     calibration = bare(name, held_by(name, seed, conditions={'temperature_range_c': [4.0, 46.0]}))
     found = back_and_forth(name, calibration)
     compare_values(found, calibration, target)
-    if (
-        target.axes == 'accelerometer_lower_triangular'
-    ):  # a file without our note of the frame: the axes of the program, origin in the middle
+    # A file without our note of the frame: the axes of the program, origin in the middle.
+    if target.axes == 'accelerometer_lower_triangular':
         own = with_values(
             calibration,
             LINEAR=np.tril,
@@ -624,16 +617,14 @@ def test_what_another_program_says_is_weak_unproven_and_of_unknown_certainty():
         and not found.uncertainty_known
     )
     assert dict(zip(found.param_names, found.status))['gyroscope.matrix.xy'] == 'weak'
-    assert (
-        dict(zip(found.param_names, found.status))['gyroscope.bias.x'] == 'held'
-    )  # Kalibr writes none
+    # Kalibr writes none.
+    assert dict(zip(found.param_names, found.status))['gyroscope.bias.x'] == 'held'
     assert 'unknown' in calibration_to_text(found)
     against = compare(calibration, found)
     assert against.agree is None
     scale = next(row for row in against.rows if row.name == 'gyroscope.matrix.zz')
-    assert scale.sd == pytest.approx(
-        calibration.sd[calibration.param_names.index(scale.name)]
-    )  # of the one that is known
+    # Of the one that is known.
+    assert scale.sd == pytest.approx(calibration.sd[calibration.param_names.index(scale.name)])
     assert compare(found, found).rows[-1].ratio is None
 
 

@@ -277,9 +277,8 @@ def test_compensation_takes_it_out_offline_and_live():
     kernel = make_kernel(truth)
     got = np.array([kernel(*f, *w, 0.0, 0.0, 0.0, 0.0) for f, w in zip(*measured, strict=True)])
     np.testing.assert_allclose(got, np.hstack([ref.force_s, ref.rate_s]), atol=1e-9)
-    still = replace(
-        truth, values=np.where(['size' in n for n in model.param_names], 0.0, values)
-    )  # without arms no slope is needed
+    # Without arms no slope is needed.
+    still = replace(truth, values=np.where(['size' in n for n in model.param_names], 0.0, values))
     samples = ImuSamples(10**18 + 10**7 * np.arange(400), *measured, '')
     live = LiveCompensation(still)
     out = [parse_imu(live(row.tobytes())).doubles for row in encode_imu(samples)]

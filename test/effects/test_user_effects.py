@@ -392,9 +392,8 @@ def test_the_example_file_is_a_catalogue_whose_effects_are_found():
     )
     catalogue = files.read_effects(example)
     names = {effect.name: effect.sensor for effect in catalogue.added}
-    assert len(names) == 2 and all(
-        effect.tolerance < 1e-3 for effect in catalogue.added
-    )  # 2e-6 is a number
+    # 2e-6 is a number.
+    assert len(names) == 2 and all(effect.tolerance < 1e-3 for effect in catalogue.added)
     model = SensorModel(
         (*BASE, 'accel_rate_coupling'),
         (*BASE, 'gyro_scale_by_force'),

@@ -124,9 +124,8 @@ def _child(pipe, name, seeds, seed, seconds):
 
         def before(data):
             last.write_bytes(data)
-            signal.setitimer(
-                signal.ITIMER_PROF, HANG
-            )  # whose signal ends the process, in library code too
+            # Whose signal ends the process, in library code too.
+            signal.setitimer(signal.ITIMER_PROF, HANG)
 
         pipe.send(str(last))
         report(
@@ -137,9 +136,8 @@ def _child(pipe, name, seeds, seed, seconds):
 
 def fuzz_slice(name, seeds, seed, seconds):
     """Read inputs in a process of its own for some seconds; return the Record."""
-    context = multiprocessing.get_context(
-        'fork'
-    )  # the parent has one thread and has imported the readers
+    # The parent has one thread and has imported the readers.
+    context = multiprocessing.get_context('fork')
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_child, args=(theirs, name, seeds, seed, seconds))
     process.start()

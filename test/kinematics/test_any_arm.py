@@ -155,9 +155,10 @@ def test_limits_come_from_the_description_and_the_site():
 
 def test_the_place_of_the_link_and_of_the_sensor_in_it_add_up():
     inner = joint('turn', 'base_link', 'arm')
+    # At the pole of roll, pitch, yaw.
     fixed = joint(
         'bent', 'arm', 'imu_link', '0.1 0.2 0.3', f'{np.pi / 2} {np.pi / 2} 0.3', kind='fixed'
-    )  # at the pole of roll, pitch, yaw
+    )
     table = table_from_urdf(
         robot(inner, fixed),
         'imu_link',

@@ -50,9 +50,8 @@ def test_a_joint_has_a_range_or_is_endless_or_is_listed():
     assert missing_ranges(Table.from_mapping(slide)) == ('x',)
     arm = table_from_urdf(SIX_AXES, 'imu_link')
     assert missing_ranges(arm) == () and limits_of(arm).endless.tolist() == [False] * 5 + [True]
-    degrees = SIX_AXES.replace(
-        'lower="-2.9" upper="2.9"', 'lower="-166" upper="166"', 1
-    )  # not radians as URDF wants
+    # Not radians as URDF wants.
+    degrees = SIX_AXES.replace('lower="-2.9" upper="2.9"', 'lower="-166" upper="166"', 1)
     assert missing_ranges(table_from_urdf(degrees, 'imu_link')) == ('pan',)
     unlimited = SIX_AXES.replace('lower="-2.9" upper="2.9"', '', 1)
     assert missing_ranges(table_from_urdf(unlimited, 'imu_link')) == ('pan',)
@@ -65,9 +64,8 @@ def test_a_joint_has_a_range_or_is_endless_or_is_listed():
     follower = Table.from_mapping(
         {'joints': [{'name': 'outer', 'axis': [0, 0, 1]}, wide], 'gravity': 9.81}
     )
-    assert (
-        missing_ranges(follower) == ()
-    )  # the table file gives this range, whatever the joint is called
+    # The table file gives this range, whatever the joint is called.
+    assert missing_ranges(follower) == ()
 
 
 def test_a_site_overrides_what_a_robot_description_says_of_the_range():
@@ -188,9 +186,8 @@ def test_a_plan_keeps_to_the_neighbourhood_of_a_pose(tmp_path, capsys):
         '--output',
         str(tmp_path / 'out'),
     ]
-    assert (
-        main([*arm, '--around', 'outer=20', '--reach', '15']) == 1
-    )  # every joint, or it is no pose
+    # Every joint, or it is no pose.
+    assert main([*arm, '--around', 'outer=20', '--reach', '15']) == 1
     assert main([*arm, '--reach', '15']) == main([*arm, '--around', 'outer:20']) == 1
     assert len(capsys.readouterr().err.splitlines()) == 3
     assert main(

@@ -81,9 +81,8 @@ def test_sag_of_a_gimbal_is_an_angle_between_axes_and_an_encoder_that_reads_wron
         for name, axis in zip(('outer', 'middle', 'inner'), ((0, 0, 1), (0, 1, 0), (1, 0, 0)))
     ]
     table, moves, sag = Table(tuple(joints), gravity=9.8), motion(3), 1e-6
-    mounted = replace(
-        moves, position=moves.position - [0.0, 0.0, sag]
-    )  # what is behind the shaft goes along with it: the zero of the inner joint
+    # What is behind the shaft goes along with it: the zero of the inner joint.
+    mounted = replace(moves, position=moves.position - [0.0, 0.0, sag])
     for of_joint, alike in (
         ([sag, 0.0], (with_axis_angles(table, np.array([sag, 0.0])), mounted)),
         (
@@ -112,9 +111,8 @@ def test_a_shaft_that_sags_points_down():
         motion(2),
     )
     hanging = reference_motion(with_sag(table, np.array([0.01])), moves)
-    np.testing.assert_allclose(
-        hanging.mat_sn[:, 0, 2], -0.01, atol=1e-6
-    )  # the shaft's direction, seen from above
+    # The shaft's direction, seen from above.
+    np.testing.assert_allclose(hanging.mat_sn[:, 0, 2], -0.01, atol=1e-6)
 
 
 def test_what_stands_straight_is_left_as_it_is():

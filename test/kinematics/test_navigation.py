@@ -92,9 +92,8 @@ def test_drift_is_zero_for_perfect_samples_and_follows_one_fault():
     )
     np.testing.assert_allclose((velocity[-1], position[-1]), [[1.0, 0, 0], [50.0, 0, 0]], rtol=1e-9)
     turned = strapdown.dead_reckoning_errors(still, still.force_s, still.rate_s + [0, 1e-5, 0])[0]
-    np.testing.assert_allclose(
-        turned[-1, 0], G * 1e-5 * 100**2 / 2, rtol=1e-6
-    )  # g times the integral of the angle, small angles
+    # g times the integral of the angle, small angles.
+    np.testing.assert_allclose(turned[-1, 0], G * 1e-5 * 100**2 / 2, rtol=1e-6)
 
 
 def test_wrong_times_are_refused():

@@ -370,9 +370,8 @@ def test_the_files_that_users_copy_have_no_place(name):
     assert [
         mapping[key] for key in ('gravity', 'gravity_sd', 'latitude', 'height', 'azimuth_deg')
     ] == [None] * 5
-    assert all(
-        set(joint) == {'name', 'axis'} for joint in mapping['joints']
-    )  # limits of another table would move joints
+    # Limits of another table would move joints.
+    assert all(set(joint) == {'name', 'axis'} for joint in mapping['joints'])
     with refused(InputError, 'gravity_missing'):
         Table.from_mapping(mapping)
     assert Table.from_mapping(mapping | {'gravity': 9.78}).gravity_value == 9.78

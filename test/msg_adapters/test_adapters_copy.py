@@ -78,15 +78,13 @@ def test_covariances_and_frame_follow_the_message_definition(tmp_path, frame_id)
     )
     message = parse_imu(raw_messages(tmp_path / 'b', '/c')[7][1])
     assert message.frame_id == (frame_id or 'imu_link')
-    np.testing.assert_array_equal(
-        message.doubles[FIELDS['force_cov']], noise.ravel()
-    )  # was unknown
+    # Was unknown.
+    np.testing.assert_array_equal(message.doubles[FIELDS['force_cov']], noise.ravel())
     np.testing.assert_allclose(
         message.doubles[FIELDS['rate_cov']], (gain @ known @ gain.T).ravel(), rtol=1e-15
     )
-    assert (
-        message.doubles[FIELDS['orientation']] == (0, 0, 0, 1) and message.doubles[3 + 1] == -1.0
-    )  # absent: left alone
+    # Absent: left alone.
+    assert message.doubles[FIELDS['orientation']] == (0, 0, 0, 1) and message.doubles[3 + 1] == -1.0
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path):

@@ -122,9 +122,8 @@ def test_chunks_without_indexes_and_definitions_in_the_middle(tmp_path, parts):
 def test_an_index_that_is_wrong_is_not_believed(tmp_path, parts):
     imu, joints, definitions, messages = parts
     offsets = np.cumsum([0, *map(len, messages[:-1])])
-    entries = np.stack(
-        [offsets, offsets + 1], axis=1
-    )  # every offset one too large, and channel 2 forgotten
+    # Every offset one too large, and channel 2 forgotten.
+    entries = np.stack([offsets, offsets + 1], axis=1)
     index = record(0x07, struct.pack('<H', 1), prefixed_string(entries.astype('<u8').tobytes()))
     check(
         write_file(

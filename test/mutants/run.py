@@ -135,6 +135,7 @@ def main():
         for number in range(asked.workers):
             folders.put(copied(Path(place) / str(number)))
         needed = sorted({path_of_test(ROOT, test) for mutant in chosen for test in mutant.tests})
+        # All of them in one go.
         code, line = tested(
             folders.queue[0],
             needed,
@@ -143,7 +144,7 @@ def main():
             '--dist',
             'loadfile',
             longest=PATIENCE * LONGEST,
-        )  # all of them in one go
+        )
         if code:
             sys.exit(f'the tests must pass before anything is broken: {line or code}')
 

@@ -198,9 +198,8 @@ def test_at_its_end_unsaved_motion_is_kept_where_a_place_was_given_and_told_lost
     told = lost.close()
     assert '~/save' in told and "'save_file'" in told
     again = start(bench, tmp_path, resume=True)
-    assert (
-        again.worker.live.n_windows >= kept.worker.live.n_windows > 0
-    )  # those that were still open count as well
+    # Those that were still open count as well.
+    assert again.worker.live.n_windows >= kept.worker.live.n_windows > 0
     assert (
         bench.heard(
             f' {again.worker.live.n_windows} ',

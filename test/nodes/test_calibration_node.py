@@ -205,9 +205,8 @@ def test_a_hidden_effect_is_named_live(tmp_path):
             'its diagnostics',
         )
         group = station.status['calibration_node: accelerometer accel_quadratic']
-    assert_same(
-        live, calibration_from_text(calibration_to_text(offline.calibration))
-    )  # the document has the common arm last
+    # The document has the common arm last.
+    assert_same(live, calibration_from_text(calibration_to_text(offline.calibration)))
     assert (
         live.statistics['added'] == offline.calibration.statistics['added'] and group.level == b'\0'
     )

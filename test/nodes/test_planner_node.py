@@ -388,9 +388,8 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
             {'diagnosis_period': 60.0},
         )
         loop.spin_for(2.0)
-        assert (
-            loop.value('state') == 'idle' and loop.value('motion') == '0'
-        )  # nothing moves before start
+        # Nothing moves before start.
+        assert loop.value('state') == 'idle' and loop.value('motion') == '0'
         loop.ask('next')
         loop.until(
             lambda: loop.value('motion') == '1' and loop.value('state') == 'idle',
@@ -416,9 +415,8 @@ def test_the_planner_drives_until_every_parameter_is_within_its_tolerance(tmp_pa
 )
 def test_a_table_that_refuses_or_stalls_ends_everything_with_one_sentence(tmp_path, fault):
     with Loop(tmp_path / 'out.txt') as loop:
-        loop.begin(
-            tmp_path, {'first_reach': 0.5}, **fault
-        )  # large enough for a joint that stands still to be noticed
+        # Large enough for a joint that stands still to be noticed.
+        loop.begin(tmp_path, {'first_reach': 0.5}, **fault)
         loop.ask('start')
         loop.until(lambda: loop.value('state') == 'stopped', 'the stop')
         assert loop.status['planner_node: drive'].level == b'\x02', loop.drive()
@@ -489,6 +487,7 @@ def test_a_class_of_effects_after_six_faces_is_separated_and_an_ending_node_stop
         # parameter separates the class before.
         wide = write_tolerances(tmp_path / 'wide.yaml', 1e4)
         arms = {'accelerometer_model': 'bias+matrix+accel_size_effect'}
+        # The class is found at this rate.
         loop.begin(
             tmp_path,
             {
@@ -508,7 +507,7 @@ def test_a_class_of_effects_after_six_faces_is_separated_and_an_ending_node_stop
             imu_rate=100.0,
             joint_rate=50.0,
             wait_for_subscribers=1,
-        )  # the class is found at this rate
+        )
         places, words = [], []
         loop.node.create_subscription(
             MarkerArray,

@@ -215,9 +215,8 @@ def answered(terminals, command):
 def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
     simulator, calibrator, compensator = map(terminals, THREE)
     calibrator.wait('/imu/data_raw from /simulator_node', 'JointState .*/simulator_node')
-    while not lists(
-        terminals('ros2 node list'), '/calibration_node'
-    ):  # the daemon that ros2 starts finds the nodes after a while
+    # The daemon that ros2 starts finds the nodes after a while.
+    while not lists(terminals('ros2 node list'), '/calibration_node'):
         pass
     asked = [command for command in commands() if not starts(command) and PLANNER not in command]
     # `ros2 doctor` needs ten seconds: it comes after the answers of a session that is still short.

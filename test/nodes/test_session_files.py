@@ -168,9 +168,8 @@ def test_what_a_killed_save_left_is_removed_at_the_next_start(tmp_path):
     done = subprocess.run([sys.executable, '-c', KILLED, str(target)], timeout=60)
     assert done.returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
-    running = (
-        tmp_path / f'.{os.getpid()}.{left.name.split(".")[2]}'
-    )  # of a process that is writing now
+    # Of a process that is writing now.
+    running = tmp_path / f'.{os.getpid()}.{left.name.split(".")[2]}'
     others = [tmp_path / name for name in ('.12.note', '.hidden', '.99999999.00000000')]
     for path in (running, *others):
         path.write_text('kept')

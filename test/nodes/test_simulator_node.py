@@ -228,9 +228,8 @@ def test_hidden_causes_change_what_their_physics_changes():
         ]
         assert np.any(at_rest_turned) == (name == 'unbalanced_mass')
         odd = np.allclose(felt.rate, -mirrored.rate) and np.allclose(felt.force, -mirrored.force)
-        assert odd == (
-            name in ('unbalanced_mass', 'narrow_range')
-        )  # the others do not change sign with what is felt
+        # The others do not change sign with what is felt.
+        assert odd == (name in ('unbalanced_mass', 'narrow_range'))
         (half,) = hidden_causes([name], 1, 0.5)
         np.testing.assert_allclose(
             half(Felt(force, rate, force, rate)).rate - rate, 0.5 * (felt.rate - rate), atol=1e-12

@@ -391,9 +391,8 @@ def test_z8_tilted_table_and_averaged_headings():
     A heading chosen against us for every face is printed beside it.
     """
     dynamic, level = design_runs('Z0')[6:], design_runs('Z0')[:6]
-    tilted_spins = [
-        replace(run, force=np.cos(TILT) * run.force) for run in dynamic
-    ]  # whole turns leave the part along the axis
+    # Whole turns leave the part along the axis.
+    tilted_spins = [replace(run, force=np.cos(TILT) * run.force) for run in dynamic]
     ups = [run.force[0] for run in level]
     errors = [
         arm_error(

@@ -199,9 +199,8 @@ def test_a_motion_begins_only_where_the_joints_rest():
     bench.move(motion_points(LIMITS, 3, kind='spin'))
     for _ in range(300):
         bench.look()
-    bench.driver.stop(
-        'stopped by hand'
-    )  # and started anew before anybody has seen the joints slow down
+    # And started anew before anybody has seen the joints slow down.
+    bench.driver.stop('stopped by hand')
     bench.table.follow(bench.now, TrajectoryPoints.stop(NAMES))
     bench.driver.start()
     began = bench.now
@@ -245,9 +244,8 @@ def test_a_motion_that_was_stopped_before_the_controller_took_it_is_waited_for(c
         np.max(np.abs(bench.driver.position - began)) > 0.01
         and not bench.table.at(np.array([bench.now + 5.0])).rate.any()
     )
-    assert waited == pytest.approx(
-        3.0 * max(clock, 1.0), abs=0.1
-    )  # by the joints' clock and by ours
+    # By the joints' clock and by ours.
+    assert waited == pytest.approx(3.0 * max(clock, 1.0), abs=0.1)
     bench.driver.stop('once more')  # nothing was in motion: nothing is waited for
     assert bench.driver.rests and not bench.driver.awaits_stop
 
@@ -321,18 +319,16 @@ def test_a_controller_has_its_patience_by_the_clock_of_the_joints_and_by_ours(cl
     assert bench.until_it_rests() is DriveState.MEASURING, bench.driver.reason
     bench, sent = begun(lag=60.0)
     assert bench.until_it_rests() is DriveState.STOPPED
-    assert (
-        0.0 <= bench.now - sent - patience < 1.0
-    )  # what lies within the tolerance of where it was counts as come further
+    # What lies within the tolerance of where it was counts as come further.
+    assert 0.0 <= bench.now - sent - patience < 1.0
     bench, _ = begun()
     while (
         np.max(np.abs(bench.driver.position - bench.sent[0].position[-1])) > 0.3
         and bench.driver.is_driving
     ):
         bench.look()
-    bench.table.follow(
-        bench.now, TrajectoryPoints.stop(NAMES)
-    )  # somebody else stops it, long after it was sent
+    # Somebody else stops it, long after it was sent.
+    bench.table.follow(bench.now, TrajectoryPoints.stop(NAMES))
     stopped = bench.now
     assert bench.until_it_rests() is DriveState.STOPPED and len(named(bench.driver.reason)) == 1
     assert 0.0 <= bench.now - stopped - patience < 1.0
@@ -542,9 +538,8 @@ def test_a_campaign_ends_when_the_time_is_over_or_motions_bring_nothing_any_more
         and vain[-2] == 'diagnose'
         and vain[-1].startswith(IN_VAIN)
     )
-    assert (
-        carried_out(Campaign(OldHand(30)))[-1] == 'all within tolerance'
-    )  # what goes on halving is worth its while
+    # What goes on halving is worth its while.
+    assert carried_out(Campaign(OldHand(30)))[-1] == 'all within tolerance'
 
 
 def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
@@ -604,9 +599,8 @@ def test_what_a_diagnosis_said_becomes_motions_that_tell_its_causes_apart():
         told.goal.causes[1].size
         * told.coordinates.units[told.coordinates.model.slices['gyroscope', 'gyro_quadratic']]
     )
-    np.testing.assert_allclose(
-        quadratic, [1e-3, -1e-3, 1e-3]
-    )  # as the diagnosis says, not as a usual session would have it
+    # As the diagnosis says, not as a usual session would have it.
+    np.testing.assert_allclose(quadratic, [1e-3, -1e-3, 1e-3])
     assert not np.allclose(told.goal.causes[1].size, imitating.size, rtol=0.1)
     with refused(InputError, 'effect_unknown', 'gremlins'):
         separator_of(table, known, Suspect('gyro_quadratic', ('gremlins',)), noise=noise)
@@ -621,9 +615,8 @@ def test_of_joints_that_move_alike_the_one_that_stands_still_is_named():
         np.zeros((1, 3)),
     )
     watch = PathWatch(np.zeros(3), points, np.full(3, 0.06))
-    for time in np.arange(
-        0.0, 6.0, 0.05
-    ):  # outer and inner arrive, middle does not move; half of the way is within the tolerance
+    # Outer and inner arrive, middle does not move; half of the way is within the tolerance.
+    for time in np.arange(0.0, 6.0, 0.05):
         part = 0.1 * min(time / 2.0, 1.0)
         watch.observe(time, np.array([part, 0.0, part]), now=time)
     assert not watch.has_strayed and watch.has_stalled_for > 1.0 and watch.suspect() == 1

@@ -394,9 +394,8 @@ def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
         np.array([window.middle for window in windows]),
         problem.variance_factor(windows),
     )
-    information = exact_information(
-        windows, times, NOISE, factor=factor
-    )  # with the same probability as the plan
+    # With the same probability as the plan.
+    information = exact_information(windows, times, NOISE, factor=factor)
     sd = predictor.coordinates.sd(
         np.linalg.inv(predictor.coordinates.prior_information + information)
     )
@@ -404,9 +403,8 @@ def test_a_plan_does_what_the_mixed_design_of_the_papers_does_in_no_more_time():
     for effect in model.effects:
         worst.setdefault(effect.sensor, {})[effect.name] = float(sd[model.slices[effect.key]].max())
     plan = make_planner(table, noise=NOISE, tolerances=worst).plan(with_bound=False)
-    assert (
-        plan.missing == () and plan.seconds <= 1.01 * profile.duration
-    )  # with its six rests, which the profile lacks
+    # With its six rests, which the profile lacks.
+    assert plan.missing == () and plan.seconds <= 1.01 * profile.duration
 
 
 def test_what_a_live_session_saved_is_known_as_well_as_its_calibration(capsys, tmp_path):

@@ -91,9 +91,8 @@ def test_an_imu_that_does_not_move_as_the_joints_say_is_refused_with_the_cause(
     with refused(InputError, 'on_table') as caught:
         calibrate_recordings(change(block), table)
     assert all(word in str(caught.value) for word in words) and '\n' not in str(caught.value)
-    assert ('--imu-topic' in caught.value.with_hint({'imu_topic': '--imu-topic'})) == (
-        not words
-    )  # no joint and no delay explains it
+    # No joint and no delay explains it.
+    assert ('--imu-topic' in caught.value.with_hint({'imu_topic': '--imu-topic'})) == (not words)
 
 
 @pytest.mark.parametrize(

@@ -338,9 +338,10 @@ def test_inspect_prints_the_findings_of_a_bag(capsys, tmp_path, session, fault):
     assert code == (1 if REFUSE in {f.severity for f in found} else 3)
 
 
+# One of each check.
 @pytest.mark.parametrize(
     'fault', {check: fault for fault, check, severity, _ in FAULTS if severity == REFUSE}.values()
-)  # one of each check
+)
 def test_calibrate_refuses_what_would_make_the_result_wrong(
     capsys, tmp_path, session, table, fault
 ):

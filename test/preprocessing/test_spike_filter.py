@@ -116,9 +116,8 @@ def test_knocks_of_one_reading_that_reach_several_axes_stay(session):
             values[at - 1 : at + 3] += np.outer(
                 [-0.05, 1.0, 0.1, -0.04], size * rng.uniform(0.5, 1.0, 3) * rng.choice([-1, 1], 3)
             )
-    assert (
-        cleaned(replace(session, force_s=force, rate_s=rate))[1] <= 3
-    )  # of 63; two thirds without the look at the other axes
+    # Of 63; two thirds without the look at the other axes.
+    assert cleaned(replace(session, force_s=force, rate_s=rate))[1] <= 3
 
 
 def test_fast_twisting_at_a_low_rate_is_no_spike():
@@ -139,9 +138,8 @@ def test_one_per_cent_of_spikes_does_not_matter_by_hand(session):
         for imu in (session, with_spikes(session, 0.01, 5))
     )
     assert np.all(np.abs(spoiled.values - clean.values)[clean.sd > 0] < clean.sd[clean.sd > 0])
-    np.testing.assert_allclose(
-        spoiled.sd[clean.sd > 0], clean.sd[clean.sd > 0], rtol=0.35
-    )  # the scatter comes from few degrees of freedom
+    # The scatter comes from few degrees of freedom.
+    np.testing.assert_allclose(spoiled.sd[clean.sd > 0], clean.sd[clean.sd > 0], rtol=0.35)
 
 
 def test_one_per_cent_of_spikes_does_not_matter_on_the_table():

@@ -96,9 +96,8 @@ def test_stamps_that_follow_no_clock_stay_as_they_are():
     stamps = stamps_of('runaway', TRUE, rng)
     assert describe_stamps(stamps).word == IRREGULAR
     number, times, _ = timed(samples(stamps))
-    assert (
-        np.mean(times == stamps[number]) > 0.75
-    )  # by chance 256 of them may look like those of a clock
+    # By chance 256 of them may look like those of a clock.
+    assert np.mean(times == stamps[number]) > 0.75
 
 
 @pytest.mark.parametrize('factor', (0.5, 0.8, 2.0))

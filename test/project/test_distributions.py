@@ -103,7 +103,6 @@ def test_it_installs_into_an_empty_environment_and_runs(archive, tmp_path):
         ).strip()
     ).is_relative_to(installed)
     tool = tmp_path / 'empty/bin/imu_calibration'
-    run(
-        tool, 'simulate', '--profile', 'six_faces', '--output', 'session', cwd=tmp_path
-    )  # by the installed table
+    # By the installed table.
+    run(tool, 'simulate', '--profile', 'six_faces', '--output', 'session', cwd=tmp_path)
     assert '/imu/data_raw' in run(tool, 'inspect', 'session', cwd=tmp_path)

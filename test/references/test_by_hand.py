@@ -338,9 +338,8 @@ def test_coarse_readings_have_the_noise_of_rounding(step):
     error, covariance = differences(found, truth)
     assert np.all(np.abs(error) < 4 * np.sqrt(np.diag(covariance)))
     fine = calibrate_by_hand(imu, HandOptions(GRAVITY), ranges)
-    np.testing.assert_allclose(
-        fine.statistics['force_noise_sd'], 0.002, rtol=0.1
-    )  # steps far below the noise change nothing
+    # Steps far below the noise change nothing.
+    np.testing.assert_allclose(fine.statistics['force_noise_sd'], 0.002, rtol=0.1)
 
 
 def test_counts_give_the_same_as_si():
@@ -551,9 +550,8 @@ def test_a_full_turn_about_the_vertical_gives_the_scale_that_gravity_does_not_se
     name = 'gyroscope.matrix.zz'
     assert before.sd_of(name) > 5 * after.sd_of(name)
     assert abs(after.value(name) - truth[PARAM_NAMES.index(name)]) < 4 * after.sd_of(name)
-    assert after.sd_of(name) == pytest.approx(
-        0.017 / (2 * np.pi), rel=0.2
-    )  # a hand's degree in a full turn
+    # A hand's degree in a full turn.
+    assert after.sd_of(name) == pytest.approx(0.017 / (2 * np.pi), rel=0.2)
 
 
 # real recordings
@@ -616,9 +614,8 @@ def test_xsens_counts_against_its_factory_calibration(recordings):
     assert np.max(np.abs(offset_f)) < 10 and np.max(np.abs(scale_f)) < 0.003
     assert np.max(np.abs(scale_w)) < 0.005 and np.max(np.abs(offset_w)) < 0.5
     assert set(found.statuses) == {'determined', 'fixed'}
-    assert (
-        s['norm_chi2_per_dof'] > 5
-    )  # the scatter of the poses is real and unexplained: white noise alone would be far too sure
+    # The scatter of the poses is real and unexplained: white noise alone would be far too sure.
+    assert s['norm_chi2_per_dof'] > 5
     assert held_out < 0.002
     # the gyroscopes' answer to gravity: chosen on the poses alone, it takes most of the scatter out
     # of the turns, which took no part
@@ -641,9 +638,8 @@ def test_mpu9150_by_hand(recordings, name):
     bias, matrix = found.accelerometer
     held_out = heldout_norm_rms(imu, ranges, found.gravity)
     norms = [np.linalg.norm(imu.force_s[r], axis=1) for r in ranges[::3]]
-    noise = float(
-        np.sqrt(np.mean([norm.var() / norm.size for norm in norms]))
-    )  # of their means: rests of one to five seconds
+    # Of their means: rests of one to five seconds.
+    noise = float(np.sqrt(np.mean([norm.var() / norm.size for norm in norms])))
     print(
         f'{name}: {len(ranges)} poses, bias {np.round(bias, 4)} +- {np.round(found.sd[:3], 4)}'
         f' m/s^2, norm residual {1e3 * found.statistics["norm_residual_rms"]:.2f} mm/s^2, before'

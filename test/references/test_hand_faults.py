@@ -373,9 +373,8 @@ def test_a_weak_cross_term_is_zero_unless_zero_is_significantly_worse():
     The profile near six faces is a parabola.
     """
     hand = calibrated(six_faces()[0])
-    hand = replace(
-        hand, terms={term: np.diag(np.diag(part)) for term, part in hand.terms.items()}
-    )  # no other replacement moves it
+    # No other replacement moves it.
+    hand = replace(hand, terms={term: np.diag(np.diag(part)) for term, part in hand.terms.items()})
     name = next(
         name for name in CROSS_TERMS if hand.statuses[hand.param_names.index(name)] == 'weak'
     )
@@ -431,9 +430,8 @@ def test_times_are_those_of_the_clock_that_jittering_stamps_follow():
         read_by_hand([SampleBlock(jitter(4, rests=10)[0])]).imu,
     )
     off = sample_times(jittering) - 1e-9 * (steady.stamp_ns - steady.stamp_ns[0])
-    assert (
-        np.std(np.diff(off[::150])) < 1e-4
-    )  # over a turn: of 3 ms, and 0.3 ms in the times that the cleaning draws over 64 samples
+    # Over a turn: of 3 ms, and 0.3 ms in the times that the cleaning draws over 64 samples.
+    assert np.std(np.diff(off[::150])) < 1e-4
     lost = np.ones(len(steady), bool)
     lost[[700, 1500, 1501, 2200]] = False
     np.testing.assert_allclose(

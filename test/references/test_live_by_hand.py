@@ -168,9 +168,8 @@ def test_after_a_solution_the_motion_that_helps_most_is_named(session):
     live.solve(pending=True)
     status, groups = live.status(), {(g.sensor, g.effect): g for g in live.groups()}
     shown = live.coverage().next
-    assert (
-        status.values['next'] == shown.text and shown.up is not None
-    )  # the terminal, the status and the picture say one step
+    # The terminal, the status and the picture say one step.
+    assert status.values['next'] == shown.text and shown.up is not None
     assert shown.text in {item['needs'] for item in missing_motion(live.result.hand)}
     assert status.word == 'weak' and re.search(r'[+-][xyz] up', status.message.split('next: ')[1])
     assert groups['accelerometer', 'matrix'].status != 'determined' and re.search(

@@ -162,6 +162,5 @@ def test_rows_are_the_derivative_of_the_residual(walking):
             few.linearise(PoseState(few.nominal + sign * step)).residual for sign in (1, -1)
         )
         slope = (behind - ahead) / 2e-6
-        assert np.abs(rows.main[:, k] - slope).max() < 0.1 * np.abs(slope).max(), (
-            k
-        )  # to first order in the residual, a tenth of a radian
+        # To first order in the residual, a tenth of a radian.
+        assert np.abs(rows.main[:, k] - slope).max() < 0.1 * np.abs(slope).max(), k

@@ -271,9 +271,10 @@ def test_expected_drift_at_rest_is_that_of_simulated_runs(on_table):
             ]
         )
     rms = np.sqrt(np.mean(np.square(ends), axis=0))
+    # 150 runs: 4 % each.
     assert rms == pytest.approx(
         [parts['noise'].velocity[0, -1], parts['noise'].position[0, -1]], rel=0.2
-    )  # 150 runs: 4 % each
+    )
 
 
 def test_drift_in_motion_falls_by_the_calibration(on_table):

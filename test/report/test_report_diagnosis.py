@@ -232,9 +232,8 @@ def test_the_headline_of_a_formula_states_its_share(of_formula):
     page = diagnosis_report(of_formula)
     headline = page.partition('<p class="word">')[2].partition('</p>')[0]
     assert '96 %' in headline and 'gyroscope' in headline
-    assert (
-        'section id="formulas"' in page and page.lower().count('turn about two axes') == 1
-    )  # advice once
+    # Advice once.
+    assert 'section id="formulas"' in page and page.lower().count('turn about two axes') == 1
     assert not any('nothing found' in line for line in of_formula.lines)
 
 

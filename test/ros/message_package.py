@@ -145,9 +145,8 @@ def _generate(folder, package, names):
     generate_type_hash(arguments('rosidl_generator_type_description'))
     generate_c(arguments('rosidl_generator_c'))
     generate_typesupport_fastrtps_c(arguments(SUPPORTS[0]))
-    generate_introspection(
-        arguments(SUPPORTS[1], folder / SUPPORTS[1] / package)
-    )  # its file has the name of another one
+    # Its file has the name of another one.
+    generate_introspection(arguments(SUPPORTS[1], folder / SUPPORTS[1] / package))
     generate_support(arguments('rosidl_typesupport_c'), list(SUPPORTS))
     generate_py(arguments('rosidl_generator_py'), ['rosidl_typesupport_c'])
     for generator in ('rosidl_generator_c', *SUPPORTS):

@@ -64,10 +64,11 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
             'accelerometer.matrix.xy'
         ] == pytest.approx(1.0, abs=0.03)
     elif kind == 'mount':
+        # To first order the change of a matrix is that of the frame.
         for sensor in (
             'accelerometer',
             'gyroscope',
-        ):  # to first order the change of a matrix is that of the frame
+        ):
             turn = 0.5 * np.array(
                 [
                     changes[f'{sensor}.matrix.{b}{a}'] - changes[f'{sensor}.matrix.{a}{b}']
@@ -76,12 +77,10 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
             )
             np.testing.assert_allclose(np.abs(turn), [0.01, 0.006, 0.008], atol=5e-4)
     else:
-        assert changes == {
-            'reference.encoder_zero.middle': pytest.approx(-0.03, abs=6e-4)
-        }  # columns at zero: slip^2 / 2
-    assert not found.named and len(found.used) < 0.7 * len(
-        recording.windows
-    )  # the longer part, in which nothing is left to find
+        # Columns at zero: slip^2 / 2.
+        assert changes == {'reference.encoder_zero.middle': pytest.approx(-0.03, abs=6e-4)}
+    # The longer part, in which nothing is left to find.
+    assert not found.named and len(found.used) < 0.7 * len(recording.windows)
     diagnosis = build_diagnosis(recording.table, found)
     assert diagnosis.onset is onset and set(onset.to_mapping()['parameters']) == set(changes)
     assert any(f'{onset.time:.1f} +-' in line for line in diagnosis_lines(diagnosis))
@@ -124,9 +123,8 @@ def test_a_clock_of_another_rate_is_named():
     _, found = investigated(Clock(rate=200e-6))
     assert [question.name for question in found.named] == ['clock_rate'] and found.onset is None
     (value,) = found.problem.values(found.named)[list(found.named[0].parameters)]
-    assert value == pytest.approx(
-        200e-6 / (1 + 200e-6), abs=1e-7
-    )  # stamps run at this rate by themselves
+    # Stamps run at this rate by themselves.
+    assert value == pytest.approx(200e-6 / (1 + 200e-6), abs=1e-7)
 
 
 def test_a_step_of_the_clock_is_named_with_its_time():
@@ -135,7 +133,6 @@ def test_a_step_of_the_clock_is_named_with_its_time():
     step, time = found.problem.values(found.named)[list(found.named[0].parameters)]
     assert step == pytest.approx(8e-3, abs=1e-4) and abs(time - moment_of(recording, 0.6)) < 1.5
     model = found.problem.recording.model
-    assert (
-        model.prior()[0][model.slices['reference', 'clock_step']][1] == time
-    )  # least squares does not move it
+    # Least squares does not move it.
+    assert model.prior()[0][model.slices['reference', 'clock_step']][1] == time
     assert model.find('reference', Role.DELAY) is not None

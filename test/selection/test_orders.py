@@ -62,14 +62,12 @@ def test_what_is_fixed_to_the_joint_is_found_in_swings_with_its_amplitude():
     'rest_of',
     [
         lambda k, angle: 0.0,
-        lambda k, angle: (
-            2.0 * np.sin(17 * angle) * (k < 4)
-        ),  # in some of the swings only: what these motions do
+        # In some of the swings only: what these motions do.
+        lambda k, angle: 2.0 * np.sin(17 * angle) * (k < 4),
         lambda k, angle: 0.5 * np.sin(2 * np.pi * 9.3 * TIME + k),  # a hum
         lambda k, angle: 3.0 * (angle - k),  # a lag, in phase with the swing
-        lambda k, angle: (
-            np.exp(-0.5 * ((angle - 2.0) / 0.02) ** 2) * 5
-        ),  # a dent of the bearing: every order, none stands out
+        # A dent of the bearing: every order, none stands out.
+        lambda k, angle: np.exp(-0.5 * ((angle - 2.0) / 0.02) ** 2) * 5,
     ],
 )
 def test_noise_hum_lags_and_dents_are_no_order(rest_of):

@@ -201,9 +201,8 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
             (('z',), None),
             (('y',), IN_MOTION),
         ]
-        assert found['accelerometer'].rms == pytest.approx(
-            20 * MG / np.sqrt(6), rel=0.1
-        )  # a mean over three axes, as of other residuals
+        # A mean over three axes, as of other residuals.
+        assert found['accelerometer'].rms == pytest.approx(20 * MG / np.sqrt(6), rel=0.1)
 
 
 @pytest.mark.long

@@ -216,9 +216,8 @@ def test_a_calibration_compensates_arrays_as_the_stream_does(found, samples):
         raw.force_s, raw.rate_s, time=1e-9 * (raw.stamp_ns - raw.stamp_ns[0])
     )
     for ours in (whole.force_s, force):
-        np.testing.assert_allclose(
-            ours, expected.force, atol=1e-6
-        )  # seconds in a float against nanoseconds
+        # Seconds in a float against nanoseconds.
+        np.testing.assert_allclose(ours, expected.force, atol=1e-6)
     for ours in (whole.rate_s, rate):
         np.testing.assert_allclose(ours, expected.rate, atol=1e-9)
     assert whole.frame_id == raw.frame_id and np.array_equal(whole.stamp_ns, raw.stamp_ns)
@@ -285,9 +284,8 @@ def test_compensating_a_bag_in_memory_and_into_a_bag_is_the_same(found, samples,
             [block.imu for block in recording.blocks(['outer', 'middle', 'inner'])]
         )
     np.testing.assert_array_equal(memory.imu.force_s, inside.imu.force_s)
-    np.testing.assert_allclose(
-        read.force_s, inside.imu.force_s, atol=1e-6
-    )  # the filter's period is the median step of the first block
+    # The filter's period is the median step of the first block.
+    np.testing.assert_allclose(read.force_s, inside.imu.force_s, atol=1e-6)
     np.testing.assert_array_equal(read.rate_s, inside.imu.rate_s)
     with refused(InputError, 'exists_already', tmp_path / 'out'):
         imu.compensate(SESSION, found.calibration, output=tmp_path / 'out')

@@ -86,9 +86,8 @@ def test_intervals_of_differences_hold_what_they_say(monkeypatch):
     inside = [
         low < 0 < high for low, high in (held_out.bootstrap_difference(a, b, rng) for a, b in pairs)
     ]
-    assert (
-        0.86 < np.mean(inside) <= 1.0
-    )  # 95 % less what a bootstrap of 30 lacks, four sd of 150 trials
+    # 95 % less what a bootstrap of 30 lacks, four sd of 150 trials.
+    assert 0.86 < np.mean(inside) <= 1.0
     assert held_out.bootstrap_difference(pairs[0][0], 4 * pairs[0][1], rng)[0] > 0
 
 

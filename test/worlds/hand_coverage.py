@@ -69,9 +69,10 @@ def errors(world, seed, **options):
     data, truth, moved = session(world, seed, **options)
     hand, truth = solve_hand_by_evidence(data, HandOptions(GRAVITY)).hand, truth.copy()
     for sensor, part in zip(SENSORS, (slice(0, 3), slice(9, 12)), strict=True):
+        # A bias beside a drift is that of the start, else a mean.
         if not any(
             effect.sensor == sensor and effect.time_constant for effect in hand.hand_model.extras
-        ):  # a bias beside a drift is that of the start, else a mean
+        ):
             truth[part] += moved[sensor]
     places = [hand.param_names.index(name) for name in PARAM_NAMES[:21]]
     fit = of_fit(hand.terms) + hand.terms[HELD_PRIORS]

@@ -274,9 +274,8 @@ class StampBursts(Cause):
         ends = starts + self.size * rng.uniform(0.3, 1.0, len(starts)) * self.HELD_UP
         k = np.searchsorted(starts, time, side='right') - 1
         late = np.where(k >= 0, np.maximum(ends[np.maximum(k, 0)] - time, 0.0), 0.0)
-        order = (
-            np.arange(len(time)) * 1e-4
-        )  # messages follow one another by a tenth of a millisecond at least
+        # Messages follow one another by a tenth of a millisecond at least.
+        order = np.arange(len(time)) * 1e-4
         return np.maximum.accumulate(time + late - order) + order - time
 
 

@@ -142,9 +142,8 @@ def draw_truth(grade, sensor, form, rng):
     figures = {'white_noise': density}
     if 'bias_instability' in form:
         figures['bias_instability'] = instability
-    if (
-        'random_walk' in form
-    ):  # crosses the flicker, or the white noise of as much, after some hundred seconds
+    # Crosses the flicker, or the white noise of as much, after some hundred seconds.
+    if 'random_walk' in form:
         figures['random_walk'] = instability / np.sqrt(100.0 * 2.0 ** rng.uniform(-1, 2))
     if 'gauss_markov' in form:
         figures |= {

@@ -105,9 +105,8 @@ def _of(*names):
 
 def _magnet(scene, rng):
     """Return the component along one axis of a field that stays with the room."""
-    field = np.append(
-        rng.normal(size=2), 0.0
-    )  # along the vertical it would be a response to gravity
+    # Along the vertical it would be a response to gravity.
+    field = np.append(rng.normal(size=2), 0.0)
     return scene.world.to_sensor(np.broadcast_to(field, scene.force.shape))
 
 

@@ -82,9 +82,8 @@ class DiagnosisQuestion:
                 )
             found, extension = evidence.found, evidence.extension
             calibrated = None if extension.changes.lacking else evidence.solution
-            del (
-                evidence
-            )  # its columns, of a wider model than those of the session, need much memory
+            # Its columns, of a wider model than those of the session, need much memory.
+            del evidence
             return Answer(
                 live_state_of(build_diagnosis(self.snapshot.table, found, calibrated=calibrated)),
                 extension,

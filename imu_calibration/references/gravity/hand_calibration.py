@@ -369,9 +369,8 @@ def _solved(data, options, point, *, untested=()):
     left = {CONTRADICTED_TURNS: contradicted} if contradicted else {}
     solved = partial(solve_joint, gravity_sd=options.gravity_sd)
     for effect in model.extras:
-        if effect.time_constant and effect.name not in (
-            point or {}
-        ):  # a time constant distant from the prior does not converge from there
+        # A time constant distant from the prior does not converge from there.
+        if effect.time_constant and effect.name not in (point or {}):
             trials = [
                 replace(model, model=each)
                 for each in at_time_constants(model.model, effect, float(poses.time[-1]))
@@ -383,9 +382,8 @@ def _solved(data, options, point, *, untested=()):
             model = trials[int(np.argmin(scatter))]
     for _ in range(MAX_HAND_PASSES):
         found, integrated = solved(model, poses, turns)
-        integrated = (
-            {} if model.model.relinearised else integrated
-        )  # the columns below are computed at the estimate
+        # The columns below are computed at the estimate.
+        integrated = {} if model.model.relinearised else integrated
         settled, model = _settled(model, found), model.at(found.state.values)
         poses, turns, out = without_outlying_poses(
             model, found, poses=poses, turns=turns, integrated=integrated
@@ -406,10 +404,11 @@ def _solved(data, options, point, *, untested=()):
         with_movement(covariance := total(found.terms), model, movements) - covariance,
     )
     terms = with_term(terms, DRIFT, _hidden_covariance(model, poses))
+    # The result has all poses unchanged, also excluded and drifting ones.
     used, poses = (
         poses,
         data.poses,
-    )  # the result has all poses unchanged, also excluded and drifting ones
+    )
     goals = tolerances_of(model.model, options.tolerances)
     statistics = {
         **data.statistics,

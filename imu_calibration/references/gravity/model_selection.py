@@ -288,9 +288,8 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     )
     constants = time_constants(float(poses.time[-1]))
     blocks, space = build_rows(baseline, data.turns, effects, constants=constants)
-    base = tuple(
-        range(baseline.hand_model.size + 1)
-    )  # including fixed parameters and the Earth's rate: their uncertainty is no finding
+    # Including fixed parameters and the Earth's rate: their uncertainty is no finding.
+    base = tuple(range(baseline.hand_model.size + 1))
     questions = _questions(effects, blocks, space, base, not_testable)
     problem = HandProblem(blocks, space, questions, baseline=base)
     named = problem.named()

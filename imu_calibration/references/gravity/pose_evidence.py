@@ -523,9 +523,8 @@ def unexplained_by_hand(
             continue
         own = (np.sum(residual**2 / block.floor) - spare) / np.sqrt(2 * spare)
         if block.name == 'poses' or own > max(sigma, SIGNIFICANT_SDS):
-            size = (
-                1.0 if block.duration is None else block.duration[:, None] ** 2
-            )  # the residual of a turn is an angle, of a pose a rate
+            # The residual of a turn is an angle, of a pose a rate.
+            size = 1.0 if block.duration is None else block.duration[:, None] ** 2
             excess = np.sum(residual**2 * size) / spare - np.mean(block.floor * size)
             if own > sigma:
                 sigma, rms, chosen = own, float(np.sqrt(max(excess, 0.0))), block

@@ -312,9 +312,8 @@ def _at_end(signed, axes, fresh):
     ]
     step = np.diff(some)
     step = step[step > 1e-9 * np.abs(some[-1])].min(initial=np.inf)
-    margin = (
-        1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step
-    )  # two's complement: one end is larger by a step
+    # Two's complement: one end is larger by a step.
+    margin = 1.5 * step if np.isfinite(step) and len(axes) > 1 else 0.5 * step
     margin = min(margin, 1e-4 * np.abs(some[-1]))
     at = np.logical_or.reduce([signed(axis) >= some[-1] - margin for axis in axes])
     below = some[some < some[-1] - margin][-TOP:]

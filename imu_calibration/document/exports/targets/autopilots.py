@@ -105,9 +105,8 @@ def imu_ardupilot(found: dict) -> AffineImu:
         s: vector_of(found, f'{TCAL}_{TCAL_SENSORS[s]}1_*') * PER_PARAMETER * on for s in SENSORS
     }
     bias = {s: vector_of(found, OFFSET[s]) for s in SENSORS}
-    if (
-        limits
-    ):  # both sensors may have been calibrated at temperatures of their own; the document has one
+    # Both sensors may have been calibrated at temperatures of their own; the document has one.
+    if limits:
         there = float(np.clip(found.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
         bias['gyroscope'] = bias['gyroscope'] + thermal['gyroscope'] * (ref - there)
     return AffineImu(

@@ -71,9 +71,8 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
 
     what = 'MATLAB calibration'
     try:
-        text = str(
-            loadmat(io.BytesIO(content), variable_names=[DOCUMENT])[DOCUMENT][0]
-        )  # damaged structs crash scipy
+        # Damaged structs crash scipy.
+        text = str(loadmat(io.BytesIO(content), variable_names=[DOCUMENT])[DOCUMENT][0])
     except (
         MatReadError,
         ValueError,
