@@ -56,6 +56,8 @@ class GroupState:
     """The motion that is still needed."""
     predicted_sd: float = float('nan')
     """Standard deviation after one minute of that motion; NaN when it cannot be predicted."""
+    counts: bool = True
+    """Whether a parameter of it was requested; those of the reference do not count."""
 
 
 def group_states(result: CalibrationResult) -> list[GroupState]:
@@ -84,6 +86,7 @@ def group_states(result: CalibrationResult) -> list[GroupState]:
                 effect.unit_of(worst - part.start),
                 text,
                 predicted,
+                any(name in calibration.requested for name in names[part]),
             )
         )
     return states

@@ -598,6 +598,21 @@ def _undecided_motion(calibration, sensor):
     return ''
 
 
+def _held_out_motions(calibration, sensor):
+    """
+    Return that held-out data prove the recorded motions only; '' if they show each parameter.
+
+    A parameter is held because no motion of the recording shows it, held-out data included.
+    """
+    states = [state for name, state in calibration.requested.items() if name.startswith(sensor)]
+    if HELD not in states:
+        return ''
+    return (
+        f'; in motions as recorded, which do not show {states.count(HELD)} of its {len(states)}'
+        ' parameters'
+    )
+
+
 def _reason(calibration, sensor):
     more = (
         '; unproven, because stamps that are late by a period of this motion without rests would'
@@ -605,8 +620,8 @@ def _reason(calibration, sensor):
     )
     reason = reason_of(calibration.proof.get(sensor)) + more * _periodic(calibration, sensor)
     if decide(calibration.proof.get(sensor)) is HELPS:
-        if why := _undecided_motion(calibration, sensor):
-            reason += f'; unproven, because {why}'
+        why = _undecided_motion(calibration, sensor)
+        reason += f'; unproven, because {why}' if why else _held_out_motions(calibration, sensor)
     if why := never_applied(calibration, sensor):
         reason += f'; not applied: {why}'
     return reason

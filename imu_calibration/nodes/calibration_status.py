@@ -198,7 +198,10 @@ def advice_of(state: WorkerState) -> str:
     if state.session is not None:
         return state.session.values.get('next', '')
     steps = [line.removeprefix('next: ') for line in state.lines if line.startswith('next: ')]
-    return next(iter([*steps, *(group.needs for group in state.groups if group.needs)]), '')
+    for group in state.groups:
+        if group.counts and group.needs:
+            steps.append(group.needs)
+    return next(iter(steps), '')
 
 
 STATUS_LEVELS = {
@@ -274,8 +277,10 @@ def _group_status(group: GroupState):
         'held': 'held at its prior: the motion so far contains almost no information',
         'waiting': 'no solution yet',
     }[group.status]
-    if group.needs:
+    if group.needs and group.counts:
         text += f'; still needed: {group.needs}'
+    elif group.needs:
+        text += '; not needed for the sensors'
     figures = {
         f'standard error [{group.unit}]': group.sd,
         f'tolerance [{group.unit}]': group.tolerance,
@@ -286,9 +291,9 @@ def _group_status(group: GroupState):
         'needs': group.needs,
         **{name: f'{figure:.3g}' for name, figure in figures.items() if not math.isnan(figure)},
     }
-    return make_status(
-        STATUS_LEVELS[group.status], f'{group.sensor} {group.effect}', text, values=values
-    )
+    # Parameters of the reference do not count: they are shown, and need no action.
+    level = STATUS_LEVELS[group.status] if group.counts else OK
+    return make_status(level, f'{group.sensor} {group.effect}', text, values=values)
 
 
 def markers_of(coverage: Coverage, stamp: Time) -> MarkerArray:

@@ -7,6 +7,7 @@ import pytest
 
 from imu_calibration.document.calibration import Calibration, parameter_rows
 from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS, UNPROVEN, WARNING
+from imu_calibration.document.outcome import exit_code
 from imu_calibration.document.verdict import judge, judged, motion_misfits
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK, tolerances_of
@@ -254,3 +255,18 @@ def test_many_lost_samples_are_worth_a_look():
         note = judge(with_statistics(dropped={'imu late': count}), TOLERANCES).reasons[-1]
         assert note.word == word and f'{count} imu late' in note.what
         assert bool(note.next) == (word is WARNING)
+
+
+def test_a_sensor_with_held_parameters_helps_in_the_recorded_motions_only():
+    """Held-out data of tilts about one axis do not show the scale of that axis either."""
+    names = ('accelerometer.matrix.xx', 'accelerometer.bias.x')
+    held = tuple(HELD if name in names else DETERMINED for name in NAMES)
+    complete = judged(calibration(proof=PROOF), TOLERANCES)
+    incomplete = judged(calibration(proof=PROOF, status=held), TOLERANCES)
+    assert incomplete.decisions == complete.decisions
+    reasons = incomplete.decision_reasons
+    count = sum(name.startswith('accelerometer') for name in complete.requested)
+    assert f'2 of its {count}' in reasons['accelerometer']
+    assert f'2 of its {count}' not in complete.decision_reasons['accelerometer']
+    assert reasons['gyroscope'] == complete.decision_reasons['gyroscope']
+    assert (exit_code(complete), exit_code(incomplete)) == (0, 3)

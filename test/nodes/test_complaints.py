@@ -4,17 +4,24 @@ What is wrong is said when it begins, now and then while it lasts, and when it i
 Each thing by a clock of its own.
 """
 
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 
-from imu_calibration.calibration.coverage import GroupState  # noqa: E402
+from imu_calibration.calibration.coverage import GroupState, group_states  # noqa: E402
 from imu_calibration.core.progress import LiveState  # noqa: E402
+from imu_calibration.document.calibration import Calibration  # noqa: E402
+from imu_calibration.effects.sensor_model import SensorModel  # noqa: E402
 from imu_calibration.nodes.calibration_status import (  # noqa: E402
     MIN_ADVICE_SECONDS,
     CalibrationGuide,
     WorkerState,  # noqa: E402
+    advice_of,
     statuses_of,  # noqa: E402
 )
 from imu_calibration.nodes.diagnostics import MOST_KINDS, REMINDER, Complaints  # noqa: E402
@@ -82,6 +89,26 @@ def test_figures_that_are_not_known_are_left_out_and_no_status_is_stale():
     for status in statuses_of(WorkerState(groups=[group], verdict='harms', faults=('no disk',))):
         assert all(value.value != 'nan' for value in status.values) and 'nan' not in status.message
         assert status.level != DiagnosticStatus.STALE
+
+
+def test_parameters_of_the_reference_warn_nobody_and_need_no_motion():
+    """The Earth's rate is weak on every table without azimuth; nothing is to be done."""
+    model = SensorModel(reference=('table_tilt',))
+    weak = ('determined',) * (len(model.param_names) - 2) + ('weak',) * 2
+    result = SimpleNamespace(
+        calibration=Calibration(model, model.start(), np.eye(len(weak)), weak),
+        tolerances=np.ones(len(weak)),
+        needed={name: ('spin', 0.1) for name in model.param_names[-2:]},
+    )
+    groups = group_states(result)
+    by_sensor = {group.sensor: group.counts for group in groups}
+    assert by_sensor == {'accelerometer': True, 'gyroscope': True, 'reference': False}
+    state = WorkerState(groups=groups, verdict='helps', complete=True)
+    assert {status.level for status in statuses_of(state)} == {DiagnosticStatus.OK}
+    assert advice_of(state) == ''
+    of_sensor = replace(state, groups=[replace(group, counts=True) for group in groups])
+    assert DiagnosticStatus.WARN in {status.level for status in statuses_of(of_sensor)}
+    assert advice_of(of_sensor) == 'spin'
 
 
 class Topic:
