@@ -13,7 +13,7 @@ import numpy as np
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.row_estimate import RowSet
 from imu_calibration.kinematics.rotations import skew, unit_rows
-from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
+from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
 
 COMPONENTS = ('pose', 'drift', 'turn')
@@ -144,7 +144,7 @@ class GravityRows:
     """Means at rest."""
     turns: Sequence[TurnData]
     """Turns between them."""
-    memory: dict = field(default_factory=dict)
+    memory: dict[int, '_RememberedTurn'] = field(default_factory=dict)
     """
     Turns integrated before; for similar parameters they are corrected to first order instead of
     being integrated again.
@@ -166,89 +166,252 @@ class GravityRows:
 
     def linearise(self, state: State) -> RowSet:
         """Return the rows of poses, bias drifts, calm drifts and turns at a state."""
-        model, poses, across = self.model, self.poses, tangent(state.up)
-        rows = [
-            _pose_rows(model, state, poses, across),
-            _drift_rows(model, state, poses),
-            _calm_rows(model, state, poses),
-        ]
-        for key, turn in enumerate(self.turns):
-            rows.append(
-                _gravity_turn_rows(model, state, turn, key, self.memory, across, poses)
-                if turn.rotation is None
-                else _known_turn_rows(model, state, turn)
-            )
-        return RowSet(*(np.concatenate(parts) for parts in zip(*rows)))
-
-
-def _pose_rows(model, state, poses, across):
-    """
-    ``force = bias + matrix @ (gravity * up) + further effects``.
-
-    Three rows per pose, two of them used for its direction.
-    """
-    bias, matrix, *_ = model.linear(state.values)
-    count = len(state.up)
-    true = model.gravity * state.up
-    more, slopes = model.further('accelerometer', state.values, true, **poses.conditions)
-    main = np.zeros((count, 3, model.size))
-    main[:, :, 0:3] = np.eye(3)
-    for i in range(3):
-        main[:, i, 3 + 3 * i : 4 + 4 * i] = true[:, : i + 1]
-    main[:, :, model.extra_index('accelerometer')] = slopes
-    return _flat(
-        poses.force - bias - true @ matrix.T - more,
-        OF_DIRECTION,
-        model.gravity * matrix @ across,
-        main,
-        poses.force_sem**2,
-        0,
-    )
-
-
-def _drift_rows(model, state, poses):
-    """``rate = bias + further effects (gravity * up) + drift`` at rest."""
-    rate, main = model.rate_rows(
-        state.values, model.gravity * state.up, poses.rate, **poses.conditions
-    )
-    return _flat(rate - state.drift, OF_DRIFT, np.eye(3), main, poses.rate_sem**2, -1)
-
-
-def _calm_rows(model, state, poses):
-    """``0 = drift`` within the scatter of the drifts."""
-    return _flat(
-        -state.drift,
-        OF_DRIFT,
-        np.eye(3),
-        np.zeros((len(state.up), 3, model.size)),
-        (CALM * poses.rate_sem) ** 2,
-        1,
-    )
-
-
-def _integrated(model, state, data, bias, key, memory):
-    """
-    Return (mat_ji, Turn), from memory when the gyroscope's parameters have hardly changed since.
-    """
-    matrix, further = model.linear(state.values)[3], state.values[model.extra_index('gyroscope')]
-    if key in memory:
-        (old_bias, old_matrix, old_further), turn = memory[key]
-        psi = (
-            turn.by_bias @ (bias - old_bias)
-            + turn.by_matrix.reshape(3, 9) @ (matrix - old_matrix).ravel()
-            + turn.by_further @ (further - old_further)
+        equations = _Equations(self.model, self.poses, state, self.memory)
+        rows = [equations.of_poses(), equations.of_drifts(), equations.of_calm_drifts()]
+        for number, turn in enumerate(self.turns):
+            if turn.rotation is None or turn.rotation_cov is None:
+                rows.append(equations.of_turn(turn, number))
+            else:
+                rows.append(equations.of_known_turn(turn, turn.rotation, turn.rotation_cov))
+        return RowSet(
+            residual=np.concatenate([part.residual for part in rows]),
+            nuisance=np.concatenate([part.nuisance for part in rows]),
+            main=np.concatenate([part.main for part in rows]),
+            noise=np.concatenate([part.noise for part in rows]),
+            component=np.concatenate([part.component for part in rows]),
+            group=np.concatenate([part.group for part in rows]),
         )
-        if np.linalg.norm(psi) < MAX_FIRST_ORDER_ANGLE:
-            return small_rotation(-psi) @ turn.mat_ji, turn
-    turn = integrate_turn(
-        data.time,
-        data.rate,
-        bias=bias,
-        matrix=matrix,
-        further=_further_of_turn(model, state, data, bias),
-    )
-    memory[key] = ((bias, matrix, further), turn)
-    return turn.mat_ji, turn
+
+
+NO_COMPONENT = -1
+"""Component of rows without scatter beyond the noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class _RememberedTurn:
+    """A turn, and the gyroscope's parameters with which it was integrated."""
+
+    bias: np.ndarray
+    """rad/s, shape (3,)."""
+    matrix: np.ndarray
+    """Shape (3, 3)."""
+    further: np.ndarray
+    """Values of the further effects."""
+    turn: Turn
+
+    def moved(self, bias: np.ndarray, matrix: np.ndarray, further: np.ndarray) -> np.ndarray | None:
+        """
+        Return `Turn.mat_ji` at other parameters to first order, ``(1 - [psi x]) mat_ji``.
+
+        None where they have changed too much for that.
+        """
+        psi = (
+            self.turn.by_bias @ (bias - self.bias)
+            + self.turn.by_matrix.reshape(3, 9) @ (matrix - self.matrix).ravel()
+            + self.turn.by_further @ (further - self.further)
+        )
+        if np.linalg.norm(psi) >= MAX_FIRST_ORDER_ANGLE:
+            return None
+        return small_rotation(-psi) @ self.turn.mat_ji
+
+
+class _Equations:
+    """The equations of poses and turns, linearised at a state."""
+
+    def __init__(
+        self, model: HandModel, poses: Poses, state: State, memory: dict[int, _RememberedTurn]
+    ):
+        self.model, self.poses, self.state, self.memory = model, poses, state, memory
+        self.across = tangent(state.up)
+        self.true_force = model.gravity * state.up
+        linear = model.linear(state.values)
+        self.force_bias, self.force_matrix, self.gyro_bias, self.gyro_matrix = linear
+        self.further_of_gyroscope = model.extra_index('gyroscope')
+
+    def of_poses(self) -> RowSet:
+        """
+        Return ``force = bias + matrix @ (gravity * up) + further effects``.
+
+        Three rows per pose, two of them used for its direction.
+        """
+        model, poses, true = self.model, self.poses, self.true_force
+        more, slopes = model.further('accelerometer', self.state.values, true, **poses.conditions)
+        main = np.zeros((len(true), 3, model.size))
+        main[:, :, 0:3] = np.eye(3)
+        # Row i of the lower triangular matrix has the elements up to i.
+        for i in range(3):
+            main[:, i, 3 + 3 * i : 4 + 4 * i] = true[:, : i + 1]
+        main[:, :, model.extra_index('accelerometer')] = slopes
+        return self._of_each_pose(
+            poses.force - self.force_bias - true @ self.force_matrix.T - more,
+            main,
+            poses.force_sem**2,
+            place=OF_DIRECTION,
+            blocks=model.gravity * self.force_matrix @ self.across,
+            component=COMPONENTS.index('pose'),
+        )
+
+    def of_drifts(self) -> RowSet:
+        """Return ``rate = bias + further effects (gravity * up) + drift`` at rest."""
+        rate, main = self.model.rate_rows(
+            self.state.values, self.true_force, self.poses.rate, **self.poses.conditions
+        )
+        return self._of_each_pose(
+            rate - self.state.drift,
+            main,
+            self.poses.rate_sem**2,
+            place=OF_DRIFT,
+            blocks=np.eye(3),
+            component=NO_COMPONENT,
+        )
+
+    def of_calm_drifts(self) -> RowSet:
+        """Return ``0 = drift`` within the scatter of the drifts."""
+        return self._of_each_pose(
+            -self.state.drift,
+            np.zeros((len(self.state.up), 3, self.model.size)),
+            (CALM * self.poses.rate_sem) ** 2,
+            place=OF_DRIFT,
+            blocks=np.eye(3),
+            component=COMPONENTS.index('drift'),
+        )
+
+    def _of_each_pose(
+        self,
+        residual: np.ndarray,
+        main: np.ndarray,
+        noise: np.ndarray,
+        *,
+        place: slice,
+        blocks: np.ndarray,
+        component: int,
+    ) -> RowSet:
+        """Return three rows per pose; `blocks`: their columns of its own nuisances at `place`."""
+        own, size = np.arange(len(residual)), residual.size
+        nuisance = np.zeros((*residual.shape, len(residual), 5))
+        nuisance[own, :, own, place] = blocks
+        return RowSet(
+            residual.ravel(),
+            nuisance.reshape(size, -1),
+            main.reshape(size, -1),
+            noise.ravel(),
+            np.full(size, component),
+            np.repeat(own, 3)[:, None].repeat(2, axis=1),
+        )
+
+    def of_turn(self, data: TurnData, number: int) -> RowSet:
+        """
+        Return the direction before a turn, rotated by the gyroscope, against that after it.
+
+        Two rows, from middle to middle::
+
+            0 = T_j' R (up_i + T_i n_i) - T_j' T_j n_j,    R = exp(-[psi x]) mat_ji
+        """
+        model, state = self.model, self.state
+        i, j = data.first, data.last
+        # The bias of the turn is that between the drifts of both poses.
+        bias = self.gyro_bias + 0.5 * (state.drift[i] + state.drift[j])
+        mat_ji, turn = self._integrated(data, bias, number)
+        mat_ji = between_middles(self.poses, data, mat_ji)
+        carried = mat_ji @ state.up[i]
+        across_i, across_j = self.across[i], self.across[j]
+
+        # By the gyroscope's parameters, through psi.
+        by_psi = across_j.T @ skew(carried)
+        main = np.zeros((2, model.size))
+        main[:, model.gyro_bias] = by_psi @ turn.by_bias
+        main[:, model.gyro_matrix] = by_psi @ turn.by_matrix.reshape(3, 9)
+        main[:, self.further_of_gyroscope] = by_psi @ turn.by_further
+
+        # By both directions and by half of each drift.
+        nuisance = np.zeros((2, len(state.up), 5))
+        nuisance[:, i, OF_DIRECTION] = across_j.T @ mat_ji @ across_i
+        nuisance[:, j, OF_DIRECTION] = -(carried @ state.up[j]) * np.eye(2)
+        nuisance[:, [i, j], OF_DRIFT] = 0.5 * main[:, None, model.gyro_bias]
+        return RowSet(
+            -across_j.T @ carried,
+            nuisance.reshape(2, -1),
+            main,
+            np.full(2, data.noise_variance),
+            np.full(2, COMPONENTS.index('turn')),
+            np.tile([i, j], (2, 1)),
+        )
+
+    def _integrated(self, data: TurnData, bias: np.ndarray, number: int) -> tuple[np.ndarray, Turn]:
+        """
+        Return (mat_ji, Turn) of turn `number`.
+
+        From memory when the gyroscope's parameters have hardly changed since.
+        """
+        further = self.state.values[self.further_of_gyroscope]
+        if number in self.memory:
+            remembered = self.memory[number]
+            mat_ji = remembered.moved(bias, self.gyro_matrix, further)
+            if mat_ji is not None:
+                return mat_ji, remembered.turn
+        turn = integrate_turn(
+            data.time,
+            data.rate,
+            bias=bias,
+            matrix=self.gyro_matrix,
+            further=self._further_of_turn(data, bias),
+        )
+        self.memory[number] = _RememberedTurn(bias, self.gyro_matrix, further, turn)
+        return turn.mat_ji, turn
+
+    def of_known_turn(self, data: TurnData, known: np.ndarray, known_cov: np.ndarray) -> RowSet:
+        """
+        Return the equation of a turn by a known rotation about a fixed body axis, three rows.
+
+        It is ``matrix^-1 integral(measured - bias - further effects) = known``, whitened.
+        """
+        model, count = self.model, len(self.state.up)
+        output, columns = self._further_of_turn(data, self.gyro_bias)
+        turn = integrate_turn(
+            data.time,
+            data.rate,
+            bias=self.gyro_bias,
+            matrix=self.gyro_matrix,
+            further=(output, columns),
+        )
+        inverse = np.linalg.inv(self.gyro_matrix)
+        rotation = inverse @ turn.integral
+
+        # d rotation by bias, matrix (d M^-1 = -M^-1 dM M^-1) and the impulse of further effects.
+        main = np.zeros((3, model.size))
+        main[:, model.gyro_bias] = -turn.duration * inverse
+        main[:, model.gyro_matrix] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
+        means = 0.5 * (columns[:-1] + columns[1:])
+        impulse = np.einsum('m,mip->ip', np.diff(data.time), means)
+        main[:, self.further_of_gyroscope] = -inverse @ impulse
+
+        variance = known_cov + data.noise_variance * np.eye(3)
+        white = np.linalg.inv(np.linalg.cholesky(variance))
+        return RowSet(
+            white @ (known - rotation),
+            np.zeros((3, 5 * count)),
+            white @ main,
+            np.ones(3),
+            np.full(3, NO_COMPONENT),
+            np.full((3, 2), count),
+        )
+
+    def _further_of_turn(self, data: TurnData, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return output and columns of the gyroscope's further effects along a turn.
+
+        They are at the forces and rates without the further effects.
+        """
+        force = np.linalg.solve(self.force_matrix, (data.force - self.force_bias).T).T
+        rate = np.linalg.solve(self.gyro_matrix, (data.rate - bias).T).T
+        return self.model.further(
+            'gyroscope',
+            self.state.values,
+            force,
+            rate=rate,
+            time=data.time,
+            temperature_c=data.temperature_c,
+        )
 
 
 def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndarray:
@@ -263,105 +426,4 @@ def between_middles(poses: Poses, turn: TurnData, mat_ji: np.ndarray) -> np.ndar
         small_rotation(-poses.half_turn[turn.last])
         @ mat_ji
         @ small_rotation(-poses.half_turn[turn.first])
-    )
-
-
-def _gravity_turn_rows(model, state, data, key, memory, across, poses):
-    """
-    The direction before the turn, rotated by the gyroscope, against the direction after it.
-
-    Two rows, from middle to middle.
-    """
-    i, j = data.first, data.last
-    mat_ji, turn = _integrated(
-        model,
-        state,
-        data,
-        state.values[model.gyro_bias] + 0.5 * (state.drift[i] + state.drift[j]),
-        key,
-        memory,
-    )
-    mat_ji = between_middles(poses, data, mat_ji)
-    carried = mat_ji @ state.up[i]
-    across_i, across_j = across[i], across[j]
-    by_psi = across_j.T @ skew(carried)
-    main, nuisance = np.zeros((2, model.size)), np.zeros((2, len(state.up), 5))
-    main[:, model.gyro_bias] = by_psi @ turn.by_bias
-    main[:, model.gyro_matrix] = by_psi @ turn.by_matrix.reshape(3, 9)
-    main[:, model.extra_index('gyroscope')] = by_psi @ turn.by_further
-    nuisance[:, i, OF_DIRECTION] = across_j.T @ mat_ji @ across_i
-    nuisance[:, j, OF_DIRECTION] = -(carried @ state.up[j]) * np.eye(2)
-    nuisance[:, [i, j], OF_DRIFT] = 0.5 * main[:, None, model.gyro_bias]
-    return (
-        -across_j.T @ carried,
-        nuisance.reshape(2, -1),
-        main,
-        np.full(2, data.noise_variance),
-        np.full(2, 2),
-        np.tile([i, j], (2, 1)),
-    )
-
-
-def _known_turn_rows(model, state, data):
-    """
-    Equation of the rotation for a turn about a fixed body axis, three rows.
-
-    It is ``matrix^-1 integral(measured - bias - further effects) = rotation``, whitened.
-    """
-    _, _, bias, matrix = model.linear(state.values)
-    further = _further_of_turn(model, state, data, bias)
-    turn = integrate_turn(data.time, data.rate, bias=bias, matrix=matrix, further=further)
-    inverse = np.linalg.inv(matrix)
-    rotation = inverse @ turn.integral
-    main = np.zeros((3, model.size))
-    main[:, model.gyro_bias] = -turn.duration * inverse
-    main[:, model.gyro_matrix] = -np.einsum('rp,q->rpq', inverse, rotation).reshape(3, 9)
-    impulse = np.einsum('m,mip->ip', np.diff(data.time), 0.5 * (further[1][:-1] + further[1][1:]))
-    main[:, model.extra_index('gyroscope')] = -inverse @ impulse
-    white = np.linalg.inv(np.linalg.cholesky(data.rotation_cov + data.noise_variance * np.eye(3)))
-    count = len(state.up)
-    return (
-        white @ (data.rotation - rotation),
-        np.zeros((3, 5 * count)),
-        white @ main,
-        np.ones(3),
-        np.full(3, -1),
-        np.full((3, 2), count),
-    )
-
-
-def _further_of_turn(model, state, data, bias):
-    """
-    Return output and columns of the gyroscope's further effects along a turn.
-
-    They are at the forces and rates without the further effects.
-    """
-    bias_f, matrix_f, _, matrix = model.linear(state.values)
-    force, rate = (
-        np.linalg.solve(matrix_f, (data.force - bias_f).T).T,
-        np.linalg.solve(matrix, (data.rate - bias).T).T,
-    )
-    return model.further(
-        'gyroscope',
-        state.values,
-        force,
-        rate=rate,
-        time=data.time,
-        temperature_c=data.temperature_c,
-    )
-
-
-def _flat(residual, place, blocks, main, noise, component):
-    """
-    Return three rows per pose; `blocks`: their columns of the pose's own nuisances at `place`.
-    """
-    own, nuisance = np.arange(len(residual)), np.zeros((*residual.shape, len(residual), 5))
-    nuisance[own, :, own, place] = blocks
-    return (
-        residual.ravel(),
-        nuisance.reshape(residual.size, -1),
-        main.reshape(residual.size, -1),
-        noise.ravel(),
-        np.full(residual.size, component),
-        np.repeat(own, 3)[:, None].repeat(2, axis=1),
     )
