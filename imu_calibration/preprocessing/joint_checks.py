@@ -14,7 +14,11 @@ from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.rotations import nearest_rotation, rpy_from_rotation
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse, span_words
-from imu_calibration.preprocessing.joint_geometry import description_error
+from imu_calibration.preprocessing.joint_geometry import (
+    description_error,
+    is_unexplained,
+    turned_rates,
+)
 from imu_calibration.preprocessing.on_table import (
     TESTED_RATE,
     a_period_late,
@@ -97,22 +101,37 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
             f'the gyroscope must measure all the time, it repeats one reading {span_words(spans)} '
             'while the joints turn; check the sensor and its driver, and exclude that time',
         )
+    as_described = [rate + bias for rate in expected]
     for k, name in enumerate(table.joint_names):
-        spans = _joined(
-            span
-            for window, rate in zip(windows, expected)
-            for span in _frozen(window, table, rate + bias, joint=k)
-        )
+        spans = _frozen_spans(windows, table, as_described, joint=k)
+        if not spans:
+            continue
+        other_cause = a_period_late(windows, table) or description_error(windows, table)
+        if other_cause:
+            return other_cause
+        # An IMU that is turned against its mount measures the rates of other joints about this
+        # axis too.
+        turned = turned_rates(windows, expected)
+        if turned is not None:
+            spans = _frozen_spans(windows, table, turned, joint=k)
         if spans:
-            other_cause = a_period_late(windows, table) or description_error(windows, table)
-            return other_cause or CheckFinding(
+            return CheckFinding(
                 'frozen',
                 REFUSE,
                 f'joint states must follow the table, {name} is constant {span_words(spans)} while'
                 ' the IMU turns about its axis; check the driver of the table, and exclude that'
                 ' time',
             )
-    return None
+    return description_error(windows, table) if is_unexplained(windows, expected) else None
+
+
+def _frozen_spans(windows, table, expected, *, joint):
+    """Return the joined spans of all windows in which a joint is frozen."""
+    return _joined(
+        span
+        for window, rate in zip(windows, expected)
+        for span in _frozen(window, table, rate, joint=joint)
+    )
 
 
 def _frozen(window, table, expected, *, joint):

@@ -7,7 +7,8 @@ import numpy as np
 
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.table import Table
+from imu_calibration.kinematics.rotations import nearest_rotation, rotation
+from imu_calibration.kinematics.table import Table, axis_error_directions
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.window import Window
 
@@ -17,6 +18,14 @@ LARGEST_UNEXPLAINED = 0.01
 """Largest unexplained share of the squared rates with a description that counts as correct."""
 LEAST_FACTOR = 10.0
 """A correction of the description divides the unexplained share at least by this factor."""
+LEAST_SPAN = 0.1
+"""Rates span three directions from this ratio of their smallest to their largest rms on."""
+SAME_AXIS = np.radians(0.5)
+"""A fitted axis that is nearer to a coordinate axis is that coordinate axis, rad."""
+FIRST_ANGLE = 1e-3
+"""Start of a fit, rad: joints about coordinate axes have no derivative, they are simplified."""
+MAX_EVALUATIONS = 20
+"""Linearisations of one fit of zeros or axes."""
 TIE = 2.0
 """
 Corrections within this factor of the smallest unexplained share of the rates are separated by the
@@ -49,22 +58,22 @@ class MovingReadings:
 
     def rate_residual(self, table: Table, motion: JointMotion) -> np.ndarray:
         """Return the residual of the rates, shape (n, 3)."""
-        return _residual(self.rate, reference_motion(table, motion, attitude=False).rate_s)
+        return _residual(self.rate, reference_motion(table, motion, attitude=False))
 
     def correction(self, words: str, table: Table, motion: JointMotion) -> Correction:
         """Return a change of the table and of the motion with its unexplained shares."""
         reference = reference_motion(table, motion)
         return Correction(
             words,
-            _share(_residual(self.rate, reference.rate_s), self.rate),
+            _share(_residual(self.rate, reference), self.rate),
             _share(self.force - reference.force_s, self.force),
         )
 
 
-def _residual(measured, reference):
-    """Return ``measured - b - M reference`` with the bias b and matrix M of least squares."""
-    design = np.insert(reference, 0, 1.0, axis=1)
-    return measured - design @ np.linalg.lstsq(design, measured, rcond=1e-6)[0]
+def _residual(rate, reference):
+    """Return ``w - b - M r - D r'`` with b, M and D of least squares; D stands for a delay."""
+    design = np.column_stack([np.ones(len(rate)), reference.rate_s, reference.alpha_s])
+    return rate - design @ np.linalg.lstsq(design, rate, rcond=1e-6)[0]
 
 
 def _share(residual, measured):
@@ -72,17 +81,44 @@ def _share(residual, measured):
     return float((residual**2).sum() / ((measured - measured.mean(axis=0)) ** 2).sum())
 
 
+def is_unexplained(windows: Sequence[Window], expected: Sequence[np.ndarray]) -> bool:
+    """
+    Return whether rates of the joints leave more unexplained than a correct description does.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Moving windows with their samples.
+    expected : sequence of arrays, shape (n, 3)
+        Rates of the joints in each window, rad/s; the matrix and bias of the sensor are free.
+
+    """
+    measured, matrix, bias = _sensor_fit(windows, expected)
+    residual = measured - np.concatenate(expected) @ matrix.T - bias
+    return _share(residual, measured) > LARGEST_UNEXPLAINED
+
+
+def _sensor_fit(windows, expected):
+    """Return (measured rates, matrix, bias) of ``measured = M r + b`` with least squares."""
+    measured = np.concatenate([window.rate_s for window in windows])
+    design = np.insert(np.concatenate(expected), 0, 1.0, axis=1)
+    solution = np.linalg.lstsq(design, measured, rcond=1e-6)[0]
+    return measured, solution[1:].T, solution[0]
+
+
 def description_error(windows: Sequence[Window], table: Table) -> CheckFinding | None:
     """
     Return the finding of a wrong zero or axis of a joint in the table description, or None.
 
     The rates w of the gyroscope are compared with those of the joints, r(p), for changes p of the
-    description. Bias b and matrix M of the sensor, its mount included, are free::
+    description. Bias b and matrix M of the sensor, its mount included, and a small delay D are
+    free::
 
-        unexplained(p) = min over b, M of  sum |w - b - M r(p)|^2 / sum |w - mean w|^2
+        unexplained(p) = min over b, M, D of  sum |w - b - M r(p) - D r'(p)|^2 / sum |w - mean w|^2
 
-    A change is reported if almost nothing is unexplained with it, and much more without it. A joint
-    that is frozen for a time is not explained by any change of the description.
+    A change is reported if almost nothing is unexplained with it, and much more without it; changes
+    of several zeros and axes together only where no single one suffices. A joint that is frozen for
+    a time is not explained by any change of the description.
 
     Parameters
     ----------
@@ -101,10 +137,16 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
         np.concatenate([window.rate_s for window in windows])[thinned],
         np.concatenate([window.force_s for window in windows])[thinned],
     )
+    if not _spans_three(readings.rate):  # many descriptions have the same rates about one axis
+        return None
     as_described = readings.correction('', table, readings.motion)
+    sufficient = min(LARGEST_UNEXPLAINED, as_described.rate_share / LEAST_FACTOR)
     corrections = list(_corrections(readings, table))
     smallest = min(correction.rate_share for correction in corrections)
-    if smallest > LARGEST_UNEXPLAINED or smallest * LEAST_FACTOR > as_described.rate_share:
+    if smallest > sufficient:
+        corrections = [_of_several(readings, table)]
+        smallest = corrections[0].rate_share
+    if smallest > sufficient:
         return None
     best = min(
         (correction for correction in corrections if correction.rate_share <= TIE * smallest),
@@ -122,33 +164,86 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
 
 
 def _corrections(readings: MovingReadings, table: Table) -> Iterator[Correction]:
-    """Yield the best change of the zeros, then each other axis of each joint."""
-    from scipy.optimize import least_squares  # here, because its import is slow
-
-    names = table.joint_names
-    columns = [names.index(name) for name in names.zeros]
-
-    def shifted(zeros):
-        position = readings.motion.position.copy()
-        position[:, columns] += zeros
-        return replace(readings.motion, position=position)
-
-    if columns:
-        fit = least_squares(
-            lambda zeros: readings.rate_residual(table, shifted(zeros)).ravel(),
-            np.zeros(len(columns)),
+    """Yield the best change of the zeros, then another axis of each joint."""
+    if table.joint_names.zeros:
+        zeros = _fitted(
+            lambda zeros: readings.rate_residual(table, _shifted(readings.motion, table, zeros)),
+            len(table.joint_names.zeros),
         )
         words = ', '.join(
             f'{name} reads {np.degrees(-zero):.2f} deg too much'
-            for name, zero in zip(names.zeros, fit.x)
+            for name, zero in zip(table.joint_names.zeros, zeros)
         )
-        yield readings.correction(words, table, shifted(fit.x))
-    for k, name in enumerate(names):
-        for axis in _other_axes(np.array(table.joints[k].axis)):
-            shown = ', '.join(f'{value + 0.0:.0f}' for value in axis)
+        yield readings.correction(words, table, _shifted(readings.motion, table, zeros))
+    for k, name in enumerate(table.joint_names):
+        for axis in (
+            *_other_axes(np.array(table.joints[k].axis)),
+            _axis_between(readings, table, k),
+        ):
+            decimals = 0 if _is_coordinate_axis(axis) else 3
+            shown = ', '.join(f'{value + 0.0:.{decimals}f}' for value in axis)
             yield readings.correction(
                 f'the axis of {name} is [{shown}]', with_axis(table, k, axis), readings.motion
             )
+
+
+def _of_several(readings: MovingReadings, table: Table) -> Correction:
+    """Return the change of all zeros and axes together that explains most of the rates."""
+    n_zeros = len(table.joint_names.zeros)
+
+    def changed(values):
+        turned = table
+        for k, angles in enumerate(values[n_zeros:].reshape(-1, 2)):
+            turned = with_axis(turned, k, _turned_axis(table, k, angles))
+        return turned, _shifted(readings.motion, table, values[:n_zeros])
+
+    values = _fitted(
+        lambda values: readings.rate_residual(*changed(values)),
+        n_zeros + 2 * len(table.joints),
+    )
+    return readings.correction('several of them are changed', *changed(values))
+
+
+def _fitted(residual, n_parameters):
+    """Return the angles with the least squares of a residual, rad, from almost zero."""
+    from scipy.optimize import least_squares  # here, because its import is slow
+
+    start = np.full(n_parameters, FIRST_ANGLE)
+    return least_squares(lambda x: residual(x).ravel(), start, max_nfev=MAX_EVALUATIONS).x
+
+
+def _shifted(motion, table, zeros):
+    """Return the motion with changed zeros of the joints that have one."""
+    position = motion.position.copy()
+    position[:, [table.joint_names.index(name) for name in table.joint_names.zeros]] += zeros
+    return replace(motion, position=position)
+
+
+def _turned_axis(table, joint, angles):
+    """Return the axis of a joint, turned by two angles about the directions across it, rad."""
+    axis = np.array(table.joints[joint].axis)
+    return rotation(angles @ axis_error_directions(axis)) @ axis
+
+
+def _axis_between(readings, table, joint):
+    """Return the axis of one joint that explains most of the rates, any unit vector."""
+
+    def turned(angles):
+        return _turned_axis(table, joint, angles)
+
+    angles = _fitted(
+        lambda angles: readings.rate_residual(
+            with_axis(table, joint, turned(angles)), readings.motion
+        ),
+        2,
+    )
+    axis = turned(angles)
+    return np.round(axis) if _is_coordinate_axis(axis) else axis
+
+
+def _is_coordinate_axis(axis):
+    """Return whether a unit vector is a coordinate axis, or the fit of one."""
+    return np.linalg.norm(axis - np.round(axis)) < SAME_AXIS
 
 
 def _other_axes(axis: np.ndarray) -> Iterator[np.ndarray]:
@@ -156,6 +251,44 @@ def _other_axes(axis: np.ndarray) -> Iterator[np.ndarray]:
     for candidate in np.concatenate([np.eye(3), -np.eye(3)]):
         if candidate @ axis < np.cos(np.pi / 6):
             yield candidate
+
+
+def _spans_three(rates):
+    """Return whether rates, shape (n, 3), span three directions."""
+    sizes = np.linalg.svd(rates - rates.mean(axis=0), compute_uv=False)
+    return bool(sizes[-1] > LEAST_SPAN * sizes[0])
+
+
+def turned_rates(
+    windows: Sequence[Window], expected: Sequence[np.ndarray]
+) -> list[np.ndarray] | None:
+    """
+    Return the rates of the joints as an IMU measures them that is turned against its mount.
+
+    ``R r + b`` with the rotation R nearest to the matrix of least squares, and its bias b. None
+    where such a turn does not explain much more than the mount of the table, or where the rates of
+    the joints do not span three directions.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Moving windows with their samples.
+    expected : sequence of arrays, shape (n, 3)
+        Rates of the joints in each window for the mount of the table, rad/s.
+
+    """
+    reference = np.concatenate(expected)
+    if not _spans_three(reference):
+        return None
+    measured, matrix, _ = _sensor_fit(windows, expected)
+    turn = nearest_rotation(matrix)
+    bias = np.mean(measured - reference @ turn.T, axis=0)
+    unexplained = _share(measured - reference @ turn.T - bias, measured)
+    difference = measured - reference
+    as_described = _share(difference - difference.mean(axis=0), measured)
+    if unexplained > min(LARGEST_UNEXPLAINED, as_described / LEAST_FACTOR):
+        return None
+    return [rates @ turn.T + bias for rates in expected]
 
 
 def with_axis(table: Table, joint: int, axis: np.ndarray) -> Table:
