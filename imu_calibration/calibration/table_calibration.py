@@ -18,6 +18,7 @@ from imu_calibration.calibration.from_solution import (
     with_gravity_uncertainty,
 )
 from imu_calibration.calibration.latitude_check import with_latitude_findings
+from imu_calibration.calibration.mount_check import with_mount_findings
 from imu_calibration.calibration.plain_fit import (
     better_plain_fits,
     changes_with,
@@ -272,6 +273,7 @@ def conclude(
     sensors with an unexplained residual, have to predict better than plain least squares.
     """
     tolerances = tolerances_of(solution.model, options.tolerances)
+    gathered.findings = with_mount_findings(gathered.findings, solution, table)
     gathered.findings = with_latitude_findings(gathered.findings, solution, table)
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)

@@ -12,6 +12,9 @@ from imu_calibration.document.calibration import Calibration, listed, never_appl
 from imu_calibration.document.decision import HELPS, SensorDecision, reason_of
 from imu_calibration.estimation.solution import DETERMINED
 
+CONTRADICTED = ('latitude', 'mount')
+"""Checks of statements in the table description that the result contradicts: exit code 3."""
+
 
 @dataclass(frozen=True)
 class ParameterCount:
@@ -77,6 +80,9 @@ def shortcomings(calibration: Calibration) -> list[str]:
             lines.append(f'{sensor} {word}: {why or reason_of(calibration.proof.get(sensor))}')
     for sensor, why in (calibration.statistics.get('unusable_sensors') or {}).items():
         lines.append(f'{sensor} not calibrated: {why}')
+    for entry in calibration.statistics.get('preflight') or ():
+        if entry['check'] in CONTRADICTED:
+            lines.append(entry['text'])
     for line in (missing(calibration), dropped_text(*dropped_of(calibration))):
         if line:
             lines.append(line)

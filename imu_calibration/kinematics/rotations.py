@@ -150,6 +150,16 @@ def rotation(vector: np.ndarray) -> np.ndarray:
     return rotations_from_quaternions(quaternions_from_vectors(np.asarray(vector, float)))
 
 
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """Return the vector of a rotation by less than half a turn, rad, shape (3,)."""
+    # The antisymmetric part is sin(angle) times the axis, the trace 1 + 2 cos(angle).
+    across = 0.5 * (matrix - matrix.T)
+    sine = np.array([across[2, 1], across[0, 2], across[1, 0]])
+    size = np.linalg.norm(sine)
+    angle = np.arctan2(size, 0.5 * (np.trace(matrix) - 1.0))
+    return sine * (angle / max(size, 1e-300))
+
+
 def rotation_from_rpy(rpy: np.ndarray) -> np.ndarray:
     """
     Return ``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3): turns about fixed axes as in URDF, rad.

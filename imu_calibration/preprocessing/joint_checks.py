@@ -11,12 +11,12 @@ from imu_calibration.core.scales import IMPOSSIBLE, scale_range
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.chain import reference_motion
-from imu_calibration.kinematics.rotations import nearest_rotation, rpy_from_rotation
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import refuse, span_words
 from imu_calibration.preprocessing.joint_geometry import (
     description_error,
     is_unexplained,
+    mount_rpy_deg,
     turned_rates,
 )
 from imu_calibration.preprocessing.on_table import (
@@ -363,19 +363,10 @@ def _cause(match, matrix, seen, table):
     fits = ''
     if table is not None and np.trace(seen) > 2.5:
         # Rounded, then plus zero: no -0.
-        angles_deg = np.round(_mount_rpy_deg(matrix, table)) + 0.0
+        angles_deg = np.round(mount_rpy_deg(matrix, table)) + 0.0
         listed = ', '.join(f'{angle:.0f}' for angle in angles_deg)
         fits = f', [{listed}] would fit'
     return f'the sensor is turned against the table; correct mount.rpy_deg in the table{fits}'
-
-
-def _mount_rpy_deg(matrix, table):
-    """
-    Return roll, pitch, yaw of the rotation nearest to the measured matrix.
-
-    The convention is that of `mount.rpy_deg`.
-    """
-    return np.degrees(rpy_from_rotation((nearest_rotation(matrix) @ table.mat_sl).T))
 
 
 def check_units(gathered: Reduced, model: SensorModel, table: Table | None = None) -> None:

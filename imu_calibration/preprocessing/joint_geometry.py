@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.kinematics.chain import reference_motion
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.rotations import nearest_rotation, rotation
+from imu_calibration.kinematics.rotations import nearest_rotation, rotation, rpy_from_rotation
 from imu_calibration.kinematics.table import Table, axis_error_directions
 from imu_calibration.preprocessing.recording_evidence import REFUSE, CheckFinding
 from imu_calibration.preprocessing.window import Window
@@ -297,3 +297,12 @@ def with_axis(table: Table, joint: int, axis: np.ndarray) -> Table:
     x, y, z = (float(value) for value in axis)
     joints[joint] = replace(joints[joint], axis=(x, y, z))
     return replace(table, joints=tuple(joints))
+
+
+def mount_rpy_deg(matrix: np.ndarray, table: Table) -> np.ndarray:
+    """
+    Return roll, pitch, yaw of the rotation nearest to the measured matrix.
+
+    The convention is that of `mount.rpy_deg`.
+    """
+    return np.degrees(rpy_from_rotation((nearest_rotation(matrix) @ table.mat_sl).T))

@@ -23,7 +23,7 @@ from imu_calibration.calibration.hand_workflow import (
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.document.outcome import shortcomings
+from imu_calibration.document.outcome import CONTRADICTED, shortcomings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
@@ -242,7 +242,10 @@ def _look(bag, topics, table, *, options, exclude):
                 mapper=_watched_by(preflight),
             )
             calibrated = table_errors.result
-            error_findings = table_errors.findings
+            stated = [
+                finding for finding in calibrated.gathered.findings if finding.check in CONTRADICTED
+            ]
+            error_findings = (*stated, *table_errors.findings)
         except ImuCalibrationError as error:
             calibrated = error
     if not preflight.streams:  # not read to its end: no data to calibrate from

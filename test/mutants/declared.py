@@ -932,6 +932,34 @@ FILES = _of(
 )
 SIGNS = _of(
     (
+        'a turned IMU reads as a frozen joint',
+        'standing_still',
+        '_1 is not None',
+        'False',
+        'test_joint_geometry.py',
+    ),
+    (
+        'axes between coordinate axes are not tried',
+        'standing_still',
+        'is_unexplained(_1, _2)',
+        'False',
+        'test_joint_geometry.py',
+    ),
+    (
+        'mount that fits of the inverse turn',
+        'mount_rpy_deg',
+        '(nearest_rotation(_1) @ _2.mat_sl).T',
+        'nearest_rotation(_1) @ _2.mat_sl',
+        'test_mount_check.py',
+    ),
+    (
+        'sensors turned differently read as a turned IMU',
+        'mount_findings',
+        '_1 < LEAST_TURN',
+        'False',
+        'test_mount_check.py',
+    ),
+    (
         'centripetal term with the other sign',
         'lever_matrix',
         'skew(_1) + _2 @ _2',

@@ -1,0 +1,66 @@
+"""A turn of the IMU against its stated mount is named; axes of a sensor that are off are not."""
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from imu_calibration.calibration.mount_check import mount_findings
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.kinematics.joint import Joint
+from imu_calibration.kinematics.rotations import rotation, rotation_vector
+from imu_calibration.kinematics.table import Table
+
+
+def table(mount_rpy_deg=(0.0, 0.0, 0.0)):
+    joints = [Joint('p', (0, 0, 1)), Joint('q', (1, 0, 0)), Joint('r', (0, 1, 0))]
+    return Table(joints, gravity=9.8, mount_rpy_deg=mount_rpy_deg)
+
+
+def solution(accelerometer, gyroscope):
+    """Two estimated matrices."""
+    parts = {'accelerometer': slice(0, 9), 'gyroscope': slice(9, 18)}
+    assert set(parts) == set(SENSORS)
+    return SimpleNamespace(
+        model=SimpleNamespace(part=lambda sensor, _role: parts[sensor]),
+        values=np.concatenate([accelerometer.ravel(), gyroscope.ravel()]),
+        held=np.zeros(18, bool),
+    )
+
+
+def off_axes(seed):
+    """Return scale factors and axes of one sensor that are off by half a percent."""
+    return np.eye(3) + np.random.default_rng(seed).normal(0.0, 0.005, (3, 3))
+
+
+def of_turn(vector_deg):
+    turn = rotation(np.radians(vector_deg))
+    return solution(off_axes(1) @ turn, off_axes(2) @ turn)
+
+
+@pytest.mark.parametrize('degrees', [-3.0, 12.0, 24.0])
+def test_a_zero_of_the_last_joint_is_named_with_the_mount_that_fits(degrees):
+    # Readings in a sensor frame that is turned by v: the mount turns by -v, its inverse.
+    (finding,) = mount_findings(of_turn((0.0, degrees, 0.0)), table())
+    roll, pitch, yaw = (float(x) for x in re.search(r'\[(.*)\]', finding.text)[1].split(','))
+    assert abs(pitch + degrees) < 0.6 and max(abs(roll), abs(yaw)) < 0.6
+    assert 'zero of r' in finding.text and finding.key == 'table'
+
+
+def test_a_turn_about_another_axis_is_no_zero():
+    stated = (0.0, 0.0, 15.0)
+    (finding,) = mount_findings(of_turn((0.0, 0.0, 15.0)), table(stated))
+    shown = [float(x) for x in re.search(r'\[(.*)\]', finding.text)[1].split(',')]
+    assert np.abs(shown).max() < 0.6 and 'zero of' not in finding.text
+
+
+def test_axes_of_the_sensors_that_are_off_are_no_turn():
+    assert mount_findings(solution(off_axes(3), off_axes(4)), table()) == ()
+    turned, opposite = rotation(np.array([0.05, 0, 0])), rotation(np.array([-0.03, 0, 0]))
+    assert mount_findings(solution(turned, opposite), table()) == ()
+
+
+def test_the_vector_of_a_rotation():
+    for vector in ([0.0, 0.0, 0.0], [1e-9, 0.0, 0.0], [0.4, -1.2, 2.0]):
+        assert np.allclose(rotation_vector(rotation(np.array(vector))), vector, atol=1e-15)
