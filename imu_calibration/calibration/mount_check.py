@@ -42,7 +42,7 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
     if not matrices:
         return ()
     turns = [nearest_rotation(matrix) for matrix in matrices]
-    common = nearest_rotation(sum(turns))
+    common = nearest_rotation(np.sum(turns, axis=0))
     turn = rotation_vector(common)
     angle = float(np.linalg.norm(turn))
     if angle < LEAST_TURN:

@@ -12,7 +12,7 @@ from imu_calibration.document.calibration import Calibration, listed, never_appl
 from imu_calibration.document.decision import HELPS, SensorDecision, reason_of
 from imu_calibration.estimation.solution import DETERMINED
 
-CONTRADICTED = ('latitude', 'mount')
+STATED_CHECKS = ('latitude', 'mount')
 """Checks of statements in the table description that the result contradicts: exit code 3."""
 
 
@@ -81,7 +81,7 @@ def shortcomings(calibration: Calibration) -> list[str]:
     for sensor, why in (calibration.statistics.get('unusable_sensors') or {}).items():
         lines.append(f'{sensor} not calibrated: {why}')
     for entry in calibration.statistics.get('preflight') or ():
-        if entry['check'] in CONTRADICTED:
+        if entry['check'] in STATED_CHECKS:
             lines.append(entry['text'])
     for line in (missing(calibration), dropped_text(*dropped_of(calibration))):
         if line:

@@ -23,7 +23,7 @@ from imu_calibration.calibration.hand_workflow import (
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock
-from imu_calibration.document.outcome import CONTRADICTED, shortcomings
+from imu_calibration.document.outcome import STATED_CHECKS, shortcomings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
@@ -243,7 +243,9 @@ def _look(bag, topics, table, *, options, exclude):
             )
             calibrated = table_errors.result
             stated = [
-                finding for finding in calibrated.gathered.findings if finding.check in CONTRADICTED
+                finding
+                for finding in calibrated.gathered.findings
+                if finding.check in STATED_CHECKS
             ]
             error_findings = (*stated, *table_errors.findings)
         except ImuCalibrationError as error:
