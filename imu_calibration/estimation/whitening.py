@@ -114,6 +114,13 @@ class Whitening:
         return white
 
 
+ALIKE = 1e11
+"""
+Largest ratio of variances whose differences are not lost in rounding; windows without weight and
+rests that all read zero are farther apart.
+"""
+
+
 class _Filter:
     """
     Innovations over their standard deviations of one chain of rows, in place.
@@ -136,7 +143,8 @@ class _Filter:
         times = np.array([process.time for process in processes])
         decay = np.exp(-steps[:, None] / times)
         fresh = -np.expm1(-2 * steps[:, None] / times) * power
-        if len(power) == 1:
+        alike = variance.max() < ALIKE * (variance + fresh[:, 0]).min()
+        if len(power) == 1 and alike:
             self.total, gain = _gains_of_one(variance, decay[:, 0], fresh[:, 0])
         else:
             self.total, gain = _gains(variance, decay, fresh)
