@@ -103,9 +103,9 @@ class FaultSearch:
     def __init__(self) -> None:
         self._last: np.ndarray | None = None
         # Readings of blocks minus the mean of their block, and the readings of the next block.
-        self._deviations: list[np.ndarray] = []
-        self._n_kept = 0
-        self._next_block = np.zeros((0, 6))
+        self._deviations: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
+        self._n_kept = dict.fromkeys(SENSORS, 0)
+        self._next_block = dict.fromkeys(SENSORS, np.zeros((0, 3)))
         self._smallest_step = np.full(6, np.inf)
         self._n_pairs = 0
         # Pairs of neighbours with one reading: of each axis, and of all axes of a sensor.
@@ -121,7 +121,6 @@ class FaultSearch:
     def push(self, values: np.ndarray, present: np.ndarray) -> None:
         """Add the next samples of a rest, shape (n, 6)."""
         rows = values[present]
-        self._add_blocks(rows)
         if self._last is not None:
             rows = np.vstack([self._last, rows])
         if not len(rows):
@@ -139,18 +138,20 @@ class FaultSearch:
             held = same[:, SENSOR_COLUMNS[sensor]].all(axis=1)
             self._n_same_sensor[k] += held.sum()
             self._add_runs(k, np.flatnonzero(~held), len(held))
+            # A repeated reading is no reading of the noise.
+            self._add_blocks(sensor, rows[1:][~held][:, SENSOR_COLUMNS[sensor]])
 
-    def _add_blocks(self, rows):
-        """Add the deviations of the complete blocks of a rest; the last one is continued."""
-        if self._n_kept >= MOST_READINGS:
+    def _add_blocks(self, sensor, readings):
+        """Add the deviations of the complete blocks of a sensor; the last one is continued."""
+        if self._n_kept[sensor] >= MOST_READINGS:
             return
-        rows = np.vstack([self._next_block, rows])
-        n_complete = len(rows) // BLOCK
-        self._next_block = rows[n_complete * BLOCK :].copy()
-        blocks = rows[: n_complete * BLOCK].reshape(n_complete, BLOCK, 6)
+        readings = np.vstack([self._next_block[sensor], readings])
+        n_complete = len(readings) // BLOCK
+        self._next_block[sensor] = readings[n_complete * BLOCK :].copy()
+        blocks = readings[: n_complete * BLOCK].reshape(n_complete, BLOCK, 3)
         deviations = blocks - blocks.mean(axis=1, keepdims=True)
-        self._deviations.append(deviations.reshape(-1, 6))
-        self._n_kept += n_complete * BLOCK
+        self._deviations[sensor].append(deviations.reshape(-1, 3))
+        self._n_kept[sensor] += n_complete * BLOCK
 
     def _add_runs(self, k, changes, n_pairs):
         """Add the lengths of the runs that end at `changes`; the last one is continued."""
@@ -167,7 +168,7 @@ class FaultSearch:
     def end_stretch(self) -> None:
         """Begin another rest: its first reading has no reading before."""
         self._last = None
-        self._next_block = np.zeros((0, 6))
+        self._next_block = dict.fromkeys(SENSORS, np.zeros((0, 3)))
         self._run_length = np.ones(2)
 
     def result(self) -> ReadingFaults:
@@ -191,20 +192,34 @@ class FaultSearch:
     def _tails(self):
         """Return by how much tails raise the noise of means, shape (6,)."""
         tails = np.ones(6)
-        if self._n_kept < LEAST_READINGS:
-            return tails
-        for column, deviation in enumerate(np.concatenate(self._deviations).T):
-            sd = float(np.sqrt(np.mean(deviation**2)))
-            for core in CORES:
-                core_sd = core.sd(deviation)
-                if core_sd < LEAST_STEPS * self._smallest_step[column]:
-                    continue
-                excess = sd / core_sd - 1.0
-                if excess < max(LEAST_EXCESS, EXCESS_SDS * core.ratio_sd / self._n_kept**0.5):
-                    continue
-                noise_steps = core_sd / self._smallest_step[column]
-                tails[column] = max(tails[column], excess_of_means(1.0 + excess, noise_steps))
+        for sensor, columns in SENSOR_COLUMNS.items():
+            n_kept = self._n_kept[sensor]
+            if n_kept < LEAST_READINGS:
+                continue
+            of_sensor = []
+            for deviation, step in zip(
+                np.concatenate(self._deviations[sensor]).T,
+                self._smallest_step[columns],
+                strict=True,
+            ):
+                of_sensor.append(_excess_of_tails(deviation, step))
+            tails[columns] = of_sensor
         return tails
+
+
+def _excess_of_tails(deviation, smallest_step):
+    """Return by how much the tails of an axis raise the noise of means, at least 1."""
+    sd = float(np.sqrt(np.mean(deviation**2)))
+    largest = 1.0
+    for core in CORES:
+        core_sd = core.sd(deviation)
+        # The quantiles of few steps are those of the steps.
+        if core_sd < LEAST_STEPS * smallest_step:
+            continue
+        excess = sd / core_sd - 1.0
+        if excess > max(LEAST_EXCESS, EXCESS_SDS * core.ratio_sd / len(deviation) ** 0.5):
+            largest = max(largest, excess_of_means(1.0 + excess, core_sd / smallest_step))
+    return largest
 
 
 def excess_of_means(ratio: float, noise_steps: float) -> float:
