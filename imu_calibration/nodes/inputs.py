@@ -223,36 +223,41 @@ class MatchedInput:
         return f'{what}: {self._elsewhere()}'
 
     def _elsewhere(self) -> str:
-        there = [
+        """Return which other topics of the type a driver publishes."""
+        there = sorted(
             name
-            for name, types in self.node.get_topic_names_and_types()
-            if self.type_name in types
-            and name != self.topic_name
-            and not name.endswith(NOT_RAW)
-            and self._has_source(name)
-        ]
+            for name in self._topics_of_sources()
+            if name != self.topic_name and not name.endswith(NOT_RAW)
+        )
         if not there:
             return 'no other node publishes that type; see that the driver runs'
         near = get_close_matches(self.topic_name, there, MAX_NAMED_TOPICS, 0.0)
         more = f' (or {", ".join(near[1:])})' if near[1:] else ''
         return f'there is {near[0]}{more}; listen to it with -r {self.topic}:={near[0]}'
 
-    def _has_source(self, name: str) -> bool:
-        """Return whether a node that is neither this one nor a compensator publishes a topic."""
-        own = self.node.get_fully_qualified_name()
-        for found in self.node.get_publishers_info_by_topic(name):
-            if node_of(found) != own and not self._is_compensator(found):
-                return True
-        return False
+    def _topics_of_sources(self) -> set[str]:
+        """
+        Return the topics of the type from nodes that are neither this one nor a compensator.
 
-    def _is_compensator(self, publisher) -> bool:
-        """Return whether the node of a publisher reloads a calibration, as compensators do."""
-        name, space = publisher.node_name, publisher.node_namespace
-        try:
-            services = self.node.get_service_names_and_types_by_node(name, space)
-        except NodeNameNonExistentError:
-            return False
-        return any(service == f'{node_of(publisher)}/reload' for service, _ in services)
+        By node: a search by topic applies the remappings of this node to the name of the topic.
+        """
+        found: set[str] = set()
+        for name, space in self.node.get_node_names_and_namespaces():
+            full_name = f'{space.rstrip("/")}/{name}'
+            if full_name == self.node.get_fully_qualified_name():
+                continue
+            try:
+                services = self.node.get_service_names_and_types_by_node(name, space)
+                topics = self.node.get_publisher_names_and_types_by_node(name, space)
+            except NodeNameNonExistentError:
+                continue
+            # A node that reloads a calibration is a compensator.
+            if any(service == f'{full_name}/reload' for service, _ in services):
+                continue
+            for topic, types in topics:
+                if self.type_name in types:
+                    found.add(topic)
+        return found
 
 
 class BatchInput(MatchedInput):
