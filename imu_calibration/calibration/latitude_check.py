@@ -1,42 +1,98 @@
 """The latitude of the table against the Earth's rate that the gyroscopes measured."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import DEG_H, significant
 from imu_calibration.effects.base import Role
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import EARTH_RATE, earth_rate_n
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.references.turntable.session_data import SessionData
 
 CHECK = 'latitude'
 CONTRADICTING_SDS = 5.0
 """Standard deviations beyond which the estimate contradicts the latitude."""
+NAMED_SDS = 3.0
+"""The same where a g-sensitivity is in the model, which may stand for another latitude."""
 LEAST_SHARE = 0.1
 """The same as a share of the Earth's rate: below, small errors of the model explain it."""
 AGREEING_SDS = 4.0
 """Standard deviations within which an estimate agrees with a cause."""
 AGREEING_SHARE = 0.15
 """The same as a share of the effect of the cause."""
+LEAST_WINDOWS = 8
+"""Windows, beyond the number of unknowns, from which a latitude is tested."""
+LEAST_RATE = 0.01
+"""Rate of the reference above which the matrix of the gyroscopes is one of the unknowns, rad/s."""
 FARTHEST_SHARE = 0.5
 """An estimate farther than this share from an effect does not agree with it, however uncertain."""
 
 
-def latitude_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]:
+@dataclass(frozen=True, eq=False)
+class WindowRates:
+    """Means of n windows: rates of the gyroscopes, of the reference, and which way was up."""
+
+    measured: np.ndarray
+    """Measured rates in the sensor frame, rad/s, shape (n, 3)."""
+    reference: np.ndarray
+    """Rates of the reference, rad/s, shape (n, 3)."""
+    up: np.ndarray
+    """Specific force of the reference over gravity, shape (n, 3): up where the IMU rests."""
+    time: np.ndarray
+    """Middle of the windows, s, shape (n,)."""
+    session: np.ndarray
+    """Recording of each window, shape (n,)."""
+    kind: np.ndarray
+    """Kind of each window, shape (n,)."""
+
+
+def window_rates(gathered: SessionData, model: SensorModel, table: Table) -> WindowRates:
+    """
+    Return the means of the windows of a session.
+
+    Parameters
+    ----------
+    gathered : SessionData
+    model : SensorModel
+        The model of the gathered columns.
+    table : Table
+
+    """
+    rows = gathered.accumulator.rows
+    rates = np.array([row.sensors['gyroscope'].mean for row in rows])
+    forces = np.array([row.sensors['accelerometer'].mean for row in rows])
+    return WindowRates(
+        rates[:, -3:],
+        rates[:, model.columns_of('gyroscope', Role.LINEAR)],
+        forces[:, model.columns_of('accelerometer', Role.LINEAR)] / table.gravity_value,
+        np.array([row.time for row in rows]),
+        np.array([row.session for row in rows]),
+        np.array([str(row.kind) for row in rows]),
+    )
+
+
+def latitude_findings(
+    solution: Solution, table: Table, windows: WindowRates | None = None
+) -> tuple[CheckFinding, ...]:
     """
     Return the contradictions between the latitude and the estimates.
 
     ``omega_up = Omega sin(latitude)`` and ``|omega| = Omega`` do not depend on the azimuth. Where
-    the table gives the azimuth, the reference contains the Earth's rate, and a latitude with the
-    wrong sign leaves ``-2 Omega sin(latitude)`` about the vertical: at rest that is a g-sensitivity
-    ``k f`` with the same k for each axis.
+    the table gives the azimuth, the reference contains the Earth's rate, and another latitude
+    leaves ``Omega (sin(true) - sin(stated))`` about the vertical.
 
     Parameters
     ----------
     solution : Solution
         With all allowances in its covariance.
     table : Table
+    windows : WindowRates, optional
+        For a table with an azimuth.
 
     Raises
     ------
@@ -51,8 +107,9 @@ def latitude_findings(solution: Solution, table: Table) -> tuple[CheckFinding, .
     free = next((effect for effect in model.effects if effect.known_size), None)
     if free is not None:
         return _of_free_rate(solution, table, model.slices[free.key])
-    if model.find('gyroscope', Role.CROSS) is not None:
-        _refuse_vertical_rate(solution, table, model.part('gyroscope', Role.CROSS))
+    if table.azimuth_deg is not None and windows is not None:
+        named = model.find('gyroscope', Role.CROSS) is not None
+        return _of_windows(windows, table, NAMED_SDS if named else CONTRADICTING_SDS)
     return ()
 
 
@@ -76,28 +133,61 @@ def _of_free_rate(solution, table, part):
     return ()
 
 
-def _refuse_vertical_rate(solution, table, part):
-    """Refuse a g-sensitivity that is the vertical rate of a latitude with the wrong sign."""
-    values = solution.values[part]
-    if len(values) != 9 or solution.held[part].any():
-        return
-    matrix = values.reshape(3, 3)
-    matrix_sd = np.sqrt(np.diag(solution.covariance[part, part])).reshape(3, 3)
-    # Common to the three axes: k = trace(K) / 3, the sds as if they were fully correlated.
-    common = float(np.trace(matrix)) / 3.0
-    common_sd = float(matrix_sd.diagonal().mean())
-    if abs(common) < CONTRADICTING_SDS * common_sd:
-        return
+def _of_windows(windows, table, sds):
+    """Compare the rate about the vertical that the reference leaves with that of the latitude."""
+    # Biases and their drift, c + d t for each recording.
+    drifts = np.zeros((len(windows.time), 0))
+    for session in np.unique(windows.session):
+        inside = windows.session == session
+        time = windows.time - windows.time[inside].mean()
+        drifts = np.column_stack([drifts, inside, inside * time / max(np.ptp(time), 1e-9)])
+    # Any linear dependence on up: w = K up + M r + c + d t.
+    design = np.column_stack([windows.up, drifts])
+    if np.abs(windows.reference).max(initial=0.0) > LEAST_RATE:
+        design = np.column_stack([design, windows.reference])
+    if len(design) < design.shape[1] + LEAST_WINDOWS:
+        return ()
+    weight = _weights_of_kinds(windows, design)
+    design, measured = design * weight[:, None], windows.measured * weight[:, None]
+    solved, _, rank, _ = np.linalg.lstsq(design, measured, rcond=1e-6)
+    if rank < design.shape[1]:
+        return ()
+    variance = ((measured - design @ solved) ** 2).sum(axis=0) / (len(design) - rank)
+    inverse = np.linalg.inv(design.T @ design)[:3, :3]
+    dependence = solved[:3].T
+    dependence_sd = np.sqrt(np.outer(variance, inverse.diagonal()))
+    # A rate about the vertical is K = k I: the weighted mean of the diagonal.
+    precision = 1.0 / np.maximum(dependence_sd.diagonal() ** 2, 1e-300)
+    vertical = float(precision @ dependence.diagonal() / precision.sum())
+    vertical_sd = float(1.0 / np.sqrt(precision.sum()))
+    if not _contradicts(vertical, vertical_sd, sds):
+        return ()
+    # A g-sensitivity has other entries too, and no latitude gives more than the Earth's rate.
+    remaining = np.abs(dependence - vertical * np.eye(3))
+    tolerated = np.maximum(AGREEING_SDS * dependence_sd, AGREEING_SHARE * abs(vertical))
     expected_up = _vertical_rate(table)
-    # Of a latitude with the wrong sign: k g = -2 Omega sin(latitude), and no other entry.
-    of_wrong_sign = -2.0 * expected_up / table.gravity_value
-    if not _agrees(common - of_wrong_sign, common_sd, of_wrong_sign):
-        return
-    remaining = np.abs(matrix - common * np.eye(3))
-    tolerated = np.maximum(AGREEING_SDS * matrix_sd, AGREEING_SHARE * abs(of_wrong_sign))
-    if np.any(remaining > tolerated):
-        return
-    raise _wrong_sign(table, expected_up + common * table.gravity_value, expected_up)
+    measured_up = expected_up + vertical
+    if np.any(remaining > tolerated) or _contradicts_length(measured_up, vertical_sd):
+        return ()
+    if _agrees(measured_up + expected_up, vertical_sd, expected_up):
+        raise _wrong_sign(table, measured_up, expected_up)
+    return (_finding('vertical component', measured_up, vertical_sd, expected=expected_up),)
+
+
+def _weights_of_kinds(windows, design):
+    """Return the inverse rms of what rests, spins and other motions leave, for each window."""
+    solved = np.linalg.lstsq(design, windows.measured, rcond=1e-6)[0]
+    squares = ((windows.measured - design @ solved) ** 2).mean(axis=1)
+    weight = np.ones(len(design))
+    for kind in np.unique(windows.kind):
+        of_kind = windows.kind == kind
+        weight[of_kind] = 1.0 / np.sqrt(max(squares[of_kind].mean(), 1e-30))
+    return weight
+
+
+def _contradicts_length(rate, sd):
+    """Return whether one component is larger than the rate of the Earth."""
+    return abs(rate) > EARTH_RATE and _contradicts(abs(rate) - EARTH_RATE, sd)
 
 
 def _vertical_rate(table):
@@ -105,8 +195,8 @@ def _vertical_rate(table):
     return float(earth_rate_n(table.latitude, 0.0)[2])
 
 
-def _contradicts(difference, sd):
-    return abs(difference) > max(CONTRADICTING_SDS * sd, LEAST_SHARE * EARTH_RATE)
+def _contradicts(difference, sd, sds=CONTRADICTING_SDS):
+    return abs(difference) > max(sds * sd, LEAST_SHARE * EARTH_RATE)
 
 
 def _agrees(difference, sd, size):
@@ -141,8 +231,12 @@ def _hourly(rate):
 
 
 def with_latitude_findings(
-    findings: tuple[CheckFinding, ...], solution: Solution, table: Table
+    findings: tuple[CheckFinding, ...],
+    solution: Solution,
+    table: Table,
+    *,
+    windows: WindowRates,
 ) -> tuple[CheckFinding, ...]:
     """Return the findings of a recording, those on the latitude first."""
     earlier = tuple(finding for finding in findings if finding.check != CHECK)
-    return (*latitude_findings(solution, table), *earlier)
+    return (*latitude_findings(solution, table, windows), *earlier)

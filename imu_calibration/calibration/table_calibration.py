@@ -17,7 +17,7 @@ from imu_calibration.calibration.from_solution import (
     weak_on_table,
     with_gravity_uncertainty,
 )
-from imu_calibration.calibration.latitude_check import with_latitude_findings
+from imu_calibration.calibration.latitude_check import window_rates, with_latitude_findings
 from imu_calibration.calibration.mount_check import with_mount_findings
 from imu_calibration.calibration.plain_fit import (
     better_plain_fits,
@@ -274,7 +274,9 @@ def conclude(
     """
     tolerances = tolerances_of(solution.model, options.tolerances)
     gathered.findings = with_mount_findings(gathered.findings, solution, table)
-    gathered.findings = with_latitude_findings(gathered.findings, solution, table)
+    gathered.findings = with_latitude_findings(
+        gathered.findings, solution, table, windows=window_rates(gathered, model, table)
+    )
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)
     uncorrected = _uncorrected(solution, gathered, model)

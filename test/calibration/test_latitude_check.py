@@ -1,12 +1,13 @@
 """The latitude of a table against the estimated Earth's rate."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from refusal import refused
 
-from imu_calibration.calibration.latitude_check import latitude_findings
+from imu_calibration.calibration.latitude_check import WindowRates, latitude_findings
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -75,18 +76,51 @@ def test_an_uncertain_estimate_contradicts_nothing():
     assert latitude_findings(earth(-LATITUDE, sd=5e-5), table()) == ()
 
 
-def test_a_vertical_rate_of_twice_the_earth_is_no_g_sensitivity():
-    """The reference contains Omega sin(latitude) with the wrong sign: at rest that is k f."""
-    known = table(azimuth_deg=20.0)
-    left = -2 * OMEGA * np.sin(np.radians(LATITUDE)) / known.gravity_value
-    matrix = left * np.eye(3)
-    matrix[0, 1] = 0.05 * left
-    sign = solution('gyroscope', 'gyro_g_sensitivity', matrix.ravel(), abs(left) / 30)
+KNOWN = 20.0
+"""deg, azimuth."""
+
+
+def windows_of(latitude, *, g_sensitivity=np.zeros((3, 3)), noise=1e-6, seed=4):
+    """
+    Return windows at a latitude with a description that states `LATITUDE`.
+
+    The vertical part of the Earth's rate only: the azimuth is known, and its error is not tested.
+    """
+    rng = np.random.default_rng(seed)
+    up = rng.normal(size=(60, 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    stated, true = (OMEGA * np.sin(np.radians(each)) * up for each in (LATITUDE, latitude))
+    turns = np.where(np.arange(60)[:, None] < 25, 0.0, rng.normal(0.0, 0.5, (60, 3)))
+    time = np.linspace(0.0, 500.0, 60)
+    drift = np.outer(time, [1e-7, 2e-7, -1e-7])
+    measured = (true + turns) @ (np.eye(3) + rng.normal(0, 0.01, (3, 3))).T + drift + 0.002
+    measured += up @ g_sensitivity.T + rng.normal(0.0, noise, (60, 3))
+    kind = np.where(np.arange(60) < 25, 'static', 'dynamic')
+    return WindowRates(measured, stated + turns, up, time, np.zeros(60, int), kind)
+
+
+def of_windows(windows, latitude=LATITUDE):
+    bias = solution('gyroscope', 'bias', np.zeros(3), 1e-6)
+    return latitude_findings(bias, table(latitude, KNOWN), windows)
+
+
+def test_another_sign_or_latitude_is_no_g_sensitivity():
+    """The reference contains Omega sin(stated): at rest, the difference is that of k f."""
+    assert of_windows(windows_of(LATITUDE)) == ()
     with refused(InputError, 'latitude_sign', 37):
-        latitude_findings(sign, known)
-    for other in (-matrix, matrix + np.diag([0, 0, left]), 4 * matrix):
-        real = solution('gyroscope', 'gyro_g_sensitivity', other.ravel(), abs(left) / 30)
-        assert latitude_findings(real, known) == ()
+        of_windows(windows_of(-LATITUDE))
+    for latitude in (5.0, 75.0):
+        (finding,) = of_windows(windows_of(latitude))
+        assert finding.check == 'latitude' and finding.key == 'latitude'
+        shown = float(re.search(r'measured ([\d.]+)', finding.text)[1]) * np.radians(1 / 3600)
+        assert shown == pytest.approx(OMEGA * np.sin(np.radians(latitude)), rel=0.1, abs=1e-6)
+    assert of_windows(windows_of(-LATITUDE, noise=1e-3)) == ()
+
+
+def test_a_g_sensitivity_is_no_latitude():
+    size = 2 * OMEGA * np.sin(np.radians(LATITUDE))
+    for matrix in (size * np.diag([-1, -1, 2]), size * np.eye(3), -4 * size * np.eye(3)):
+        assert of_windows(windows_of(LATITUDE, g_sensitivity=matrix)) == ()
 
 
 def test_a_simulated_world_turns_wherever_a_latitude_is_given():

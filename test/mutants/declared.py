@@ -932,6 +932,13 @@ FILES = _of(
 )
 SIGNS = _of(
     (
+        'another latitude reads as a g-sensitivity',
+        'latitude_findings',
+        '_1.azimuth_deg is not None and _2 is not None',
+        'False',
+        'test_latitude_check.py',
+    ),
+    (
         'a turned IMU reads as a frozen joint',
         'standing_still',
         '_1 is not None',
