@@ -223,6 +223,10 @@ determined directions.
 """
 
 
+LEAST_TIME_CONSTANT = 0.3
+"""Least time constant after a step, as a share of that before it."""
+
+
 def linearise_again(model: SensorModel, solution: Solution) -> SensorModel | None:
     """
     Return the model linearised at a solution outside the validity of its linearisation, else None.
@@ -254,9 +258,14 @@ def _cautious(solution):
 
     At zero, lag and delay have the same first derivative. They are separable only at a point where
     both are nonzero; a full step along their difference would be arbitrary. The step is therefore
-    regularised with LINEAR_STEPS towards the point.
+    regularised with LINEAR_STEPS towards the point. A time constant is positive: its step ends at
+    the share `LEAST_TIME_CONSTANT` of the point at the latest.
     """
-    model, values = solution.model, solution.values
+    model, values = solution.model, solution.values.copy()
+    for effect in model.relinearised:
+        if effect.time_constant:
+            last = model.slices[effect.key].stop - 1
+            values[last] = max(values[last], LEAST_TIME_CONSTANT * model.point_of(effect)[-1])
     move, pull = np.zeros(len(values)), np.zeros(len(values))
     for effect in model.relinearised:
         if effect.warp is not None:

@@ -13,7 +13,7 @@ import pytest
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.noise_likelihood import FLICKER_MARK, NoiseLikelihood
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel, ReferenceNoise
 from imu_calibration.estimation.noise_search import BiasProcessSearch
@@ -40,7 +40,7 @@ from imu_calibration.selection.parameter_space import (
     scatter_of_each,
     white_means,
 )
-from imu_calibration.selection.questions import Question
+from imu_calibration.selection.questions import Question, linearise_again
 from imu_calibration.selection.search import MIN_GAIN_NATS, Search
 
 KINDS = np.array(['static'] * 20 + ['spin'] * 12)
@@ -985,3 +985,19 @@ def test_a_bias_that_follows_the_temperature_late_is_named(lag):
     beside = residual - np.outer(measured - 25, [1.0, -0.5, 0.2])
     name, share = rests.correlate(rests.slow_explanations(time, measured), beside)
     assert {0: None, 45: 'temperature rate'}.get(lag, name) == name
+
+
+@pytest.mark.parametrize(('constant', 'expected'), [(-0.09, 30.0), (0.0, 30.0), (250.0, 250.0)])
+def test_a_step_to_a_negative_time_constant_is_cut(constant, expected):
+    # A warm-up of 30 s: the first step ended at -0.09 s, and its columns were not finite.
+    model = SensorModel(BASE, (*BASE, 'gyro_bias_drift'))
+    effect = next(each for each in model.effects if each.time_constant)
+    model = replace(model, point={effect.name: effect.at_time_constant(100.0)})
+    values = model.start()
+    values[model.slices[effect.key].stop - 1] = constant
+    count = len(values)
+    solution = SimpleNamespace(
+        model=model, values=values, sd=np.full(count, 15.0), covariance=np.eye(count)
+    )
+    again = linearise_again(model, solution)
+    assert again.point_of(effect)[-1] == pytest.approx(expected)
