@@ -1,5 +1,6 @@
 """Logs as text with columns, read as a bag."""
 
+import codecs
 import csv
 import io
 import re
@@ -79,13 +80,13 @@ COLUMN_PATTERNS = (
     (
         'time',
         r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|'
-        r'(.* )?stamp|.*elapsed|time since start.*|millis|micros|nanos|rtc ?time|time of day|'
-        r'sample ?time ?fine',
+        r'(.* )?stamp|.*elapsed|time ?(since )?start.*|millis|micros|nanos|ms|us|ns|rtc ?time|'
+        r'time of day|sample ?time ?fine',
     ),
     (
         'force',
         r'(a|ac|acc|acc smooth|accel|accelerometer|acceleration|f|specific force|a rs'
-        r' s|(accelerometer|acc|raw|imu|total) ?accel\w*|'
+        r' s|(accelerometer|acc|raw|imu|total) ?accel\w*|(uncomp\w*|uncal\w*) ?acc\w*|'
         r'(.* )?linear acceleration|d ?vel|(delta|d) ?v|delta ?vel(ocity)?|'
         r'vel(ocity)? ?inc(rement)?s?)',
     ),
@@ -93,6 +94,7 @@ COLUMN_PATTERNS = (
         'rate',
         r'(g|w|gy|gyr|gyro|gyro adc|gyroscope|omega|rate|w rs s|'
         r'(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
+        r'(uncomp\w*|uncal\w*) ?gyr\w*|'
         r'(.* )?angular velocity|(d|delta) ?(theta|ang|angle)|(ang|angle|theta) ?inc(rement)?s?)',
     ),
     (
@@ -114,8 +116,13 @@ PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns
 Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within
 the usual rates.
 """
-CLOCK = re.compile(r'\s*(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d+))?\s*')
-"""Time of day: hours, minutes, seconds, decimals."""
+CLOCK = re.compile(
+    r'\s*(?:\d{1,2}[./-]\d{1,2}[./-]\d{2,4},?[ T]\s*)?(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d+))?\s*'
+)
+"""
+Time of day: hours, minutes, seconds, decimals. A date with the day or the month first is not read,
+because the order is unknown; midnights are counted.
+"""
 DAY_NS = 86_400 * 10**9
 NO_TIME = np.iinfo(np.int64).min
 """The value of NaT."""
@@ -236,7 +243,9 @@ def read_csv(
     table = _Table(path)
     found = [_parse(text) for text in columns]
     given = {(each.quantity, each.joint) for each in found}
-    found += [each for each in _guess(table) if (each.quantity, each.joint) not in given]
+    stated = {each.quantity for each in found}
+    guessed = _guess(table, stated)
+    found += [each for each in guessed if (each.quantity, each.joint) not in given]
     found = [
         replace(each, unit=RAW_UNIT, origin='given') if each.quantity in raw else each
         for each in found
@@ -576,8 +585,28 @@ def _size_of(columns):
     return 1.0 / np.asarray(unit_of(SENSOR_OF[columns.quantity], columns.unit).scale)
 
 
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""First bytes of text in UTF-16, as spreadsheets export it."""
+COMPRESSED = {b'\x1f\x8b': 'gzip', b'PK': 'zip', b'\x28\xb5': 'zstd', b'BZ': 'bzip2'}
+"""First two bytes -> program that has compressed a file."""
+
+
 def _opened(path):
-    return io.TextIOWrapper(open_regular(path), encoding='utf-8-sig', errors='replace')
+    file = open_regular(path)
+    encoding = 'utf-16' if file.read(2) in UTF_16 else 'utf-8-sig'
+    file.seek(0)
+    return io.TextIOWrapper(file, encoding=encoding, errors='replace')
+
+
+def _refuse_compressed(path):
+    with open_regular(path) as file:
+        program = COMPRESSED.get(file.read(2))
+        binary = b'\0' in file.read(HEAD_BYTES)
+    if program is not None and binary:
+        raise InputError(
+            f'a text log must not be compressed, {path} is ({program}); decompress it',
+            code='csv_compressed',
+        )
 
 
 def split_cells(line: str, delimiter: str | None, path: Path) -> list[str]:
@@ -603,6 +632,7 @@ class _Table:
         if not path.is_file():
             raise InputError(f'a text log must be a regular file, got {path}; check the path')
         self.path = path
+        _refuse_compressed(path)
         with _opened(path) as file:
             head = file.read(HEAD_BYTES)
         lines = head.splitlines()
@@ -802,7 +832,9 @@ class _Table:
 
 def _dates(cells):
     """Return dates with time as datetime64[ns], shape (n,); NaT where a cell is none."""
-    texts = [re.sub(r'(Z|[+-]\d\d:?\d\d)$', '', cell.strip()).replace(' ', 'T') for cell in cells]
+    texts = [
+        re.sub(r'\s*(Z|[+-]\d\d:?\d\d)$', '', cell.strip()).replace(' ', 'T') for cell in cells
+    ]
     try:
         return np.array(texts, 'datetime64[ns]')
     except ValueError:
@@ -856,8 +888,8 @@ def _numeric(cell):
     return re.fullmatch(r'\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*', cell) is not None
 
 
-def _guess(table):
-    """Return the Columns that the header names."""
+def _guess(table, stated=frozenset()):
+    """Return the Columns that the header names; sets of a `stated` quantity may be several."""
     axes, found = {'force': {}, 'rate': {}}, []
     sensor_of_file = _words(table.path.stem)[0]
     for name in table.names:
@@ -867,13 +899,17 @@ def _guess(table):
         if words in ('t', 't imu') and _unit('temperature', unit_text):
             words = 'temperature'
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
-        axis = re.fullmatch(r'(.*?) ?([xyz])', re.sub(r'^([xyz]) (.*)$', r'\2 \1', words))
+        # acc x raw, x acc
+        without_raw = re.sub(r'^([xyz]) (.*)$', r'\2 \1', words.removesuffix(' raw'))
+        axis = re.fullmatch(r'(.*?) ?([xyz])', without_raw)
+        suffix = words[len(words.removesuffix(' raw')) :]
         for quantity, pattern in COLUMN_PATTERNS:
             if quantity in axes:
                 if axis and re.fullmatch(pattern, axis.group(1)):
-                    axes[quantity].setdefault(re.sub(r'[^a-z]', '', axis.group(1)), {})[
-                        axis.group(2)
-                    ] = (name, _unit(quantity, unit_text))
+                    # Numbers distinguish sensors, and "raw" columns from converted ones.
+                    group = re.sub(r'[^a-z0-9]', '', axis.group(1) + suffix)
+                    unit = _unit(quantity, unit_text)
+                    axes[quantity].setdefault(group, {})[axis.group(2)] = (name, unit)
             elif (
                 re.fullmatch(pattern, words)
                 # T (°C) is no time, and temp (F) is not read as °C
@@ -883,8 +919,12 @@ def _guess(table):
                 found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
         if joint:
             found.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
+    if not any(columns.quantity == 'time' for columns in found):
+        found += _unnamed_time(table)
     for quantity, groups in axes.items():
         complete = [group for group in groups.values() if set(group) == set('xyz')]
+        if quantity in stated:
+            continue
         if len(complete) > 1:
             raise InputError(
                 f'{table.path} must have one column of {quantity} per axis, got {len(complete)}'
@@ -903,6 +943,27 @@ def _guess(table):
                 )
             )
     return found
+
+
+def _unnamed_time(table):
+    """
+    Return the column of time where no usual name has it, in a list; empty if several may be it.
+
+    The only one with times of day or dates, else with a unit of time in brackets, else with "time"
+    and "stamp" in its name.
+    """
+    clocks = [table.names[k] for k in sorted(table.clocks | table.dates)]
+    with_unit, stamps = [], []
+    for name in table.names:
+        words, unit_text = _words(name)
+        if re.search(r'[(\[]', name) and _unit('time', unit_text):
+            with_unit.append(name)
+        if re.search('time ?stamp', words):
+            stamps.append(name)
+    for names in (clocks, with_unit, stamps):
+        if len(names) == 1:
+            return [Columns('time', (names[0],), _unit('time', _words(names[0])[1]))]
+    return []
 
 
 ELEMENT = re.compile(r'(.*\S)\[([012])\]')
@@ -946,7 +1007,7 @@ def _without_unit(name):
         ) or re.search(r'(?<=temp)((?:deg)?c)$|(?<=temperature)((?:deg)?c)$', text, re.IGNORECASE)
         if suffix:
             unit, text = suffix.group().removeprefix('_'), text[: suffix.start()]
-    if not unit and text.lower() in ('millis', 'micros', 'nanos'):
+    if not unit and text.lower() in ('millis', 'micros', 'nanos', 'ms', 'us', 'ns'):
         unit = text
     return text, unit
 

@@ -4,6 +4,8 @@ Text logs: columns and units from header and values, and refusals.
 A log, its bag and arrays give the same result.
 """
 
+import gzip
+
 import numpy as np
 import pytest
 from refusal import refused
@@ -341,6 +343,72 @@ def test_times_of_day_pass_midnight(tmp_path, imu):
     np.testing.assert_allclose(np.diff(log.imu.stamp_ns), np.diff(imu.stamp_ns), atol=1.1e6)
     np.testing.assert_allclose(log.imu.force_s, imu.force_s)
     assert log.unused == ('rtcDate',)
+
+
+@pytest.mark.parametrize(
+    'header',
+    [
+        'Zeit [s],ax,ay,az,gx,gy,gz',
+        'since_boot_timestamp (s),a_x_raw,a_y_raw,a_z_raw,g_x_raw,g_y_raw,g_z_raw',
+        'TimeStartup (s),UncompAccX,UncompAccY,UncompAccZ,UncompGyroX,UncompGyroY,UncompGyroZ',
+    ],
+)
+@pytest.mark.parametrize('encoding', ['utf-8', 'utf-16'])
+def test_names_and_encodings_of_other_programs(tmp_path, imu, header, encoding):
+    path = write(tmp_path / 'log.csv', header, seconds(imu), imu.force_s, imu.rate_s)
+    path.write_bytes(path.read_text().encode(encoding))
+    assert_read(read_csv(path), imu)
+
+
+def test_a_date_with_the_day_first_is_read_as_the_time_of_day(tmp_path, imu):
+    """The only column with times of day is the time, whatever its name is."""
+    lines = ['Aufnahme;ax;ay;az;gx;gy;gz']
+    for clock, force, rate in zip(clock_text(seconds(imu)), imu.force_s, imu.rate_s):
+        day = '28.02.2021' if clock.startswith('23') else '01.03.2021'
+        lines.append(';'.join([f'{day} {clock}', *force.astype(str), *rate.astype(str)]))
+    path = tmp_path / 'clock.csv'
+    path.write_text('\n'.join(lines) + '\n')
+    log = read_csv(path)
+    assert log.imu.stamp_ns[0] == 86_390 * 10**9
+    np.testing.assert_allclose(np.diff(log.imu.stamp_ns), np.diff(imu.stamp_ns), atol=1.1e6)
+
+
+def test_dates_with_a_zone_after_a_space(tmp_path, imu):
+    lines = ['time,ax,ay,az,gx,gy,gz']
+    start = np.datetime64('2024-05-06T07:08:09', 'ns')
+    for time_ns, force, rate in zip(imu.stamp_ns - imu.stamp_ns[0], imu.force_s, imu.rate_s):
+        date = str(start + np.timedelta64(int(time_ns), 'ns')).replace('T', ' ') + ' +0200'
+        lines.append(','.join([date, *force.astype(str), *rate.astype(str)]))
+    path = tmp_path / 'zone.csv'
+    path.write_text('\n'.join(lines) + '\n')
+    assert_read(read_csv(path), imu)
+
+
+def test_a_compressed_log_is_named(tmp_path, imu):
+    path = write(tmp_path / 'log.csv', PLAIN, seconds(imu), imu.force_s, imu.rate_s)
+    path.write_bytes(gzip.compress(path.read_bytes()))
+    with refused(InputError, 'csv_compressed', 'gzip'):
+        read_csv(path)
+
+
+@pytest.mark.parametrize('name', ['imu{}_linear_acceleration_{}', 'imu{}.linear_acceleration.{}'])
+def test_columns_of_two_imus_are_never_mixed(tmp_path, imu, name):
+    """Numbers in names distinguish sensors; before, the last one was read without a word."""
+    names = ['time']
+    for k in (1, 2):
+        names += [name.format(k, axis) for axis in 'xyz']
+    rates = ['gx', 'gy', 'gz']
+    header = ','.join([*names, *rates])
+    path = write(
+        tmp_path / 'two.csv', header, seconds(imu), imu.force_s, imu.force_s + 0.4, imu.rate_s
+    )
+    with pytest.raises(InputError) as caught:
+        read_csv(path)
+    assert caught.value.key == 'columns' and names[1] in str(caught.value)
+    log = read_csv(
+        path, ['time=time:s', f'force={",".join(names[4:7])}:m/s^2', 'rate=gx,gy,gz:rad/s']
+    )
+    np.testing.assert_allclose(log.imu.force_s, imu.force_s + 0.4, atol=1e-8)
 
 
 @pytest.mark.parametrize('delimiter', [';', '\t'])
