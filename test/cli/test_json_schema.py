@@ -42,11 +42,11 @@ QUICK = {
 }
 """Verb -> arguments, in an order in which each finds the files of those before."""
 LONG = {
-    'calibrate': [SESSION, '--table', TABLE, '--output', 'found'],
+    'calibrate': [SESSION, '--table', TABLE, '--no-report', '--output', 'found'],
     'compensate': [SESSION, '--calibration', 'found/calibration.yaml', '--output', 'corrected'],
     'check': [SESSION, '--table', TABLE, '--calibration', 'found/calibration.yaml'],
     'diagnose': [SESSION, '--table', TABLE, '--output', 'diagnosed'],
-    'noise': [SESSION, '--output', 'noise'],
+    'noise': [SESSION, '--no-report', '--output', 'noise'],
     'view': [SESSION, '--table', TABLE, '--model-as-asked', '--output', 'view.mcap'],
     'fleet': [
         'units',
