@@ -74,7 +74,12 @@ def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
 
     def source():
         with open_recording(folder, imu_topic='/imu/data_raw') as recording:
-            yield from recording.blocks(table.joint_names)
+            start = None
+            for block in recording.blocks(table.joint_names):
+                start = block.imu.stamp_ns[0] if start is None else start
+                if block.imu.stamp_ns[0] > start + 240 * 10**9:
+                    return
+                yield block
 
     document = diagnose_recording(source, table).document
     effects = {finding['effect'] for finding in document['findings']}

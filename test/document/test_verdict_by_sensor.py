@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from few_candidates import restricted
 
 import imu_calibration as imu
 from imu_calibration.cli.main import main
@@ -225,6 +226,7 @@ def test_check_says_which_sensor_it_helps(yaw, block):
 
 @pytest.mark.long
 @pytest.mark.real_data
+@restricted()
 def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     """
     A vertical shaft.
