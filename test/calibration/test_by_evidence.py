@@ -37,6 +37,7 @@ from worlds.physics_beyond import Beyond
 TABLE = Table.from_mapping(TABLES['three_axis'])
 NAMES = tuple(TABLE.joint_names)
 OFFSET = 'reference.time_offset.offset'
+COARSE = {'imu_rate': 50.0, 'joint_rate': 50.0}
 SHAFT = {'table': 'shaft', 'profile': 'sweeps'}
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
@@ -307,7 +308,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
 
 def test_an_effect_that_is_removed_as_faint_leaves_an_unexplained_residual(monkeypatch):
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
-    session = make_session(5, {'accel_quadratic': 2e-4}, 'realistic')
+    session = make_session(5, {'accel_quadratic': 2e-4}, 'realistic', **COARSE)
     found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration.statistics
     assert (
         found['denied'] == ['accel_quadratic']
@@ -337,7 +338,7 @@ def test_a_bias_is_not_known_better_than_windows_agree_on_it():
     Poses of each sense agree so well that their mean passed for sure, ten sd from the truth.
     """
     cause = Beyond('backlash', 2)
-    session = make_session(2, None, 'realistic', cause=cause)
+    session = make_session(2, None, 'realistic', cause=cause, **COARSE)
     calibration = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
     (axis,) = cause.axes
     places = {name: calibration.param_names.index(f'accelerometer.bias.{name}') for name in 'xyz'}
@@ -374,7 +375,7 @@ def test_what_a_rest_may_move_biases_by():
 
 @pytest.mark.long
 def test_a_bias_that_steps_on_every_axis_passes_for_noise_and_is_told():
-    session = make_session(7, {'knock_step': 0.05}, 'realistic')
+    session = make_session(7, {'knock_step': 0.05}, 'realistic', **COARSE)
     result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))
     assert (
         not result.diagnosis.findings
@@ -388,7 +389,7 @@ def test_a_bias_that_steps_on_every_axis_passes_for_noise_and_is_told():
             and note[1:] in diagnosis_report(result)
         )
     assert result.document['notes'] == [motion, bias]
-    plain = make_session(7, None, 'realistic')
+    plain = make_session(7, None, 'realistic', **COARSE)
     assert not diagnose_recording(
         lambda: iter([plain.block]), Table.from_mapping(plain.table)
     ).notes
