@@ -602,15 +602,18 @@ def _held_out_motions(calibration, sensor):
     """
     Return that held-out data prove the recorded motions only; '' if they show each parameter.
 
-    A parameter is held because no motion of the recording shows it, held-out data included.
+    A parameter that is held and needs a motion is shown by no motion of the recording, held-out
+    data included. One that is held because of an error of the model is.
     """
-    states = [state for name, state in calibration.requested.items() if name.startswith(sensor)]
-    if HELD not in states:
+    own = {name: state for name, state in calibration.requested.items() if name.startswith(sensor)}
+    held = [name for name, state in own.items() if state == HELD]
+    n_unseen = 0
+    for need, names in _by_need(calibration, held).items():
+        if need not in REMEDY_KEYS:
+            n_unseen += len(names)
+    if not n_unseen:
         return ''
-    return (
-        f'; in motions as recorded, which do not show {states.count(HELD)} of its {len(states)}'
-        ' parameters'
-    )
+    return f'; in motions as recorded, which do not show {n_unseen} of its {len(own)} parameters'
 
 
 def _reason(calibration, sensor):

@@ -10,7 +10,13 @@ from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS,
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.document.verdict import judge, judged, motion_misfits
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK, tolerances_of
+from imu_calibration.estimation.solution import (
+    DETERMINED,
+    EXCESS_REMEDY,
+    HELD,
+    WEAK,
+    tolerances_of,
+)
 
 MODEL = SensorModel(reference=('table_tilt',))
 NAMES = list(MODEL.param_names)
@@ -269,4 +275,10 @@ def test_a_sensor_with_held_parameters_helps_in_the_recorded_motions_only():
     assert f'2 of its {count}' in reasons['accelerometer']
     assert f'2 of its {count}' not in complete.decision_reasons['accelerometer']
     assert reasons['gyroscope'] == complete.decision_reasons['gyroscope']
+    # An error of the model is no lack of motions.
+    cause = ({'parameters': dict.fromkeys(names, 3.0), 'needs': EXCESS_REMEDY},)
+    of_model = judged(
+        calibration(proof=PROOF, status=held, undetermined=cause), TOLERANCES
+    ).decision_reasons
+    assert of_model['accelerometer'] == complete.decision_reasons['accelerometer']
     assert (exit_code(complete), exit_code(incomplete)) == (0, 3)
