@@ -663,6 +663,10 @@ class _Table:
             for cell in row
         )
         width = len(rows[first])
+        if not self.first_row[-1].strip():  # rows end with a separator, the header does not
+            for row in rows[:first]:
+                if len(row) == width - 1:
+                    row.append('')
         header = [row for row in rows[:first] if len(row) == width][-2:]
         self.names = [
             re.sub(r'\s+', ' ', ''.join(c if c.isprintable() else ' ' for c in name)).strip()
@@ -1004,7 +1008,11 @@ def _without_unit(name):
             r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|ms|us|ns|deg|rad|deg_?c|celsius|c|s)$',
             text,
             re.IGNORECASE,
-        ) or re.search(r'(?<=temp)((?:deg)?c)$|(?<=temperature)((?:deg)?c)$', text, re.IGNORECASE)
+        ) or re.search(
+            r'(?<=temp)((?:deg)?c)$|(?<=temperature)((?:deg)?c)$|(?<=time)([mun]s)$',
+            text,
+            re.IGNORECASE,
+        )
         if suffix:
             unit, text = suffix.group().removeprefix('_'), text[: suffix.start()]
     if not unit and text.lower() in ('millis', 'micros', 'nanos', 'ms', 'us', 'ns'):
