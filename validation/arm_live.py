@@ -68,7 +68,7 @@ class Case:
         )
 
 
-def prepare(folder, name, arm_from, pair=PAIR, seconds=STRETCH_S):
+def prepare(folder, name, arm_from, *, seconds, pair=PAIR):
     """
     Return the Case of the last `seconds` of a recording.
 
@@ -266,7 +266,8 @@ def run(folder, plots):
         return section
     rows, bins, case, found = [], [], None, None
     for name in NAMES:
-        case = prepare(folder, name, arm_from=NAMES[1 - NAMES.index(name)])
+        arm_from = NAMES[1 - NAMES.index(name)]
+        case = prepare(folder, name, arm_from, seconds=STRETCH_S)
         found, count = residuals(case, play(case))
         before, after, ahead = rms(found['turned']), rms(found['moved']), looking_ahead(case)
         lost = 2 * len(case.imu_a) - sum(count.values())

@@ -4,6 +4,7 @@ Each script of the repository runs once at its smallest size.
 The scripts run in a copy of the tree, because some of them write pages.
 """
 
+import ast
 import os
 import shutil
 import subprocess
@@ -84,6 +85,19 @@ def test_every_script_is_listed():
                 scripts.add(str(path.relative_to(ROOT)))
     assert scripts == RUN.keys() | RUN_ELSEWHERE.keys()
     assert not RUN.keys() & RUN_ELSEWHERE.keys()
+
+
+def test_what_is_smaller_is_no_default_of_an_argument():
+    """A default keeps the value that the constant had when its function was defined."""
+    smaller = {place.split('.')[1] for place in run.SMALLEST}
+    bound = set()
+    for path in (ROOT / 'validation').glob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.arguments):
+                for default in filter(None, node.defaults + node.kw_defaults):
+                    names = {part.id for part in ast.walk(default) if isinstance(part, ast.Name)}
+                    bound |= {f'{path.stem}.{name}' for name in names & smaller}
+    assert not bound
 
 
 @pytest.fixture(scope='module')
