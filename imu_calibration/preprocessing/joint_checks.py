@@ -46,6 +46,8 @@ OWN = 0.3
 The unexplained rate along that axis is at least this share of the measured rate along it: a wrong
 gain causes less.
 """
+SATURATED_SAMPLES = 50
+"""Equal largest readings of one axis above which they are an end of its range."""
 OFTEN = 0.25
 """
 Share of repeated readings of one axis from which the steps of a gyroscope are coarser than its
@@ -101,6 +103,10 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
             f'the gyroscope must measure all the time, it repeats one reading {span_words(spans)} '
             'while the joints turn; check the sensor and its driver, and exclude that time',
         )
+    windows = _unsaturated(windows)
+    if not windows:
+        return None
+    expected = [reference_motion(table, window.motion, attitude=False).rate_s for window in windows]
     as_described = [rate + bias for rate in expected]
     for k, name in enumerate(table.joint_names):
         spans = _frozen_spans(windows, table, as_described, joint=k)
@@ -123,6 +129,22 @@ def standing_still(windows: Sequence[Window], table: Table) -> CheckFinding | No
                 ' time',
             )
     return description_error(windows, table) if is_unexplained(windows, expected) else None
+
+
+def _unsaturated(windows):
+    """
+    Return the windows in which no rate is at an end of its range.
+
+    What a saturated axis lacks may lie along the axis of a joint that rests.
+    """
+    rates = np.concatenate([window.rate_s for window in windows])
+    ends = np.stack([rates.min(axis=0), rates.max(axis=0)])
+    at_end = rates == ends[:, None]
+    # Of noisy readings one is the largest; an end of the range is reached again and again.
+    is_limit = at_end.sum(axis=1) > SATURATED_SAMPLES
+    saturated = (at_end & is_limit[:, None]).any(axis=(0, 2))
+    parts = np.split(saturated, np.cumsum([len(window) for window in windows])[:-1])
+    return [window for window, part in zip(windows, parts) if not part.any()]
 
 
 def _frozen_spans(windows, table, expected, *, joint):

@@ -932,6 +932,13 @@ FILES = _of(
 )
 SIGNS = _of(
     (
+        'saturated rates read as a frozen joint',
+        '_unsaturated',
+        'not _1.any()',
+        'True',
+        'test_joint_geometry.py',
+    ),
+    (
         'another latitude reads as a g-sensitivity',
         'latitude_findings',
         '_1.azimuth_deg is not None and _2 is not None',

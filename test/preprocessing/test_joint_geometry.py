@@ -131,3 +131,26 @@ def test_a_late_imu_does_not_hide_a_wrong_zero():
     window = window_of(TABLE, motion.select(slice(0, -n_late)), replace(stated, position=position))
     shown = re.search(r'b reads (-?[\d.]+) deg', description_error([window], TABLE).text)[1]
     assert abs(float(shown) - 9.0) < 0.2
+
+
+def test_a_saturated_gyroscope_is_no_frozen_joint():
+    """What a clipped axis lacks lies along the axis of a joint that rests, in a tilted attitude."""
+    motion = motion_of_steps(19)
+    motion = replace(motion, position=motion.position + [0.0, 0.7, 0.4])
+    whole = window_of(TABLE, motion, motion)
+    limit = 0.6
+    windows = []
+    for start in range(0, len(motion), 300):
+        part = slice(start, start + 300)
+        clipped = np.clip(whole.rate_s[part], -limit, limit)
+        windows.append(
+            replace(
+                whole,
+                stamp_ns=whole.stamp_ns[part],
+                time=whole.time[part],
+                force_s=whole.force_s[part],
+                rate_s=clipped,
+                motion=motion.select(part),
+            )
+        )
+    assert standing_still(windows, TABLE) is None
