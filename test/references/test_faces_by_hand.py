@@ -96,6 +96,13 @@ def test_errors_of_placements_do_not_demand_cross_terms():
     assert np.all(np.abs(values + 0.0231) < 3 * sd) and decide(proof['accelerometer']) is UNPROVEN
 
 
+def test_a_wandering_bias_estimated_with_cross_terms_does_not_demand_them():
+    # Its path fitted errors of placements: p = 1e-5, 7.1 sd wrong, and `helps`.
+    values, sd, proof = calibrated(*board(7426, placements=15, rests=5, shared=0.01))
+    np.testing.assert_array_equal(values, 0.0)
+    assert np.all(sd > 0.09) and decide(proof['accelerometer']) is UNPROVEN
+
+
 @pytest.mark.parametrize('wrong', [0.0, 0.4])
 def test_one_wrong_placement_demands_no_cross_terms(wrong):
     model, held, poses, up = placed(7440, count=16, cross=0.0, wrong=wrong)

@@ -319,11 +319,16 @@ def solve_by_hand(
     testing = turns_between(up, free.used_turns)
     held = _solved(data, options, point, untested=names)
     if len(testing) < TESTING_TURNS:
-        # Norms decide, with one error for all rests of a placement.
-        used = np.all(poses.force_sem <= data.poses.force_sem, axis=1)
-        demanded = placements_demand(model, held.hand_model, poses, up=up, used=used)
+        # Norms decide, with one error for all rests of a placement. The readings are those of the
+        # recording: outliers and a wandering bias were estimated with one of the models, whose
+        # errors they would hide.
+        measured = data.poses
+        used = np.zeros(len(up), bool)
+        for hand in (free, held):
+            used |= np.all(hand.used_poses.force_sem <= measured.force_sem, axis=1)
+        demanded = placements_demand(model, held.hand_model, measured, up=up, used=used)
         chosen = free if demanded else held
-        fit = fit_placements(chosen.hand_model, chosen.values, poses, up=up, used=used)
+        fit = fit_placements(chosen.hand_model, chosen.values, measured, up=up, used=used)
         excess = fit.excess(total(chosen.terms))
         return replace(chosen, terms=with_term(chosen.terms, SAMPLE_NOISE, excess))
     errors = [np.array([_missed_by(hand, turn) for turn in testing]) for hand in (free, held)]
