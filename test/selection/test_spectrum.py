@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from few_candidates import restricted
 
 import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
@@ -112,6 +113,7 @@ def test_a_fixed_frequency_is_removed_before_orders_are_searched():
     assert np.std(left - other) < 0.05 and abs(left @ line) / len(time) < 1e-3
 
 
+@restricted()
 def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
     recording = record(5, None, 'realistic', through_bag=False, cause=Machine())
     found = investigate(recording.windows, recording.table, recording.model)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from few_candidates import restricted
 
 import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
@@ -69,6 +70,7 @@ def test_no_jitter_changes_nothing():
     assert np.all(jitter_ratio(rough[0], slope[0], 0.0) == 1.0)
 
 
+@restricted()
 def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
     """Independent errors of 50 us at 1 rad/s are 0.5 mm/s^2, six times the noise of this grade."""
     recording = record(5, None, 'realistic@navigation', through_bag=False)
@@ -78,6 +80,7 @@ def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
     assert timing_lines(diagnosis) == diagnosis.stamp_jitter.lines != []
 
 
+@restricted()
 def test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model():
     session = make_session(6, None, 'realistic', grade='navigation')
     result = imu.calibrate(session.block, Table.from_mapping(session.table))
