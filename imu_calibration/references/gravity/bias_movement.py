@@ -55,41 +55,44 @@ def bias_movements(model: HandModel, values: np.ndarray, poses: Poses) -> dict[s
     return {sensor: movement for sensor, movement in found.items() if movement is not None}
 
 
-def _powers(time, count):
+def _powers(time: np.ndarray, count: int) -> np.ndarray:
     """Return time and, with enough poses, its square, without their means, shape (k, 1 or 2)."""
-    powers = np.column_stack([time, time**2][: 2 if count >= 2 * MIN_DRIFT_FREEDOM else 1])
+    powers = time[:, None]
+    if count >= 2 * MIN_DRIFT_FREEDOM:
+        powers = np.column_stack([time, time**2])
     return powers - powers.mean(axis=0)
 
 
-def _of_norms(time, residual, base):
+def _of_norms(time: np.ndarray, residual: np.ndarray, base: np.ndarray) -> BiasMovement | None:
     """
-    The drift of the accelerometer's bias: only its component along gravity is observable in a pose.
+    Return the drift of the accelerometer's bias, or None where it is not significant.
+
+    Only its component along gravity is observable in a pose: a column of the drift is that of the
+    bias times a power of time.
     """
-    back = base[:, 0:3]
-    powers = _powers(time, len(time) - base.shape[1] - 3)
-    added = np.hstack([power[:, None] * back for power in powers.T])
-    known, new = orthonormal_basis(base), orthonormal_basis(np.hstack([base, added]))
+    n_base = base.shape[1]
+    powers = _powers(time, len(time) - n_base - 3)
+    both = np.hstack([base, *(power[:, None] * base[:, 0:3] for power in powers.T)])
+
+    # F test of the drift, on the columns that are independent.
+    known, new = orthonormal_basis(base), orthonormal_basis(both)
     spare = len(time) - new.shape[1]
     square_before = np.sum((residual - known @ (known.T @ residual)) ** 2)
     square_after = np.sum((residual - new @ (new.T @ residual)) ** 2)
-    if spare < MIN_DRIFT_FREEDOM or not _shown(
-        square_before,
-        square_after,
-        new.shape[1] - known.shape[1],
-        spare,
-    ):
+    n_added = new.shape[1] - known.shape[1]
+    if spare < MIN_DRIFT_FREEDOM or not _shown(square_before, square_after, n_added, spare):
         return None
-    both = np.hstack([base, added])
-    fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][base.shape[1] :].reshape(-1, 3)
-    alone, beside = (
-        np.diag(np.linalg.pinv(part.T @ part))[: base.shape[1]] for part in (base, both)
-    )
-    return BiasMovement(
-        powers @ fitted, np.sqrt(np.maximum(beside / np.maximum(alone, 1e-300), 1.0))
-    )
+
+    # Growth of the sds by the columns that are estimated besides.
+    fitted = np.linalg.lstsq(both, residual, rcond=1e-9)[0][n_base:].reshape(-1, 3)
+    variance_before = np.diag(np.linalg.pinv(base.T @ base))
+    variance_after = np.diag(np.linalg.pinv(both.T @ both))[:n_base]
+    growth = variance_after / np.maximum(variance_before, 1e-300)
+    return BiasMovement(powers @ fitted, np.sqrt(np.maximum(growth, 1.0)))
 
 
-def _of_rates(time, rates):
+def _of_rates(time: np.ndarray, rates: np.ndarray) -> BiasMovement | None:
+    """Return the drift of the gyroscope's bias, or None where it is not significant."""
     powers = _powers(time, len(time))
     spare = 3 * (len(time) - 1 - powers.shape[1])
     if spare < 3 * MIN_DRIFT_FREEDOM:
@@ -97,9 +100,9 @@ def _of_rates(time, rates):
     rates = rates - rates.mean(axis=0)
     course = powers @ np.linalg.lstsq(powers, rates, rcond=None)[0]
     scale = np.mean((rates - course) ** 2, axis=0) + 1e-300
-    if not _shown(
-        np.sum(rates**2 / scale), np.sum((rates - course) ** 2 / scale), 3 * powers.shape[1], spare
-    ):
+    square_before = np.sum(rates**2 / scale)
+    square_after = np.sum((rates - course) ** 2 / scale)
+    if not _shown(square_before, square_after, 3 * powers.shape[1], spare):
         return None
     return BiasMovement(course, np.ones(12))
 
@@ -118,9 +121,10 @@ def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
     return left[:, singular > least * singular[0]]
 
 
-def _shown(before, after, added, spare):
+def _shown(before: float, after: float, added: int, spare: int) -> bool:
+    """Return whether the fall of a sum of squares by `added` columns is significant (F test)."""
     ratio = (before - after) / max(added, 1) / max(after / spare, 1e-300)
-    return added > 0 and fdtrc(added, spare, max(ratio, 0.0)) < DRIFT_P_VALUE
+    return bool(added > 0 and fdtrc(added, spare, max(ratio, 0.0)) < DRIFT_P_VALUE)
 
 
 def without_movement(poses: Poses, movements: Mapping[str, BiasMovement]) -> Poses:

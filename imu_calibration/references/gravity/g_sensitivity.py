@@ -100,7 +100,7 @@ def shown(evidence: dict) -> bool:
     )
 
 
-def _loss(covariance, design, values):
+def _loss(covariance: np.ndarray, design: np.ndarray, values: np.ndarray) -> float:
     """Return minus twice the restricted log likelihood, with the best scale of each axis."""
     factor = np.linalg.cholesky(covariance)
     white = scipy.linalg.solve_triangular(factor, np.hstack([design, values]), lower=True)
@@ -111,7 +111,9 @@ def _loss(covariance, design, values):
     return spare * np.log((rest**2).sum(axis=0) + 1e-300).sum() + values.shape[1] * logs
 
 
-def _left(covariance, design, values):
+def _left(
+    covariance: np.ndarray, design: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the weighted residual sum of squares of a fit.
 

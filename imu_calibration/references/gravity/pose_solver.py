@@ -6,6 +6,7 @@ First guess, and the covariance due to gravity, the Earth's rate and the model e
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -17,7 +18,12 @@ from imu_calibration.estimation.model_error import (
     ModelError,
     model_error_of_rows,
 )
-from imu_calibration.estimation.row_estimate import MAX_NEWTON_STEPS, RowEstimate, estimate_rows
+from imu_calibration.estimation.row_estimate import (
+    MAX_NEWTON_STEPS,
+    RowEstimate,
+    RowSet,
+    estimate_rows,
+)
 from imu_calibration.estimation.scaled_solve import triangular_of_band
 from imu_calibration.estimation.solution import GRAVITY, UNMODELLED_EARTH_RATE, total
 from imu_calibration.estimation.window_outliers import OUTLIER_P_VALUE
@@ -73,21 +79,18 @@ def solve_joint(
     return replace(found, terms=terms), reference.memory
 
 
-def _model_error(reference, found):
+def _model_error(reference: GravityRows, found: RowEstimate) -> ModelError:
     """
     Return the model error; a block is a pose with the turn that begins in it.
 
     None where parts are fitted almost exactly: they have no scatter to compare.
     """
-    model, free, count, rows = (
-        reference.model,
-        found.free,
-        len(reference.poses.start),
-        reference.linearise(found.state),
-    )
-    spare = (
-        np.isin(rows.component, (0, 2)).sum() - 2 * count - free.sum() + free[model.gyro_bias].sum()
-    )
+    model, free, count = reference.model, found.free, len(reference.poses.start)
+    rows = reference.linearise(found.state)
+    # The rows of poses and turns, without those that directions and parameters need; the bias of
+    # the gyroscope is determined at rest.
+    of_poses_and_turns = np.isin(rows.component, (0, 2)).sum()
+    spare = of_poses_and_turns - 2 * count - free.sum() + free[model.gyro_bias].sum()
     if min(count, spare) < MIN_SCATTER_BLOCKS or not free.any():
         return ModelError(np.ones(model.size), *np.zeros((2, model.size)))
     return model_error_of_rows(
@@ -115,7 +118,7 @@ def first_state(model: HandModel, poses: Poses) -> State:
     return State(values, unit_rows(true), np.zeros_like(poses.rate))
 
 
-def _starting_points(model, poses):
+def _starting_points(model: HandModel, poses: Poses) -> list[np.ndarray]:
     """Return parameter vectors: nominal, with the scale of the norms, and with the sphere."""
     bias_at = model.model.part('accelerometer', Role.OFFSET)
     matrix_at = model.model.part('accelerometer', Role.LINEAR)
@@ -142,14 +145,14 @@ class _NormEstimate:
     """Sum of the squared residuals and of the distances from the priors, in sds."""
 
 
-def _by_norms(model, poses, start):
+def _by_norms(model: HandModel, poses: Poses, start: np.ndarray) -> _NormEstimate:
     """Return the `_NormEstimate` from Gauss-Newton steps that begin at the parameters `start`."""
     norm_sd = NORM_SD_SHARE * model.gravity
     free = model.base_index('accelerometer')
     free = free[~model.withheld[free]]
     prior_sd = model.priors[free]
 
-    def linearised(values):
+    def linearised(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the residuals in sds, those of the priors last, and their columns."""
         residual, columns = model.norm_rows(values, poses.force, **poses.conditions)
         distance = (model.nominal - values)[free] / prior_sd
@@ -170,31 +173,34 @@ def _by_norms(model, poses, start):
     return _NormEstimate(values, float(target @ target))
 
 
-def _of_gravity(model, values, relative_sd):
+def _of_gravity(model: HandModel, values: np.ndarray, relative_sd: float) -> np.ndarray:
     """
     Return the contribution of a wrong gravity to the covariance.
 
     Poses at rest determine only matrix / gravity.
     """
-    common, part = np.zeros(len(values)), model.model.part('accelerometer', Role.LINEAR)
+    common = np.zeros(len(values))
+    part = model.model.part('accelerometer', Role.LINEAR)
     common[part] = values[part]
     return relative_sd**2 * np.outer(common, common)
 
 
-def _of_earth(model, state, poses, free):
+def _of_earth(model: HandModel, state: State, poses: Poses, free: np.ndarray) -> np.ndarray:
     """
     Return the contribution of the Earth's rate to the covariance.
 
     It is the rate about the vertical, which contributes through biases and responses to gravity.
     """
-    columns = model.rate_rows(
+    _, columns = model.rate_rows(
         state.values, model.gravity * state.up, poses.rate, **poses.conditions
-    )[1].reshape(-1, model.size)
+    )
+    columns = columns.reshape(-1, model.size)
+    # What the free parameters of the rates at rest take from one sd of the Earth's rate.
     own = np.concatenate([np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')])
-    taken, kept = np.zeros(model.size), own[free[own]]
-    taken[kept] = np.linalg.lstsq(
-        columns[:, kept], EARTH_UPWARDS_SD * state.up.ravel(), rcond=None
-    )[0]
+    kept = own[free[own]]
+    earth = EARTH_UPWARDS_SD * state.up.ravel()
+    taken = np.zeros(model.size)
+    taken[kept] = np.linalg.lstsq(columns[:, kept], earth, rcond=None)[0]
     return np.outer(taken, taken)
 
 
@@ -212,6 +218,8 @@ scale errors of a tenth cause less.
 """
 CONTRADICTED_TURNS = 'contradicted by gravity'
 """Kind of the turns that are left out by CONTRADICTED, in `left_out` of the statistics."""
+LEAST_SHARE_OF_KIND = 1e-3
+"""The same for all rows of a kind together."""
 LEAST_ERROR_SHARE = 0.05
 """
 A combination of a unit's rows that keeps less than this share of its error after the fit is not
@@ -229,12 +237,13 @@ def possible_turns(
 
     In a pause of the recorder, rates miss a turn.
     """
-    kept = [
-        turn
-        for turn in turns
-        if turn.rotation is not None
-        or missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3)) < CONTRADICTED
-    ]
+    kept = []
+    for turn in turns:
+        if turn.rotation is None:
+            missed = missed_angle(state, poses, turn, matrix=model.gyro_factor * np.eye(3))
+            if missed >= CONTRADICTED:
+                continue
+        kept.append(turn)
     return kept, len(turns) - len(kept)
 
 
@@ -255,24 +264,28 @@ def without_outlying_poses(
     estimate, from `solve_joint`.
     """
     rows = GravityRows(model, poses, turns, integrated or {}).linearise(found.state)
-    rest, leverage = _whitened(rows, found)
-    left, first, of_turn = (
-        {},
-        rows.group[:, 0],
-        {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None},
-    )
-    for kind in range(len(COMPONENTS)):
-        of_kind = rows.component == kind
-        index = of_turn if COMPONENTS[kind] == 'turn' else range(len(poses.start))
-        own = [(index[number], of_kind & (first == number)) for number in np.unique(first[of_kind])]
-        total, spare = _distance(rest[of_kind], leverage[of_kind], 1e-3)
-        allowed = max(1, int(MAX_POSE_OUTLIERS * len(own)))
-        worst = sorted(
-            (_p_value(rest[at], leverage[at], total, spare), number) for number, at in own
-        )
-        out = [number for p, number in worst[:allowed] if p * max(len(own), 1) < OUTLIER_P_VALUE]
+    rest, basis = _whitened(rows, found)
+    pose = rows.group[:, 0]
+    # The turn that begins in a pose.
+    turn_of = {turn.first: number for number, turn in enumerate(turns) if turn.rotation is None}
+
+    left: dict[str, list[int]] = {}
+    for component, kind in enumerate(COMPONENTS):
+        of_kind = rows.component == component
+        all_of_kind = _distance(rest[of_kind], basis[of_kind], LEAST_SHARE_OF_KIND)
+        tested = []
+        for number in np.unique(pose[of_kind]).tolist():
+            own = of_kind & (pose == number)
+            p_value = _p_value(_distance(rest[own], basis[own], LEAST_ERROR_SHARE), all_of_kind)
+            tested.append((p_value, turn_of[number] if kind == 'turn' else number))
+        # Only the worst few, with Bonferroni's correction for the choice.
+        allowed = max(1, int(MAX_POSE_OUTLIERS * len(tested)))
+        out = []
+        for p_value, number in sorted(tested)[:allowed]:
+            if p_value * len(tested) < OUTLIER_P_VALUE:
+                out.append(number)
         if out:
-            left[COMPONENTS[kind]] = out
+            left[kind] = out
     if left.get('pose'):
         poses = replace(poses, force_sem=_loosened(poses.force_sem, left['pose']))
     if left.get('drift'):
@@ -281,40 +294,49 @@ def without_outlying_poses(
     return poses, turns, {kind: len(out) for kind, out in left.items()}
 
 
-def _whitened(rows, found):
+def _whitened(rows: RowSet, found: RowEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return residuals in sds, and an orthonormal basis of the fitted columns."""
     root = np.sqrt(found.scatter.total(rows.noise, rows.component))
     design = np.hstack([rows.nuisance, rows.main[:, found.free]]) / root[:, None]
     rest = rows.residual / root
-    factor = triangular_of_band(
-        np.vstack([design, np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)])
-    )
+    # A ridge, as some columns may be dependent.
+    ridge = np.diag(1e-6 * np.linalg.norm(design, axis=0) + 1e-300)
+    factor = triangular_of_band(np.vstack([design, ridge]))
     basis = solve_triangular(factor, design.T, trans='T').T
     return rest - basis @ (basis.T @ rest), basis
 
 
-def _distance(rest, basis, least):
-    """
-    Return (squared Mahalanobis distance of some residuals, rank of the covariance).
+class _Misfit(NamedTuple):
+    """Misfit of some rows, in standard deviations after the fit."""
 
-    The distance is with the covariance of residuals after the fit, and the rank is that of this
-    covariance.
+    square: float
+    """Squared Mahalanobis distance."""
+    rank: int
+    """Rank of the covariance of the residuals."""
+
+
+def _distance(rest: np.ndarray, basis: np.ndarray, least: float) -> _Misfit:
+    """
+    Return the misfit of residuals with the covariance ``1 - basis basis'`` after the fit.
+
+    Combinations that keep less than the share `least` of their error are left out.
     """
     values, vectors = np.linalg.eigh(np.eye(len(rest)) - basis @ basis.T)
     seen = values > least
-    return float(np.sum((vectors[:, seen].T @ rest) ** 2 / values[seen])), int(
-        np.count_nonzero(seen)
-    )
+    square = np.sum((vectors[:, seen].T @ rest) ** 2 / values[seen])
+    return _Misfit(float(square), int(np.count_nonzero(seen)))
 
 
-def _p_value(rest, basis, total, spare):
-    square, count = _distance(rest, basis, LEAST_ERROR_SHARE)
-    if not count or spare - count < MIN_POSE_FREEDOM:
+def _p_value(own: _Misfit, all_rows: _Misfit) -> float:
+    """Return the p-value of an F test of some rows against the other ones; 1 without freedom."""
+    spare = all_rows.rank - own.rank
+    if not own.rank or spare < MIN_POSE_FREEDOM:
         return 1.0
-    return chance_of_fall(square, count, rest=total - square, spare=spare - count)
+    return chance_of_fall(own.square, own.rank, rest=all_rows.square - own.square, spare=spare)
 
 
-def _loosened(sem, index):
+def _loosened(sem: np.ndarray, index: list[int]) -> np.ndarray:
+    """Return standard errors with those of the poses `index` so large that they hardly count."""
     loose = sem.copy()
     loose[index] *= OUTLIER_SD_FACTOR
     return loose

@@ -38,10 +38,11 @@ class HandStore:
     """
 
     def __init__(self, most: int):
-        self.most, self._parts = most, []
+        self.most = most
+        self._parts: list[ImuSamples] = []
         self._stamps, self.forgotten = ContinuedStamps(RESET_PAUSE_NS), 0
 
-    def __len__(self):
+    def __len__(self) -> int:
         return sum(len(part) for part in self._parts)
 
     def copy(self) -> 'HandStore':
@@ -104,20 +105,19 @@ class HandStore:
             return False
         return True
 
-    def _least_telling(self, imu, rests, count):
-        long = max(
+    def _least_telling(self, imu: ImuSamples, rests: Sequence[slice], count: int) -> slice:
+        """Return `count` samples inside the longest rest, or the oldest where it is too short."""
+        longest = max(
             _across_holes(imu.stamp_ns, rests),
             key=lambda rest: rest.stop - rest.start,
             default=slice(0, 0),
         )
         kept = int(REST_KEPT * 1e9 / max(np.median(np.diff(imu.stamp_ns)), 1))
-        return (
-            slice(long.start + kept, long.start + kept + count)
-            if long.stop - long.start >= count + 2 * kept
-            else slice(0, count)
-        )
+        if longest.stop - longest.start < count + 2 * kept:
+            return slice(0, count)
+        return slice(longest.start + kept, longest.start + kept + count)
 
-    def _drop(self, imu, gone):
+    def _drop(self, imu: ImuSamples, gone: slice) -> None:
         keep = np.ones(len(imu), bool)
         keep[gone] = False
         self.forgotten += int(np.count_nonzero(~keep))
@@ -179,20 +179,19 @@ class HandStore:
             self._stamps.continue_after(int(imu.stamp_ns[-1]))
 
 
-def _across_holes(stamp_ns, rests):
+def _across_holes(stamp_ns: np.ndarray, rests: Sequence[slice]) -> list[slice]:
     """
     Return the ranges at rest, joined across short interruptions.
 
     They are joined where only discarded samples and the time excluded after a hole lie between
     them.
     """
-    joined, hole = [], 5 * np.median(np.diff(stamp_ns)) * 1e-9
+    joined: list[slice] = []
+    hole = 5 * np.median(np.diff(stamp_ns)) * 1e-9
     for rest in rests:
-        between = (
-            np.diff(stamp_ns[joined[-1].stop - 1 : rest.start + 1]) * 1e-9
-            if joined
-            else np.zeros(0)
-        )
+        between = np.zeros(0)
+        if joined:
+            between = np.diff(stamp_ns[joined[-1].stop - 1 : rest.start + 1]) * 1e-9
         if len(between) and between.max() > hole and between.sum() - between.max() < HELD_OUT:
             joined[-1] = slice(joined[-1].start, rest.stop)
         else:
