@@ -4,6 +4,8 @@ Readings in other units than SI, from the recording to the corrected topic.
 Situations of drivers in g, of register counts and of rates in other units, with own numbers.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -144,6 +146,18 @@ def test_a_recording_in_another_unit_is_refused_with_the_option_that_states_it(
         SampleBlock(imu), in_g, accelerometer_unit='m/s^2', gyroscope_unit='rad/s'
     )
     np.testing.assert_allclose(lengths_at_rest(stated.imu, ranges), GRAVITY, rtol=1e-3)
+
+
+def test_compensate_refuses_readings_without_gravity(tmp_path, truth, in_g):
+    """A driver that subtracts gravity: the calibration is that of the readings with it."""
+    imu = truth[0]
+    motion = np.random.default_rng(7).normal(0.0, 0.03, imu.force_s.shape)
+    write_session(tmp_path / 'free', replace(imu, force_s=motion))
+    units = {'accelerometer_unit': 'm/s^2', 'gyroscope_unit': 'rad/s'}
+    for output in (None, tmp_path / 'out'):
+        with refused(InputError, 'without_gravity'):
+            compensate_recording(tmp_path / 'free', in_g, output=output, **units)
+    assert not (tmp_path / 'out').exists()
 
 
 @pytest.mark.parametrize('rate_unit', ['deg/s', 'counts:65.5/(deg/s)'])
