@@ -92,6 +92,7 @@ def better_plain_fits(
     *,
     under_test: Collection[str],
     centre: Centre,
+    as_asked: bool = False,
 ) -> tuple[PlainFit, ...]:
     """
     Return the plain fits to apply: they predict held-out windows better than a solution.
@@ -110,12 +111,16 @@ def better_plain_fits(
         Sensors with a residual that is neither noise nor an effect of the catalogue.
     centre : mapping
         As for `applied_folds`.
+    as_asked : bool
+        Whether the model was stated and not searched for: its effects are replaced only by a test.
 
     """
     regimes, counts = judged_regimes(held_out)
     model = solution.model
     # An effect that compensation does not apply is a residual of each other session.
-    replaceable = set(under_test) | {effect.sensor for effect in not_applied(model)}
+    replaceable = set(under_test)
+    if not as_asked:
+        replaceable |= {effect.sensor for effect in not_applied(model)}
     if not regimes or not replaceable:
         return ()
     nominal = nominal_values(model)

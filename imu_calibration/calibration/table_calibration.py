@@ -288,6 +288,7 @@ def conclude(
         folds,
         under_test={*changes.unexplained, *under_test},
         centre=uncorrected.centre,
+        as_asked=options.as_asked,
     )
     applied = with_plain_fits(solution, plain)
     for fit in plain:

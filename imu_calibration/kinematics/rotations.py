@@ -125,7 +125,7 @@ def quaternions_from_vectors(vectors: np.ndarray) -> np.ndarray:
     Return the unit quaternions (x, y, z, w) of rotation vectors, rad, shape (..., 3) to (..., 4).
 
     ``(v sin(a / 2) / a, cos(a / 2))`` with the angle ``a = |v|``. These three functions are not
-    those of `scipy.spatial`, as its import needs more time than a short recording.
+    those of SciPy, as its import needs more time than a short recording.
     """
     angle = np.linalg.norm(vectors, axis=-1, keepdims=True)
     # np.sinc(x) is sin(pi x) / (pi x), and 1 at zero.

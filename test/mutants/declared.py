@@ -727,7 +727,7 @@ HAND = _of(
     (
         'what does not belong to the others stays',
         'without_outlying_poses',
-        '_1 * max(len(_2), 1) < OUTLIER_P_VALUE',
+        '_1 * len(_2) < OUTLIER_P_VALUE',
         '_1 < 0',
         'test_hand_faults.py::test_a_pose_a_rest_and_a_turn_that_were_disturbed_are_left_out',
     ),
