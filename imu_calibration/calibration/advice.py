@@ -403,7 +403,7 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
     if of_turns and contradicted > hand.statistics['turns']:
         return TURNS_REMEDY
 
-    # A parameter that the attitudes do not determine needs others, whatever the scatter is.
+    # A parameter that the attitudes do not determine needs other attitudes for any scatter.
     if hand.judged_sd[index] > UNKNOWN_SHARE * model.priors[index]:
         return ''
     if hand.param_names[index].startswith('accelerometer'):

@@ -258,7 +258,7 @@ def _misses_other_regimes(
     n_pieces = 0
     for block in held_out.blocks:
         n_pieces += sum(count_pieces(row.duration) for row in block.accumulator.rows)
-    # Another regime of the same session has its drift; another session has what is applied.
+    # Another regime of the same session has its drift; another session has the applied values.
     trials = (
         (_groups_by_regime(held_out, sensor), None),
         (_groups_by_time(held_out, sensor), centre),

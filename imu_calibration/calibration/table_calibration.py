@@ -294,7 +294,7 @@ def conclude(
     for fit in plain:
         folds = fit.merged(folds)
     if plain:
-        # Of the effects that a plain fit replaces nothing remains uncorrected.
+        # The effects that a plain fit replaces do not remain uncorrected.
         uncorrected = _uncorrected(applied, gathered, model)
     proof = prove_solution(held_out, applied, folds)
     calibration = document(

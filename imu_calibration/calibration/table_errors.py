@@ -46,7 +46,7 @@ def calibrate_with_table_errors(
     result = calibrate_on_table(sources, table, options, mapper=mapper)
     if options.as_asked or not _unlike_noise(result):
         return TableErrors(result, ())
-    # Those that the table has: the zero of the first joint is part of the attitude of the base.
+    # The ones that the table has: the zero of the first joint is part of the attitude of the base.
     added = [
         key
         for key, effect in result.model.catalogue.effects(table.joint_names).items()

@@ -105,7 +105,7 @@ def estimate_group_variances(
             break
     dof = np.where(free, step.dof, 0.0)
 
-    # Few degrees of freedom widen the intervals. A group with hardly any may have all the misfit.
+    # Few degrees of freedom widen the intervals. A group with almost none may have all the misfit.
     upper = current * np.where(dof > DOF_LEAST, student_factor(dof), 1.0)
     for index in np.flatnonzero(spare < DOF_SEPARATE):
         alone = np.arange(len(free)) == index

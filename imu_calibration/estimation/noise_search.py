@@ -135,7 +135,7 @@ class _Search:
         """
         trials = [NoiseShape(offset, 0.0, TYPICAL_TIME) for offset in OFFSET_GRID]
         without_process = np.array([self.cost(trial, session) for trial in trials])
-        # Offsets that are far too large without a process are so with one.
+        # Offsets that are much too large without a process are so with one.
         likely = OFFSET_GRID[without_process < without_process.min() + LIKELY_SPAN]
         offsets = np.unique(np.concatenate([[0.0], likely]))
         for bias in self.biases:

@@ -51,7 +51,7 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
     factor = np.zeros((width, width))
     carried = rows[:0]
     for number in range(-(-width // BAND_COLUMNS)):
-        # The rows that begin in this band, and what remained of the rows before it.
+        # The rows that begin in this band, and the remainder of the rows before it.
         own = np.concatenate([carried, rows[band == number]])
         used = np.flatnonzero(own.any(axis=0))
         part = triangular(own[:, used])

@@ -370,7 +370,7 @@ class Planner:
             factor = problem.variance_factor(windows)
             relaxed = problem.relaxation(factor=factor)
             bound = problem.lower_bound(factor=factor, relaxed=relaxed)
-            # What limits the relaxed plan counts more: a second attempt.
+            # The limits of the relaxed plan count more: a second attempt.
             if seconds > MAX_BOUND_RATIO * bound:
                 weights = np.maximum(relaxed.weights / relaxed.weights.max(), MIN_RELATIVE_WEIGHT)
                 problem.goal = WithinTolerances(problem.coordinates, weights)

@@ -231,7 +231,7 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
         change=change[used],
     )
 
-    # The least residual, first among delays far apart, then near the best of them.
+    # The least residual, first among widely spaced delays, then near the best of them.
     coarse = np.arange(-MAX_DELAY, MAX_DELAY + DELAY_STEP / 2, DELAY_STEP)
     near = coarse[int(np.argmin([cost.residuals(delay)[0] for delay in coarse]))]
     fine = near + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)

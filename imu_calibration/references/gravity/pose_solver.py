@@ -195,7 +195,7 @@ def _of_earth(model: HandModel, state: State, poses: Poses, free: np.ndarray) ->
         state.values, model.gravity * state.up, poses.rate, **poses.conditions
     )
     columns = columns.reshape(-1, model.size)
-    # What the free parameters of the rates at rest take from one sd of the Earth's rate.
+    # The change of the free parameters of the rates at rest by one sd of the Earth's rate.
     own = np.concatenate([np.arange(model.size)[model.gyro_bias], model.extra_index('gyroscope')])
     kept = own[free[own]]
     earth = EARTH_UPWARDS_SD * state.up.ravel()
