@@ -5,10 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.readings import SensorUnit
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.scales import USUAL, scale_range
 from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.preprocessing.value_checks import force_error
+from imu_calibration.preprocessing.value_checks import (
+    force_error,
+    increments_error,
+    samples_per_second,
+)
 
 WINDOW_S = 1.0
 """s; readings are collected over it before they are judged."""
@@ -24,21 +28,25 @@ MOST_IN_MOTION = 16 * STANDARD_GRAVITY
 
 class UnitGate:
     """
-    Withholds the output while the specific force is not in the stated unit.
+    Withholds the output while the readings are not in the stated units.
 
     The gate opens with a first reading of usual length, or the first window of readings that can be
     gravity, and then stays open: a later motion or another publisher does not stop the output.
+    Increments of either sensor have to arrive at the stated rate, which needs a window.
 
     Parameters
     ----------
-    stated : SensorUnit
-        Unit of the accelerometer's readings.
+    readings : RawReadings
+        Units of both sensors.
 
     """
 
-    def __init__(self, stated: SensorUnit):
-        self._stated = stated
-        self._start_ns: int | None = None
+    def __init__(self, readings: RawReadings):
+        self._readings = readings
+        self._is_increments = bool(
+            readings.accelerometer.per_second or readings.gyroscope.per_second
+        )
+        self._stamps: list[int] = []
         self._lengths: list[float] = []
         self._judged = False
         self.is_open = False
@@ -62,33 +70,43 @@ class UnitGate:
         # A driver without an accelerometer fills zeros, which are no measurement of gravity.
         if length == 0.0 or not np.isfinite(length):
             return True
-        if self._start_ns is None or stamp_ns < self._start_ns:
-            self._start_ns, self._lengths = stamp_ns, []
+        if not self._stamps or stamp_ns < self._stamps[0]:
+            self._begin()
             # Only the very first reading opens by itself, where its length is usual: a shaken IMU
             # in g reaches any length.
-            if not self._judged and scale_range(length / STANDARD_GRAVITY) is USUAL:
+            is_usual = scale_range(length / STANDARD_GRAVITY) is USUAL
+            if not self._judged and is_usual and not self._is_increments:
                 self._open()
                 return True
+        self._stamps.append(stamp_ns)
         self._lengths.append(length)
-        is_long = stamp_ns - self._start_ns >= WINDOW_S * 1e9
+        is_long = stamp_ns - self._stamps[0] >= WINDOW_S * 1e9
         is_complete = is_long and len(self._lengths) >= LEAST_READINGS
         if not is_complete and len(self._lengths) < MOST_READINGS:
             return False
-        self._judge(1e-9 * (stamp_ns - self._start_ns))
+        self._judge()
         return self.is_open
 
-    def _judge(self, seconds):
+    def _begin(self) -> None:
+        """Begin a window with the next reading."""
+        self._stamps, self._lengths = [], []
+
+    def _judge(self) -> None:
         """Open, or set the error of a window at rest; begin the next window."""
         median = float(np.median(self._lengths))
-        per_second = (len(self._lengths) - 1) / seconds if seconds > 0 else 0.0
-        error = force_error(median, 'at rest', self._stated, per_second=per_second)
+        per_second = samples_per_second(np.array(self._stamps))
+        error = force_error(median, 'at rest', self._readings.accelerometer, per_second=per_second)
         moves = np.std(self._lengths) > REST_SPREAD * median
+        wrong_rate = increments_error(per_second, self._readings) if per_second else None
         # A motion may exceed gravity, as no reading in g does; a motion must not stop the output.
-        if error is None or (moves and STANDARD_GRAVITY < median < MOST_IN_MOTION):
+        if wrong_rate is not None:
+            self.error = wrong_rate
+        elif error is None or (moves and STANDARD_GRAVITY < median < MOST_IN_MOTION):
             self._open()
         elif not moves or error.code in ('without_gravity', 'increments'):
             self.error = error
-        self._start_ns, self._lengths, self._judged = None, [], True
+        self._begin()
+        self._judged = True
 
-    def _open(self):
+    def _open(self) -> None:
         self.is_open, self.error = True, None

@@ -358,7 +358,7 @@ def _prepared(
         correct_stamps=settings.correct_stamps,
         watch=_watch(calibration, transfer, settings, before),
         readings=calibration.readings,
-        gate=UnitGate(calibration.readings.accelerometer),
+        gate=UnitGate(calibration.readings),
     )
     if before is not None:
         compensation.prepare(before.compensation)

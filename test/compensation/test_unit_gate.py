@@ -7,7 +7,7 @@ import pytest
 from test_live_compensation import field, imu_samples, messages
 
 from imu_calibration.compensation.unit_gate import MOST_READINGS, UnitGate
-from imu_calibration.core.readings import SI_ACCELEROMETER, RawReadings, combined
+from imu_calibration.core.readings import RawReadings, combined
 from imu_calibration.nodes.message_compensation import WITHHELD, LiveCompensation
 from validation.imu_messages import patch_imu
 
@@ -49,44 +49,44 @@ def run(gate, lengths, period=0.01):
 @pytest.mark.parametrize('length', [1.0, 980.0, 16384.0, 0.05])
 def test_no_reading_in_another_unit_passes(length):
     rng = np.random.default_rng(5)
-    gate = UnitGate(SI_ACCELEROMETER)
+    gate = UnitGate(RawReadings())
     assert not any(run(gate, length * (1 + 0.005 * rng.standard_normal(400))))
     code = 'without_gravity' if length < 0.5 else 'force_unit'
     assert gate.error is not None and gate.error.code == code
 
 
 def test_the_first_reading_of_gravity_opens_and_a_motion_does_not_close():
-    gate = UnitGate(SI_ACCELEROMETER)
+    gate = UnitGate(RawReadings())
     assert all(run(gate, [9.8, *np.linspace(9.8, 160.0, 200), *np.full(200, 1.0)]))
 
 
 def test_a_shock_at_the_start_delays_the_first_output_by_one_window():
-    gate = UnitGate(SI_ACCELEROMETER)
+    gate = UnitGate(RawReadings())
     passed = run(gate, [60.0, *np.full(300, 9.75)])
     assert passed.index(True) == 100 and gate.error is None and all(passed[100:])
 
 
 def test_a_violent_motion_at_the_start_delays_the_output_by_one_window():
     shaken = 40.0 + 25.0 * np.sin(np.arange(400))
-    passed = run(UnitGate(SI_ACCELEROMETER), [60.0, *shaken])
+    passed = run(UnitGate(RawReadings()), [60.0, *shaken])
     assert passed.index(True) == 100 and all(passed[100:])
 
 
 def test_frozen_stamps_do_not_keep_the_gate_from_a_decision():
-    gate = UnitGate(SI_ACCELEROMETER)
+    gate = UnitGate(RawReadings())
     assert not any(run(gate, np.ones(MOST_READINGS), period=0.0))
     assert gate.error is not None and gate.error.code == 'force_unit'
-    gate = UnitGate(SI_ACCELEROMETER)
+    gate = UnitGate(RawReadings())
     assert run(gate, [60.0, *np.full(MOST_READINGS, 9.75)], period=0.0)[-1]
 
 
 def test_a_shaken_imu_in_g_does_not_pass():
-    gate = UnitGate(SI_ACCELEROMETER)
+    gate = UnitGate(RawReadings())
     assert not any(run(gate, np.tile([1.0, 1.0, 1.0, 5.0, 0.6], 100)))
 
 
 def test_withheld_messages_are_counted_by_their_reason():
-    live = LiveCompensation(random_calibration(4), gate=UnitGate(SI_ACCELEROMETER))
+    live = LiveCompensation(random_calibration(4), gate=UnitGate(RawReadings()))
     raw = messages(raw_of(imu_samples()))
     assert [live(data) for data in raw] == [None] * len(raw)
     assert live.counts[WITHHELD] == len(raw)

@@ -122,8 +122,22 @@ def test_a_log_of_increments_names_the_option(tmp_path, session, header):
 
 
 def test_the_node_names_increments():
-    gate = UnitGate(SensorUnit('m/s^2'))
+    gate = UnitGate(RawReadings())
     passed = [gate.passes(10**9 + k * 5_000_000, (0.0, 0.003, GRAVITY / 200)) for k in range(300)]
     assert not any(passed)
     assert gate.error is not None and gate.error.code == 'increments'
     assert float(gate.error.value) == pytest.approx(200.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ('per_second', 'opens'), [(200.0, True), (100.0, False)], ids=['as stated', 'at half the rate']
+)
+def test_the_node_compares_the_rate_of_increments_of_either_sensor(per_second, opens):
+    """Angles over 5 ms that arrive at 100 Hz would be rates of twice their value."""
+    gate = UnitGate(combined(RawReadings(), gyroscope_unit='increments:200*rad/s'))
+    stamps = 10**9 + np.arange(400) * round(1e9 / per_second)
+    passed = [gate.passes(int(stamp), (0.0, 0.003, GRAVITY)) for stamp in stamps]
+    assert not any(passed[: int(0.9 * per_second)]) and passed[-1] == opens
+    assert (gate.error is None) == opens
+    if not opens:
+        assert (gate.error.code, float(gate.error.value)) == ('increments_rate', 100.0)
