@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.diagnosis.diagnosis_result import residual_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import beyond_lines
 from imu_calibration.calibration.diagnosis.findings import (
     DISAGREED,
@@ -175,6 +176,7 @@ def test_a_residual_below_the_limit_is_significant_by_its_structure_only(sigma, 
     assert rest.by_structure == by_structure
     assert not replace(rest, significant=False).by_structure
     assert all('gyroscope' in line for line in beyond_lines('gyroscope', rest))
+    assert residual_mapping('gyroscope', rest, None)['sigma'] == (None if by_structure else sigma)
 
 
 def test_an_effect_that_the_calibration_refused_has_that_reason():

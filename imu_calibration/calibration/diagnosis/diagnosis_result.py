@@ -11,6 +11,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.stamp_jitter import NO_JITTER, StampJitter
+from imu_calibration.selection.unexplained import Unexplained
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,7 @@ def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
                 sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()
             },
             'unexplained': {
-                sensor: _rest(
+                sensor: residual_mapping(
                     sensor, diagnosis.unexplained[sensor], diagnosis.formula_gains.get(sensor)
                 )
                 for sensor in SENSORS
@@ -236,13 +237,19 @@ def _gain(gain):
     return {name: getattr(gain, name) for name in names}
 
 
-def _rest(sensor, rest, formula_gain):
+def residual_mapping(sensor: str, rest: Unexplained, formula_gain: Gain | None) -> dict[str, Any]:
+    """
+    Return the unexplained residual of a sensor as plain data.
+
+    `sigma` is None where structure makes it significant and not its size.
+    """
     unit = rest.unit or UNITS[sensor]
     return {
         'significant': rest.significant,
         'rms': rest.rms,
         'unit': unit,
-        'sigma': rest.sigma,
+        'sigma': None if rest.by_structure else rest.sigma,
+        'by_structure': rest.by_structure,
         'correlates_with': rest.correlates_with,
         'share': rest.share,
         'where': '; '.join(regime.text for regime in rest.regimes) or None,
