@@ -41,7 +41,9 @@ def save(drawn: Figure, path: Path):
 
 
 def losses(names):
-    return {name: export_calibration(RESULT, name, bag='session').loss for name in names}
+    return {
+        name: export_calibration(RESULT, name, bag='session', axes='flu').loss for name in names
+    }
 
 
 def bars_of_loss(path, names, last=()):

@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / 'examples'))
 
+import answer_pictures  # noqa: E402
 import answers  # noqa: E402
 
 KEY = re.compile(r'[A-Za-z]\w*(?:[./]\w+)+|[A-Za-z]+_\w+')
@@ -82,3 +83,6 @@ def test_the_commands_still_print_what_the_pages_say(tmp_path):
         for page in answers.pages():
             text = page.read_text()
             assert same(answers.worked_through(text), text), page.name
+        # The picture with the loss of every target; before, two of them refused without axes.
+        answer_pictures.after_calibration(tmp_path / 'loss.png')
+        assert (tmp_path / 'loss.png').stat().st_size > 10_000
