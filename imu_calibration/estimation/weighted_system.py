@@ -57,15 +57,23 @@ def make_prior(model: SensorModel) -> Prior:
         rows.append(gauge)
         sd = sd.copy()
         sd[arms.ravel()] *= np.sqrt(2 / 3)
-    sums = []
+    rows.append(bias_sum_rows(model))
+    return Prior(mean, np.concatenate(rows), sd, gauge)
+
+
+def bias_sum_rows(model: SensorModel) -> np.ndarray:
+    """
+    Return the rows ``sum / tolerance`` of parameters that act as a bias (`Effect.bias_sums`).
+
+    Shape (k, n_params); the sums are zero with a standard deviation of one row unit.
+    """
+    rows = []
     for effect in model.effects:
         for group in effect.bias_sums:
-            row = np.zeros(len(mean))
+            row = np.zeros(len(model.param_names))
             row[model.slices[effect.key].start + np.array(group)] = 1 / effect.tolerance
-            sums.append(row)
-    if sums:
-        rows.append(np.array(sums))
-    return Prior(mean, np.concatenate(rows), sd, gauge)
+            rows.append(row)
+    return np.array(rows).reshape(-1, len(model.param_names))
 
 
 def fixed_parameters(model: SensorModel) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.row_estimate import RowSet
+from imu_calibration.estimation.weighted_system import bias_sum_rows
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -167,7 +168,12 @@ class GravityRows:
     def linearise(self, state: State) -> RowSet:
         """Return the rows of poses, bias drifts, calm drifts and turns at a state."""
         equations = _Equations(self.model, self.poses, state, self.memory)
-        rows = [equations.of_poses(), equations.of_drifts(), equations.of_calm_drifts()]
+        rows = [
+            equations.of_poses(),
+            equations.of_drifts(),
+            equations.of_calm_drifts(),
+            equations.of_bias_sums(),
+        ]
         for number, turn in enumerate(self.turns):
             if turn.rotation is None or turn.rotation_cov is None:
                 rows.append(equations.of_turn(turn, number))
@@ -297,6 +303,25 @@ class _Equations:
             noise.ravel(),
             np.full(size, component),
             np.repeat(own, 3)[:, None].repeat(2, axis=1),
+        )
+
+    def of_bias_sums(self) -> RowSet:
+        """
+        Return ``0 = sum / tolerance`` of the parameters that act as a bias (`Effect.bias_sums`).
+
+        At rest the length of the specific force is that of gravity, so that poses and turns do not
+        distinguish such a sum from the bias. The same rows are in the prior on a table.
+        """
+        model = self.model
+        sums = bias_sum_rows(model.model)
+        count, n_poses = len(sums), len(self.state.up)
+        return RowSet(
+            -sums @ self.state.values,
+            np.zeros((count, 5 * n_poses)),
+            sums,
+            np.ones(count),
+            np.full(count, NO_COMPONENT),
+            np.full((count, 2), n_poses),
         )
 
     def of_turn(self, data: TurnData, number: int) -> RowSet:
