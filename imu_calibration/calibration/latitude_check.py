@@ -228,15 +228,3 @@ def _finding(name, measured, sd, *, expected):
 
 def _hourly(rate):
     return significant(rate / DEG_H, 3)
-
-
-def with_latitude_findings(
-    findings: tuple[CheckFinding, ...],
-    solution: Solution,
-    table: Table,
-    *,
-    windows: WindowRates,
-) -> tuple[CheckFinding, ...]:
-    """Return the findings of a recording, those on the latitude first."""
-    earlier = tuple(finding for finding in findings if finding.check != CHECK)
-    return (*latitude_findings(solution, table, windows), *earlier)

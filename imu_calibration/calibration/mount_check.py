@@ -62,11 +62,3 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
         ' the matrices contain this turn'
     )
     return (CheckFinding(CHECK, WARNING, text, key='table'),)
-
-
-def with_mount_findings(
-    findings: tuple[CheckFinding, ...], solution: Solution, table: Table
-) -> tuple[CheckFinding, ...]:
-    """Return the findings of a recording with those on the mount."""
-    earlier = tuple(finding for finding in findings if finding.check != CHECK)
-    return (*mount_findings(solution, table), *earlier)

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from imu_calibration.calibration import latitude_check, mount_check
 from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.collector import GatherStep, from_bytes
 from imu_calibration.calibration.from_solution import (
@@ -17,8 +18,6 @@ from imu_calibration.calibration.from_solution import (
     weak_on_table,
     with_gravity_uncertainty,
 )
-from imu_calibration.calibration.latitude_check import window_rates, with_latitude_findings
-from imu_calibration.calibration.mount_check import with_mount_findings
 from imu_calibration.calibration.plain_fit import (
     better_plain_fits,
     changes_with,
@@ -56,6 +55,7 @@ from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_units
+from imu_calibration.preprocessing.recording_evidence import with_findings_of
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
@@ -273,9 +273,14 @@ def conclude(
     sensors with an unexplained residual, have to predict better than plain least squares.
     """
     tolerances = tolerances_of(solution.model, options.tolerances)
-    gathered.findings = with_mount_findings(gathered.findings, solution, table)
-    gathered.findings = with_latitude_findings(
-        gathered.findings, solution, table, windows=window_rates(gathered, model, table)
+    gathered.findings = with_findings_of(
+        mount_check.CHECK, mount_check.mount_findings(solution, table), gathered.findings
+    )
+    windows = latitude_check.window_rates(gathered, model, table)
+    gathered.findings = with_findings_of(
+        latitude_check.CHECK,
+        latitude_check.latitude_findings(solution, table, windows),
+        gathered.findings,
     )
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
     needed = motions_needed(solution, tolerances, table)

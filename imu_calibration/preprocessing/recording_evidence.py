@@ -4,7 +4,7 @@ Evidence of one pass over a recording for its checks, and checks of messages.
 The checks of messages are of the header and covariance of single messages.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -278,6 +278,13 @@ class MessageEvidence:
     Arrival minus stamp by the clock of this computer, s, shape (n,); messages without a stamp are
     left out.
     """
+
+
+def with_findings_of(
+    check: str, new: Iterable[CheckFinding], findings: Iterable[CheckFinding]
+) -> tuple[CheckFinding, ...]:
+    """Return findings in which those of one check are replaced by new ones, which are first."""
+    return (*new, *(finding for finding in findings if finding.check != check))
 
 
 def check_messages(evidence: MessageEvidence) -> tuple[CheckFinding, ...]:
