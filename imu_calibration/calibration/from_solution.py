@@ -12,7 +12,7 @@ from imu_calibration.core.documents import finite
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import Uncorrected
-from imu_calibration.document.verdict import MIN_STRUCTURE, NOTED_MISFIT, judged
+from imu_calibration.document.verdict import NOTED_MISFIT, is_structured, judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
@@ -162,7 +162,7 @@ def _has_misfit(solution, sensor):
     for kind, ratio in (solution.chi2_per_dof.get(sensor) or {}).items():
         if kind == 'means' or ratio is None or ratio <= NOTED_MISFIT:
             continue
-        if slow_over_fast.get(kind, np.inf) > MIN_STRUCTURE:
+        if is_structured(slow_over_fast, kind):
             return True
     return False
 

@@ -277,8 +277,12 @@ def has_structure(calibration: Calibration, sensor: str, kind: str) -> bool:
 
     True for documents that do not contain the comparison.
     """
-    ratios = calibration.statistics.get(sensor, {}).get('slow_over_fast') or {}
-    return ratios.get(kind, np.inf) > MIN_STRUCTURE
+    return is_structured(calibration.statistics.get(sensor, {}).get('slow_over_fast') or {}, kind)
+
+
+def is_structured(slow_over_fast: Mapping[str, float], kind: str) -> bool:
+    """Return whether `BandMisfit.slow_over_fast` of a kind, if it is known, shows a structure."""
+    return slow_over_fast.get(kind, np.inf) > MIN_STRUCTURE
 
 
 def rested(calibration: Calibration) -> bool:
