@@ -160,8 +160,9 @@ def _with_gyroscope(blocks, path, topic):
                 samples.append(getattr(block, name))
         dropped.update(block.dropped or {})
         notes.update(block.notes or {})
-    gyroscope, lost = _imu_samples(path, Topics(imu=topic))
-    dropped.update(lost)
+    other = _imu_messages(path, Topics(imu=topic))
+    gyroscope = other.imu
+    dropped.update(other.lost)
     if not parts['imu']:
         raise _no_samples('the topic of the accelerometer')
     imu = ImuSamples.concatenate(parts['imu'])
@@ -179,8 +180,20 @@ def _with_gyroscope(blocks, path, topic):
     return SampleBlock(joined.imu, joints, temperature, dict(dropped), dict(notes))
 
 
-def _imu_samples(path, topics):
-    """Return (all samples of an Imu topic, reason -> lost messages)."""
+@dataclass(frozen=True, eq=False)
+class _ImuMessages:
+    """All messages of an Imu topic."""
+
+    topic: str
+    """Its name."""
+    imu: ImuSamples
+    """Their samples."""
+    lost: dict[str, int]
+    """Reason -> messages that could not be read."""
+
+
+def _imu_messages(path: str | PathLike, topics: Topics) -> _ImuMessages:
+    """Read an Imu topic to its end."""
     parts = []
     with open_bag(path, topics, want_joints=False, want_temperature=False) as recording:
         for block in recording.blocks():
@@ -188,7 +201,7 @@ def _imu_samples(path, topics):
                 parts.append(block.imu)
     if not parts:
         raise _no_samples(recording.imu_topic)
-    return ImuSamples.concatenate(parts), recording.lost
+    return _ImuMessages(recording.imu_topic, ImuSamples.concatenate(parts), recording.lost)
 
 
 def _no_samples(topic):
@@ -222,19 +235,16 @@ def read_split(path: str | PathLike, topics: Topics) -> SplitRecording:
 
     """
     # The delay needs all readings of both sensors.
-    of_force = topics._replace(gyroscope=None)
-    with open_bag(path, of_force, want_joints=False, want_temperature=False) as recording:
-        force_topic = recording.imu_topic
-    imu, _ = _imu_samples(path, of_force)
-    gyroscope, _ = _imu_samples(path, Topics(imu=topics.gyroscope))
-    force = finite_stream(imu.stamp_ns, imu.force_s)
-    rate = finite_stream(gyroscope.stamp_ns, gyroscope.rate_s)
-    joined = join_sensors(force, rate, imu.frame_id)
+    of_force = _imu_messages(path, topics._replace(gyroscope=None))
+    of_rate = _imu_messages(path, Topics(imu=topics.gyroscope))
+    frame = of_force.imu.frame_id
+    force = finite_stream(of_force.imu.stamp_ns, of_force.imu.force_s)
+    rate = finite_stream(of_rate.imu.stamp_ns, of_rate.imu.rate_s)
+    joined = join_sensors(force, rate, frame)
     remark(joined.text)
     if joined.slower == 'accelerometer':
-        return SplitRecording(joined, force_topic, OtherSensor('rate', rate, imu.frame_id))
-    assert topics.gyroscope is not None  # by the caller
-    return SplitRecording(joined, topics.gyroscope, OtherSensor('force', force, imu.frame_id))
+        return SplitRecording(joined, of_force.topic, OtherSensor('rate', rate, frame))
+    return SplitRecording(joined, of_rate.topic, OtherSensor('force', force, frame))
 
 
 def source_of(

@@ -24,6 +24,16 @@ from msg_adapters.write import encode_imu
 from worlds.small_hand import ACCELEROMETER, GRAVITY, GYROSCOPE, hand_motion
 
 
+def written(path, accel, gyro):
+    """Write a bag with one Imu topic for each sensor."""
+    with BagWriter(path, 'mcap') as writer:
+        for name, imu in (('/accel', accel), ('/gyro', gyro)):
+            topic = writer.add_topic(name, standard_definition(IMU_TYPE))
+            packed = Packed.of_rows(encode_imu(imu))
+            writer.write(np.full(len(imu), topic), imu.stamp_ns, packed)
+    return path
+
+
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     """The force at 80 Hz on /accel, the rate at 160 Hz on /gyro."""
@@ -34,12 +44,7 @@ def bag(tmp_path_factory):
     accel = accel.select(slice(None, None, 2))
     gyro = ImuSamples(stamps, nothing, GYROSCOPE.read(motion.rate, generator), 'gyro')
     path = tmp_path_factory.mktemp('split') / 'bag'
-    with BagWriter(path, 'mcap') as writer:
-        for name, imu in (('/accel', accel), ('/gyro', gyro)):
-            topic = writer.add_topic(name, standard_definition(IMU_TYPE))
-            packed = Packed.of_rows(encode_imu(imu))
-            writer.write(np.full(len(imu), topic), imu.stamp_ns, packed)
-    return path
+    return written(path, accel, gyro)
 
 
 @pytest.fixture(scope='module')
@@ -181,9 +186,4 @@ def exchanged(bag, path):
         force[:, axis] = np.interp(gyro.stamp_ns, accel.stamp_ns, accel.force_s[:, axis])
     accel = ImuSamples(gyro.stamp_ns, force, np.zeros_like(force), 'accel')
     gyro = gyro.select(slice(None, None, 2))
-    with BagWriter(path, 'mcap') as writer:
-        for name, imu in (('/accel', accel), ('/gyro', gyro)):
-            topic = writer.add_topic(name, standard_definition(IMU_TYPE))
-            packed = Packed.of_rows(encode_imu(imu))
-            writer.write(np.full(len(imu), topic), imu.stamp_ns, packed)
-    return path
+    return written(path, accel, gyro)
