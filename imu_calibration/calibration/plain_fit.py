@@ -322,8 +322,7 @@ def _error_on_groups(
     Return the root of the sum of squared errors on groups, each predicted from the remaining ones.
 
     One step from `values`, with parameters as compensation applies them where there is a `centre`.
-    `n_pieces`: number of
-    pieces that the factors stand for, for the weight of the prior.
+    `n_pieces`: number of pieces that the factors stand for, for the weight of the prior.
     """
     # Slopes per standard deviation of the prior: the coefficients are linear over it.
     total = coefficients(model, sensor, values)

@@ -170,9 +170,7 @@ def given_calibration(chosen: Calibration | str | PathLike[str]) -> Calibration:
 def read_noise(path: str | os.PathLike) -> 'NoiseFigures':
     """Return the noise in a file that the verb `noise` wrote; an error names the file."""
     # Here, because its import needs 1 MB of the compensator node.
-    from imu_calibration.allan.document import (
-        noise_from_text,
-    )
+    from imu_calibration.allan.document import noise_from_text
 
     try:
         return noise_from_text(read_text(path, 'noise document'))

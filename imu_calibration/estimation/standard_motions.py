@@ -64,7 +64,7 @@ class _Surroundings:
     """Variance of vibration, (m/s^2)^2, shape (3,)."""
 
 
-NOTHING = _Surroundings()
+NO_SURROUNDINGS = _Surroundings()
 
 
 def _turn(
@@ -76,7 +76,7 @@ def _turn(
     alpha: np.ndarray,
     gravity: float,
     up: ArrayLike,
-    surroundings: _Surroundings = NOTHING,
+    surroundings: _Surroundings = NO_SURROUNDINGS,
 ) -> Reference:
     """
     Return the reference of a sensor that turns about its own `axis`.
@@ -189,7 +189,7 @@ def _oscillation(axis: ArrayLike, up: ArrayLike | None = None) -> Pieces:
 
 
 def _rest(
-    up: ArrayLike, number: int, gravity: float, surroundings: _Surroundings = NOTHING
+    up: ArrayLike, number: int, gravity: float, surroundings: _Surroundings = NO_SURROUNDINGS
 ) -> Reference:
     """Return a rest: one sample, a minute after the rest before it."""
     zero = np.zeros(1)

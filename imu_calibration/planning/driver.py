@@ -306,7 +306,7 @@ class Driver:
             Seconds of a steady clock.
 
         """
-        # Ros2_control publishes NaN until the hardware was read.
+        # The driver ros2_control publishes NaN until the hardware was read.
         if not np.all(np.isfinite(position)):
             for joint in np.flatnonzero(~np.isfinite(position)):
                 self.ignored[self.joint_names[joint]] = (

@@ -295,18 +295,17 @@ class _DelayCost:
             normal[number] = blocks.transpose(0, 2, 1, 3).reshape(12, 12)
             applied[number] = (self._applied[number] @ turned[part]).reshape(12)
 
-        return np.concatenate(
-            [
-                _least_squares_residual(
-                    normal.sum(axis=0), applied.sum(axis=0), self._observed.sum()
-                )[None],
-                _least_squares_residual(
-                    normal.sum(axis=0) - normal,
-                    applied.sum(axis=0) - applied,
-                    self._observed.sum() - self._observed,
-                ),
-            ]
+        return _least_squares_residual(
+            _all_and_without_each(normal),
+            _all_and_without_each(applied),
+            _all_and_without_each(self._observed),
         )
+
+
+def _all_and_without_each(of_parts):
+    """Return the sum over the parts, then without each part in turn, shape (k + 1, ...)."""
+    total = of_parts.sum(axis=0)
+    return np.concatenate([total[None], total - of_parts])
 
 
 def _least_squares_residual(normal, applied, observed):

@@ -432,7 +432,7 @@ def _that_help(problem, explained, named):
     ]
     while kept:
         least = [_sure_reduction(problem, kept, each) for each in kept]
-        # Nan is not sure.
+        # A NaN is not sure.
         short = [
             not paid > _needed_reduction(problem, explained, kept, each)
             for paid, each in zip(least, kept)
