@@ -95,8 +95,8 @@ def outcome(found, checked):
     words, claimed = [], []
     for sensor, entry in checked.proof.items():
         ratio, worst = (
-            entry['after'] / entry['before'],
-            max(part['after'] / part['before'] for part in entry['regimes'].values()),
+            entry.after / entry.before,
+            max(part.after / part.before for part in entry.regimes.values()),
         )
         words.append(
             f'{sensor} {found.verdict.decisions[sensor]}: {ratio:.2f}, at most {worst:.2f} in any'

@@ -71,7 +71,7 @@ def judged(case, first, second, table=None, **choices) -> Iterator[Outcome]:
         return
     for sensor, entry in proof.items():
         yield Outcome(
-            case, sensor, str(found.calibration.decisions[sensor]), entry['after'] / entry['before']
+            case, sensor, str(found.calibration.decisions[sensor]), entry.after / entry.before
         )
 
 

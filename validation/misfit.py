@@ -45,17 +45,15 @@ def outcome(cause, options):
         check_recording(pair.second.block, found.calibration, table).proof,
         found.calibration.decisions,
     )
-    ratios = {sensor: entry['after'] / entry['before'] for sensor, entry in proof.items()}
+    ratios = {sensor: entry.after / entry.before for sensor, entry in proof.items()}
     worst = {
-        sensor: max(part['after'] / part['before'] for part in entry['regimes'].values())
+        sensor: max(part.after / part.before for part in entry.regimes.values())
         for sensor, entry in proof.items()
     }
     cells = [' / '.join(str(decisions[sensor]) for sensor in proof)]
     cells += [' / '.join(f'{value:.2f}' for value in values.values()) for values in (ratios, worst)]
     worse = {
-        sensor: {
-            name for name, part in entry['regimes'].items() if part['after'] > HARM * part['before']
-        }
+        sensor: {name for name, part in entry.regimes.items() if part.after > HARM * part.before}
         for sensor, entry in proof.items()
     }
     return cells, [

@@ -1,7 +1,6 @@
 """Result of the check of a calibration on another recording: the same for every reference."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.settings import CHANGE
@@ -15,17 +14,15 @@ from imu_calibration.document.decision import (
     reason_of,
     worse_regimes,
 )
+from imu_calibration.document.proof_entry import Proof, ProofEntry
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
     """The errors of a calibration on a recording."""
 
-    proof: dict
-    """
-    Sensor -> error before and after, interval and amount of data, by regime (see `proof.prove`);
-    {}: not determined.
-    """
+    proof: Proof
+    """Sensor -> error before and after by regime (see `proof.prove`); {}: not determined."""
     findings: tuple = ()
     """Findings of the checks of the recording."""
     why: str = 'fewer than three windows of rest or motion were found; record for longer'
@@ -72,7 +69,7 @@ class CheckResult:
             lines.append(self.dropped)
         return lines
 
-    def _change_lines(self):
+    def _change_lines(self) -> dict[str, str]:
         """Return sensor -> how its error compares with that on the day of the calibration."""
         lines = {}
         for sensor in dict.fromkeys(each.sensor for each in self.changes):
@@ -94,12 +91,12 @@ class CheckResult:
         found = decide(self.proof.get(sensor))
         return most_cautious([found, UNPROVEN]) if sensor in self.refused else found
 
-    def _line(self, sensor, entry):
+    def _line(self, sensor: str, entry: ProofEntry) -> str:
         why = f'; not applied: {self.refused[sensor]}' if sensor in self.refused else ''
         return f'{sensor} {self.decision(sensor)}: {reason_of(entry)}{why}'
 
     @property
-    def helped(self) -> dict[str, Any]:
+    def helped(self) -> Proof:
         """The entries of the proof of the sensors that it helps."""
         return {
             sensor: entry for sensor, entry in self.proof.items() if self.decision(sensor) is HELPS
@@ -120,7 +117,7 @@ class CheckResult:
             *self._change_lines().values(),
         ]
 
-    def __str__(self):
+    def __str__(self) -> str:
         helped = ', '.join(self.helped)
         answer = (
             'the calibration helps'

@@ -11,6 +11,7 @@ import imu_calibration
 from imu_calibration.core.documents import finite
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected
 from imu_calibration.document.verdict import NOTED_MISFIT, is_structured, judged
 from imu_calibration.effects.base import SENSORS, Role
@@ -186,7 +187,7 @@ def document(
     undetermined: tuple[dict, ...],
     statistics: dict,
     provenance: dict | None,
-    proof: dict | None,
+    proof: Proof | None,
     changes: ModelChanges,
     uncorrected: Uncorrected,
     tested: Collection[str] = (),

@@ -8,12 +8,14 @@ import numpy as np
 from imu_calibration.calibration.proof import compared
 from imu_calibration.compensation.compensate import Corrected, compensated_samples
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.proof_entry import Proof, ProofEntry
 from imu_calibration.document.trust import (
     Uncorrected,
     judged_from_of,
     latest_settling,
     uncorrected_in_time,
 )
+from imu_calibration.effects.base import UNITS
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular_of_band
 from imu_calibration.estimation.solution import HELD
@@ -48,11 +50,9 @@ TURN_ANGLE_UNIT = 'rad per turn'
 """Unit of the angle between rotated and observed gravity."""
 
 
-def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
+def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> Proof:
     """
     Return the proof of a calibration by hand.
-
-    Sensor -> entry of a document (see `calibration.proof`).
 
     Every eighth pose, with few attitudes one pose, is held out with the turns that begin or end
     there: one step from the solution without their rows. The error of the accelerometer is the
@@ -102,9 +102,9 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> dict:
             )
     if not norms:
         return {}
-    proof = {'accelerometer': entry_of(_joined(norms), 'm/s^2')}
-    if model.untested:  # held-out rests have the directions of the other rests
-        proof['accelerometer']['few_directions'] = True
+    # Rests near the axes of the sensor: held-out rests have the directions of the other rests.
+    lengths = entry_of(_joined(norms), UNITS['accelerometer'])
+    proof = {'accelerometer': replace(lengths, few_directions=bool(model.untested))}
     if sum(part[0].size for part in angles) >= TURNS_LEAST:
         proof['gyroscope'] = entry_of(_joined(angles), TURN_ANGLE_UNIT)
     return proof
@@ -157,7 +157,7 @@ def values_without(
     return found
 
 
-def _folds(poses):
+def _folds(poses: Poses) -> list[np.ndarray]:
     """
     Return masks of the poses to hold out in turn.
 
@@ -187,24 +187,25 @@ def uncorrected_by_hand(hand: HandCalibration) -> Uncorrected:
     )
 
 
-def _joined(folds):
+def _joined(folds: Iterable[Sequence[np.ndarray]]) -> list[np.ndarray]:
     """Return errors before and after of all folds, each shape (n, 1)."""
     return [np.concatenate(side)[:, None] for side in zip(*folds)]
 
 
-def entry_of(errors: Iterable[np.ndarray], unit: str) -> dict:
+def entry_of(errors: Iterable[np.ndarray], unit: str, seconds: float | None = None) -> ProofEntry:
     """Return an entry of a proof, of the errors before and after, each shape (n, components)."""
     before, after = errors
     found = compared(
         (before**2).sum(axis=1),
         (after**2).sum(axis=1),
         np.ones(len(before)),
+        unit=unit,
         components=before.shape[1],
     )
-    return found | {'unit': unit, 'windows': len(before)}
+    return ProofEntry(**vars(replace(found, windows=len(before), seconds=seconds)))
 
 
-def _selected(poses, mask):
+def _selected(poses: Poses, mask: np.ndarray) -> Poses:
     """Return some of the poses."""
     parts = {f.name: getattr(poses, f.name) for f in fields(poses)}
     return replace(

@@ -35,6 +35,7 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, JoinedParts, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration, one_significant
+from imu_calibration.document.proof_entry import Proof, ProofEntry
 from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.solution import REJECTED, with_term, with_weak_replaced
@@ -613,22 +614,22 @@ def prove_hand_readings(
     *,
     gravity: float,
     absent: Collection[str] = (),
-) -> dict:
+) -> Proof:
     """
     Return the proof of corrected samples `after` against the raw ones.
 
-    Sensor -> entry of a document (see `calibration.proof`); none of the sensors `absent`.
+    None of the sensors `absent`.
     """
     poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
     ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
     (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
     rested = float(np.sum(poses.stop - poses.start) * poses.period)
     lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
-    proof = {}
+    proof: dict[str, ProofEntry] = {}
     for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate)), strict=True):
         if sensor not in absent:
-            rest = entry_of(errors, UNITS[sensor]) | {'seconds': rested}
-            proof[sensor] = rest | {'regimes': {'rest': rest}}
+            rest = entry_of(errors, UNITS[sensor], seconds=rested)
+            proof[sensor] = replace(rest, regimes={'rest': rest})
     # The directions at both ends of a turn are those of the corrected accelerometer.
     if not absent and len(turns) >= TURNS_LEAST:
         up = unit_rows(force)
@@ -649,11 +650,10 @@ def prove_hand_readings(
             )
             for imu in (before, after)
         )
-        angles = entry_of(errors, TURN_ANGLE_UNIT) | {
-            'seconds': float(sum(turn.time[-1] - turn.time[0] for turn in turns))
-        }
-        regimes = proof['gyroscope']['regimes'] | {'turns': angles}
-        proof['gyroscope'] = angles | {'regimes': regimes}
+        turning = float(sum(turn.time[-1] - turn.time[0] for turn in turns))
+        angles = entry_of(errors, TURN_ANGLE_UNIT, seconds=turning)
+        regimes = {**proof['gyroscope'].regimes, 'turns': angles}
+        proof['gyroscope'] = replace(angles, regimes=regimes)
     return proof
 
 

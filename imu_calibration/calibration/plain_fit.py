@@ -20,7 +20,7 @@ from imu_calibration.calibration.proof import (
     nominal_values,
     with_reference,
 )
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS, UNITS, Role
 from imu_calibration.effects.forward_equations import (
     Centre,
     applied_values,
@@ -146,8 +146,8 @@ def better_plain_fits(
         if np.sqrt(with_estimated.sum()) < CLEARLY_BETTER * np.sqrt(with_described.sum()):
             chosen, of_plain = estimates[1], with_estimated
 
-        figures = compared(of_solution, of_plain, counts.sum(axis=1))
-        error, error_of_solution = figures['after'], figures['before']
+        errors = compared(of_solution, of_plain, counts.sum(axis=1), unit=UNITS[sensor])
+        error, error_of_solution = errors.after, errors.before
         is_close = error / max(error_of_solution, 1e-300) < HARDLY_WORSE
         if (is_close and sensor in under_test) or _misses_other_regimes(
             held_out, solution, chosen, sensor, centre=centre

@@ -10,11 +10,12 @@ estimated for each side: so a wrong scale that compensates for a lag is visible.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.document.proof_entry import Proof, ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.forward_equations import Centre, applied_values, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
@@ -62,9 +63,9 @@ def applied_folds(held_out: HeldOut, solution: Solution, *, centre: Centre) -> l
     return [applied_values(solution.model, values, centre) for values in folds]
 
 
-def prove_solution(held_out: HeldOut, solution: Solution, folds: Sequence[np.ndarray]) -> dict:
+def prove_solution(held_out: HeldOut, solution: Solution, folds: Sequence[np.ndarray]) -> Proof:
     """
-    Return the proof of a solution on held-out windows: sensor -> entry of a document (see `prove`).
+    Return the proof of a solution on held-out windows (see `prove`).
 
     Every fold of windows is predicted with parameters estimated without it, as compensation applies
     them (`applied_values`). The correction is linearised at the reference motion, ``true +
@@ -89,13 +90,14 @@ def prove_solution(held_out: HeldOut, solution: Solution, folds: Sequence[np.nda
         after=(held_out, (folds, described)),
     )
     if proof and one_attitude([block.accumulator for block in held_out.blocks], model):
-        proof['accelerometer']['one_attitude'] = True
+        same = replace(proof['accelerometer'], one_attitude=True)
+        proof = {**proof, 'accelerometer': same}
     return proof
 
 
 def prove_readings(
     before: HeldOut, after: HeldOut, model: SensorModel, *, reference: np.ndarray
-) -> dict:
+) -> Proof:
     """
     Return the proof of corrected readings `after` and raw readings `before`.
 
@@ -108,12 +110,9 @@ def prove_readings(
     return prove(model, before=(before, candidates), after=(after, candidates))
 
 
-def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
+def prove(model: SensorModel, *, before: Side, after: Side) -> Proof:
     """
-    Return for each sensor the figures before and after, with their statistics.
-
-    The result is sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows',
-    'seconds', 'delay_s', 'regimes'}.
+    Return for each sensor its errors before and after, in all motions and by regime.
 
     Parameters
     ----------
@@ -127,7 +126,7 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
     regimes, counts = judged_regimes(before[0])
     if not regimes:
         return {}
-    proof = {}
+    proof: dict[str, ProofEntry] = {}
     for sensor in SENSORS:
         was, now = (
             min(
@@ -139,21 +138,21 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> dict:
             )
             for dealt, candidates in (before, after)
         )
-        entry = _entry(was.squares.sum(axis=1), now.squares.sum(axis=1), counts.sum(axis=1))
-        moving = {
-            str(name): _entry(was.squares[:, k], now.squares[:, k], counts[:, k])
-            for k, name in enumerate(regimes)
-            if (counts[:, k] > 0).sum() >= MIN_REGIME_BLOCKS
-        }
-        late = {
-            'delay_s': now.delay,
-            'delay_explains': 1.0 - now.squares.sum() / max(now.without_delay, 1e-300),
-        }
-        proof[sensor] = (
-            entry
-            | {'unit': UNITS[sensor], 'windows': before[0].n_judged}
-            | late
-            | {'regimes': moving}
+        unit = UNITS[sensor]
+        of_regimes = {}
+        for k, name in enumerate(regimes):
+            if (counts[:, k] > 0).sum() >= MIN_REGIME_BLOCKS:
+                of_regimes[str(name)] = errors_in_pieces(
+                    was.squares[:, k], now.squares[:, k], counts[:, k], unit=unit
+                )
+        in_total = errors_in_pieces(
+            was.squares.sum(axis=1), now.squares.sum(axis=1), counts.sum(axis=1), unit=unit
+        )
+        proof[sensor] = ProofEntry(
+            **vars(replace(in_total, windows=before[0].n_judged)),
+            delay_s=now.delay,
+            delay_explains=float(1.0 - now.squares.sum() / max(now.without_delay, 1e-300)),
+            regimes=of_regimes,
         )
     return proof
 
@@ -273,7 +272,7 @@ def errors_of(
     return Errors(squares, float(best[0]), delay_free)
 
 
-def _nuisances(stacked):
+def _nuisances(stacked: np.ndarray) -> tuple[np.ndarray, float]:
     """
     Return the nuisances that minimise ``error + sum(nuisance change)``.
 
@@ -296,10 +295,11 @@ class _Correction:
     included.
     """
 
-    def __init__(self, model, sensor, values):
+    def __init__(self, model: SensorModel, sensor: str, values: np.ndarray):
         total = coefficients(model, sensor, values)
-        self.matrix = model.value(sensor, Role.LINEAR, values)
-        self.inverse = np.linalg.inv(self.matrix)
+        matrix = model.value(sensor, Role.LINEAR, values)
+        assert matrix is not None, 'each sensor has a matrix'
+        self.matrix, self.inverse = matrix, np.linalg.inv(matrix)
         self.total, self.arms = total, []
         arm = model.part(sensor, Role.ARM)
         for index in range(arm.start, arm.stop):
@@ -307,7 +307,7 @@ class _Correction:
             moved[index] += 1.0
             self.arms.append(coefficients(model, sensor, moved) - total)
 
-    def errors(self, rows):
+    def errors(self, rows: np.ndarray) -> np.ndarray:
         """
         Return errors and their change with each nuisance, (1 + n_nuisances, k, 3).
 
@@ -327,17 +327,26 @@ class _Correction:
         return np.stack(parts) @ self.inverse.T
 
 
-def _entry(before, after, count):
-    return compared(before, after, count) | {'seconds': float(count.sum() * PIECE_TIME)}
+def errors_in_pieces(
+    before: np.ndarray, after: np.ndarray, count: np.ndarray, *, unit: str
+) -> RegimeErrors:
+    """Return `compared` errors of the means of so many pieces, with their length."""
+    found = compared(before, after, count, unit=unit)
+    return replace(found, seconds=float(count.sum() * PIECE_TIME))
 
 
 def compared(
-    before: np.ndarray, after: np.ndarray, count: np.ndarray, *, components: int = N_AXES
-) -> dict:
+    before: np.ndarray,
+    after: np.ndarray,
+    count: np.ndarray,
+    *,
+    unit: str,
+    components: int = N_AXES,
+) -> RegimeErrors:
     """
-    Return {'before', 'after', 'ci95'}.
+    Return the rms errors per component, and the interval of their ratio.
 
-    Rms per component, and the interval of their ratio over resamples of complete blocks.
+    The interval is over resamples of complete blocks.
 
     Parameters
     ----------
@@ -345,6 +354,7 @@ def compared(
         Sums of squared errors.
     count : array, shape (n_blocks,)
         Number of errors in each sum, per component.
+    unit : str
     components : int
 
     """
@@ -355,8 +365,9 @@ def compared(
         ratio = np.sqrt(after[draw].sum(axis=1) / before[draw].sum(axis=1))
     low, high = np.nan_to_num(np.quantile(ratio, (0.025, 0.975)), nan=1.0, posinf=1e9)
     total = components * count.sum()
-    return {
-        'before': float(np.sqrt(before.sum() / total)),
-        'after': float(np.sqrt(after.sum() / total)),
-        'ci95': [float(low), float(high)],
-    }
+    return RegimeErrors(
+        before=float(np.sqrt(before.sum() / total)),
+        after=float(np.sqrt(after.sum() / total)),
+        ci95=(float(low), float(high)),
+        unit=unit,
+    )

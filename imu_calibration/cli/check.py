@@ -74,7 +74,7 @@ def run(options: Options) -> VerbResult:
         files.write_texts(page.parent, {page.name: text})
         out.print(f'written: {page}')
     document = {
-        'proof': found.proof,
+        'proof': {sensor: entry.to_mapping() for sensor, entry in found.proof.items()},
         'helps': found.helps,
         'changes': [asdict(each) for each in found.changes],
         'changed': bool(found.changed),
@@ -92,17 +92,15 @@ def _table(found):
     since = {(each.sensor, each.regime): each for each in found.changes}
     rows = []
     for sensor, entry in found.proof.items():
-        for motion, part in (('all', entry), *entry['regimes'].items()):
+        for motion, part in (('all', entry), *entry.regimes.items()):
             change = since.get((sensor, motion))
             rows.append(
                 (
                     sensor,
                     motion,
-                    f'{part["seconds"]:.0f}',
-                    *(
-                        error_text(part[when], part.get('unit', entry['unit']))
-                        for when in ('before', 'after')
-                    ),
+                    f'{part.seconds:.0f}',
+                    error_text(part.before, part.unit),
+                    error_text(part.after, part.unit),
                     ratio_text(part),
                     '-' if change is None else error_text(change.stored, change.unit),
                     '-' if change is None else f'{change.low:.2g} to {change.high:.2g}',

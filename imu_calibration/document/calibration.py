@@ -33,6 +33,7 @@ from imu_calibration.document.decision import (
     decisions_text,
     most_cautious,
 )
+from imu_calibration.document.proof_entry import Proof
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import (
@@ -81,11 +82,8 @@ class Calibration:
     """Sensor -> the reason for the decision."""
     notes: tuple = ()
     """Parameters within tolerance, warnings, notes and next steps, a line each."""
-    proof: dict = field(default_factory=dict)
-    """
-    Sensor -> {'before', 'after', 'ci95' of after / before, 'unit', 'windows'}: its error on
-    held-out data; {}: never measured.
-    """
+    proof: Proof = field(default_factory=dict)
+    """Sensor -> its errors on held-out data; {}: never measured."""
     covariance_terms: dict[str, np.ndarray] = field(default_factory=dict)
     """
     Term (`estimation.solution`) -> its variance of each parameter, shape (n_params,); the sum is

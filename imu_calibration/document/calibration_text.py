@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from imu_calibration.core.errors import DocumentError, InputError, shortened
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration, with_nominal
 from imu_calibration.document.decision import HARMS, SensorDecision
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.effects.sensor_model import BASE, SensorModel
@@ -94,18 +95,41 @@ _NOISE = {
     'between_window_dof': _is_size,
     'wander_sd': _is_size,
 }
-_PROOF = {
+_ERRORS: dict[str, Callable[[Any], bool]] = {
     'before': _is_size,
     'after': _is_size,
     'ci95': lambda value: _is_range(value, _is_size),
+}
+"""Fields that errors in a regime of motion must have."""
+_PROOF = {**_ERRORS, 'unit': _is_text, 'windows': _is_count}
+"""Fields that the errors of a sensor must have."""
+_FURTHER: dict[str, Callable[[Any], bool]] = {
     'unit': _is_text,
     'windows': _is_count,
+    'seconds': _is_size,
+    'delay_s': _is_number,
+    'delay_explains': _is_number,
 }
+"""Fields that they may have."""
 
 
-def _is_proof(value):
-    return isinstance(value, dict) and all(
-        name in value and kind(value[name]) for name, kind in _PROOF.items()
+def _are_errors(value: Any, needed: Mapping[str, Callable[[Any], bool]]) -> bool:
+    """Return whether a mapping has the fields `needed`, and no other one of a wrong type."""
+    if not isinstance(value, dict) or not all(name in value for name in needed):
+        return False
+    known = {**_FURTHER, **needed}
+    return all(kind(value[name]) for name, kind in known.items() if name in value)
+
+
+def _is_proof(value: Any) -> bool:
+    if not _are_errors(value, _PROOF):
+        return False
+    earlier, regimes = value.get('earlier'), value.get('regimes') or {}
+    of_earlier = {name: kind for name, kind in _ERRORS.items() if name != 'before'}
+    if earlier is not None and not _are_errors(earlier, of_earlier):
+        return False
+    return isinstance(regimes, dict) and all(
+        _is_text(name) and _are_errors(part, _ERRORS) for name, part in regimes.items()
     )
 
 
@@ -327,9 +351,13 @@ def parts_of(document: Mapping) -> dict[str, Any]:
                 'conditions',
                 'decision',
                 'decision_reasons',
-                'proof',
                 'provenance',
             )
+        },
+        'proof': {
+            sensor: ProofEntry.from_mapping(entry)
+            for sensor, entry in (document.get('proof') or {}).items()
+            if sensor in SENSORS and entry
         },
     }
 
@@ -513,6 +541,8 @@ def calibration_mapping(calibration: Calibration) -> dict:
     ]
     for name in ('statistics', 'conditions', *_WHERE_KNOWN, 'provenance'):
         part = getattr(calibration, name)
+        if name == 'proof':
+            part = {sensor: entry.to_mapping() for sensor, entry in part.items()}
         if part or name not in _WHERE_KNOWN:
             document[name] = plain(part)
     return document

@@ -1,12 +1,11 @@
 """Whether the error of a calibration has changed since its recording, by regime of motion."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from imu_calibration.core.errors import InputError
+from imu_calibration.document.proof_entry import Proof, RegimeErrors
 
 QUANTILE = 1.96
 """Of the normal distribution, for 95 %."""
@@ -60,7 +59,7 @@ def checked_limit(limit: float) -> float:
     return limit
 
 
-def with_kinds_by_hand(stored: Mapping[str, Any]) -> dict[str, Any]:
+def with_kinds_by_hand(stored: Proof) -> Proof:
     """
     Return the proof of a file with the kind of motion of its entries by hand, which have none.
 
@@ -73,12 +72,12 @@ def with_kinds_by_hand(stored: Mapping[str, Any]) -> dict[str, Any]:
     found = {}
     for sensor, entry in stored.items():
         found[sensor] = entry
-        if entry and 'regimes' not in entry:
-            found[sensor] = {**entry, 'regimes': {KIND_BY_HAND[sensor]: entry}}
+        if not entry.regimes:
+            found[sensor] = replace(entry, regimes={KIND_BY_HAND[sensor]: entry})
     return found
 
 
-def changes_since(stored: Mapping[str, Any], proof: Mapping[str, Any]) -> tuple[RegimeChange, ...]:
+def changes_since(stored: Proof, proof: Proof) -> tuple[RegimeChange, ...]:
     """
     Return the changes of the error in the regimes that both proofs have, with the same unit.
 
@@ -94,24 +93,23 @@ def changes_since(stored: Mapping[str, Any], proof: Mapping[str, Any]) -> tuple[
     """
     found = []
     for sensor, entry in proof.items():
-        before = stored.get(sensor) or {}
-        regimes = before.get('regimes') or {}
-        for regime, part in (entry.get('regimes') or {}).items():
-            earlier = regimes.get(regime)
-            if not earlier or not earlier['after'] > 0.0 or not part['after'] > 0.0:
+        if sensor not in stored:
+            continue
+        for regime, part in entry.regimes.items():
+            earlier = stored[sensor].regimes.get(regime)
+            if earlier is None or not earlier.after > 0.0 or not part.after > 0.0:
                 continue
-            unit = part.get('unit', entry['unit'])
-            if earlier.get('unit', before['unit']) != unit:
+            if earlier.unit != part.unit:
                 continue
-            ratio = part['after'] / earlier['after']
+            ratio = part.after / earlier.after
             spread = np.exp(QUANTILE * np.hypot(_log_sd(earlier), _log_sd(part)))
             found.append(
                 RegimeChange(
                     sensor,
                     regime,
-                    unit,
-                    stored=float(earlier['after']),
-                    now=float(part['after']),
+                    part.unit,
+                    stored=earlier.after,
+                    now=part.after,
                     low=float(ratio / spread),
                     high=float(ratio * spread),
                 )
@@ -119,9 +117,9 @@ def changes_since(stored: Mapping[str, Any], proof: Mapping[str, Any]) -> tuple[
     return tuple(found)
 
 
-def _log_sd(part):
+def _log_sd(part: RegimeErrors) -> float:
     """Return the standard deviation of the logarithm of an error, from its interval."""
-    low, high = part['ci95']
+    low, high = part.ci95
     if not high > 0.0:
         return 0.0
     return float(np.log(high / max(low, SMALLEST_SHARE * high)) / (2.0 * QUANTILE))

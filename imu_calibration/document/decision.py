@@ -7,6 +7,7 @@ from typing import Any
 from imu_calibration.core.errors import with_hint
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.core.units import error_text
+from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS
 
 HARM = 1.05
@@ -49,19 +50,21 @@ BY_DEFINITION: dict[str, Any] = {
 """Fields of the Calibration with which a session was simulated."""
 
 
-def same_directions(entry: Mapping) -> str:
+def same_directions(entry: ProofEntry) -> str:
     """Return why other attitudes are unproven, from an entry of a proof; '' where they are not."""
-    if entry.get('one_attitude'):
+    if entry.one_attitude:
         return OTHER_ATTITUDES
-    return FEW_DIRECTIONS if entry.get('few_directions') else ''
+    return FEW_DIRECTIONS if entry.few_directions else ''
 
 
-def decide(entry: Mapping | None) -> SensorDecision:
+def decide(entry: ProofEntry | None) -> SensorDecision:
     """Return the decision on a sensor from its entry of a proof (`proof.prove`), or from None."""
-    if not entry or not entry['windows'] or same_directions(entry):
+    if entry is None or not entry.windows or same_directions(entry):
         return UNPROVEN
-    low, high = entry['ci95']
-    return HELPS if high < 1.0 else HARMS if low > 1.0 else UNPROVEN
+    low, high = entry.ci95
+    if high < 1.0:
+        return HELPS
+    return HARMS if low > 1.0 else UNPROVEN
 
 
 def most_cautious(decisions: Iterable[SensorDecision]) -> SensorDecision:
@@ -79,81 +82,80 @@ def decisions_text(decisions: Mapping[str, SensorDecision]) -> str:
     )
 
 
-def reason_of(entry: Mapping | None) -> str:
+def reason_of(entry: ProofEntry | None) -> str:
     """
     Return the reason for `decide`.
 
     Errors before and after, the interval of their ratio, and where it does not help the likely
     cause.
     """
-    if not entry or not entry['windows']:
+    if entry is None or not entry.windows:
         return NO_PROOF
-    earlier = entry.get('earlier')
-    more = (
-        f', {error_text(earlier["after"], entry["unit"])} with the earlier calibration'
-        if earlier
-        else ''
-    )
+    more = ''
+    if entry.earlier is not None:
+        error = error_text(entry.earlier.after, entry.unit)
+        more = f', {error} with the earlier calibration'
     cause = same_directions(entry)
     if not cause and decide(entry) is not HELPS:
         cause = _cause(entry)
     return (
-        f'{_errors(entry, entry["unit"])} on held-out data ({entry["windows"]} windows, after /'
+        f'{_errors(entry)} on held-out data ({entry.windows} windows, after /'
         f' before {ratio_text(entry)}){more}{cause}'
     )
 
 
-def worse_regimes(entry: Mapping) -> list[str]:
+def worse_regimes(entry: ProofEntry) -> list[str]:
     """Return a line for each regime in which the error grows."""
-    return [
-        f'{_errors(part, part.get("unit", entry["unit"]))} on held-out data of the regime {name}'
-        f' (after / before {ratio_text(part)})'
-        for name, part in harmed(entry).items()
-    ]
+    lines = []
+    for name, part in harmed(entry).items():
+        lines.append(
+            f'{_errors(part)} on held-out data of the regime {name}'
+            f' (after / before {ratio_text(part)})'
+        )
+    return lines
 
 
-def harmed(entry: Mapping) -> dict[str, Any]:
-    """Return {regime: entry} of the regimes of a proof in which the error grows."""
-    return {
-        name: part
-        for name, part in (entry.get('regimes') or {}).items()
-        if part['after'] > HARM * part['before'] and part['ci95'][0] > 1.0
-    }
+def harmed(entry: ProofEntry) -> dict[str, RegimeErrors]:
+    """Return the regimes of a proof in which the error grows, with their errors."""
+    found = {}
+    for name, part in entry.regimes.items():
+        if part.after > HARM * part.before and part.ci95[0] > 1.0:
+            found[name] = part
+    return found
 
 
-def _errors(entry, unit):
-    return f'error {error_text(entry["before"], unit)} to {error_text(entry["after"], unit)}'
+def _errors(entry: RegimeErrors) -> str:
+    before, after = (error_text(size, entry.unit) for size in (entry.before, entry.after))
+    return f'error {before} to {after}'
 
 
-def ratio_text(entry: Mapping) -> str:
+def ratio_text(entry: RegimeErrors) -> str:
     """Return the interval of error after / error before as it is printed everywhere."""
-    low, high = entry['ci95']
+    low, high = entry.ci95
     return f'{low:.2g} to {high:.2g}'
 
 
-def _cause(entry):
+def _cause(entry: ProofEntry) -> str:
     """Return the most likely cause as the end of a sentence."""
-    late, share = entry.get('delay_s', 0.0), entry.get('delay_explains', 0.0)
+    late, share = entry.delay_s or 0.0, entry.delay_explains or 0.0
     if abs(late) > MIN_NAMED_DELAY and share > DELAY_SHARE:
         side = 'late' if late > 0 else 'early'
         return (
             f'; likely cause: the readings are {abs(late) * 1e3:.0f} ms {side}, which the model'
             ' does not include'
         )
-    regimes = entry.get('regimes') or {}
-    rest = regimes.get('rest', {'after': 0.0})
-    if (
-        'rest' in harmed(entry)
-        or rest['after'] > REST_SHARE * entry['after'] > 0.0
-        and rest.get('unit', entry['unit']) == entry['unit']
-    ):
+    rest = entry.regimes.get('rest')
+    at_rest = 0.0
+    if rest is not None and rest.unit == entry.unit:
+        at_rest = rest.after
+    if 'rest' in harmed(entry) or at_rest > REST_SHARE * entry.after > 0.0:
         return '; likely cause: the bias has changed'
-    if regimes and set(harmed(entry)) == {'angular acceleration'}:
+    if entry.regimes and set(harmed(entry)) == {'angular acceleration'}:
         return (
             '; likely cause: the error correlates with angular acceleration: a lever arm, a varying'
             ' lag, a loose mount'
         )
-    if entry['after'] < HARM * entry['before']:
+    if entry.after < HARM * entry.before:
         return (
             '; likely cause: the error is close to the smallest that this recording can show, or'
             ' the parameters change during it'

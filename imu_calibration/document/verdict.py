@@ -40,6 +40,7 @@ from imu_calibration.document.decision import (
     worse_regimes,
 )
 from imu_calibration.document.outcome import dropped_of, is_complete, parameter_count
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.rest_noise import moved_at_rest
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
@@ -291,14 +292,11 @@ def rested(calibration: Calibration) -> bool:
     return windows is None or bool(windows.get('static'))
 
 
-def helps_everywhere(entry: Mapping | None) -> bool:
+def helps_everywhere(entry: ProofEntry | None) -> bool:
     """Return whether an entry of a proof shows a smaller error in total and in each regime."""
     if decide(entry) is not HELPS or entry is None:
         return False
-    return not any(
-        part['after'] >= part['before'] or part['ci95'][1] >= 1.0
-        for part in (entry.get('regimes') or {}).values()
-    )
+    return all(part.after < part.before and part.ci95[1] < 1.0 for part in entry.regimes.values())
 
 
 def motion_misfits(calibration: Calibration) -> list[Reason]:
@@ -546,7 +544,7 @@ def _step_of(calibration, sensor):
     # Values that are refused have their own cause, and no measurement of their error is missing.
     if limit := surpassed_limit(calibration, sensor):
         return limit.remedy, limit.key
-    if not entry or not entry['windows']:
+    if entry is None or not entry.windows:
         if not by_hand:
             return 'record more windows of rest and motion', None
         if needs := _needs_of(calibration, sensor):
@@ -556,7 +554,7 @@ def _step_of(calibration, sensor):
             'gyroscope': 'turn it between more attitudes held still',
         }
         return more[sensor], None
-    if entry.get('few_directions'):
+    if entry.few_directions:
         return 'hold it still between the axes of the sensor as well', None
     if same_directions(entry):
         mount = '' if by_hand else ', or mount it at another angle'

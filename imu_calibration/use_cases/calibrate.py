@@ -32,6 +32,7 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.change import changes_since, checked_limit, with_kinds_by_hand
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
+from imu_calibration.document.proof_entry import EarlierErrors
 from imu_calibration.document.verdict import judged
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import (
@@ -205,17 +206,10 @@ def _beside(result, proof):
     """
     Return the result with the error after an earlier calibration, from `proof`, in its own proof.
     """
-    known = {
-        sensor: (
-            found
-            | (
-                {'earlier': {name: proof[sensor][name] for name in ('after', 'ci95')}}
-                if sensor in proof
-                else {}
-            )
-        )
-        for sensor, found in result.calibration.proof.items()
-    }
+    known = dict(result.calibration.proof)
+    for sensor in known.keys() & proof.keys():
+        earlier = EarlierErrors(proof[sensor].after, proof[sensor].ci95)
+        known[sensor] = replace(known[sensor], earlier=earlier)
     return replace(
         result, calibration=judged(replace(result.calibration, proof=known), result.tolerances)
     )

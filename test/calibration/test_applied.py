@@ -70,11 +70,13 @@ def spoiled(calibration, seed=3):
 
 def same(found, wanted):
     """Assert that two entries of proofs have the same errors in total and in each regime."""
-    for part, other in (
-        (found, wanted),
-        *((found['regimes'][name], wanted['regimes'][name]) for name in wanted['regimes']),
-    ):
-        assert part == pytest.approx(other, rel=1e-9)
+    assert found.regimes.keys() == wanted.regimes.keys()
+    pairs = [(found, wanted)]
+    pairs += [(found.regimes[name], wanted.regimes[name]) for name in wanted.regimes]
+    for part, other in pairs:
+        assert (part.before, part.after) == pytest.approx((other.before, other.after), rel=1e-9)
+        assert part.ci95 == pytest.approx(other.ci95, rel=1e-9)
+        assert (part.seconds, part.unit) == (other.seconds, other.unit)
 
 
 @pytest.mark.parametrize('name', SESSIONS)
@@ -89,10 +91,10 @@ def test_check_reports_the_error_of_the_compensated_bag(name, tmp_path):
     )
     assert checked.proof.keys() == {'accelerometer', 'gyroscope'}
     for sensor, entry in checked.proof.items():
-        assert entry['after'] == pytest.approx(written.proof[sensor]['before'], rel=1e-9)
-        for regime, part in entry['regimes'].items():
-            assert part['after'] == pytest.approx(
-                written.proof[sensor]['regimes'][regime]['before'], rel=1e-9
+        assert entry.after == pytest.approx(written.proof[sensor].before, rel=1e-9)
+        for regime, part in entry.regimes.items():
+            assert part.after == pytest.approx(
+                written.proof[sensor].regimes[regime].before, rel=1e-9
             )
 
 
@@ -109,8 +111,8 @@ def test_check_by_hand_reports_the_error_of_the_compensated_bag(tmp_path):
     written = prove_hand_readings(gather_by_hand(raw), raw, corrected, gravity=GRAVITY)
     for sensor, entry in checked.proof.items():
         assert (
-            entry['after'] == pytest.approx(written[sensor]['after'], rel=1e-9)
-            and entry['after'] < 0.5 * entry['before']
+            entry.after == pytest.approx(written[sensor].after, rel=1e-9)
+            and entry.after < 0.5 * entry.before
         )
 
 
@@ -135,7 +137,7 @@ def test_the_proof_from_window_statistics_differs_by_the_square_of_the_errors():
     found = prove(model, before=(dealt, ([nominal_values(model)],)), after=(dealt, ([values],)))
     checked = imu.check(session.samples, result.calibration, session.table)
     for sensor, entry in checked.proof.items():
-        assert found[sensor]['after'] == pytest.approx(entry['after'], rel=0.02)
+        assert found[sensor].after == pytest.approx(entry.after, rel=0.02)
 
 
 def drifting(size=0.5 * DEG, time_constant=35.0):
@@ -177,11 +179,11 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
     line = next(line for line in caveats(calibration) if 'gyro_bias_drift' in line)
     assert line in imu.compensate(samples, calibration, anyway=True).warnings
     judged, every = (
-        calibration.proof['gyroscope']['windows'],
+        calibration.proof['gyroscope'].windows,
         sum(calibration.statistics['windows'].values()),
     )
     assert 0.2 * every < judged < 0.5 * every
-    assert calibration.proof['gyroscope']['after'] < 0.2 * DEG
+    assert calibration.proof['gyroscope'].after < 0.2 * DEG
     again = calibration_from_text(calibration_to_text(calibration))
     np.testing.assert_array_equal(
         again.model.centre['gyro_warm_up'], calibration.model.centre['gyro_warm_up']
@@ -213,7 +215,7 @@ def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_w
         calibration.value('gyroscope', 'bias'), at_start + course.mean(), atol=0.03 * course[-1]
     )
     np.testing.assert_allclose(entry['rms'], course.std(), rtol=0.1)
-    assert calibration.proof['gyroscope']['windows'] > 0.5 * sum(
+    assert calibration.proof['gyroscope'].windows > 0.5 * sum(
         calibration.statistics['windows'].values()
     )
     assert not any('starts again' in line for line in caveats(calibration))
@@ -260,7 +262,7 @@ def test_a_formula_in_the_joint_angle_is_centred_on_the_mean_of_the_recording():
     truth = session.truth.value('gyroscope', 'bias') + mean
     uncentred = result.solution.values[result.model.slices['gyroscope', 'bias']]
     assert np.abs(calibration.value('gyroscope', 'bias') - truth).max() < 0.01 * DEG
-    assert calibration.proof['gyroscope']['after'] < 0.05 * DEG
+    assert calibration.proof['gyroscope'].after < 0.05 * DEG
     part = calibration.model.slices['gyroscope', 'by_angle']
     mean_column = calibration.model.centre['by_angle'][0]
     np.testing.assert_allclose(
@@ -281,7 +283,7 @@ def test_a_drift_by_hand_is_applied_as_its_value_at_the_end():
     # Its columns are taken at a point, not at its prior.
     assert 'gyroscope.gyro_bias_drift.time_constant' not in calibration.held_reason
     assert calibration.statistics['uncorrected'][0]['applied'] == END
-    assert calibration.proof['accelerometer']['windows'] < 40 / 2
+    assert calibration.proof['accelerometer'].windows < 40 / 2
 
 
 def test_corrected_readings_travel_with_their_sample():

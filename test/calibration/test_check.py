@@ -36,9 +36,9 @@ def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
     )
     assert found.helps and found.exit_code == 0
     assert all(
-        part['after'] < 0.6 * part['before']
+        part.after < 0.6 * part.before
         for entry in found.proof.values()
-        for part in entry['regimes'].values()
+        for part in entry.regimes.values()
     )
 
 
@@ -93,6 +93,6 @@ def test_an_earlier_calibration_is_proven_beside_a_new_one(pair, calibrated):
         pair.second.block, Table.from_mapping(pair.table), model_as_asked=True, earlier=earlier
     )
     entry = found.calibration.proof['gyroscope']
-    assert entry['earlier']['after'] > 3 * entry['after']
+    assert entry.earlier.after > 3 * entry.after
     with refused(InputError, 'table_missing'):
         calibrate_recordings(pair.second.block, earlier=earlier)

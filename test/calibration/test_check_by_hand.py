@@ -39,20 +39,17 @@ def test_a_good_file_helps_at_rest_and_in_turns(second, calibrated):
     assert found.helps and found.exit_code == 0
     accelerometer, gyroscope = found.proof['accelerometer'], found.proof['gyroscope']
     # Scatter of the poses 2 mm/s^2, biases 0.2 m/s^2.
-    assert accelerometer['after'] < 0.01 < 0.05 < accelerometer['before']
-    assert gyroscope['unit'] == 'rad per turn' and gyroscope['after'] < 0.3 * gyroscope['before']
-    assert (
-        gyroscope['regimes']['rest']['unit'] == 'rad/s'
-        and gyroscope['regimes']['rest']['after'] < 1e-3
-    )
-    assert accelerometer['windows'] == 12 and gyroscope['windows'] == 11
+    assert accelerometer.after < 0.01 < 0.05 < accelerometer.before
+    assert gyroscope.unit == 'rad per turn' and gyroscope.after < 0.3 * gyroscope.before
+    assert gyroscope.regimes['rest'].unit == 'rad/s' and gyroscope.regimes['rest'].after < 1e-3
+    assert accelerometer.windows == 12 and gyroscope.windows == 11
 
 
 def test_a_bias_that_moved_is_named(second, calibrated):
     # It has passed zero, so that nothing at all would now be better.
     moved = second.rate_s - 3 * calibrated.value('gyroscope', 'bias')
     found = check_recording(SampleBlock(replace(second, rate_s=moved)), calibrated, gravity=GRAVITY)
-    assert found.exit_code == 3 and found.proof['gyroscope']['regimes']['rest']['ci95'][0] > 1
+    assert found.exit_code == 3 and found.proof['gyroscope'].regimes['rest'].ci95[0] > 1
     assert 'bias' in found.lines[1]
 
 
@@ -68,12 +65,12 @@ def test_turns_alone_tell_a_wrong_scale_of_the_gyroscope(second, calibrated):
     bias = calibrated.value('gyroscope', 'bias')
     wrong = replace(second, rate_s=bias + 1.05 * (second.rate_s - bias))
     right, found = (
-        check_recording(SampleBlock(imu), calibrated, gravity=GRAVITY).proof['gyroscope']['regimes']
+        check_recording(SampleBlock(imu), calibrated, gravity=GRAVITY).proof['gyroscope'].regimes
         for imu in (second, wrong)
     )
     assert (
-        found['rest']['after'] == pytest.approx(right['rest']['after'], rel=0.1)
-        and found['turns']['after'] > 5 * right['turns']['after']
+        found['rest'].after == pytest.approx(right['rest'].after, rel=0.1)
+        and found['turns'].after > 5 * right['turns'].after
     )
 
 
@@ -97,7 +94,7 @@ def test_check_gives_3_when_the_error_by_hand_has_changed(first, second, calibra
     assert found.helps and found.exit_code == 3
     assert (change.sensor, change.regime) == ('accelerometer', 'rest')
     assert change.now == pytest.approx(0.05, rel=0.05)
-    assert change.stored == calibrated.proof['accelerometer']['after']
+    assert change.stored == calibrated.proof['accelerometer'].after
 
 
 def test_temperatures_reach_the_correction(first):
@@ -111,9 +108,7 @@ def test_temperatures_reach_the_correction(first):
         block, gravity=GRAVITY, gyroscope_model='bias+matrix', model_as_asked=True
     ).calibration
     errors = [
-        check_recording(block, found, gravity=GRAVITY).proof['gyroscope']['regimes']['rest'][
-            'after'
-        ]
+        check_recording(block, found, gravity=GRAVITY).proof['gyroscope'].regimes['rest'].after
         for found in (asked, plain)
     ]
     assert errors[0] < 0.3 * errors[1]

@@ -219,10 +219,8 @@ def test_a_proven_session_is_proven_after_resume(quick):
     after = LiveCalibration(TABLE, saved=first.saved(pending=True)).solve().calibration
     assert set(before.decisions.values()) == {HELPS} and after.decisions == before.decisions
     for sensor in before.proof:
-        assert after.proof[sensor]['windows'] == before.proof[sensor]['windows']
-        assert after.proof[sensor]['after'] == pytest.approx(
-            before.proof[sensor]['after'], rel=1e-3
-        )
+        assert after.proof[sensor].windows == before.proof[sensor].windows
+        assert after.proof[sensor].after == pytest.approx(before.proof[sensor].after, rel=1e-3)
 
 
 def test_a_session_resumed_30_kelvin_warmer_knows_both_temperatures(quick):

@@ -107,7 +107,7 @@ def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(
     assert found.statistics['added'] == expected.calibration.statistics['added']
     assert_same(found, expected.calibration)
     for sensor, entry in expected.calibration.proof.items():
-        assert found.proof[sensor]['after'] == pytest.approx(entry['after'], rel=1e-9)
+        assert found.proof[sensor].after == pytest.approx(entry.after, rel=1e-9)
     assert sum('accel_quadratic (' in line for line in found.notes) == 1
     again = station.question().answer()  # about a session whose model is wide already
     assert again.extension.added == station.answer.extension.added

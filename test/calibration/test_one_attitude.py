@@ -9,6 +9,7 @@ import pytest
 
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
 from imu_calibration.document.decision import UNPROVEN, decide, reason_of
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.effects.base import Role
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.kinematics.table import Table
@@ -50,7 +51,7 @@ def test_a_calibration_of_one_attitude_is_unproven_for_others_and_applies_to_the
     assert 'the same attitude' in calibration.decision_reasons['accelerometer']
     again = calibration_from_text(calibration_to_text(calibration))
     assert (
-        again.proof['accelerometer']['one_attitude'] is True
+        again.proof['accelerometer'].one_attitude is True
         and again.decisions == calibration.decisions
     )
     gravity = np.array([0.0, 0.0, pair.second.truth['gravity']])
@@ -64,25 +65,18 @@ def test_a_calibration_of_one_attitude_is_unproven_for_others_and_applies_to_the
 def test_check_on_the_same_attitude_reports_the_error_of_that_recording(vertical):
     pair, calibration = vertical
     proof = check_recording(pair.second.block, calibration, Table.from_mapping(pair.table)).proof
-    assert 'one_attitude' not in proof['accelerometer']
+    assert not proof['accelerometer'].one_attitude
 
 
 def test_one_attitude_is_never_called_harmful():
-    entry = {
-        'before': 0.01,
-        'after': 0.03,
-        'ci95': [2.9, 3.2],
-        'unit': 'm/s^2',
-        'windows': 24,
-        'one_attitude': True,
-    }
+    entry = ProofEntry(0.01, 0.03, (2.9, 3.2), unit='m/s^2', windows=24, one_attitude=True)
     assert decide(entry) is UNPROVEN and 'the same attitude' in reason_of(entry)
 
 
 def test_a_horizontal_shaft_has_many_attitudes():
     pair = make_pair(None, 3, table='shaft', profile='sweeps')
     calibration = calibrate_recordings(pair.first.block, Table.from_mapping(pair.table)).calibration
-    assert 'one_attitude' not in calibration.proof['accelerometer']
+    assert not calibration.proof['accelerometer'].one_attitude
     assert set(calibration.status[calibration.model.part('accelerometer', Role.LINEAR)]) != {HELD}
 
 

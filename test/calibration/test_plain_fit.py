@@ -23,6 +23,7 @@ from imu_calibration.calibration.table_calibration import (
     conclude,
     solve_recordings,
 )
+from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
@@ -152,7 +153,7 @@ def plain_values(session, table):
 def errors_on_second(kind, seed, calibration):
     pair, table, *_ = world(kind, seed)
     proof = check_on_table([source(pair.second)], table, calibration).proof
-    return np.array([proof[sensor]['after'] for sensor in SENSORS])
+    return np.array([proof[sensor].after for sensor in SENSORS])
 
 
 def with_plain_values(calibration, kind, seed):
@@ -235,12 +236,13 @@ def test_the_solution_is_applied_unless_a_residual_is_unexplained():
     fitted = calibrated('cable', 604, unexplained=UNEXPLAINED)
     gyroscope = fitted.statistics['least_squares']['gyroscope']
     assert gyroscope['error'] < 0.95 * gyroscope['error_of_model']
-    assert fitted.proof['gyroscope']['after'] < solution.proof['gyroscope']['after']
+    assert fitted.proof['gyroscope'].after < solution.proof['gyroscope'].after
     assert np.all(fitted.sd >= 0.0) and not np.array_equal(fitted.values, solution.values)
 
 
 def formula_proof(after, *, fast):
-    return {'gyroscope': {'after': after, 'regimes': {'fast turns': {'after': fast}}}}
+    regimes = {'fast turns': RegimeErrors(1.0, fast, (0.1, 2.0))}
+    return {'gyroscope': ProofEntry(1.0, after, (0.1, 2.0), regimes=regimes)}
 
 
 @pytest.mark.parametrize(

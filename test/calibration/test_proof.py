@@ -1,11 +1,13 @@
 """A calibration is proven on windows that took no part, before it is handed over."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from imu_calibration.document.decision import HELPS, reason_of, worse_regimes
+from imu_calibration.document.proof_entry import RegimeErrors
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import applied_values
 from imu_calibration.effects.sensor_model import SensorModel
@@ -62,10 +64,10 @@ def test_a_good_calibration_is_proven_in_every_motion(clean):
     found = clean.calibration.proof
     assert set(found) == set(SENSORS) and clean.verdict.word is HELPS
     for entry in found.values():
-        assert entry['windows'] == sum(clean.calibration.statistics['windows'].values())
-        assert set(entry['regimes']) >= {Regime.REST, Regime.FAST, Regime.ACCELERATING}
-        for part in (entry, *entry['regimes'].values()):
-            assert part['ci95'][0] <= part['after'] / part['before'] <= part['ci95'][1] < 0.6
+        assert entry.windows == sum(clean.calibration.statistics['windows'].values())
+        assert set(entry.regimes) >= {Regime.REST, Regime.FAST, Regime.ACCELERATING}
+        for part in (entry, *entry.regimes.values()):
+            assert part.ci95[0] <= part.after / part.before <= part.ci95[1] < 0.6
 
 
 def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, tmp_path):
@@ -77,7 +79,7 @@ def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, t
     gain = late.calibration.value('gyroscope', 'matrix')[0, 0]
     assert abs(gain - true) > 2 * abs(1.0 - true)  # what has to be noticed
     assert late.verdict.decisions['gyroscope'] is not HELPS and late.exit_code == 3
-    assert late.calibration.proof['gyroscope']['delay_s'] == pytest.approx(0.012, abs=2e-3)
+    assert late.calibration.proof['gyroscope'].delay_s == pytest.approx(0.012, abs=2e-3)
     line = reason_of(late.calibration.proof['gyroscope'])
     assert (
         re.search(r'\b1\d(\.\d+)? ms\b', line)
@@ -129,10 +131,11 @@ def test_memory_does_not_grow_with_the_session(clean):
 
 def test_a_regime_that_gets_worse_is_named(clean):
     entry = clean.calibration.proof['gyroscope']
-    worse = {'before': 1.0, 'after': 1.2, 'ci95': [1.1, 1.3], 'seconds': 10.0}
-    lines = worse_regimes(entry | {'regimes': entry['regimes'] | {Regime.FAST: worse}})
+    worse = RegimeErrors(1.0, 1.2, (1.1, 1.3), seconds=10.0, unit='rad/s')
+    lines = worse_regimes(replace(entry, regimes={**entry.regimes, Regime.FAST: worse}))
     assert len(lines) == 1 and Regime.FAST in lines[0]
-    assert not worse_regimes(entry | {'regimes': {Regime.FAST: worse | {'ci95': [0.9, 1.5]}}})
+    doubtful = replace(worse, ci95=(0.9, 1.5))
+    assert not worse_regimes(replace(entry, regimes={Regime.FAST: doubtful}))
 
 
 def test_a_piece_knows_its_mean_and_how_the_input_changed():

@@ -27,12 +27,12 @@ def test_a_good_calibration_is_proven_on_poses_and_turns(session):
     hand = solve_by_hand(session, OPTIONS)
     proof = prove_by_hand(hand, session.turns)
     assert (
-        proof['accelerometer']['windows'] == 20
-        and proof['gyroscope']['unit'] == 'rad per turn'
+        proof['accelerometer'].windows == 20
+        and proof['gyroscope'].unit == 'rad per turn'
         and all(decide(entry) is HELPS for entry in proof.values())
     )
     for entry in proof.values():
-        assert entry['after'] < 0.2 * entry['before'] and entry['ci95'][1] < 0.3
+        assert entry.after < 0.2 * entry.before and entry.ci95[1] < 0.3
 
 
 def test_a_part_is_left_out_as_if_it_had_not_been_recorded(session):
@@ -69,5 +69,5 @@ def test_few_attitudes_are_left_out_one_by_one_and_six_are_too_few():
         imu, ranges, _ = simulate(4, n_poses=poses)
         data = gather_by_hand(imu, ranges)
         found = prove_by_hand(solve_by_hand(data, OPTIONS), data.turns)
-        assert found.get('accelerometer', {}).get('windows') == windows
-        assert not found or found['accelerometer']['ci95'][1] < 1.0
+        assert getattr(found.get('accelerometer'), 'windows', None) == windows
+        assert not found or found['accelerometer'].ci95[1] < 1.0

@@ -14,6 +14,7 @@ from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.units import MILLI_G
 from imu_calibration.document.calibration import surpassed_limit
 from imu_calibration.document.decision import PARAMETERS
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.verdict import _step_of, unsteady
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
@@ -123,14 +124,15 @@ def test_live_the_next_step_is_the_cause_where_no_attitude_helps():
 
 def test_the_next_step_of_an_unproven_sensor_is_that_of_its_reason():
     """Attitudes were proposed where the proof lacked rests, turns, or another sensor."""
-    helps = {'before': 1.0, 'after': 0.1, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 9}
-    proven = random_calibration(3, proof={sensor: dict(helps) for sensor in SENSORS}, decision={})
+    helps = ProofEntry(1.0, 0.1, (0.05, 0.2), unit='m/s^2', windows=9)
+    proven = random_calibration(3, proof=dict.fromkeys(SENSORS, helps), decision={})
     by_hand = replace(proven, gauge={'axes': 'accelerometer_lower_triangular'})
     near_faces = replace(
-        by_hand, proof={**proven.proof, 'accelerometer': {**helps, 'few_directions': True}}
+        by_hand,
+        proof={**proven.proof, 'accelerometer': replace(helps, few_directions=True)},
     )
     nothing = [replace(each, proof={}) for each in (proven, by_hand)]
-    diagnosed = replace(proven, proof={sensor: {**helps, 'ci95': [0.5, 1.5]} for sensor in SENSORS})
+    diagnosed = replace(proven, proof=dict.fromkeys(SENSORS, replace(helps, ci95=(0.5, 1.5))))
     of_accelerometer = [
         _step_of(each, 'accelerometer') for each in (*nothing, near_faces, diagnosed)
     ]

@@ -62,7 +62,7 @@ def test_live_a_requested_warm_up_is_that_of_the_recording(session, calibration)
     found = live.solve(pending=True).calibration
     assert found.param_names == calibration.param_names
     assert np.all(np.abs(found.values - calibration.values) <= 1e-6 * calibration.sd)
-    assert found.proof['gyroscope']['windows'] == calibration.proof['gyroscope']['windows']
+    assert found.proof['gyroscope'].windows == calibration.proof['gyroscope'].windows
 
 
 @pytest.mark.parametrize('constant', [60.0])

@@ -15,11 +15,12 @@ from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.document.decision import NO_PROOF, reason_of
 from imu_calibration.document.exports.export import find_target, loss_lines
 from imu_calibration.document.exports.loss import Loss
+from imu_calibration.document.proof_entry import ProofEntry
 
 from worlds.compensation_cases import random_calibration
 
-ENTRY = {'before': 0.2, 'after': 0.01, 'ci95': [0.03, 0.08], 'unit': 'm/s^2', 'windows': 8}
-HARMED = ENTRY | {'after': 0.3, 'ci95': [1.2, 1.8]}
+ENTRY = ProofEntry(0.2, 0.01, (0.03, 0.08), unit='m/s^2', windows=8)
+HARMED = replace(ENTRY, after=0.3, ci95=(1.2, 1.8))
 PLAIN = random_calibration(1, decision={})
 
 

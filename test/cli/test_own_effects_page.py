@@ -37,7 +37,7 @@ def test_the_commands_of_the_page_run_in_its_order(tmp_path, monkeypatch, capsys
     assert ('gyroscope', 'gyro_scale_by_force') in result.model.slices
     later = read_calibration(tmp_path / 'later')
     for sensor in ('accelerometer', 'gyroscope'):
-        assert later.proof[sensor]['earlier']['after'] > 0
+        assert later.proof[sensor].earlier.after > 0
     overlay = (tmp_path / 'overlay.mcap').read_bytes()
     for topic in (b'/overlay/gyroscope/x', b'/residual/gyroscope', b'/residual_spectrum/gyroscope'):
         assert topic in overlay

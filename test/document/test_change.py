@@ -8,6 +8,7 @@ from refusal import refused
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.change import changes_since
+from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
@@ -18,15 +19,11 @@ pytestmark = pytest.mark.usefixtures('few_candidates')
 
 def proof(unit='m/s^2', **regimes):
     """Return a proof of one sensor: regime -> (after, low, high of after / before)."""
-    return {
-        'accelerometer': {
-            'unit': unit,
-            'regimes': {
-                name: {'after': after, 'ci95': [low, high]}
-                for name, (after, low, high) in regimes.items()
-            },
-        }
+    errors = {
+        name: RegimeErrors(1.0, after, (low, high), unit=unit)
+        for name, (after, low, high) in regimes.items()
     }
+    return {'accelerometer': ProofEntry(1.0, 0.5, (0.4, 0.6), unit=unit, regimes=errors)}
 
 
 def test_the_interval_of_a_change_has_the_spread_of_both_errors():
@@ -50,13 +47,12 @@ def test_check_gives_3_when_the_error_has_changed_even_if_it_still_helps():
     assert same.exit_code == 0 and same.changes and not same.changed
     assert all(each.factor == pytest.approx(1.0, abs=0.15) for each in same.changes)
     better = {
-        sensor: entry
-        | {
-            'regimes': {
-                name: part | {'after': part['after'] / 5.0}
-                for name, part in entry['regimes'].items()
-            }
-        }
+        sensor: replace(
+            entry,
+            regimes={
+                name: replace(part, after=part.after / 5.0) for name, part in entry.regimes.items()
+            },
+        )
         for sensor, entry in calibration.proof.items()
     }
     changed = check_recording(block, replace(calibration, proof=better), table)

@@ -9,6 +9,7 @@ import copy
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -27,6 +28,7 @@ from imu_calibration.document.calibration_text import (
     from_mapping,
 )
 from imu_calibration.document.decision import decisions_text
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from msg_adapters.imu import FIELDS
@@ -61,7 +63,7 @@ WRONG = (
     'x' * 4000,
 )
 """What a field is replaced by."""
-PROOF = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
+PROOF = ProofEntry(0.1, 0.01, (0.05, 0.2), unit='m/s^2', windows=12)
 
 
 def calibration():
@@ -74,7 +76,7 @@ def calibration():
         decision={'accelerometer': 'helps', 'gyroscope': 'helps'},
         decision_reasons={'accelerometer': 'a reason', 'gyroscope': 'another'},
         notes=('a note', 'next: a step'),
-        proof={'accelerometer': PROOF, 'gyroscope': PROOF | {'unit': 'rad/s'}},
+        proof={'accelerometer': PROOF, 'gyroscope': replace(PROOF, unit='rad/s')},
         provenance={'software': '1', 'bags': [{'name': 'a', 'sha256': 'b'}]},
         undetermined=({'parameters': {'accelerometer.bias.x': 0.5}, 'needs': 'a motion'},),
     )

@@ -20,6 +20,7 @@ from imu_calibration.document.outcome import (
     parameter_count,
     shortcomings,
 )
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.trust import caveats, refused_sensors
 from imu_calibration.document.verdict import judge
 from imu_calibration.effects.sensor_model import SensorModel
@@ -27,13 +28,7 @@ from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFindi
 from imu_calibration.use_cases.inspect import RecordingSummary
 
 PROOF = {
-    sensor: {
-        'before': 1.0,
-        'after': 0.1,
-        'ci95': [0.05, 0.2],
-        'unit': unit,
-        'windows': 30,
-    }
+    sensor: ProofEntry(1.0, 0.1, (0.05, 0.2), unit=unit, windows=30)
     for sensor, unit in (('accelerometer', 'm/s^2'), ('gyroscope', 'rad/s'))
 }
 

@@ -29,14 +29,15 @@ from imu_calibration.document.decision import (
     most_cautious,
     reason_of,
 )
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD
 from msg_adapters.write import write_session
 
 from worlds.compensation_cases import random_calibration
 
-ENTRY = {'before': 0.2, 'after': 0.01, 'ci95': [0.03, 0.08], 'unit': 'm/s^2', 'windows': 8}
-INTERVALS = {HELPS: [0.03, 0.08], UNPROVEN: [0.8, 1.1], HARMS: [1.2, 1.8]}
+ENTRY = ProofEntry(0.2, 0.01, (0.03, 0.08), unit='m/s^2', windows=8)
+INTERVALS = {HELPS: (0.03, 0.08), UNPROVEN: (0.8, 1.1), HARMS: (1.2, 1.8)}
 PLAIN = random_calibration(1, decision={})
 
 
@@ -45,19 +46,21 @@ def proven(accelerometer, gyroscope, **changes):
     words = {'accelerometer': accelerometer, 'gyroscope': gyroscope}
     return replace(
         PLAIN,
-        proof={sensor: ENTRY | {'ci95': INTERVALS[word]} for sensor, word in words.items() if word},
+        proof={
+            sensor: replace(ENTRY, ci95=INTERVALS[word]) for sensor, word in words.items() if word
+        },
         **changes,
     )
 
 
 @pytest.mark.parametrize(
     ('interval', 'word'),
-    [([0.1, 0.999], HELPS), ([0.1, 1.0], UNPROVEN), ([1.0, 2.0], UNPROVEN), ([1.001, 2.0], HARMS)],
+    [((0.1, 0.999), HELPS), ((0.1, 1.0), UNPROVEN), ((1.0, 2.0), UNPROVEN), ((1.001, 2.0), HARMS)],
 )
 def test_the_decision_follows_from_the_interval(interval, word):
-    assert decide(ENTRY | {'ci95': interval}) is word
-    assert decide(ENTRY | {'ci95': interval, 'windows': 0}) is UNPROVEN and decide(None) is UNPROVEN
-    entry = ENTRY | {'ci95': interval}
+    entry = replace(ENTRY, ci95=interval)
+    assert decide(entry) is word
+    assert decide(replace(entry, windows=0)) is UNPROVEN and decide(None) is UNPROVEN
     assert (decision._cause(entry) in reason_of(entry)) == (word is not HELPS) and reason_of(
         None
     ) == NO_PROOF

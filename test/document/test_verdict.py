@@ -8,6 +8,7 @@ import pytest
 from imu_calibration.document.calibration import Calibration, parameter_rows
 from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS, UNPROVEN, WARNING
 from imu_calibration.document.outcome import exit_code
+from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.document.verdict import judge, judged, motion_misfits
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import (
@@ -22,7 +23,7 @@ MODEL = SensorModel(reference=('table_tilt',))
 NAMES = list(MODEL.param_names)
 TOLERANCES = tolerances_of(MODEL, {})
 SPIN = 'spin about the z axis'
-ENTRY = {'before': 2.0, 'after': 1.0, 'unit': 'rad/s', 'windows': 9, 'ci95': [0.4, 0.6]}
+ENTRY = ProofEntry(2.0, 1.0, (0.4, 0.6), unit='rad/s', windows=9)
 PROOF = {'accelerometer': ENTRY, 'gyroscope': ENTRY}
 
 
@@ -158,11 +159,11 @@ def test_only_residuals_with_structure_show_an_incomplete_model(
 
 def test_a_regime_in_which_the_error_grows_is_a_warning_and_leaves_the_decision():
     regimes = {
-        'turns': {'before': 1.0, 'after': 2.0, 'ci95': [1.5, 2.5]},
-        'rest': {'before': 2.0, 'after': 1.0, 'ci95': [0.4, 0.6]},
+        'turns': RegimeErrors(1.0, 2.0, (1.5, 2.5), unit='rad/s'),
+        'rest': RegimeErrors(2.0, 1.0, (0.4, 0.6), unit='rad/s'),
     }
     found = judge(
-        calibration(proof=PROOF | {'gyroscope': PROOF['gyroscope'] | {'regimes': regimes}}),
+        calibration(proof=PROOF | {'gyroscope': replace(ENTRY, regimes=regimes)}),
         TOLERANCES,
     )
     assert found.decisions['gyroscope'] is HELPS

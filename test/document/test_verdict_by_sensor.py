@@ -19,6 +19,7 @@ from imu_calibration.document.calibration_text import calibration_from_text, cal
 from imu_calibration.document.decision import HARMS as HARMFUL
 from imu_calibration.document.decision import HELPS, UNPROVEN, decisions_text
 from imu_calibration.document.exports.export import export, find_target
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.kinematics.table import Table
 from msg_adapters.bag import open_recording
@@ -32,22 +33,10 @@ pytestmark = pytest.mark.usefixtures('few_candidates')
 
 VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
 PROOF = {
-    'accelerometer': {
-        'before': 0.2,
-        'after': 0.01,
-        'ci95': [0.03, 0.08],
-        'unit': 'm/s^2',
-        'windows': 8,
-    },
-    'gyroscope': {
-        'before': 0.02,
-        'after': 0.001,
-        'ci95': [0.03, 0.08],
-        'unit': 'rad/s',
-        'windows': 8,
-    },
+    'accelerometer': ProofEntry(0.2, 0.01, (0.03, 0.08), unit='m/s^2', windows=8),
+    'gyroscope': ProofEntry(0.02, 0.001, (0.03, 0.08), unit='rad/s', windows=8),
 }
-HARMS = {'after': 0.3, 'ci95': [1.2, 1.8]}
+HARMS = {'after': 0.3, 'ci95': (1.2, 1.8)}
 GOOD = random_calibration(1, proof=PROOF)
 
 
@@ -71,7 +60,7 @@ def yaw(block):
 
 def harmed(sensor, **changes):
     """A calibration that is good but for the proof of one sensor."""
-    return replace(GOOD, proof=PROOF | {sensor: PROOF[sensor] | HARMS}, **changes)
+    return replace(GOOD, proof=PROOF | {sensor: replace(PROOF[sensor], **HARMS)}, **changes)
 
 
 def test_each_sensor_has_its_own_decision(yaw):
@@ -259,10 +248,8 @@ def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     here = imu.check(second, found.calibration, table)
     assert (
         list(here.helped) == ['accelerometer', 'gyroscope']
-        and here.proof['gyroscope']['after'] < 0.6 * here.proof['gyroscope']['before']
+        and here.proof['gyroscope'].after < 0.6 * here.proof['gyroscope'].before
     )
     left = imu.check(second, used.calibration, table).proof
-    assert left['accelerometer']['after'] == pytest.approx(
-        left['accelerometer']['before'], rel=0.02
-    )
-    assert left['gyroscope']['after'] == pytest.approx(here.proof['gyroscope']['after'], rel=0.02)
+    assert left['accelerometer'].after == pytest.approx(left['accelerometer'].before, rel=0.02)
+    assert left['gyroscope'].after == pytest.approx(here.proof['gyroscope'].after, rel=0.02)

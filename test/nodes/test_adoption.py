@@ -9,6 +9,7 @@ from refusal import refused
 from imu_calibration.compensation.plausible_change import implausible_change
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.nodes import adoption
 from imu_calibration.nodes.adoption import CompensatorSettings, adopt, again
 
@@ -40,22 +41,21 @@ def test_another_sensor_does_not_take_the_place_of_this_one():
         )
 
 
-HELPS = {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
-UNPROVEN, HARMS = ({'after': 0.1, 'ci95': [0.8, 1.2]}, {'after': 0.2, 'ci95': [1.5, 2.5]})
+HELPS = ProofEntry(0.1, 0.01, (0.05, 0.2), unit='m/s^2', windows=12)
+UNPROVEN = replace(HELPS, after=0.1, ci95=(0.8, 1.2))
+HARMS = replace(HELPS, after=0.2, ci95=(1.5, 2.5))
 
 
 def test_an_unproven_sensor_needs_consent_and_a_harmful_one_is_never_corrected():
     insisting = replace(SETTINGS, anyway=True)
     for change, excluded in ((UNPROVEN, set()), (HARMS, {'accelerometer'})):
         text = calibration_to_text(
-            replace(GOOD, proof={'accelerometer': HELPS | change, 'gyroscope': HELPS})
+            replace(GOOD, proof={'accelerometer': change, 'gyroscope': HELPS})
         )
         assert adopt(text, 'a file', SETTINGS, frames=None).used.refused.keys() == {'accelerometer'}
         found = adopt(text, 'a file', insisting, frames=None)
         assert found.used.refused.keys() == excluded and len(found.caveats) == 1
-    both = calibration_to_text(
-        replace(GOOD, proof={'accelerometer': HELPS | HARMS, 'gyroscope': HELPS | HARMS})
-    )
+    both = calibration_to_text(replace(GOOD, proof={'accelerometer': HARMS, 'gyroscope': HARMS}))
     for settings in (SETTINGS, insisting):
         with refused(DocumentError, 'no_sensor_helps') as refusal:
             adopt(both, 'a file', settings, frames=None)
@@ -63,9 +63,7 @@ def test_an_unproven_sensor_needs_consent_and_a_harmful_one_is_never_corrected()
 
 
 def test_a_refused_sensor_is_not_corrected_and_the_other_one_is():
-    text = calibration_to_text(
-        replace(GOOD, proof={'accelerometer': HELPS | UNPROVEN, 'gyroscope': HELPS})
-    )
+    text = calibration_to_text(replace(GOOD, proof={'accelerometer': UNPROVEN, 'gyroscope': HELPS}))
     adopted, whole = (
         adopt(text, 'a file', replace(SETTINGS, anyway=flag), frames=None) for flag in (False, True)
     )

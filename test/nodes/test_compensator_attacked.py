@@ -15,6 +15,7 @@ from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.document.calibration_text import calibration_to_text
+from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.effects.base import Role
 from imu_calibration.preprocessing.stamping import COUNTED, REGULAR, StampLine
 from msg_adapters.write import encode_imu
@@ -39,12 +40,12 @@ from ros.live_station import Station  # noqa: E402
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures('executor_only')]
 OK, WARN, ERROR = range(3)
 PROOF = {
-    sensor: {'before': 0.1, 'after': 0.01, 'ci95': [0.05, 0.2], 'unit': 'm/s^2', 'windows': 12}
+    sensor: ProofEntry(0.1, 0.01, (0.05, 0.2), unit='m/s^2', windows=12)
     for sensor in ('accelerometer', 'gyroscope')
 }
 GOOD, OTHER = (random_calibration(seed, proof=PROOF, decision={}) for seed in (1, 2))
 GOOD_TEXT, OTHER_TEXT = map(calibration_to_text, (GOOD, OTHER))
-WORSE = {sensor: part | {'after': 0.2, 'ci95': [1.5, 2.5]} for sensor, part in PROOF.items()}
+WORSE = {sensor: replace(part, after=0.2, ci95=(1.5, 2.5)) for sensor, part in PROOF.items()}
 MESSAGES = [
     row.tobytes()
     for row in encode_imu(

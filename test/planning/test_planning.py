@@ -188,7 +188,7 @@ def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_di
             if wanted
         } == {'determined'}
         assert found.decision == {'accelerometer': 'helps', 'gyroscope': 'helps'}
-        assert found.proof['accelerometer']['windows'] >= 8
+        assert found.proof['accelerometer'].windows >= 8
 
 
 def test_the_sd_of_a_plan_stays_below_the_tolerance_by_the_scatter_of_the_noise_estimate(

@@ -88,7 +88,7 @@ def test_check_and_compensate_note_the_part(clean, usual):
     checked = check_by_hand(lambda: iter([SampleBlock(bad)]), usual.calibration, OPTIONS)
     good = check_by_hand(lambda: iter([SampleBlock(clean)]), usual.calibration, OPTIONS)
     assert (checked.exit_code, good.exit_code) == (3, 0)
-    assert checked.proof['accelerometer']['after'] < 2 * good.proof['accelerometer']['after']
+    assert checked.proof['accelerometer'].after < 2 * good.proof['accelerometer'].after
     corrected = compensate_recording(bad, usual.calibration)
     assert corrected.exit_code == 3 and corrected.frozen == pytest.approx(16 * 90, rel=0.05)
     unharmed = compensate_recording(clean, usual.calibration)

@@ -342,8 +342,7 @@ def test_what_was_left_out_does_not_come_back_in_the_proof():
     )
     assert found.hand.statistics['left_out'] == {'contradicted by gravity': 1}
     assert (
-        found.calibration.proof['gyroscope']['after']
-        < 2 * clean.calibration.proof['gyroscope']['after']
+        found.calibration.proof['gyroscope'].after < 2 * clean.calibration.proof['gyroscope'].after
     )
 
 

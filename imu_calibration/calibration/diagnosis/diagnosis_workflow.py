@@ -290,13 +290,13 @@ def helpful_formulas(
             continue
         if effect.sensor in extended.statistics.get('least_squares', ()):
             continue
-        if after['after'] > CLEARLY_BETTER * before['after']:
+        if after.after > CLEARLY_BETTER * before.after:
             continue
-        known = before['regimes']
+        known = before.regimes
         grown = [
             name
-            for name, entry in after['regimes'].items()
-            if name in known and entry['after'] > HARM * known[name]['after']
+            for name, errors in after.regimes.items()
+            if name in known and errors.after > HARM * known[name].after
         ]
         if not grown:
             helpful.append(effect)

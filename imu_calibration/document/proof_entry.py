@@ -1,0 +1,99 @@
+"""Errors of readings on held-out data before and after a calibration, by regime of motion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
+
+Entry = TypeVar('Entry', bound='RegimeErrors')
+
+
+@dataclass(frozen=True)
+class RegimeErrors:
+    """Errors of readings before and after, in all motions or in one regime."""
+
+    before: float
+    """Rms error per component with nominal parameters, in `unit`."""
+    after: float
+    """Rms error per component with the calibration, in `unit`."""
+    ci95: tuple[float, float]
+    """95 % interval of after / before, from resamples of complete blocks."""
+    seconds: float | None = None
+    """Length of the data, s; None where poses or turns are counted."""
+    unit: str = ''
+    """Unit of the errors."""
+    windows: int | None = None
+    """Number of windows, poses or turns; None where only the length is known."""
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the entry of a document: the fields that are not at their default."""
+        found: dict[str, Any] = {}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if value is not None and value is not False and value != '':
+                found[each.name] = list(value) if isinstance(value, tuple) else value
+        return found
+
+    @classmethod
+    def from_mapping(cls: type[Entry], entry: Mapping[str, Any]) -> Entry:
+        """Return the errors that an entry of a document describes; further keys are ignored."""
+        known = {each.name: entry[each.name] for each in fields(cls) if each.name in entry}
+        known['ci95'] = tuple(known['ci95'])
+        return cls(**known)
+
+
+@dataclass(frozen=True)
+class EarlierErrors:
+    """Error of an earlier calibration on the same data."""
+
+    after: float
+    """Rms error per component, in the unit of the entry."""
+    ci95: tuple[float, float]
+    """95 % interval of after / before."""
+
+
+@dataclass(frozen=True)
+class ProofEntry(RegimeErrors):
+    """Errors of one sensor on held-out data."""
+
+    delay_s: float | None = None
+    """Delay of the readings that the model does not include, s; None where it is unknown."""
+    delay_explains: float | None = None
+    """Share of the squared error after that this delay explains."""
+    regimes: Mapping[str, RegimeErrors] = field(default_factory=dict)
+    """Regime of motion -> its errors; a regime with too few windows is left out."""
+    one_attitude: bool = False
+    """Whether all held-out windows of the accelerometer have the same attitude."""
+    few_directions: bool = False
+    """Whether all held-out rests lie near the axes of the sensor."""
+    earlier: EarlierErrors | None = None
+    """Error of an earlier calibration, where it was given."""
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the entry of a document."""
+        found = super().to_mapping()
+        del found['regimes']
+        if self.regimes:
+            found['regimes'] = {}
+            for name, errors in self.regimes.items():
+                part = errors.to_mapping()
+                if errors.unit == self.unit:
+                    part.pop('unit', None)
+                found['regimes'][str(name)] = part
+        if self.earlier is not None:
+            found['earlier'] = {'after': self.earlier.after, 'ci95': list(self.earlier.ci95)}
+        return found
+
+    @classmethod
+    def from_mapping(cls, entry: Mapping[str, Any]) -> 'ProofEntry':
+        """Return the errors that an entry of a document describes; further keys are ignored."""
+        regimes = {}
+        for name, part in (entry.get('regimes') or {}).items():
+            regimes[name] = RegimeErrors.from_mapping({'unit': entry['unit'], **part})
+        earlier = entry.get('earlier')
+        if earlier is not None:
+            earlier = EarlierErrors(earlier['after'], tuple(earlier['ci95']))
+        return super().from_mapping({**entry, 'regimes': regimes, 'earlier': earlier})
+
+
+Proof = Mapping[str, ProofEntry]
+"""Sensor -> its errors on held-out data; a sensor without held-out data is left out."""
