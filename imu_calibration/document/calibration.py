@@ -34,7 +34,7 @@ from imu_calibration.document.decision import (
     most_cautious,
 )
 from imu_calibration.document.proof_entry import Proof
-from imu_calibration.effects.base import SECTIONS, SENSORS, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import (
     COMMON_SCALE,
@@ -279,7 +279,7 @@ class Calibration:
             rate_s = self.readings.gyroscope.convert(np.asarray(rate_s, float))
         return compensate_readings(self, samples, rate_s, time=time, temperature_c=temperature_c)
 
-    def __repr__(self):
+    def __repr__(self) -> str:
         known = list(self.requested.values())
         counts = ', '.join(
             f'{known.count(status)} {status}' for status in Status if status in known
@@ -289,7 +289,7 @@ class Calibration:
             f' {counts}>'
         )
 
-    def __str__(self):
+    def __str__(self) -> str:
         rows = [PARAMETER_HEADINGS, *parameter_rows(self)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         aligned = (
@@ -301,7 +301,7 @@ class Calibration:
         )
         return '\n'.join([repr(self), *map(str.rstrip, aligned)])
 
-    def _repr_html_(self):
+    def _repr_html_(self) -> str:
         def row(cells: tuple[str, ...], tag: str) -> str:
             style = [
                 f' style="text-align:{"right" if heading in NUMBER_COLUMNS else "left"}"'
@@ -395,7 +395,7 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     )
 
 
-def _stays(effect, sensors):
+def _stays(effect: Effect, sensors: Sequence[str]) -> bool:
     if effect.sensor in sensors:
         return effect.role in (Role.OFFSET, Role.LINEAR, Role.LIMIT)
     return effect.sensor == 'reference' or not any(

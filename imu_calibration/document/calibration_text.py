@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration, with_nominal
 from imu_calibration.document.decision import HARMS, SensorDecision
 from imu_calibration.document.proof_entry import ProofEntry
-from imu_calibration.effects.base import SECTIONS, SENSORS, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import Status
@@ -38,41 +38,41 @@ semidefinite.
 """
 
 
-def _is_number(value, low=-MAX_VALUE, high=MAX_VALUE):
+def _is_number(value: Any, low: float = -MAX_VALUE, high: float = MAX_VALUE) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
 
 
-def _is_size(value):
+def _is_size(value: Any) -> bool:
     return _is_number(value, 0.0)
 
 
-def _is_count(value):
+def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 2**62
 
 
-def _is_text(value):
+def _is_text(value: Any) -> bool:
     return isinstance(value, str)
 
 
-def _is_list_of(kind, length=None):
+def _is_list_of(kind: Callable[[Any], bool], length: int | None = None) -> Callable[[Any], bool]:
     return lambda value: (
         isinstance(value, (list, tuple)) and length in (None, len(value)) and all(map(kind, value))
     )
 
 
-def _is_range(value, kind=_is_number):
+def _is_range(value: Any, kind: Callable[[Any], bool] = _is_number) -> bool:
     return _is_list_of(kind, 2)(value) and value[0] <= value[1]
 
 
-def _is_temperature_range(value):
+def _is_temperature_range(value: Any) -> bool:
     return _is_range(value) and RANGE_C[0] <= value[0] and value[1] <= RANGE_C[1]
 
 
-def _or_none(kind):
+def _or_none(kind: Callable[[Any], bool]) -> Callable[[Any], bool]:
     return lambda value: value is None or kind(value)
 
 
-def _is_direction(value):
+def _is_direction(value: Any) -> bool:
     weights = value.get('parameters') if isinstance(value, dict) else None
     return (
         isinstance(weights, dict)
@@ -81,7 +81,7 @@ def _is_direction(value):
     )
 
 
-def _is_joint_errors(value):
+def _is_joint_errors(value: Any) -> bool:
     return isinstance(value, dict) and all(
         _is_list_of(_is_text)(value.get(name))
         and len(set(value[name])) == len(value[name]) <= MAX_DOCUMENT_JOINTS
@@ -251,7 +251,7 @@ def check_numbers(calibration: Calibration) -> Calibration:
     return _without_ill_conditioned(calibration)
 
 
-def _without_ill_conditioned(calibration):
+def _without_ill_conditioned(calibration: Calibration) -> Calibration:
     condition = {
         sensor: float(np.linalg.cond(calibration.of(sensor, Role.LINEAR))) for sensor in SENSORS
     }
@@ -274,7 +274,7 @@ def _without_ill_conditioned(calibration):
     )
 
 
-def _check_covariance(covariance):
+def _check_covariance(covariance: np.ndarray) -> None:
     variance = np.diag(covariance)
     if np.any(variance < 0):
         raise DocumentError(
@@ -362,7 +362,9 @@ def parts_of(document: Mapping) -> dict[str, Any]:
     }
 
 
-def _model(document):
+def _model(
+    document: Mapping[str, Any],
+) -> tuple[SensorModel, dict[tuple[str, str], dict[str, Any]]]:
     """Return (SensorModel, {(sensor, effect): entry of the document})."""
     joint_names = JointNames.of(document.get('joint_names', JOINTS), document.get('joint_errors'))
     catalogue = CATALOGUE.with_definitions(document.get('effects') or {})
@@ -396,7 +398,7 @@ def _model(document):
     )
 
 
-def _shaped(value, effect):
+def _shaped(value: Any, effect: Effect) -> np.ndarray:
     array = np.asarray(value, float)
     if array.shape != effect.shape or np.asarray(value).dtype == bool:
         raise DocumentError(
@@ -407,7 +409,7 @@ def _shaped(value, effect):
     return array.ravel()
 
 
-def _statuses(value, effect):
+def _statuses(value: Any, effect: Effect) -> Iterator[Status]:
     words = np.array(value, dtype=object).reshape(effect.size).tolist()
     if any(word not in tuple(Status) for word in words):
         raise DocumentError(
@@ -417,7 +419,7 @@ def _statuses(value, effect):
     return map(Status, words)
 
 
-def _check_unit(found, effect):
+def _check_unit(found: Any, effect: Effect) -> None:
     wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
     if found is not None and found != wanted:
         raise DocumentError(
@@ -427,7 +429,9 @@ def _check_unit(found, effect):
         )
 
 
-def _centre(model, entries):
+def _centre(
+    model: SensorModel, entries: Mapping[tuple[str, str], Mapping[str, Any]]
+) -> dict[str, np.ndarray]:
     """Return column group -> the value from which its columns are measured."""
     known = {group.name: group for e in model.effects for group in e.groups}
     found = {
@@ -449,7 +453,11 @@ def _centre(model, entries):
     return found
 
 
-def _covariance(given, model, entries):
+def _covariance(
+    given: Mapping[str, Any] | None,
+    model: SensorModel,
+    entries: Mapping[tuple[str, str], Mapping[str, Any]],
+) -> np.ndarray:
     """
     Return the covariance in the model's order.
 
@@ -548,7 +556,7 @@ def calibration_mapping(calibration: Calibration) -> dict:
     return document
 
 
-def _section(calibration, section):
+def _section(calibration: Calibration, section: str) -> dict[str, Any]:
     effects = [effect for effect in calibration.model.effects if effect.section == section]
     entries: dict[str, Any] = {'effects': [effect.name for effect in effects]}
     for effect in effects:
@@ -613,7 +621,7 @@ def from_mapping(document: Any) -> Calibration:
     return check_numbers(calibration)
 
 
-def _check_format(found):
+def _check_format(found: Any) -> None:
     name, _, number = str(found).partition('/')
     if name != 'imu_calibration' or not number.isdigit():
         raise DocumentError(

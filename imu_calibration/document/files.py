@@ -72,7 +72,7 @@ def read_bytes(path: str | PathLike[str], what: str) -> bytes:
         ) from error
 
 
-def _why(error):
+def _why(error: Exception) -> str:
     return getattr(error, 'strerror', None) or str(error) or type(error).__name__
 
 
@@ -262,7 +262,7 @@ HASHED_PIECE_BYTES = 1 << 20
 
 
 @lru_cache
-def _hash_of_unchanged(files):
+def _hash_of_unchanged(files: tuple[tuple[Path, int, int, int]]) -> str:
     """
     Return the hash of (path, size, time of the last change, inode) of each file.
 
@@ -377,7 +377,7 @@ def _ending(path: Path) -> str:
 
 
 @contextmanager
-def _beside(path):
+def _beside(path: Path) -> Iterator[Path]:
     """
     Yield an unpredictable name in the same folder for a new file.
 

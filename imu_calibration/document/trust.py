@@ -122,7 +122,7 @@ def uncorrected_on_table(
     return Uncorrected(centre, tuple(sizes))
 
 
-def _moved(effect, columns, change):
+def _moved(effect: Effect, columns: np.ndarray, change: np.ndarray) -> np.ndarray:
     """
     Return columns at parameters that differ by `change` from the point of the columns.
 
@@ -227,7 +227,7 @@ def columns_at(
     return {group.name: group.columns(ref, model.full_point()) for group in effect.groups}
 
 
-def _size(effect, rms, at_end):
+def _size(effect: Effect, rms: np.ndarray, at_end: bool) -> dict[str, Any]:
     return {
         'effect': effect.name,
         'sensor': effect.sensor,
@@ -345,7 +345,7 @@ def refused_sensors(
     return refused
 
 
-def _mostly_undetermined(calibration, sensor):
+def _mostly_undetermined(calibration: Calibration, sensor: str) -> str:
     """Return why an unproven sensor is not applied even with consent; '' where it may be."""
     status = [
         known
@@ -361,7 +361,7 @@ def _mostly_undetermined(calibration, sensor):
     )
 
 
-def _text(calibration, sensor):
+def _text(calibration: Calibration, sensor: str) -> str:
     """Return the decision on a sensor with its reason."""
     return (
         f'{calibration.decisions[sensor]}:'

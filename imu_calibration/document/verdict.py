@@ -1,6 +1,6 @@
 """The verdict of a calibration and its notes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from imu_calibration.document.decision import (
     UNPROVEN,
     WARNING,
     Reason,
+    SensorDecision,
     Verdict,
     decide,
     lines_of,
@@ -39,7 +40,12 @@ from imu_calibration.document.decision import (
     same_directions,
     worse_regimes,
 )
-from imu_calibration.document.outcome import dropped_of, is_complete, parameter_count
+from imu_calibration.document.outcome import (
+    ParameterCount,
+    dropped_of,
+    is_complete,
+    parameter_count,
+)
 from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.rest_noise import moved_at_rest
 from imu_calibration.document.trust import uncorrected_lines
@@ -83,7 +89,7 @@ LOST_SHARE = 0.05
 """A warning is issued when more than this share of the samples is lost."""
 
 
-def _doubtful_scales(calibration):
+def _doubtful_scales(calibration: Calibration) -> list[Reason]:
     """Return a warning for each sensor with a scale factor that a wrong unit may explain."""
     return [
         Reason(
@@ -97,7 +103,7 @@ def _doubtful_scales(calibration):
     ]
 
 
-def _worse(calibration):
+def _worse(calibration: Calibration) -> list[Reason]:
     return [
         Reason(WARNING, f'{sensor}: {line}', 'find the cause', key='diagnose', sensors=(sensor,))
         for sensor, entry in calibration.proof.items()
@@ -105,7 +111,7 @@ def _worse(calibration):
     ]
 
 
-def _unused_rests(calibration):
+def _unused_rests(calibration: Calibration) -> list[Reason]:
     """
     Return a warning about rests without any static window.
 
@@ -169,7 +175,7 @@ recording.
 """
 
 
-def _adopted(calibration):
+def _adopted(calibration: Calibration) -> list[Reason]:
     """Return notes on the changes of the model by the recording."""
     names: dict[str, Any] = {}
     for change in CHANGES:
@@ -187,7 +193,7 @@ def _adopted(calibration):
     ]
 
 
-def _unexplained(calibration):
+def _unexplained(calibration: Calibration) -> list[Reason]:
     """Return notes on the unexplained residuals of the search, by the test of diagnoses."""
     return [
         Reason(
@@ -209,7 +215,7 @@ def unexplained_text(sensor: str, rms: float, unit: str | None = None) -> str:
     )
 
 
-def _least_squares(calibration):
+def _least_squares(calibration: Calibration) -> list[Reason]:
     """Return a note for each sensor with values by plain least squares."""
     reasons = []
     for sensor, entry in (calibration.statistics.get('least_squares') or {}).items():
@@ -230,7 +236,7 @@ def _least_squares(calibration):
     return reasons
 
 
-def _jitter(calibration):
+def _jitter(calibration: Calibration) -> list[Reason]:
     """Return a note on independent errors of the stamps."""
     found = calibration.statistics.get('stamp_jitter')
     return (
@@ -240,7 +246,7 @@ def _jitter(calibration):
     )
 
 
-def _with_size(calibration, name):
+def _with_size(calibration: Calibration, name: str) -> str:
     """Return an effect with its most significant parameter, in common units."""
     effect = next((effect for effect in calibration.model.effects if effect.name == name), None)
     if effect is None:
@@ -343,7 +349,7 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
     return reasons
 
 
-def _misfit(calibration, sensor):
+def _misfit(calibration: Calibration, sensor: str) -> float:
     """Return the scatter of window means that the model may cause, in the unit of the sensor."""
     if any(sensor in reason.sensors for reason in _strange_causes(calibration)):
         return np.inf
@@ -386,7 +392,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
     return reasons
 
 
-def _smallest_share(calibration, sensor):
+def _smallest_share(calibration: Calibration, sensor: str) -> float:
     """
     Return the lower limit of a scatter as a share of its estimate.
 
@@ -400,7 +406,7 @@ def _smallest_share(calibration, sensor):
     return float(np.sqrt(dof / chdtri(dof, SCATTER_P_VALUE))) if dof > 0 else 0.0
 
 
-def _left_out(calibration):
+def _left_out(calibration: Calibration) -> list[Reason]:
     """Return notes on windows that are inconsistent with the remaining windows."""
     notes = []
     for sensor in SENSORS:
@@ -423,7 +429,7 @@ def _left_out(calibration):
     return notes
 
 
-def _lost(calibration):
+def _lost(calibration: Calibration) -> list[Reason]:
     dropped = dropped_of(calibration)[0]
     if not dropped:
         return []
@@ -511,7 +517,7 @@ def judged(calibration: Calibration, tolerances: np.ndarray) -> Calibration:
     )
 
 
-def _absent(calibration):
+def _absent(calibration: Calibration) -> list[Reason]:
     unusable = calibration.statistics.get('unusable_sensors') or {}
     reasons = []
     for sensor in calibration.absent:
@@ -527,7 +533,7 @@ def _absent(calibration):
     return reasons
 
 
-def _decided(calibration, sensor, word):
+def _decided(calibration: Calibration, sensor: str, word: SensorDecision) -> Reason:
     step, key = ('', None) if word is HELPS else _step_of(calibration, sensor)
     return Reason(
         DECISION,
@@ -538,7 +544,7 @@ def _decided(calibration, sensor, word):
     )
 
 
-def _step_of(calibration, sensor):
+def _step_of(calibration: Calibration, sensor: str) -> tuple[str, str | None]:
     """Return (next step, its key) for a sensor that the calibration does not certainly help."""
     entry, by_hand = calibration.proof.get(sensor), calibration.gauge.get('axes') == HAND_AXES
     # Values that are refused have their own cause, and no measurement of their error is missing.
@@ -567,7 +573,7 @@ def _step_of(calibration, sensor):
     return 'find the cause', 'diagnose'
 
 
-def _decisions(calibration):
+def _decisions(calibration: Calibration) -> dict[str, SensorDecision]:
     """Return sensor -> decision; at best UNPROVEN for an uncertain clock or refused values."""
     found = {}
     for sensor in calibration.sensors:
@@ -585,7 +591,7 @@ def _decisions(calibration):
     return found
 
 
-def _undecided_motion(calibration, sensor):
+def _undecided_motion(calibration: Calibration, sensor: str) -> str:
     """
     Return why a smaller error on held-out data proves nothing; '' where it does.
 
@@ -600,7 +606,7 @@ def _undecided_motion(calibration, sensor):
     return ''
 
 
-def _held_out_motions(calibration, sensor):
+def _held_out_motions(calibration: Calibration, sensor: str) -> str:
     """
     Return that held-out data prove the recorded motions only; '' if they show each parameter.
 
@@ -618,7 +624,7 @@ def _held_out_motions(calibration, sensor):
     return f'; in motions as recorded, which do not show {n_unseen} of its {len(own)} parameters'
 
 
-def _reason(calibration, sensor):
+def _reason(calibration: Calibration, sensor: str) -> str:
     more = (
         '; unproven, because stamps that are late by a period of this motion without rests would'
         ' give the same errors'
@@ -632,7 +638,7 @@ def _reason(calibration, sensor):
     return reason
 
 
-def _periodic(calibration, sensor):
+def _periodic(calibration: Calibration, sensor: str) -> bool:
     """
     Return whether held-out windows may repeat an error of the clock.
 
@@ -643,7 +649,7 @@ def _periodic(calibration, sensor):
     )
 
 
-def _parameters(count, limiting, *, complete):
+def _parameters(count: ParameterCount, limiting: tuple[str, float], *, complete: bool) -> Reason:
     name, share = limiting
     limit = f'; limiting: {name}, its sd is {share:.2g} of its tolerance' if name else ''
     return Reason(
@@ -653,7 +659,7 @@ def _parameters(count, limiting, *, complete):
     )
 
 
-def _implausible(calibration):
+def _implausible(calibration: Calibration) -> list[Reason]:
     return [
         Reason(
             WARNING,
@@ -666,7 +672,7 @@ def _implausible(calibration):
     ]
 
 
-def _whose(sections):
+def _whose(sections: Iterable[str]) -> tuple[str, ...]:
     """
     Return the sensors that something of these sections concerns; table and clock concern both.
     """
@@ -676,7 +682,7 @@ def _whose(sections):
     )
 
 
-def _strange_causes(calibration):
+def _strange_causes(calibration: Calibration) -> list[Reason]:
     """Return reasons why a known cause is not in the model."""
     found = calibration.statistics.get('implausible') or {}
     catalogue = {
@@ -696,7 +702,7 @@ def _strange_causes(calibration):
     ]
 
 
-def _blind(calibration):
+def _blind(calibration: Calibration) -> list[Reason]:
     reasons = []
     for sensor in calibration.sensors:
         own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
@@ -719,7 +725,7 @@ def _blind(calibration):
     return reasons
 
 
-def _needs_of(calibration, sensor):
+def _needs_of(calibration: Calibration, sensor: str) -> list[str]:
     """Return what the undetermined parameters of a sensor need."""
     needs = []
     for direction in calibration.undetermined:
@@ -728,7 +734,7 @@ def _needs_of(calibration, sensor):
     return needs
 
 
-def _moved(calibration):
+def _moved(calibration: Calibration) -> list[Reason]:
     """Return a warning for each sensor that moved where it was held still."""
     reasons = []
     for sensor in calibration.sensors:
@@ -738,7 +744,7 @@ def _moved(calibration):
     return reasons
 
 
-def _undetermined(calibration):
+def _undetermined(calibration: Calibration) -> list[Reason]:
     reasons = []
     for status, text in (
         (Status.WEAK, 'sd above the tolerance'),
@@ -769,7 +775,7 @@ def _undetermined(calibration):
     return reasons
 
 
-def _by_need(calibration, names):
+def _by_need(calibration: Calibration, names: Sequence[str]) -> dict[str, list[str]]:
     """
     Return {motion: names}: each name with the motion of the weak direction in which it weighs most.
     """

@@ -8,6 +8,7 @@ import re
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -56,7 +57,7 @@ class Capability:
         return next(effect for effect in CATALOGUE.effects().values() if self.covers(effect))
 
 
-def _both(**kind) -> tuple[Capability, ...]:
+def _both(**kind: Any) -> tuple[Capability, ...]:
     return tuple(Capability(sensor, **kind) for sensor in SENSORS)
 
 
@@ -80,7 +81,7 @@ def capability_of(effect: Effect, capabilities: tuple[Capability, ...]) -> Capab
     return next((capability for capability in capabilities if capability.covers(effect)), None)
 
 
-def _zeros(*shape):
+def _zeros(*shape: int) -> Any:
     return field(default_factory=lambda: {sensor: np.zeros(shape) for sensor in SENSORS})
 
 

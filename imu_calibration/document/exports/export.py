@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
+from typing import Any
 
 import numpy as np
 
@@ -163,7 +164,9 @@ def placed_numbers(calibration: Calibration, target: Target) -> tuple[Placement,
     return placement, target.numbers(calibration_moved(held, placement))
 
 
-def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, list[str]]:
+def _noise_numbers(
+    calibration: Calibration, target: Target, figures: NoiseFigures | None, rate: float | None
+) -> tuple[Numbers | None, list[str]]:
     """Return (noise in the target's terms or None, notes on unknown figures)."""
     if target.noise is None:
         return None, []
@@ -194,7 +197,7 @@ def _noise_numbers(calibration, target, figures, rate) -> tuple[Numbers | None, 
     ]
 
 
-def _require_rest_for_walk(figures):
+def _require_rest_for_walk(figures: NoiseFigures) -> None:
     """Refuse the random walk of a rest in which none can be seen; imported figures have no rest."""
     seconds = figures.recording.get('seconds_at_rest')
     if seconds is None or seconds >= MIN_WALK_REST:
@@ -208,7 +211,9 @@ def _require_rest_for_walk(figures):
     )
 
 
-def _noise_of(calibration, figures, rate) -> Noise | None:
+def _noise_of(
+    calibration: Calibration, figures: NoiseFigures | None, rate: float | None
+) -> Noise | None:
     if figures is not None:
         figures.require_both_sensors('record both sensors, or export without it')
         accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
@@ -234,7 +239,7 @@ def _noise_of(calibration, figures, rate) -> Noise | None:
     return Noise(accelerometer, gyroscope, rate, walk_known=False)
 
 
-def _placement_lines(calibration, target, placement) -> list[str]:
+def _placement_lines(calibration: Calibration, target: Target, placement: Placement) -> list[str]:
     """Describe the frame of the numbers relative to the sensor frame."""
     name = calibration.frame_id or UNNAMED
     if target.only_noise:
@@ -262,7 +267,7 @@ def _placement_lines(calibration, target, placement) -> list[str]:
     ]
 
 
-def _axis(row):
+def _axis(row: np.ndarray) -> str:
     """Return the axis of the source, with its sign, that a row of a signed permutation selects."""
     index = int(np.argmax(np.abs(row)))
     if row[index] < 0:
@@ -270,7 +275,9 @@ def _axis(row):
     return 'xyz'[index]
 
 
-def _worked_sample(target, numbers, placement, calibration) -> list[str]:
+def _worked_sample(
+    target: Target, numbers: dict[str, Any], placement: Placement, calibration: Calibration
+) -> list[str]:
     """Show one reading before and after the target's formula."""
     if target.whole or target.only_noise or target.estimates:
         return []

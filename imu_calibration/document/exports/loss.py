@@ -17,6 +17,7 @@ from imu_calibration.document.calibration import UNKNOWN_SD, Calibration
 from imu_calibration.document.calibration_text import check_numbers, from_mapping
 from imu_calibration.document.decision import UNPROVEN
 from imu_calibration.document.exports import affine
+from imu_calibration.document.exports.affine import Capability
 from imu_calibration.document.exports.target import Numbers, Read, Readings, Target
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.forward_equations import sensor_output
@@ -242,7 +243,12 @@ def loss_of(
     )
 
 
-def _lost(calibration, effect, holds, motion):
+def _lost(
+    calibration: Calibration,
+    effect: Effect,
+    holds: tuple[Capability, ...],
+    motion: TrialMotion,
+) -> LostEffect | None:
     """
     Return the part of the readings due to the part of an effect that is not represented.
 
@@ -259,7 +265,7 @@ def _lost(calibration, effect, holds, motion):
     return LostEffect(effect, capability is not None, _rms(change[0] - change[1]))
 
 
-def _rms(values):
+def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 

@@ -4,7 +4,7 @@ Target of an export: representable effects, frames, formula, file; text that it 
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -133,7 +133,7 @@ def read_parameters(content: bytes, what: str) -> dict[str, float]:
     return found
 
 
-def vector_of(found: dict[str, float], name: str, missing: float = 0.0) -> np.ndarray:
+def vector_of(found: Mapping[str, float], name: str, missing: float = 0.0) -> np.ndarray:
     """
     Return the parameters of the three axes, whose letter replaces ``*`` in the name, shape (3,).
     """

@@ -15,6 +15,7 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BASE, G_SENSITIVE, SensorModel
+from imu_calibration.estimation.row_estimate import RowEstimate
 from imu_calibration.estimation.solution import (
     DRIFT,
     GRAVITY,
@@ -33,7 +34,7 @@ from imu_calibration.references.gravity.bias_movement import (
     with_movement,
     without_movement,
 )
-from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State
+from imu_calibration.references.gravity.equations import COMPONENTS, Poses, State, TurnData
 from imu_calibration.references.gravity.g_sensitivity import (
     NO_EVIDENCE,
     g_sensitivity_evidence,
@@ -335,14 +336,16 @@ def solve_by_hand(
     return held if contradicted_by_turns(*errors) else free
 
 
-def _missed_by(hand, turn):
+def _missed_by(hand: HandCalibration, turn: TurnData) -> float:
     """Return the angle between rotated and measured gravity after a turn, rad."""
     force = hand.compensate(hand.poses.force, hand.poses.rate, **hand.poses.conditions)[0]
     state = replace(hand.state, up=unit_rows(force))
     return missed_angle(state, hand.poses, turn, matrix=hand.gyroscope[1])
 
 
-def _solved(data, options, point, *, untested=()):
+def _solved(
+    data: HandData, options: HandOptions, point: dict | None, *, untested: tuple[str, ...] = ()
+) -> HandCalibration:
     """Return the calibration with the cross terms `untested` held at their prior."""
     poses, turns = data.poses, data.turns
     if data.absent:
@@ -455,7 +458,7 @@ def _solved(data, options, point, *, untested=()):
     )
 
 
-def _hidden_covariance(model, poses):
+def _hidden_covariance(model: HandModel, poses: Poses) -> np.ndarray:
     """
     Return the covariance of the biases from errors that are the same at every rest.
 
@@ -469,7 +472,7 @@ def _hidden_covariance(model, poses):
     return covariance
 
 
-def _settled(model, found):
+def _settled(model: HandModel, found: RowEstimate) -> bool:
     """Return whether the columns of warm-ups were computed close enough to the solution."""
     known = [
         (model.model.slices[e.key].stop - 1, model.model.point_of(e)[-1])
@@ -502,7 +505,9 @@ def default_gyroscope(poses: Poses) -> tuple[tuple[str, ...], dict]:
     return G_SENSITIVE if shown(evidence) else BASE, evidence
 
 
-def _statistics(model, found, poses, turns):
+def _statistics(
+    model: HandModel, found: RowEstimate, poses: Poses, turns: Sequence[TurnData]
+) -> dict[str, float | None]:
     before, after = (
         model.norm_rows(values, poses.force, **poses.conditions)[0]
         for values in (model.nominal, found.state.values)
@@ -524,7 +529,7 @@ def _statistics(model, found, poses, turns):
     return result
 
 
-def _as_ranges(imu, stills):
+def _as_ranges(imu: ImuSamples, stills: Sequence[slice] | None) -> list[tuple[int, int]]:
     if stills is None:
         stills = find_still(imu)
     ranges = [(s.start, s.stop) if isinstance(s, slice) else (int(s[0]), int(s[1])) for s in stills]

@@ -72,7 +72,7 @@ class HandModel:
     absent: tuple[str, ...] = ()
     """Sensors without readings; all their parameters are held."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse effects that are not observable by hand."""
         strange = [e.name for e in self.model.further if not possible_by_hand(e)]
         if strange:

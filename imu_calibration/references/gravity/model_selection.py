@@ -12,9 +12,9 @@ import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.progress import reported
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import BASE
-from imu_calibration.references.gravity.equations import TurnData
+from imu_calibration.references.gravity.equations import Poses, TurnData
 from imu_calibration.references.gravity.g_sensitivity import g_sensitivity_evidence, shown
 from imu_calibration.references.gravity.hand_calibration import (
     HandCalibration,
@@ -84,7 +84,7 @@ class HandProblem:
             self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline
         )
 
-    def _blocks_without(self, poses):
+    def _blocks_without(self, poses: np.ndarray) -> list[Block]:
         blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
         return [block for block in blocks if block.known.size > 3]
 
@@ -119,7 +119,7 @@ class HandProblem:
         # the chosen effects are no noise here, so they are part of the baseline
         first, second, whole = (
             HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
-            for out in (*np.array_split(poses, 2), ())
+            for out in (*np.array_split(poses, 2), poses[:0])
         )
         return agree((first, second), whole, [used.index(k) for k in question.parameters])
 
@@ -321,7 +321,11 @@ def too_few_poses(count: int) -> NotObservableError:
     )
 
 
-def _that_predict(problem, held_out, named):
+def _that_predict(
+    problem: HandProblem,
+    held_out: Sequence[tuple[np.ndarray, list[Question], HandProblem]],
+    named: Sequence[Question],
+) -> list[Question]:
     """Return the findings that improve the prediction of poses held out from their choice."""
     named = list(named)
     while named:
@@ -336,7 +340,9 @@ def _that_predict(problem, held_out, named):
     return named
 
 
-def _why_not(effect, poses, turns, follows_gravity):
+def _why_not(
+    effect: Effect, poses: Poses, turns: Sequence[TurnData], follows_gravity: bool
+) -> tuple[str, str] | None:
     if effect.role is Role.LIMIT:
         return (
             'the true values of clipped samples are unknown; turns that reach a limit are excluded',
@@ -348,13 +354,15 @@ def _why_not(effect, poses, turns, follows_gravity):
         return 'poses by hand are at rest, so that the vibration does not vary', 'record on a table'
     if not possible_by_hand(effect):
         return 'gravity in poses and the turns between them do not show it', 'record on a table'
-    if 'temperature' in effect.needs and poses.temperature_c is None:
-        return 'no temperature was recorded', 'record imu/temperature'
-    if 'temperature' in effect.needs and np.ptp(poses.temperature_c) < TEMPERATURE_SPAN:
-        return (
-            f'the temperature changed by {np.ptp(poses.temperature_c):.2f} K only',
-            'record while the sensor warms up by at least some kelvins',
-        )
+    if 'temperature' in effect.needs:
+        if poses.temperature_c is None:
+            return 'no temperature was recorded', 'record imu/temperature'
+        span = np.ptp(poses.temperature_c)
+        if span < TEMPERATURE_SPAN:
+            return (
+                f'the temperature changed by {span:.2f} K only',
+                'record while the sensor warms up by at least some kelvins',
+            )
     if effect.role is Role.CROSS and not follows_gravity:  # the same test as in calibration
         return (
             'rates at rest do not separate it from a bias that moves in time',
@@ -369,7 +377,13 @@ def _why_not(effect, poses, turns, follows_gravity):
     return None
 
 
-def _questions(effects, blocks, space, base, not_testable):
+def _questions(
+    effects: Sequence[Effect],
+    blocks: Sequence[Block],
+    space: HandSpace,
+    base: Sequence[int],
+    not_testable: list[dict[str, str]],
+) -> list[Question]:
     """
     Return the questions.
 
@@ -395,7 +409,7 @@ def _questions(effects, blocks, space, base, not_testable):
     return asked
 
 
-def _held_out(problem):
+def _held_out(problem: HandProblem) -> list[tuple[np.ndarray, list[Question], HandProblem]]:
     """
     Return fold -> (poses, findings without them, evidence without them).
 

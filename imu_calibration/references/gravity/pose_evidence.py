@@ -6,7 +6,7 @@ Norms of gravity in poses, rates at rest, directions after turns, and their resi
 Poses are few, so that variances are estimated too and every pose is held out in turn.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -23,7 +23,7 @@ from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.rotations import skew
 from imu_calibration.kinematics.strapdown import integrate_turn
 from imu_calibration.references.gravity.bias_movement import orthonormal_basis
-from imu_calibration.references.gravity.equations import TurnData, between_middles, tangent
+from imu_calibration.references.gravity.equations import Poses, TurnData, between_middles, tangent
 from imu_calibration.references.gravity.g_sensitivity import EARTH_UPWARDS_SD
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -161,7 +161,15 @@ def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
     return [turn for turn in turns if turn.rotation is None]
 
 
-def _columns(hand, effect, tau, force, rate, time, temperature_c):
+def _columns(
+    hand: HandCalibration,
+    effect: Effect,
+    tau: float | None,
+    force: np.ndarray,
+    rate: np.ndarray,
+    time: np.ndarray,
+    temperature_c: np.ndarray | None,
+) -> np.ndarray:
     """
     Return the contribution of the effect's parameters to its sensor's output.
 
@@ -171,19 +179,27 @@ def _columns(hand, effect, tau, force, rate, time, temperature_c):
     names = {
         sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS
     }
-    model = HandModel(replace(hand.model, **names, point=point), hand.gravity)
+    sensors = replace(
+        hand.model,
+        accelerometer=names['accelerometer'],
+        gyroscope=names['gyroscope'],
+        point=point,
+    )
+    model = HandModel(sensors, hand.gravity)
     values = model.model.start_from(hand.model, hand.values)
     return model.further(
         effect.sensor, values, force, rate=rate, time=time, temperature_c=temperature_c
     )[1]
 
 
-def _natural(poses, sensor):
+def _natural(poses: Poses, sensor: str) -> np.ndarray:
     """Return the variance of the usual bias drift, shape (3,)."""
     return NATURAL**2 * poses.noise[sensor].white_variance * poses.period
 
 
-def _norm_block(hand, space, at_rest):
+def _norm_block(
+    hand: HandCalibration, space: HandSpace, at_rest: Mapping[str, np.ndarray]
+) -> Block:
     """One row per pose: ``|true force| - gravity``."""
     poses, count = hand.poses, len(hand.poses.start)
     residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
@@ -205,7 +221,9 @@ def _norm_block(hand, space, at_rest):
     )
 
 
-def _rest_block(hand, space, at_rest):
+def _rest_block(
+    hand: HandCalibration, space: HandSpace, at_rest: Mapping[str, np.ndarray]
+) -> Block:
     """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
     poses, count = hand.poses, len(hand.poses.start)
     residual, base = hand.rate_rows()
@@ -222,7 +240,13 @@ def _rest_block(hand, space, at_rest):
     return Block('poses', 'gyroscope', rows, known, floor, np.arange(count), poses.time)
 
 
-def _turn_block(hand, turns, space, at_rest, moving):
+def _turn_block(
+    hand: HandCalibration,
+    turns: Sequence[TurnData],
+    space: HandSpace,
+    at_rest: Mapping[str, np.ndarray],
+    moving: Sequence[Effect],
+) -> Block:
     """
     Two rows per turn.
 
@@ -342,7 +366,7 @@ class HandEvidence(Evidence):
             total, np.array(without), prior_sd=space.prior_sd, prior_mean=np.zeros(space.size)
         )
 
-    def _whitened(self, number=None):
+    def _whitened(self, number: int | None = None) -> list[np.ndarray]:
         """
         Return the rows of each block, without fold `number`.
 
@@ -402,19 +426,19 @@ class HandEvidence(Evidence):
             for sensor in SENSORS
         }
 
-    def _heldout(self, used):
+    def _heldout(self, used: Sequence[int]) -> float:
         squares = [
             r**2 / (variance + sum(process.sd**2 for process in processes))
             for r, (variance, processes) in zip(self.heldout_residuals(used), self._noise)
         ]
         return float(sum(s.size * np.log(s.mean()) for s in squares))
 
-    def _loss(self, used):
+    def _loss(self, used: Sequence[int]) -> float:
         return float(
             sum(len(white) * np.log(np.mean(self._left(white, used) ** 2)) for white in self._white)
         )
 
-    def _left(self, white, used):
+    def _left(self, white: np.ndarray, used: Sequence[int]) -> np.ndarray:
         return white[:, -1] - white[:, list(used)] @ self.fit(used)[0]
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
@@ -455,7 +479,7 @@ class HandEvidence(Evidence):
         return int(np.sum(sines > MIN_COLUMN_SINE))
 
 
-def _noise(block, used):
+def _noise(block: Block, used: Sequence[int]) -> tuple[np.ndarray, tuple[BiasProcess, ...]]:
     """
     Return (independent variance of each row (m, n_axes), bias processes).
 
@@ -555,7 +579,7 @@ def unexplained_by_hand(
     )
 
 
-def _explanations(hand):
+def _explanations(hand: HandCalibration) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     poses, up = hand.poses, hand.state.up
     every = np.ones(len(up), bool)
     yield from slow_explanations(

@@ -4,7 +4,7 @@ Poses and turns from samples.
 Means over the intervals held still, with standard errors, and the readings between them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -92,7 +92,9 @@ def average_poses(
     )
 
 
-def _with_rounding(variance, parts, rounding):
+def _with_rounding(
+    variance: np.ndarray, parts: Sequence[np.ndarray], rounding: np.ndarray
+) -> np.ndarray:
     """
     Return the variance of the means, at least that of rounding where it matters.
 
@@ -102,7 +104,9 @@ def _with_rounding(variance, parts, rounding):
     return np.where(within < DITHER * rounding, np.maximum(variance, rounding), variance)
 
 
-def _hidden_rates(rate_s, parts, means):
+def _hidden_rates(
+    rate_s: np.ndarray, parts: Sequence[np.ndarray], means: np.ndarray
+) -> HiddenRates:
     """
     Return the `HiddenRates` of poses with the readings `parts` and their means (k, 3).
 
@@ -121,7 +125,7 @@ def _hidden_rates(rate_s, parts, means):
     return HiddenRates(tuple(bands.tolist()), tuple(rounding_sd.tolist()), tuple(step.tolist()))
 
 
-def _creep(forces, length, noise):
+def _creep(forces: Sequence[np.ndarray], length: np.ndarray, noise: NoiseModel) -> np.ndarray:
     """
     Return the rates at which the attitude creeps in each pose, as observable from gravity, rad/s.
 
@@ -152,7 +156,7 @@ def noise_statistics(poses: Poses) -> dict:
     return found | {'period': poses.period}
 
 
-def _pooled_noise(parts, rounding, pieces=8):
+def _pooled_noise(parts: Sequence[np.ndarray], rounding: np.ndarray, pieces: int = 8) -> NoiseModel:
     """
     Return the NoiseModel of samples.
 
@@ -255,7 +259,9 @@ def collect_turns(
     return turns, dropped
 
 
-def _slow_rounding_variance(time, rate, hidden):
+def _slow_rounding_variance(
+    time: np.ndarray, rate: np.ndarray, hidden: HiddenRates | None
+) -> float:
     """
     Return the variance of the angle of a turn from rounding at its slow ends, rad^2, axis mean.
 
@@ -268,7 +274,7 @@ def _slow_rounding_variance(time, rate, hidden):
     return float(np.mean(np.square(hidden.rounding_sd * slow_seconds)))
 
 
-def _unusable(time, ended, gap):
+def _unusable(time: np.ndarray, ended: np.ndarray, gap: float) -> str:
     if time[-1] - time[0] > TURN_LONGEST:
         return 'too long'
     if np.max(np.diff(time)) > gap:
@@ -301,7 +307,7 @@ def at_range_end(rate: np.ndarray) -> np.ndarray:
     return ended
 
 
-def _at_end(signed, axes, fresh):
+def _at_end(signed: Callable, axes: np.ndarray, fresh: np.ndarray) -> np.ndarray:
     """
     Return the samples at the largest value of ``signed(axes)``.
 
@@ -326,7 +332,7 @@ def _at_end(signed, axes, fresh):
     return at if number >= max(2, CROWDED * chance) else np.zeros(len(fresh), bool)
 
 
-def _largest(signed, axis, fresh):
+def _largest(signed: Callable, axis: np.ndarray, fresh: np.ndarray) -> np.ndarray:
     """Return the largest values of ``signed(axis[fresh])``, block by block."""
     largest, least = np.zeros(0), -np.inf
     for start in range(0, len(axis), BLOCK):
@@ -392,7 +398,7 @@ def sample_times(imu: ImuSamples) -> np.ndarray:
     )
 
 
-def _clock_times(stamps, period):
+def _clock_times(stamps: np.ndarray, period: float) -> np.ndarray:
     """
     Return the times of the clock of one stretch, or its stamps where samples were lost unnoticed.
     """
@@ -412,7 +418,7 @@ def _clock_times(stamps, period):
     return line if np.abs(late).max() < 0.6 * period else stamps
 
 
-def _clock_line(number, time, pieces):
+def _clock_line(number: np.ndarray, time: np.ndarray, pieces: int) -> np.ndarray:
     line = np.polynomial.Polynomial.fit(number, time, 1)(number)
     means = np.array(
         [
@@ -423,7 +429,7 @@ def _clock_line(number, time, pieces):
     return line + np.interp(number, *means)
 
 
-def _roughness(time, rate):
+def _roughness(time: np.ndarray, rate: np.ndarray) -> float:
     """
     Return the sum of squared errors of linear interpolation.
 
@@ -468,7 +474,7 @@ def full_scale_factor(state: State, poses: Poses, turns: Sequence[TurnData]) -> 
     if len(some) < LEAST_TURNS:
         return 1.0
 
-    def missed(factor):
+    def missed(factor: float) -> float:
         return float(
             np.median(
                 [missed_angle(state, poses, turn, matrix=factor * np.eye(3)) for turn in some]

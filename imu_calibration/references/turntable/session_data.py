@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,12 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator, restrict, selected_columns, stack
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters, make_prior
+from imu_calibration.estimation.weighted_system import (
+    Prior,
+    WeightedSystem,
+    fixed_parameters,
+    make_prior,
+)
 from imu_calibration.estimation.window_statistics import (
     N_AXES,
     WindowStatistics,
@@ -88,7 +94,9 @@ class WindowStore:
                 yield _again(entry, model, table)
 
 
-def _again(entry, model, table):
+def _again(
+    entry: tuple[WindowStatistics, JointMotion, np.ndarray | None], model: SensorModel, table: Table
+) -> WindowStatistics:
     """Return a static window's statistics with recomputed columns."""
     reduced, motion, temperature = entry
     references = References(model, table, motion, temperature_c=temperature)
@@ -269,7 +277,7 @@ class HeldOut:
         return found
 
 
-def _linearised(blocks, solution, prior):
+def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution, prior: Prior) -> np.ndarray:
     """
     Return the triangular factor of ``[derivative of the residuals | residuals]``.
 
@@ -458,7 +466,7 @@ def naming(names: Sequence[str], session: int) -> Callable:
     With several recordings, the name of the recording is put before its error.
     """
 
-    def call(function, *arguments, **options):
+    def call(function: Callable, *arguments: Any, **options: Any) -> Any:
         try:
             return function(*arguments, **options)
         except ImuCalibrationError as error:
@@ -499,7 +507,9 @@ def join(
     return merge(parts)
 
 
-def _require_like_the_first(first, part, first_name, name):
+def _require_like_the_first(
+    first: SessionData, part: SessionData, first_name: str, name: str
+) -> None:
     if not part.accumulator.rows:
         raise InputError(
             f'{name}: every recording must contain a static window, spin or dynamic segment, this'

@@ -4,7 +4,9 @@ ArduPilot and PX4.
 Parameter files with offsets, scale factors and linear temperature calibration of the first IMU.
 """
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,16 +32,16 @@ from imu_calibration.document.exports.target import (
 from imu_calibration.effects.base import SENSORS
 
 
-def _by_axis(pattern, values):
+def _by_axis(pattern: str, values: Iterable[Any]) -> dict[str, Any]:
     """Return parameters of the three axes, whose letter replaces ``*`` in the name."""
     return {pattern.replace('*', axis): value for axis, value in zip(AXIS_LETTERS, values)}
 
 
-def _has(found, pattern):
+def _has(found: Mapping[str, float], pattern: str) -> bool:
     return any(name in found for name in _by_axis(pattern, AXIS_LETTERS))
 
 
-def _linear(imu, offset, scale):
+def _linear(imu: AffineImu, offset: Mapping[str, str], scale: str) -> dict[str, float]:
     """Return the offsets of both sensors, and the scale factors of the accelerometer."""
     return {
         name: value
@@ -48,7 +50,7 @@ def _linear(imu, offset, scale):
     } | _by_axis(scale, 1.0 / np.diag(imu.matrix['accelerometer']))
 
 
-def _matrix(found, scale):
+def _matrix(found: Mapping[str, float], scale: str) -> dict[str, np.ndarray]:
     return {'accelerometer': np.diag(1.0 / vector_of(found, scale, 1.0)), 'gyroscope': np.eye(3)}
 
 

@@ -2,7 +2,9 @@
 Visual, lidar and wheel estimators with noise parameters only; their input is compensated readings.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.exports.affine import SLOW_OFFSETS
@@ -81,7 +83,16 @@ def write(page: Page, inside: str = '', gravity: str = '', *, head: str = '') ->
     return yaml_file(page.comments, {inside: values} if inside else values, head)
 
 
-def _target(name, title, formula, source, noise, noise_is, writer, **more):
+def _target(
+    name: str,
+    title: str,
+    formula: str,
+    source: str,
+    noise: Callable,
+    noise_is: str,
+    writer: Callable,
+    **more: Any,
+) -> Target:
     return Target(
         name=name,
         title=title,

@@ -107,7 +107,7 @@ def read_imu_tk(content: bytes, path: str | Path) -> Read:
     )
 
 
-def _numbers(content):
+def _numbers(content: bytes) -> list[float] | None:
     words = text_of(content, 'imu_tk file').split()
     try:
         values = [float(word) for word in words]

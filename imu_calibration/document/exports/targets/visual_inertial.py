@@ -95,7 +95,7 @@ def noise_kalibr(found: Noise) -> dict:
     }
 
 
-def _sensor_entries(page):
+def _sensor_entries(page: Page) -> dict[str, float | np.ndarray | str]:
     """Return the entries of an IMU in addition to its intrinsics."""
     known = (
         page.noise if page.noise is not None else {'update_rate': page.rate} if page.rate else {}

@@ -3,6 +3,7 @@
 import io
 import json
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,7 @@ def read_mat(content: bytes, _path: str | Path) -> Read:
     return Read(read_json(text.encode(), what))
 
 
-def _target(name, title, writer, reader, suffix):
+def _target(name: str, title: str, writer: Callable, reader: Callable, suffix: str) -> Target:
     return Target(
         name=name,
         title=title,
