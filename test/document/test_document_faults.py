@@ -28,7 +28,7 @@ from imu_calibration.document.calibration_text import (
     from_mapping,
 )
 from imu_calibration.document.decision import decisions_text
-from imu_calibration.document.proof_entry import ProofEntry
+from imu_calibration.document.proof_entry import EarlierErrors, ProofEntry, RegimeErrors
 from imu_calibration.kinematics.table import Table
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from msg_adapters.imu import FIELDS
@@ -63,7 +63,16 @@ WRONG = (
     'x' * 4000,
 )
 """What a field is replaced by."""
-PROOF = ProofEntry(0.1, 0.01, (0.05, 0.2), unit='m/s^2', windows=12)
+PROOF = ProofEntry(
+    0.1,
+    0.01,
+    (0.05, 0.2),
+    unit='m/s^2',
+    windows=12,
+    delay_s=1e-3,
+    regimes={'rest': RegimeErrors(0.1, 0.01, (0.05, 0.2), seconds=30.0, unit='m/s^2')},
+    earlier=EarlierErrors(0.02, (0.1, 0.3)),
+)
 
 
 def calibration():
