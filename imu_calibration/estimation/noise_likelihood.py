@@ -86,8 +86,11 @@ class NoiseLikelihood:
         logs, normal = self._eliminated(key)
         choice = (key, None if used is None else tuple(used))
         if choice not in self._profiles:
-            at = np.arange(len(normal)) if used is None else [*used, len(normal) - 1]
-            self._profiles[choice] = logs + profile(normal[np.ix_(at, at)])
+            chosen = normal
+            if used is not None:
+                at = np.array([*used, len(normal) - 1])
+                chosen = normal[at[:, None], at]
+            self._profiles[choice] = logs + profile(chosen)
         return self._profiles[choice]
 
     def _eliminated(self, key: tuple[float, ...]) -> tuple[float, np.ndarray]:

@@ -361,12 +361,12 @@ def eliminate(normal: np.ndarray, count: int) -> tuple[float, np.ndarray]:
     """
     if not count:
         return 0.0, normal
-    scale = np.sqrt(np.maximum(np.diag(normal)[:count], 1e-300))
-    scaled = normal[:count, :count] / np.outer(scale, scale)
+    scale = np.sqrt(np.maximum(normal.diagonal()[:count], 1e-300))
+    scaled = normal[:count, :count] / (scale[:, None] * scale)
     scaled.flat[:: count + 1] += JITTER
     factor = np.linalg.cholesky(scaled)
     solved = lapack.dtrtrs(factor, normal[:count, count:] / scale[:, None], lower=1)[0]
-    logs = 2 * np.log(np.diag(factor)).sum() + 2 * np.log(scale).sum()
+    logs = 2 * np.log(factor.diagonal()).sum() + 2 * np.log(scale).sum()
     return float(logs), normal[count:, count:] - solved.T @ solved
 
 

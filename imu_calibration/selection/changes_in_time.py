@@ -149,45 +149,26 @@ class WindowRows:
         """Normal matrix of the columns and the residual, shape (q + 1, q + 1)."""
         return self.part_normals.sum(axis=0)
 
-    def changes(self, at: np.ndarray, functions: np.ndarray) -> Changes:
+    def changing(self, at: np.ndarray) -> 'ChangingColumns':
         """
-        Return the Changes of parameters along functions of time.
+        Return the columns of parameters that may change.
 
         Parameters
         ----------
         at : ndarray, shape (c,)
             Places of the parameters.
-        functions : ndarray, shape (n, m)
-            Their values in each window.
 
         """
-        n_parts, size = len(self.expected), self.space.size + 1
-        count, n_functions = len(at), functions.shape[1]
-        cross = np.zeros((n_parts, size, n_functions * count))
-        squares = np.zeros((n_parts, n_functions * count, n_functions * count))
+        axes = []
         for rows in self.axes:
             own = np.flatnonzero(np.isin(rows.places[:-1], at))
-            if not len(own):
-                continue
-            order = np.searchsorted(at, rows.places[own])
-            places = (np.arange(n_functions)[:, None] * count + order).ravel()
-            at_cross, at_squares = np.ix_(rows.places, places), np.ix_(places, places)
-
-            # Means: the product with the function first, then independent rows.
-            columns = functions[:, :, None] * rows.mean[:, None, own]
-            white = rows.whitening(columns.reshape(len(columns), 1, -1))[:, 0]
-            cross[rows.part][at_cross] += rows.white.T @ white
-            squares[rows.part][at_squares] += white.T @ white
-
-            # Within windows, where the function is constant: sum_w f_w P_w and sum_w f_w g_w P_w.
-            products = rows.within[:, :, own]
-            along = np.einsum('wm,wpo->pmo', functions, products)
-            both = np.einsum(
-                'wm,wl,wqo->mqlo', functions, functions, products[:, own], optimize=True
-            )
-            cross[rows.part + 1][at_cross] += along.reshape(len(rows.places), -1)
-            squares[rows.part + 1][at_squares] += both.reshape(len(places), -1)
-        return Changes(cross, squares)
+            if len(own):
+                order = np.searchsorted(at, rows.places[own])
+                within = rows.within[:, :, own]
+                axes.append(
+                    _ChangingOfAxis(rows, order, rows.mean[:, None, own], within, within[:, own])
+                )
+        return ChangingColumns(len(self.expected), self.space.size + 1, len(at), tuple(axes))
 
     def fit(self, own: np.ndarray, changes: Changes | None = None) -> ChangeFit:
         """Return the ChangeFit of the parameters `own`, with their priors, and of some changes."""
@@ -221,3 +202,66 @@ class WindowRows:
         significant = beyond > SIGNIFICANT_REST * np.sqrt(2 * self.expected)
         limit = SIGNIFICANT_REST * np.sqrt(2 * self.expected[significant].sum())
         return SignificantExcess(float(beyond[significant].sum()), float(limit))
+
+
+@dataclass(frozen=True, eq=False)
+class _ChangingOfAxis:
+    """Columns of one axis of a sensor that belong to c of the parameters that may change."""
+
+    rows: _RowsOfAxis
+    """All rows of the axis."""
+    order: np.ndarray
+    """Numbers of the c parameters among those that may change, shape (c,)."""
+    mean: np.ndarray
+    """Means of the windows, shape (n, 1, c)."""
+    within: np.ndarray
+    """Products with all columns within each window, shape (n, p + 1, c)."""
+    squares: np.ndarray
+    """Products with one another within each window, shape (n, c, c)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangingColumns:
+    """Columns of parameters that may change, selected once for many functions of time."""
+
+    n_parts: int
+    """Number of parts."""
+    size: int
+    """Number of all columns, that of the residual included."""
+    count: int
+    """Number of parameters that may change."""
+    axes: tuple[_ChangingOfAxis, ...]
+    """The axes that have some of the columns."""
+
+    def along(self, functions: np.ndarray) -> Changes:
+        """
+        Return the Changes of the parameters along functions of time.
+
+        Parameters
+        ----------
+        functions : ndarray, shape (n, m)
+            Their values in each window.
+
+        """
+        n_functions = functions.shape[1]
+        n_changes = n_functions * self.count
+        cross = np.zeros((self.n_parts, self.size, n_changes))
+        squares = np.zeros((self.n_parts, n_changes, n_changes))
+        pairs = functions[:, :, None] * functions[:, None]
+        for axis in self.axes:
+            rows = axis.rows
+            places = (np.arange(n_functions)[:, None] * self.count + axis.order).ravel()
+            at_cross, at_squares = (rows.places[:, None], places), (places[:, None], places)
+
+            # Means: the product with the function first, then independent rows.
+            columns = functions[:, :, None] * axis.mean
+            white = rows.whitening(columns.reshape(len(columns), 1, -1))[:, 0]
+            cross[rows.part][at_cross] += rows.white.T @ white
+            squares[rows.part][at_squares] += white.T @ white
+
+            # Within windows, where the function is constant: sum_w f_w P_w and sum_w f_w g_w P_w.
+            along = np.tensordot(axis.within, functions, (0, 0)).transpose(0, 2, 1)
+            both = np.tensordot(pairs, axis.squares, (0, 0)).transpose(0, 2, 1, 3)
+            cross[rows.part + 1][at_cross] += along.reshape(len(rows.places), -1)
+            squares[rows.part + 1][at_squares] += both.reshape(len(places), -1)
+        return Changes(cross, squares)

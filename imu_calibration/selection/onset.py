@@ -209,19 +209,21 @@ def _candidate(rows, group, kept, *, n_base, allowed):
     base = np.arange(n_base)
     at = np.flatnonzero(np.isin(kept, group.parameters))
     own = np.union1d(base, at)
-    losses = _losses_of_moments(rows, own, at, allowed)
+    changing = rows.changing(at)
+    losses = _losses_of_moments(rows, own, changing, allowed)
     last = min(losses, key=losses.__getitem__)
     least = losses[last]
-    if group.role is Role.OFFSET and _follows_temperature(rows, own, at, least):
+    if group.role is Role.OFFSET and _follows_temperature(rows, own, changing, least):
         return None
 
     # The change lies within one of the windows about the moment, which hold both states: all
     # models are compared without them.
     clear = ~np.isin(np.arange(rows.count), (last, last + 1))
     apart = rows.selected(clear)
-    change = apart.changes(at, _after(rows, last))
+    changing = apart.changing(at)
+    change = changing.along(_after(rows, last))
     alone, step = apart.fit(base), apart.fit(own, change)
-    gradual = apart.fit(own, apart.changes(at, _curves(rows.space.recording.time)))
+    gradual = apart.fit(own, changing.along(_curves(rows.space.recording.time)))
     before, after = apart.excess(base, alone), apart.excess(own, step, change)
     if after.squares >= (1 - MIN_EXPLAINED_SHARE) * before.squares:
         return None
@@ -239,28 +241,28 @@ def _candidate(rows, group, kept, *, n_base, allowed):
     )
 
 
-def _losses_of_moments(rows, own, at, allowed):
+def _losses_of_moments(rows, own, changing, allowed):
     """Return last window before a moment -> loss of the fit with a change there."""
     coarse = np.unique(np.linspace(0, len(allowed) - 1, min(COARSE, len(allowed))).astype(int))
     losses = {}
     for last in allowed[coarse].tolist():
-        losses[last] = _loss_of_step(rows, own, at, _after(rows, last))
+        losses[last] = _loss_of_step(rows, own, changing, _after(rows, last))
     # All moments between the neighbours of the best one.
     place = int(np.searchsorted(allowed[coarse], min(losses, key=losses.__getitem__)))
     first = coarse[max(place - 1, 0)]
     end = coarse[min(place + 1, len(coarse) - 1)]
     for last in allowed[first:end].tolist():
         if last not in losses:
-            losses[last] = _loss_of_step(rows, own, at, _after(rows, last))
+            losses[last] = _loss_of_step(rows, own, changing, _after(rows, last))
     return losses
 
 
-def _loss_of_step(rows, own, at, second):
+def _loss_of_step(rows, own, changing, second):
     """Return the loss with another value of some parameters where `second` (n, 1) is one."""
-    return rows.fit(own, rows.changes(at, second)).loss
+    return rows.fit(own, changing.along(second)).loss
 
 
-def _follows_temperature(rows, own, at, loss):
+def _follows_temperature(rows, own, changing, loss):
     """
     Return whether a step where the temperature passes a value fits as well as one at a moment.
 
@@ -272,7 +274,7 @@ def _follows_temperature(rows, own, at, loss):
     limits = np.sort(warmth)[MIN_ONSET_WINDOWS:-MIN_ONSET_WINDOWS]
     for limit in limits[:: max(len(limits) // MOST_LIMITS, 1)]:
         warm = (warmth > limit).astype(float)[:, None]
-        if _loss_of_step(rows, own, at, warm) <= loss:
+        if _loss_of_step(rows, own, changing, warm) <= loss:
             return True
     return False
 

@@ -358,6 +358,7 @@ class HandEvidence(Evidence):
         n_folds = len(poses) if len(poses) <= ONE_BY_ONE else POSE_FOLDS
         self.folds = [np.searchsorted(poses, block.pose) % n_folds for block in blocks]
         self._white = self._whitened()
+        self._bases: dict[tuple[int, ...], np.ndarray] = {}
         total, *without = (
             sum(rows.T @ rows for rows in white)
             for white in (self._white, *map(self._whitened, range(n_folds)))
@@ -468,15 +469,19 @@ class HandEvidence(Evidence):
         """
         Return how many combinations of the added columns are not collinear with the smaller choice.
         """
-        white = np.concatenate(self._white)
-        known, new = (
-            orthonormal_basis(white[:, list(smaller)], DEPENDENT),
-            orthonormal_basis(white[:, list(added)], MIN_COLUMN_DIFFERENCE),
-        )
+        known = self._basis_of(tuple(smaller))
+        new = orthonormal_basis(np.concatenate(self._white)[:, list(added)], MIN_COLUMN_DIFFERENCE)
         if not new.shape[1]:
             return 0
         sines = np.linalg.svd(new - known @ (known.T @ new), compute_uv=False)
         return int(np.sum(sines > MIN_COLUMN_SINE))
+
+    def _basis_of(self, used: tuple[int, ...]) -> np.ndarray:
+        """Return a basis of the columns of a choice, which is met with many larger choices."""
+        if used not in self._bases:
+            white = np.concatenate(self._white)
+            self._bases[used] = orthonormal_basis(white[:, list(used)], DEPENDENT)
+        return self._bases[used]
 
 
 def _noise(block: Block, used: Sequence[int]) -> tuple[np.ndarray, tuple[BiasProcess, ...]]:
