@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.units import DEG
+from imu_calibration.document.rest_noise import moved_at_rest
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.estimation.observability import sd_excess, share_gained
-from imu_calibration.estimation.solution import LACKING, TURNS_REMEDY, remedy
+from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY, TURNS_REMEDY, remedy
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS, DIRECTIONS
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.references.gravity.equations import SCATTER_SD, Poses, tangent
@@ -398,6 +399,12 @@ def _without_motion(hand: HandCalibration, index: int, excesses: '_Excesses') ->
     of_turns = hand.param_names[index].startswith('gyroscope') and index not in range(
         bias.start, bias.stop
     )
+    # A turn is compared with the directions of gravity before and after it, so that a moved
+    # accelerometer spoils it as well.
+    used_sensors = SENSORS if of_turns else (hand.param_names[index].partition('.')[0],)
+    if any(moved_at_rest(hand.statistics, sensor) for sensor in used_sensors):
+        return MOVED_REMEDY
+
     # More turns are left out as well where most of them contradict gravity.
     contradicted = hand.statistics['left_out'].get(CONTRADICTED_TURNS, 0)
     if of_turns and contradicted > hand.statistics['turns']:

@@ -13,13 +13,15 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected
-from imu_calibration.document.verdict import NOTED_MISFIT, is_structured, judged
+from imu_calibration.document.verdict import incomplete_motions, judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.solution import (
+    BIAS_PROCESS,
     GRAVITY,
+    HELD_PRIORS,
     REJECTED,
     Solution,
     reasons_held,
@@ -129,43 +131,48 @@ class ModelExtension:
 
 
 def motions_needed(
-    solution: Solution, tolerances: np.ndarray, table: Table
+    solution: Solution, tolerances: np.ndarray, table: Table, *, quality: Mapping
 ) -> dict[str, tuple[str, float]]:
     """
     Return undetermined parameter -> (best motion, its sd after a minute of it).
 
     The motion is the one that would serve best a parameter that is not determined; where no motion
     serves it, the remedy for the cause and NaN (`estimation.solution.remedy`).
+
+    Parameters
+    ----------
+    solution : Solution
+    tolerances : ndarray, shape (n_params,)
+    table : Table
+    quality : mapping
+        Statistics of the document, from which it follows whether the model is incomplete
+        (`verdict.incomplete_motions`).
+
     """
+    prior_sd = make_prior(solution.model).sd
     needed = observability.needed_motions(
         solution,
         tolerances,
         table.gravity_value,
-        prior_sd=make_prior(solution.model).sd,
+        prior_sd=prior_sd,
         possible=possible_motions(table),
     )
+    data_sd = observability.sd_of_data(solution, prior_sd)
+    is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
     for name in needed:
         index = solution.param_names.index(name)
-        text = remedy(
-            solution.terms,
-            index,
-            tolerances[index],
-            is_misfit=_has_misfit(solution, name.partition('.')[0]),
-        )
+        sensor = name.partition('.')[0]
+        of_misfit = []
+        if incomplete_motions(quality, sensor):
+            # Bias processes describe the error of the model.
+            of_misfit.append(BIAS_PROCESS)
+        if any(each.startswith(sensor) and is_shown[each] for each in solution.not_believed):
+            # A parameter that the motions determine is held for its misfit, not for their lack.
+            of_misfit.append(HELD_PRIORS)
+        text = remedy(solution.terms, index, tolerances[index], of_misfit=of_misfit)
         if text:
             needed[name] = (text, float('nan'))
     return needed
-
-
-def _has_misfit(solution, sensor):
-    """Return whether the verdict calls the model of a sensor incomplete (`motion_misfits`)."""
-    slow_over_fast = solution.slow_over_fast.get(sensor, {})
-    for kind, ratio in (solution.chi2_per_dof.get(sensor) or {}).items():
-        if kind == 'means' or ratio is None or ratio <= NOTED_MISFIT:
-            continue
-        if is_structured(slow_over_fast, kind):
-            return True
-    return False
 
 
 def possible_motions(table: Table) -> tuple[Motion, ...] | None:

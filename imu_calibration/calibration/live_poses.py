@@ -48,6 +48,7 @@ from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import (
     COMMON_SCALE,
     LACKING,
+    NO_STEP,
     REMEDY_KEYS,
     tolerances_of,
 )
@@ -199,11 +200,12 @@ def _needs(found, not_seen, calibration, *, step, hints):
         ]
     needs = dict.fromkeys(item['needs'] for item in calibration.undetermined)
     without_motion = [
-        with_hint(need, REMEDY_KEYS[need], hints) for need in needs if need in REMEDY_KEYS
+        with_hint(need, REMEDY_KEYS.get(need), hints) for need in needs if need in NO_STEP
     ]
     if len(without_motion) == len(needs) > 0:
         return Progress.WEAK, without_motion
-    return Progress.WEAK, [step] if step else list(needs)
+    # The planned step serves the parameters whose need is a pose or a turn.
+    return Progress.WEAK, [step, *without_motion] if step else list(needs)
 
 
 def _plural(count, noun):

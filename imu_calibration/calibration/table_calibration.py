@@ -283,7 +283,8 @@ def conclude(
         gathered.findings,
     )
     solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
-    needed = motions_needed(solution, tolerances, table)
+    quality = {**statistics(solution, gathered), **changes.to_mapping()}
+    needed = motions_needed(solution, tolerances, table, quality=quality)
     uncorrected = _uncorrected(solution, gathered, model)
     held_out = gathered.held_out.restricted(model, solution.model)
     folds = applied_folds(held_out, solution, centre=uncorrected.centre)

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.calibration.table_result import TableResult
-from imu_calibration.document.verdict import NOTED_MISFIT, misfit_ratios
+from imu_calibration.document.verdict import incomplete_motions
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import Status
 from imu_calibration.kinematics.table import Table
@@ -72,11 +72,8 @@ def calibrate_with_table_errors(
 
 def _unlike_noise(result: TableResult) -> bool:
     """Return whether moving windows scatter clearly more than the noise at rest."""
-    for sensor in SENSORS:
-        for ratio in misfit_ratios(result.calibration, sensor).values():
-            if ratio > NOTED_MISFIT:
-                return True
-    return False
+    statistics = result.calibration.statistics
+    return any(incomplete_motions(statistics, sensor) for sensor in SENSORS)
 
 
 def _table_error_findings(result: TableResult) -> list[CheckFinding]:

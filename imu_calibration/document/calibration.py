@@ -117,6 +117,11 @@ class Calibration:
         return np.sqrt(np.clip(np.diag(self.covariance), 0, None))
 
     @property
+    def by_hand(self) -> dict:
+        """Statistics of poses and turns by hand; {} for a calibration on a table."""
+        return self.statistics.get('by_hand') or {}
+
+    @property
     def common_scale(self) -> dict:
         """
         {'sd', 'tolerance', 'status'} of the accelerometer's common scale by hand.
@@ -125,7 +130,7 @@ class Calibration:
         """
         if 'accelerometer' in self.absent:
             return {}
-        return self.statistics.get('by_hand', {}).get('common_scale', {})
+        return self.by_hand.get('common_scale', {})
 
     @property
     def own_sd(self) -> np.ndarray:

@@ -56,6 +56,7 @@ from imu_calibration.estimation.solution import (
     DRIFT,
     HELD,
     MODEL_ERROR,
+    MOVED_REMEDY,
     REJECTED,
     REMEDIES,
     REMEDY_KEYS,
@@ -126,7 +127,7 @@ def _unused_rests(calibration: Calibration) -> list[Reason]:
         sum(unused.values()),
         sum((calibration.statistics.get('samples_used') or {}).values()),
     )
-    if rested(calibration) or total <= LOST_SHARE * used:
+    if rested(calibration.statistics) or total <= LOST_SHARE * used:
         return []
     return [
         Reason(
@@ -181,16 +182,22 @@ def _adopted(calibration: Calibration) -> list[Reason]:
     for change in CHANGES:
         names[change] = calibration.statistics.get(change) or []
     names['added'] = [_with_size(calibration, name) for name in names['added']]
-    if held := names['not_believed']:
+    held = names['not_believed']
+    if held:
         names['not_believed'] = [f'{name} ({value:.3g})' for name, value in held.items()][
             :SHOWN_NAMES
         ]
         names['not_believed'] += ['...'] * (len(held) > SHOWN_NAMES)
-    return [
-        Reason(NOTE, text.format(', '.join(names[change])), step, key=key)
-        for change, (text, step, key) in CHANGES.items()
-        if names[change]
-    ]
+    reasons = []
+    for change, (text, step, key) in CHANGES.items():
+        if change == 'not_believed':
+            # Where the motions determine them, the misfit has another cause.
+            remedies = [need for need in _by_need(calibration, held) if need in REMEDY_KEYS]
+            if remedies:
+                step, key = remedies[0], REMEDY_KEYS[remedies[0]]
+        if names[change]:
+            reasons.append(Reason(NOTE, text.format(', '.join(names[change])), step, key=key))
+    return reasons
 
 
 def _unexplained(calibration: Calibration) -> list[Reason]:
@@ -262,39 +269,50 @@ def _with_size(calibration: Calibration, name: str) -> str:
     )
 
 
-def misfit_ratios(calibration: Calibration, sensor: str) -> dict[str, float]:
+def misfit_ratios(statistics: Mapping, sensor: str) -> dict[str, float]:
     """
     Return kind of window -> ratio of residual variance to expected variance.
 
     It is the ratio of the residual variance of the sensor to that of its noise and of errors of the
     stamps.
+
+    Parameters
+    ----------
+    statistics : mapping
+        Of a calibration.
+    sensor : str
+
     """
-    chi2 = calibration.statistics.get(sensor, {}).get('chi2_per_dof') or {}
-    by_stamps = (
-        (calibration.statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
-    )
-    return {
-        kind: ratio / by_stamps.get(kind, 1.0) for kind, ratio in chi2.items() if kind != 'means'
-    }
+    chi2 = statistics.get(sensor, {}).get('chi2_per_dof') or {}
+    of_stamps = (statistics.get('stamp_jitter') or {}).get('variance_ratio', {}).get(sensor, {})
+    ratios = {}
+    for kind, ratio in chi2.items():
+        if kind != 'means' and ratio is not None:
+            ratios[kind] = ratio / of_stamps.get(kind, 1.0)
+    return ratios
 
 
-def has_structure(calibration: Calibration, sensor: str, kind: str) -> bool:
+def incomplete_motions(statistics: Mapping, sensor: str) -> dict[str, float]:
     """
-    Return whether the residual of a kind of moving window is correlated in time.
+    Return kind of window -> ratio of `misfit_ratios` where the model of the sensor is incomplete.
 
-    True for documents that do not contain the comparison.
+    The ratio exceeds `NOTED_MISFIT`, and the residual is correlated in time
+    (`BandMisfit.slow_over_fast`, if it is known). Without a rest the ratio compares the residual
+    with its slow part, so that every excess has structure. Arguments as for `misfit_ratios`.
     """
-    return is_structured(calibration.statistics.get(sensor, {}).get('slow_over_fast') or {}, kind)
+    slow_over_fast = statistics.get(sensor, {}).get('slow_over_fast') or {}
+    at_rest = rested(statistics)
+    found = {}
+    for kind, ratio in misfit_ratios(statistics, sensor).items():
+        has_structure = slow_over_fast.get(kind, np.inf) > MIN_STRUCTURE
+        if ratio > NOTED_MISFIT and (has_structure or not at_rest):
+            found[kind] = ratio
+    return found
 
 
-def is_structured(slow_over_fast: Mapping[str, float], kind: str) -> bool:
-    """Return whether `BandMisfit.slow_over_fast` of a kind, if it is known, shows a structure."""
-    return slow_over_fast.get(kind, np.inf) > MIN_STRUCTURE
-
-
-def rested(calibration: Calibration) -> bool:
+def rested(statistics: Mapping) -> bool:
     """Return whether a recording on a table has rests, from which the noise is known."""
-    windows = calibration.statistics.get('windows')
+    windows = statistics.get('windows')
     return windows is None or bool(windows.get('static'))
 
 
@@ -314,7 +332,7 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
 
     Without a rest they are compared with their slow part; lags are visible in the fast part.
     """
-    at_rest = rested(calibration)
+    at_rest = rested(calibration.statistics)
     reference = (
         'the noise at rest' if at_rest else 'their slow part (as after a lag or a late clock)'
     )
@@ -325,14 +343,15 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
             if at_rest and helps_everywhere(calibration.proof.get(sensor))
             else ''
         )
-        for kind, ratio in misfit_ratios(calibration, sensor).items():
+        incomplete = incomplete_motions(calibration.statistics, sensor)
+        for kind, ratio in misfit_ratios(calibration.statistics, sensor).items():
             if ratio <= NOTED_MISFIT:
                 continue
             size = (
                 f'the {sensor} residuals of {kind} windows are {np.sqrt(ratio):.1f} times'
                 f' {reference}'
             )
-            if at_rest and not has_structure(calibration, sensor, kind):
+            if kind not in incomplete:
                 reasons.append(
                     Reason(NOTE, f'{size}, {LOUDER_ONLY}', 'reduce vibration', sensors=(sensor,))
                 )
@@ -374,7 +393,7 @@ def unsteady(calibration: Calibration, tolerances: np.ndarray) -> list[Reason]:
         part = calibration.model.part(sensor, Role.OFFSET)
         scatter = float(np.max(calibration.noise(sensor)[1]))
         certain = scatter * _smallest_share(calibration, sensor)
-        if moved_at_rest(calibration, sensor):
+        if moved_at_rest(calibration.by_hand, sensor):
             continue
         if certain > tolerances[part][0] and scatter > _misfit(calibration, sensor):
             factor, unit = for_people(UNITS[sensor])
@@ -550,6 +569,8 @@ def _step_of(calibration: Calibration, sensor: str) -> tuple[str, str | None]:
     # Values that are refused have their own cause, and no measurement of their error is missing.
     if limit := surpassed_limit(calibration, sensor):
         return limit.remedy, limit.key
+    if moved_at_rest(calibration.by_hand, sensor):
+        return MOVED_REMEDY, None
     if entry is None or not entry.windows:
         if not by_hand:
             return 'record more windows of rest and motion', None
@@ -598,7 +619,7 @@ def _undecided_motion(calibration: Calibration, sensor: str) -> str:
     A sensor moved where it was held still, or none of its requested parameters is determined:
     held-out windows then contain the same motions.
     """
-    if moved := moved_at_rest(calibration, sensor):
+    if moved := moved_at_rest(calibration.by_hand, sensor):
         return moved
     own = [status for name, status in calibration.requested.items() if name.startswith(sensor)]
     if own and DETERMINED not in own:
@@ -644,8 +665,8 @@ def _periodic(calibration: Calibration, sensor: str) -> bool:
 
     No rests, and residuals far above the noise.
     """
-    return not rested(calibration) and any(
-        ratio > MAX_MISFIT_RATIO for ratio in misfit_ratios(calibration, sensor).values()
+    return not rested(calibration.statistics) and any(
+        ratio > MAX_MISFIT_RATIO for ratio in misfit_ratios(calibration.statistics, sensor).values()
     )
 
 
@@ -738,9 +759,8 @@ def _moved(calibration: Calibration) -> list[Reason]:
     """Return a warning for each sensor that moved where it was held still."""
     reasons = []
     for sensor in calibration.sensors:
-        if text := moved_at_rest(calibration, sensor):
-            step = 'put the IMU down in each attitude, with engines and fans off, and record again'
-            reasons.append(Reason(WARNING, text, step, sensors=(sensor,)))
+        if text := moved_at_rest(calibration.by_hand, sensor):
+            reasons.append(Reason(WARNING, text, MOVED_REMEDY, sensors=(sensor,)))
     return reasons
 
 

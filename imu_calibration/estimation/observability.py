@@ -164,7 +164,7 @@ def needed_motions(
     lacking = np.flatnonzero(solution.sd > tolerances)
     if not len(lacking):
         return {}
-    base = solution.information + np.diag(1 / prior_sd**2)
+    base = _information_of(solution, prior_sd)
     # The model error remains: a motion reduces the noise only.
     remaining = np.maximum(solution.sd / _sd_of(base), 1.0)
     predicted = {}
@@ -177,6 +177,20 @@ def needed_motions(
         solution.param_names[k]: _best(solution, k, predicted, one_joint=possible is not None)
         for k in lacking.tolist()
     }
+
+
+def sd_of_data(solution: Solution, prior_sd: np.ndarray) -> np.ndarray:
+    """
+    Return the standard deviations that the recording has from noise, shape (n_params,).
+
+    No parameter is held, and there are no allowances.
+    """
+    return _sd_of(_information_of(solution, prior_sd))
+
+
+def _information_of(solution: Solution, prior_sd: np.ndarray) -> np.ndarray:
+    """Return the information of the data and of the prior, shape (n_params, n_params)."""
+    return solution.information + np.diag(1 / prior_sd**2)
 
 
 def _sd_of(information: np.ndarray) -> np.ndarray:

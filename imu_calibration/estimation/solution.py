@@ -49,12 +49,16 @@ TURNS_REMEDY = (
     'check that both sensors have the same axes, and that the recording contains each complete turn'
 )
 """Remedy where the rates of most turns by hand contradict gravity before and after them."""
+MOVED_REMEDY = 'put the IMU down in each attitude, with engines and fans off, and record again'
+"""Remedy where a sensor moved although it was held still."""
 REMEDY_KEYS = {
     REMEDIES[GRAVITY,]: 'gravity',
     REMEDIES[MODEL_ERROR, DRIFT, REJECTED]: 'diagnose',
     EXCESS_REMEDY: 'diagnose',
 }
 """Remedy that is no motion -> the key of its input or program (`errors.ERROR_KEYS`)."""
+NO_STEP = (*REMEDY_KEYS, TURNS_REMEDY, MOVED_REMEDY)
+"""Remedies in place of a next step by hand: no further attitude repairs the recording."""
 
 
 def remedy(
@@ -63,7 +67,7 @@ def remedy(
     tolerance: float,
     *,
     excess: float = 1.0,
-    is_misfit: bool = False,
+    of_misfit: Collection[str] = (),
 ) -> str:
     """
     Return how a parameter gets within its tolerance if more data do not help; '' if they do.
@@ -82,15 +86,13 @@ def remedy(
     excess : float
         Standard deviation of the residual over that of the noise, where the terms follow from the
         residual.
-    is_misfit : bool
-        Whether the residual in motion has structure in time: bias processes then describe the
-        error of the model, which more data do not reduce.
+    of_misfit : names
+        Terms that describe an error of the model here, so that more data do not reduce them.
 
     """
     variances = {name: float(term[index, index]) for name, term in terms.items()}
     fixed = {names: sum(variances.get(name, 0.0) for name in names) for names in REMEDIES}
-    if is_misfit:
-        fixed[MODEL_ERROR, DRIFT, REJECTED] += variances.get(BIAS_PROCESS, 0.0)
+    fixed[MODEL_ERROR, DRIFT, REJECTED] += sum(variances.get(name, 0.0) for name in of_misfit)
     reducible = sum(variances.values()) - sum(fixed.values())
     if reducible > (excess * tolerance) ** 2:
         return ''

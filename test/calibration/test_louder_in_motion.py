@@ -16,7 +16,7 @@ def test_noise_that_is_larger_in_motion_is_no_error_of_the_model():
         accelerometer_model='bias+matrix',
         gyroscope_model='bias+matrix',
     )
-    assert max(misfit_ratios(result.calibration, 'gyroscope').values()) > NOTED_MISFIT
+    assert max(misfit_ratios(result.calibration.statistics, 'gyroscope').values()) > NOTED_MISFIT
     found = motion_misfits(result.calibration)
     assert found
     assert {(reason.key, reason.sensors) for reason in found} == {(None, ('gyroscope',))}

@@ -18,7 +18,12 @@ from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.verdict import _step_of, unsteady
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
-from imu_calibration.estimation.solution import EXCESS_REMEDY, REMEDY_KEYS, TURNS_REMEDY
+from imu_calibration.estimation.solution import (
+    EXCESS_REMEDY,
+    MOVED_REMEDY,
+    REMEDY_KEYS,
+    TURNS_REMEDY,
+)
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS
 
 from worlds.compensation_cases import random_calibration
@@ -108,7 +113,12 @@ def test_a_warm_up_is_determined_and_a_weak_one_needs_no_attitude():
 def test_live_the_next_step_is_the_cause_where_no_attitude_helps():
     """The planner would propose poses for ever."""
     status = {'accelerometer.bias.x': 'weak'}
-    for need, expected in ((EXCESS_REMEDY, 'call ~/diagnose'), ('turn it', 'the planned pose')):
+    for need, expected in (
+        (EXCESS_REMEDY, 'call ~/diagnose'),
+        (MOVED_REMEDY, MOVED_REMEDY),
+        (TURNS_REMEDY, TURNS_REMEDY),
+        ('turn it', 'the planned pose'),
+    ):
         calibration = SimpleNamespace(
             requested=status, undetermined=({'parameters': {}, 'needs': need},)
         )

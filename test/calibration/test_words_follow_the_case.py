@@ -10,6 +10,7 @@ from imu_calibration.calibration.from_solution import motions_needed
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
+from imu_calibration.document.verdict import motion_misfits
 from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
     GRAVITY,
@@ -32,13 +33,19 @@ from worlds.physics import make_session
 VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
 
 
+def needed_motions(result, table):
+    """Return the motions that a result needs, with the statistics of its document."""
+    quality = result.calibration.statistics
+    return motions_needed(result.solution, result.tolerances, table, quality=quality)
+
+
 def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
     pair = make_pair(None, 1, table='shaft', profile='sweeps')
     table = Table.from_mapping(pair.table)
     result = calibrate_recordings(
         pair.first.block, table, accelerometer_model='bias+matrix', model_as_asked=True
     ).result
-    needs = {text for text, _ in motions_needed(result.solution, result.tolerances, table).values()}
+    needs = {text for text, _ in needed_motions(result, table).values()}
     possible = {motion.text for motion in motions_about((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))}
     assert OTHER_MOUNT in needs and needs <= {OTHER_MOUNT} | possible
     assert possible == {
@@ -60,7 +67,7 @@ def test_on_a_vertical_shaft_nothing_but_another_mount_turns_gravity():
         accelerometer_model='bias+matrix',
         model_as_asked=True,
     ).result
-    needed = motions_needed(result.solution, result.tolerances, table)
+    needed = needed_motions(result, table)
     held = [
         name
         for name, status in zip(result.calibration.param_names, result.calibration.status)
@@ -89,7 +96,7 @@ def test_an_uncertain_gravity_needs_its_value_and_no_spins():
         SampleBlock(session.imu, session.joints), table, model_as_asked=True
     ).result
     scales = [f'accelerometer.matrix.{axis}' for axis in ('xx', 'yy', 'zz')]
-    needed = motions_needed(result.solution, result.tolerances, table)
+    needed = needed_motions(result, table)
     assert {needed[name][0] for name in scales} == {REMEDIES[GRAVITY,]}
     reasons = [reason for reason in result.verdict.reasons if 'matrix.xx' in reason.what]
     assert [reason.next for reason in reasons] == [REMEDIES[GRAVITY,]]
@@ -117,8 +124,8 @@ def test_bias_processes_of_a_misfit_are_its_error():
     """A residual with structure in motion is described by a bias that moves."""
     terms = {SAMPLE_NOISE: np.diag([0.25]), BIAS_PROCESS: np.diag([9.0])}
     assert remedy(terms, 0, 1.0) == ''
-    assert REMEDY_KEYS[remedy(terms, 0, 1.0, is_misfit=True)] == 'diagnose'
-    assert remedy(terms | {SAMPLE_NOISE: np.diag([4.0])}, 0, 1.0, is_misfit=True) == ''
+    assert REMEDY_KEYS[remedy(terms, 0, 1.0, of_misfit=[BIAS_PROCESS])] == 'diagnose'
+    assert remedy(terms | {SAMPLE_NOISE: np.diag([4.0])}, 0, 1.0, of_misfit=[BIAS_PROCESS]) == ''
 
 
 def test_a_missing_effect_on_a_table_needs_its_cause_and_no_motions():
@@ -133,6 +140,58 @@ def test_a_missing_effect_on_a_table_needs_its_cause_and_no_motions():
     needs = {need for need, _ in result.needed.values()}
     assert needs and {REMEDY_KEYS.get(need) for need in needs} == {'diagnose'}
     assert not any('window to window' in reason.what for reason in result.verdict.reasons)
+
+
+def test_an_effect_that_is_held_for_a_misfit_needs_its_cause_and_no_motions():
+    """Arms are not in the model: a quadratic response takes their part, and is not believed."""
+    session = make_session(8, profile='short', noise='realistic', grade='industrial', arms=True)
+    found = calibrate_recordings(
+        SampleBlock(session.imu, session.joints),
+        Table.from_mapping(session.table),
+        accelerometer_model='bias+matrix+accel_quadratic',
+        model_as_asked=True,
+    )
+    held = found.calibration.statistics['not_believed']
+    assert {name.split('.')[1] for name in held} == {'accel_quadratic'}
+    reasons = [
+        reason
+        for reason in found.result.verdict.reasons
+        if reason.next and any(name in reason.what for name in ('accelerometer.', *held))
+    ]
+    assert reasons and {reason.key for reason in reasons} == {'diagnose'}
+
+
+def test_needs_and_verdict_have_one_rule_for_an_incomplete_model():
+    """Its bias process is an error of the model, unless errors of the stamps explain it."""
+    session = make_session(6, profile='short', noise='realistic', grade='industrial')
+    table = Table.from_mapping(session.table)
+    result = calibrate_recordings(
+        SampleBlock(session.imu, session.joints), table, model_as_asked=True
+    ).result
+    size = len(result.tolerances)
+    terms = {
+        SAMPLE_NOISE: np.diag((0.1 * result.tolerances) ** 2),
+        BIAS_PROCESS: np.diag((3.0 * result.tolerances) ** 2),
+        MODEL_ERROR: np.zeros((size, size)),
+    }
+    wandering = replace(result.solution, terms=terms, held=np.zeros(size, bool))
+    misfit = {'chi2_per_dof': {'spin': 20.0}, 'slow_over_fast': {'spin': 1.5}}
+    louder = misfit | {'slow_over_fast': {'spin': 0.9}}
+    of_stamps = {'stamp_jitter': {'variance_ratio': {'gyroscope': {'spin': 15.0}}}}
+    rests, none = {'windows': {'static': 9}}, {'windows': {'spin': 9}}
+    for quality, is_incomplete in (
+        ({'gyroscope': misfit} | rests, True),
+        ({'gyroscope': louder} | rests, False),
+        ({'gyroscope': louder} | none, True),
+        ({'gyroscope': misfit} | rests | of_stamps, False),
+    ):
+        found = replace(
+            result, solution=wandering, calibration=replace(result.calibration, statistics=quality)
+        )
+        need, _ = needed_motions(found, table)['gyroscope.bias.x']
+        assert (REMEDY_KEYS.get(need) == 'diagnose') is is_incomplete
+        keys = {reason.key for reason in motion_misfits(found.calibration)}
+        assert ('diagnose' in keys) is is_incomplete
 
 
 def test_compare_says_that_off_diagonal_terms_include_the_mounting():

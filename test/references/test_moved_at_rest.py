@@ -8,7 +8,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.rest_noise import MOVED_DENSITY, moved_at_rest, rest_density
-from imu_calibration.document.verdict import judge
+from imu_calibration.document.verdict import _step_of, judge
+from imu_calibration.estimation.solution import LACKING, MOVED_REMEDY
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY, simulate
@@ -43,11 +44,16 @@ def test_motion_at_rest_is_named_and_never_helps(sway, shake, correlation_s):
     found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
     assert set(found.decisions.values()) <= {'unproven', 'harms'}
     for sensor in ('accelerometer', 'gyroscope'):
-        text = moved_at_rest(found, sensor)
+        text = moved_at_rest(found.by_hand, sensor)
         assert text and any(text in note for note in found.notes)
+    # No pose and no turn repairs such a recording.
+    lacking = [name for name, status in found.requested.items() if status in LACKING]
+    assert lacking and {entry['needs'] for entry in found.undetermined} == {MOVED_REMEDY}
+    for sensor in ('accelerometer', 'gyroscope'):
+        assert _step_of(found, sensor) == (MOVED_REMEDY, None)
     # density of band-limited noise: sd^2 times twice the integral of its autocorrelation
     expected = shake * np.sqrt(2 * np.sqrt(np.pi) * correlation_s)
-    assert rest_density(found, 'accelerometer') == pytest.approx(expected, rel=0.5)
+    assert rest_density(found.by_hand, 'accelerometer') == pytest.approx(expected, rel=0.5)
 
 
 def test_a_steady_hand_is_not_named():
@@ -55,8 +61,8 @@ def test_a_steady_hand_is_not_named():
     found = calibrate_recordings(SampleBlock(imu), gravity=GRAVITY).calibration
     assert set(found.decisions.values()) == {'helps'}
     for sensor, limit in MOVED_DENSITY.items():
-        assert 0 < rest_density(found, sensor) < 0.3 * limit
-        assert not moved_at_rest(found, sensor)
+        assert 0 < rest_density(found.by_hand, sensor) < 0.3 * limit
+        assert not moved_at_rest(found.by_hand, sensor)
 
 
 def test_a_sensor_without_a_determined_parameter_is_not_said_to_help():
