@@ -11,7 +11,7 @@ deviations instead. So do alternatives to a chosen effect that fit nearly as wel
 unexplained residual: by the change of a bias that it may cause.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -37,7 +37,7 @@ from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.parameter_space import ParameterSpace
 from imu_calibration.selection.questions import Question
-from imu_calibration.selection.residual_analysis import inquire
+from imu_calibration.selection.residual_analysis import ResidualAnalysis, inquire
 from imu_calibration.selection.saturation import Saturation
 from imu_calibration.selection.search import FAMILY_WISE
 from imu_calibration.selection.unexplained import biases_off
@@ -229,7 +229,7 @@ def windows_to_ask(gathered: SessionData) -> list[list[Window]]:
     ]
 
 
-def _clipped(found):
+def _clipped(found: ResidualAnalysis) -> Solution | None:
     """
     Return the solution of a search that found a limit.
 
@@ -248,13 +248,15 @@ def _clipped(found):
     )
 
 
-def _examined(found):
+def _examined(found: ResidualAnalysis) -> ResidualAnalysis:
     """Return a search whose unexplained residual is evaluated and whose blocks are freed."""
     found.released()
     return found
 
 
-def _changes(searches, added):
+def _changes(
+    searches: Sequence[ResidualAnalysis], added: Sequence[tuple[str, str]]
+) -> ModelChanges:
     """
     Return the changes of the requested model by searches, and their effects.
 
@@ -262,7 +264,7 @@ def _changes(searches, added):
     """
     found, model = searches[0], searches[0].problem.baseline
     clipping = (
-        model.with_role(limit.sensor, Role.LIMIT).find(limit.sensor, Role.LIMIT).name
+        model.with_role(limit.sensor, Role.LIMIT).effect_of(limit.sensor, Role.LIMIT).name
         for limit in found.limits
     )
     rests = {
@@ -280,17 +282,17 @@ def _changes(searches, added):
     )
 
 
-def _beyond(named, model):
+def _beyond(named: Iterable[Question], model: SensorModel) -> list[Question]:
     """Return the findings that a model lacks."""
     return [question for question in named if question.effect.key not in model.slices]
 
 
-def _is_faint(solution, question):
+def _is_faint(solution: Solution, question: Question) -> bool:
     """Return whether an effect is in a solution but not significant."""
     return question.effect.key in solution.model.slices and not stands_out(solution, question)
 
 
-def _without_faint(found, solution):
+def _without_faint(found: ResidualAnalysis, solution: Solution) -> ResidualAnalysis:
     """Return the Investigation without findings that are in a solution but not significant."""
     faint = [question for question in found.named if _is_faint(solution, question)]
     return (
@@ -304,7 +306,7 @@ def _without_faint(found, solution):
     )
 
 
-def _named_elsewhere(found, others):
+def _named_elsewhere(found: Investigation, others: Sequence[Investigation]) -> list[Question]:
     """
     Return the effects that the search found in other recordings only, larger recordings first.
     """
@@ -355,7 +357,7 @@ def baseline_options(options: CalibrationOptions) -> CalibrationOptions:
     )
 
 
-def _baseline_model(options, table, solved):
+def _baseline_model(options: CalibrationOptions, table: Table, solved: SensorModel) -> SensorModel:
     """
     Return the baseline model of the search.
 
@@ -376,7 +378,7 @@ def _baseline_model(options, table, solved):
     )
 
 
-def _strange(found):
+def _strange(found: Sequence[Investigation]) -> dict[str, float]:
     """
     Return implausible effect -> share of the excess variance that it explains.
 
@@ -389,7 +391,7 @@ def _strange(found):
     }
 
 
-def _point(found):
+def _point(found: Investigation) -> dict[str, np.ndarray]:
     """Return effect -> values at which its columns are linearised, of the effects found."""
     model = found.problem.recording.model
     return {
@@ -399,7 +401,9 @@ def _point(found):
     }
 
 
-def _moves(found, lacking=()):
+def _moves(
+    found: ResidualAnalysis, lacking: Sequence[Question] = ()
+) -> tuple[tuple[dict[str, float], float], ...]:
     """
     Return (changes of parameters by other choices of effects, weight).
 
@@ -455,7 +459,7 @@ def extended_solution(
     return solution
 
 
-def _in_trusted_band(noise, slow_only):
+def _in_trusted_band(noise: NoiseModel, slow_only: np.ndarray) -> NoiseModel:
     """
     Return the noise with weight zero for fast parts on axes where only the slow part is compared.
     """
@@ -470,11 +474,11 @@ def _in_trusted_band(noise, slow_only):
     )
 
 
-def _with_limit(solution, limit):
+def _with_limit(solution: Solution, limit: Saturation) -> Solution:
     model = solution.model.with_role(limit.sensor, Role.LIMIT)
     place = model.part(limit.sensor, Role.LIMIT).start
 
-    def grown(matrix, corner):
+    def grown(matrix: np.ndarray, corner: float) -> np.ndarray:
         matrix = np.insert(np.insert(matrix, place, 0.0, axis=0), place, 0.0, axis=1)
         matrix[place, place] = corner
         return matrix

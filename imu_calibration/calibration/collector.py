@@ -16,7 +16,7 @@ from imu_calibration.calibration.from_solution import ModelChanges, ModelExtensi
 from imu_calibration.core.documents import load_arrays
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import SampleBlock
+from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
@@ -120,7 +120,7 @@ def to_bytes(
     return target.getvalue()
 
 
-def _packed(values, arrays):
+def _packed(values: Sequence[Any], arrays: list[np.ndarray]) -> list:
     """
     Return a column of values as plain lists, one column per part of values of equal type.
 
@@ -163,7 +163,7 @@ def _packed(values, arrays):
     ]
 
 
-def _kind(value):
+def _kind(value: Any) -> Any:
     """
     Return the shape, the keys, the length or the type, which values of one column have in common.
     """
@@ -179,11 +179,11 @@ def _kind(value):
 class _SavedNumbers(io.BytesIO):
     """The numbers of an archive, and how many more values its columns may have together."""
 
-    def __init__(self, data, most_values):
+    def __init__(self, data: bytes, most_values: int):
         super().__init__(data)
         self._most_values = self._remaining = most_values
 
-    def count(self, n_values):
+    def count(self, n_values: int) -> None:
         """Count the values of a column; raises ValueError above the limit."""
         self._remaining -= n_values
         if n_values < 0 or self._remaining < 0:
@@ -192,7 +192,7 @@ class _SavedNumbers(io.BytesIO):
             )
 
 
-def _unpacked(column, numbers):
+def _unpacked(column: list, numbers: _SavedNumbers) -> list:
     """
     Return the values that `_packed` wrote.
 
@@ -278,7 +278,7 @@ def require_columns(known: SensorModel, model: SensorModel) -> None:
         )
 
 
-def _text(model):
+def _text(model: SensorModel) -> str:
     effects = ' / '.join('+'.join(getattr(model, sensor)) or 'none' for sensor in SECTIONS)
     return f'{effects} at {model.temperature_ref_c:g} C'
 
@@ -341,13 +341,13 @@ class Collector:
         counts.update(self.gatherer.cleaner.lost)
         self.gathered.counts = dict(counts)
 
-    def _note_imu(self, imu):
+    def _note_imu(self, imu: ImuSamples) -> None:
         found = self.gathered
         if found.first_stamp_ns is None:
             found.first_stamp_ns, found.frame_id = int(imu.stamp_ns[0]), imu.frame_id
         found.last_stamp_ns = max(int(imu.stamp_ns[-1]), found.last_stamp_ns or 0)
 
-    def _note_temperature(self, temperature_c):
+    def _note_temperature(self, temperature_c: np.ndarray) -> None:
         finite = temperature_c[np.isfinite(temperature_c)]
         if len(finite):
             low, high = self.gathered.temperature_c or (np.inf, -np.inf)
@@ -356,7 +356,7 @@ class Collector:
                 float(max(high, finite.max())),
             )
 
-    def _take(self, windows):
+    def _take(self, windows: Sequence[Window]) -> list[Window]:
         if self.windows is not None:
             self.windows.extend(windows)
         used = [window for window in windows if window.kind != 'unused']
@@ -364,7 +364,7 @@ class Collector:
             self._add(window)
         return used
 
-    def _add(self, window):
+    def _add(self, window: Window) -> None:
         reduced = reduce_window(window, self.model, self.table, session=self.session)
         found = self.gathered
         found.take(reduced)
@@ -378,7 +378,7 @@ class Collector:
             )
         self._store(window, reduced)
 
-    def _store(self, window, _reduced: WindowStatistics):
+    def _store(self, window: Window, _reduced: WindowStatistics) -> None:
         kept = self.gathered.kept
         if (
             window.kind != 'static'
@@ -451,7 +451,15 @@ class GatherStep:
         gathered.findings = preflight.findings
         return gathered
 
-    def _gather(self, blocks, session, watchers, *, windows, without=NO_RANGES):
+    def _gather(
+        self,
+        blocks: Iterable[SampleBlock],
+        session: int,
+        watchers: Sequence[Watcher],
+        *,
+        windows: list | StoredWindows | None,
+        without: np.ndarray = NO_RANGES,
+    ) -> SessionData:
         collector = Collector(
             self.table,
             self.model,
@@ -485,7 +493,7 @@ class LiveCollector(Collector):
         self.store = store
         self.gathered.spreads = [DecimatedWindows(MAX_LIVE_SAMPLES)]
 
-    def _store(self, window, reduced):
+    def _store(self, window: Window, reduced: WindowStatistics) -> None:
         kept = owned_window(window)
         self.store.add(kept, reduced)
         self.gathered.spreads[0].add(kept)

@@ -1,6 +1,6 @@
 """Coverage of directions by a calibration, and the state of each effect."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from imu_calibration.estimation.standard_motions import (
     ALL_MOTIONS,
     DIRECTIONS,
     MOTIONS,
+    Motion,
     rest_with_up,
 )
 from imu_calibration.estimation.weighted_system import GAUGE_SD, make_prior
@@ -202,17 +203,17 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     gauge = GAUGE_SD / GAUGE_SHOWN * prior.gauge  # as exact as sums of squares bear it
     base = solution.information + np.diag(1 / prior.sd**2) + gauge.T @ gauge
 
-    def expected_sd(information):
+    def expected_sd(information: np.ndarray) -> np.ndarray:
         return np.sqrt(np.clip(np.diag(inverse_normal(information)), 0, None))
 
     # unmodelled effects widen the standard deviations beyond those of the information matrix; the
     # same factor is predicted
     wider = np.maximum(result.calibration.sd / np.maximum(expected_sd(base), 1e-300), 1.0)
 
-    def left(information):
+    def left(information: np.ndarray) -> np.ndarray:
         return sd_excess((wider * expected_sd(information))[wanted], result.tolerances[wanted])
 
-    def added(motion):
+    def added(motion: Motion) -> np.ndarray:
         return added_information(
             solution.model, solution.values, solution.noise, motion=motion, gravity=result.gravity
         )
@@ -232,7 +233,12 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     return Coverage(worth, unit_rows(force), None, step, seconds, False, _arms(result), frame_id)
 
 
-def _foretold(information, left, added, motions):
+def _foretold(
+    information: np.ndarray,
+    left: Callable[[np.ndarray], np.ndarray],
+    added: Callable[[Motion], np.ndarray],
+    motions: Sequence[Motion],
+) -> tuple[Motion | None, float]:
     """
     Return (first motion, seconds of all) of the motions that remove the excess.
 
@@ -256,7 +262,7 @@ def _foretold(information, left, added, motions):
     return None, float('nan')
 
 
-def _next_on_table(result):
+def _next_on_table(result: TableResult) -> Step:
     """Return the motion that serves the parameter worst off."""
     needed = result.needed
     if not needed:
@@ -271,14 +277,14 @@ def _next_on_table(result):
     return _step(needed[worst][0])
 
 
-def _step(text):
+def _step(text: str) -> Step:
     motion = next((motion for motion in MOTIONS if motion.text == text), None)
     return Step(
         text, axis=None if motion is None or motion.axis is None else np.array(motion.axis, float)
     )
 
 
-def _arms(result):
+def _arms(result: TableResult) -> np.ndarray | None:
     """Return the sensitive points, None while one of them is not determined."""
     effect = result.model.find('accelerometer', Role.ARMS)
     if effect is None:

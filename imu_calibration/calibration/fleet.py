@@ -35,7 +35,7 @@ class Unit:
     """
     bags: tuple = ()
     """Names of the recordings."""
-    provenance: object = None
+    provenance: Callable[[], dict] | None = None
     """Callable that returns bag hashes and options for the document, or None."""
 
 
@@ -99,14 +99,15 @@ class FleetStep:
             text = f'stopped by {type(error).__name__}: {" ".join(str(error).split())}'
             return UnitResult(unit.name, error=text, reasons=(text,))
 
-    def _calibrated(self, unit):
+    def _calibrated(self, unit: Unit) -> UnitResult:
         provenance = unit.provenance() if unit.provenance is not None else None
         result = calibrate_by_evidence(
             unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None
         ).result
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
-        if self.report is not None:
-            texts['report.html'] = self.report(result)
+        report_of = self.report
+        if report_of is not None:
+            texts['report.html'] = report_of(result)
         return UnitResult(
             unit.name,
             result.calibration,
@@ -180,7 +181,7 @@ def summarise(results: Sequence[UnitResult]) -> list[Spread]:
     return [_spread(name, units[name], found) for name, found in values.items()]
 
 
-def _spread(name, unit, found):
+def _spread(name: str, unit: str, found: Sequence[tuple[float, float, str]]) -> Spread:
     if not found:
         missing = float('nan')
         return Spread(name, unit, 0, missing, missing, missing, (missing, ''), (missing, ''))

@@ -4,9 +4,9 @@ A calibration by hand.
 With the effects that it supports, and with the document and result of a calibration on a table.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -64,6 +64,7 @@ from imu_calibration.references.gravity.hand_parameters import (
 )
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
+from imu_calibration.selection.questions import Question
 
 if TYPE_CHECKING:
     from imu_calibration.references.gravity.model_selection import HandInvestigation
@@ -133,7 +134,7 @@ def solve_hand_by_evidence(
     return EvidentHand(hand, found, changes)
 
 
-def _solved(data, found, options):
+def _solved(data: HandData, found: HandInvestigation, options: HandOptions) -> HandCalibration:
     """
     Return the calibration with the requested model and the findings.
 
@@ -148,7 +149,9 @@ def _solved(data, found, options):
     )
 
 
-def _faint(hand, found, asked):
+def _faint(
+    hand: HandCalibration, found: HandInvestigation, asked: Mapping[str, Collection[str]]
+) -> list[Question]:
     """Return the effects that were added and are implausible or have no significant coefficient."""
     faint = []
     for question in found.adopted:
@@ -172,7 +175,9 @@ def extended_by_hand(
     """
     asked, names = _asked(data, options), found.names
     extended = replace(
-        options, **{sensor: _joined(asked[sensor], names[sensor]) for sensor in SENSORS}
+        options,
+        accelerometer=_joined(asked['accelerometer'], names['accelerometer']),
+        gyroscope=_joined(asked['gyroscope'], names['gyroscope']),
     )
     hand = solve_by_hand(data, extended, found.point(found.problem, found.named))
     terms = hand.terms
@@ -183,14 +188,14 @@ def extended_by_hand(
     return replace(hand, terms=terms)
 
 
-def _asked(data, options):
+def _asked(data: HandData, options: HandOptions) -> dict[str, tuple[str, ...]]:
     return {
         'accelerometer': options.accelerometer or BASE,
         'gyroscope': options.gyroscope or default_gyroscope(data.poses)[0],
     }
 
 
-def _joined(asked, found):
+def _joined(asked: tuple[str, ...], found: Iterable[str]) -> tuple[str, ...]:
     return asked + tuple(name for name in found if name not in asked)
 
 
@@ -385,7 +390,7 @@ def late_gyroscope(delay: GyroscopeDelay | None) -> Iterator[CheckFinding]:
         )
 
 
-def _readings_only(imu, ranges):
+def _readings_only(imu: ImuSamples, ranges: np.ndarray) -> ImuSamples:
     """Return the samples that are in none of the ranges of `Preflight.without_readings`."""
     kept = outside(ranges, np.arange(len(imu)))
     if not kept.any():
@@ -514,7 +519,9 @@ def hand_result(
     )
 
 
-def _statistics(hand, counts, n_samples):
+def _statistics(
+    hand: HandCalibration, counts: Mapping[str, int], n_samples: int
+) -> dict[str, dict[str, Any]]:
     found = hand.statistics
     keys = {
         'accelerometer': ('force_noise_sd', 'pose_scatter_sd', 'pose_dof'),
@@ -657,7 +664,7 @@ def prove_hand_readings(
     return proof
 
 
-def _means(imu, ranges):
+def _means(imu: ImuSamples, ranges: Sequence[slice]) -> tuple[np.ndarray, ...]:
     return tuple(
         np.array([np.nanmean(values[part], axis=0) for part in ranges])
         for values in (imu.force_s, imu.rate_s)

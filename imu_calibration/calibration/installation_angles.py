@@ -104,11 +104,11 @@ def angles_of(axes: np.ndarray) -> np.ndarray:
     return np.arctan2(across, axes)
 
 
-def _angle(first, second):
+def _angle(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
 
 
-def _angle_sd(axis, j, spread):
+def _angle_sd(axis: np.ndarray, j: int, spread: np.ndarray) -> float:
     """
     Return the sd of the angle to coordinate axis j.
 
@@ -124,7 +124,9 @@ def _angle_sd(axis, j, spread):
     return float(np.sqrt(slope @ spread @ slope))
 
 
-def _between_sd(axes, tangent, covariance, i, j):
+def _between_sd(
+    axes: np.ndarray, tangent: np.ndarray, covariance: np.ndarray, i: int, j: int
+) -> float:
     slope = np.zeros(9)
     slope[3 * i : 3 * i + 3] = axes[j] @ tangent[i]
     slope[3 * j : 3 * j + 3] = axes[i] @ tangent[j]

@@ -38,6 +38,7 @@ from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import setting
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import check_units
@@ -90,7 +91,7 @@ class LiveSnapshot:
         if not self.store.complete:
             return solve_gathered(self.gathered, self.model, options), self.gathered, self.model
 
-        def solved(model, judged_from):
+        def solved(model: SensorModel, judged_from: float) -> tuple[Solution, SessionData]:
             known = model is self.model and judged_from == self.gathered.judged_from
             total = (
                 self.gathered
@@ -377,7 +378,7 @@ class LiveCalibration:
             return self._push_before_temperature(block)
         return self._collector.push(block)
 
-    def _push_before_temperature(self, block):
+    def _push_before_temperature(self, block: SampleBlock) -> list:
         self._waiting.append(block)
         del self._waiting[:-HELD_BACK]
         if self._first_temperature_c is None:
@@ -388,7 +389,7 @@ class LiveCalibration:
         blocks, self._waiting = self._waiting, []
         return [window for held_back in blocks for window in self._collector.push(held_back)]
 
-    def _begin(self, model):
+    def _begin(self, model: SensorModel) -> None:
         session = 0
         if self.earlier is not None:
             session = 1 + max((row.session for row in self.earlier.accumulator.rows), default=-1)
@@ -489,7 +490,7 @@ class LiveCalibration:
             )
         return self._collector
 
-    def _with_earlier(self, gathered):
+    def _with_earlier(self, gathered: SessionData) -> SessionData:
         if self.earlier is None:
             return gathered
         return merge([copied(self.earlier), gathered])
@@ -506,7 +507,7 @@ class LiveCalibration:
             return None
         return ImuSamples.concatenate([self._residual(window) for window in windows])
 
-    def _residual(self, window):
+    def _residual(self, window: Window) -> ImuSamples:
         every = max(int(np.ceil(1.0 / max(window.period * self.settings.residual_rate, 1e-9))), 1)
         some = slice(every // 2 if len(window) > every // 2 else 0, None, every)
         # Residuals exist after a solution of the gathered windows.

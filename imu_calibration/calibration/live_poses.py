@@ -181,7 +181,14 @@ def unseen(found: PoseScan) -> list[str]:
     )
 
 
-def _needs(found, not_seen, calibration, *, step, hints):
+def _needs(
+    found: PoseScan,
+    not_seen: Sequence[str],
+    calibration: Calibration | None,
+    *,
+    step: str,
+    hints: dict[str, str],
+) -> tuple[Progress, list[str]]:
     if found.attitudes < MIN_ATTITUDES or calibration is None:
         more = f' (faces not seen yet: {", ".join(not_seen)})' if not_seen else ''
         return Progress.WAITING, [
@@ -208,7 +215,7 @@ def _needs(found, not_seen, calibration, *, step, hints):
     return Progress.WEAK, [step, *without_motion] if step else list(needs)
 
 
-def _plural(count, noun):
+def _plural(count: int, noun: str) -> str:
     return f'{count} {noun}' + ('' if count == 1 else 's')
 
 
@@ -404,12 +411,12 @@ class LiveByHand:
         self._pacer.note(start, self._clock())
         return self._newly_over()
 
-    def _search(self, store):
+    def _search(self, store: HandStore) -> None:
         imu = store.samples()
         if imu is not None and len(imu) > 2:
             self.found = look_for_poses(imu, self.options.windows)
 
-    def _newly_over(self):
+    def _newly_over(self) -> list[ImuSamples]:
         imu, found = self._store.samples(), self.found
         if imu is None or found.poses is None:
             return []
@@ -545,7 +552,7 @@ class LiveByHand:
         )
 
 
-def _check_model(model):
+def _check_model(model: SensorModel) -> None:
     """
     Refuse effects that need a table, and effects of temperature.
 

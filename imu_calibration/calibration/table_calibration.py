@@ -1,6 +1,6 @@
 """Calibration on a table, and the check of a calibration on another recording."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -38,9 +38,10 @@ from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import TemperatureSamples
+from imu_calibration.core.samples import SampleBlock, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import (
+    Uncorrected,
     end_of,
     judged_from_of,
     latest_settling,
@@ -131,7 +132,7 @@ def solve_recordings(
     if model.needs_temperature:
         model = model.with_reference_temperature(_first_temperature(sources))
 
-    def solved(model, judged_from):
+    def solved(model: SensorModel, judged_from: float) -> tuple[Solution, SessionData]:
         step = GatherStep(
             table, model, options.windows, options.nominal, names, keep_windows, judged_from
         )
@@ -170,7 +171,9 @@ def solve_in_passes(
     return solution, gathered, model
 
 
-def _at_time_constants(model, options, solved):
+def _at_time_constants(
+    model: SensorModel, options: CalibrationOptions, solved: Callable
+) -> SensorModel:
     """
     Return the model with the columns of requested warm-ups.
 
@@ -188,7 +191,7 @@ def _at_time_constants(model, options, solved):
     return model
 
 
-def _first_temperature(sources):
+def _first_temperature(sources: Sequence[Callable]) -> float:
     """Return the first temperature of the first recording."""
     for block in sources[0]():
         if block.temperature is not None and len(block.temperature):
@@ -336,7 +339,7 @@ def conclude(
     )
 
 
-def _uncorrected(solution, gathered, model):
+def _uncorrected(solution: Solution, gathered: SessionData, model: SensorModel) -> Uncorrected:
     """Return the errors that a solution of data with the columns of `model` leaves uncorrected."""
     values = solution.values
     return uncorrected_on_table(
@@ -348,7 +351,7 @@ def _uncorrected(solution, gathered, model):
     )
 
 
-def _by_default(model, options):
+def _by_default(model: SensorModel, options: CalibrationOptions) -> list[slice]:
     """
     Return the parameters of each effect that is in the model unasked.
 
@@ -367,7 +370,7 @@ def _by_default(model, options):
     ]
 
 
-def _size_effect_unseen(solution):
+def _size_effect_unseen(solution: Solution) -> bool:
     arms, arm = (
         solution.held[solution.model.part('accelerometer', role)] for role in (Role.ARMS, Role.ARM)
     )
@@ -434,7 +437,9 @@ def check_on_table(
     )
 
 
-def _with_corrected(source, calibration, options):
+def _with_corrected(
+    source: Callable, calibration: Calibration, options: CalibrationOptions
+) -> Iterator[SampleBlock]:
     """
     Yield the blocks of a recording with corrected readings in addition to the raw ones.
 
@@ -456,13 +461,15 @@ def _with_corrected(source, calibration, options):
         yield block
 
 
-def _both(window):
+def _both(window: Window) -> tuple[Window, Window]:
     """
     Return a window with raw readings and the same with corrected ones.
 
     Both are without samples that cannot be corrected.
     """
-    known = np.isfinite(window.corrected).all(axis=1)
+    corrected = window.corrected
+    assert corrected is not None, 'the window is of corrected readings'
+    known = np.isfinite(corrected).all(axis=1)
     if not known.all():
-        window = window.select(known)
-    return window, replace(window, force_s=window.corrected[:, :3], rate_s=window.corrected[:, 3:])
+        window, corrected = window.select(known), corrected[known]
+    return window, replace(window, force_s=corrected[:, :3], rate_s=corrected[:, 3:])

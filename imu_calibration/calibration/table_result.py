@@ -7,7 +7,7 @@ Noise gives the covariance of the solution; a wrong reference that changes the p
 not level and independent when an encoder is read in every pose.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, NamedTuple
@@ -91,13 +91,15 @@ def error_budget(result: 'TableResult') -> ErrorBudget:
     return ErrorBudget(tuple(result.solution.param_names), causes, texts)
 
 
-def _causes(result, gravity_sd):
+def _causes(
+    result: 'TableResult', gravity_sd: float
+) -> list[tuple[str, str, bool, Sequence[Callable]]]:
     """
     Return (name, text, scattered, changes).
 
     A change maps (table, motion) to values that differ by one sd.
     """
-    found = []
+    found: list[tuple[str, str, bool, Sequence[Callable]]] = []
     if result.solution.model.find('reference', Role.TILT) is None:
         text = f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated'
         found.append(
@@ -126,21 +128,21 @@ def _causes(result, gravity_sd):
     return found
 
 
-def _tilted(angles, table, motion):
+def _tilted(angles: np.ndarray, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
     return tilt(table, angles), motion
 
 
-def _turned(angles, table, motion):
+def _turned(angles: np.ndarray, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
     return table, replace(motion, position=motion.position + angles)
 
 
-def _faster(factor, table, motion):
+def _faster(factor: float, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
     return table, replace(
         motion, rate=factor * motion.rate, acceleration=factor**2 * motion.acceleration
     )
 
 
-def _heavier(change, table, motion):
+def _heavier(change: float, table: Table, motion: JointMotion) -> tuple[Table, JointMotion]:
     return replace(table, gravity=table.gravity_value + change), motion
 
 
@@ -199,7 +201,7 @@ class _Source(NamedTuple):
     temperature_c: np.ndarray | None
 
 
-def _sources(result):
+def _sources(result: 'TableResult') -> Iterator[_Source]:
     """Yield the windows at rest, and the moving ones that were kept."""
     rows = {
         (row.session, row.time): row.count
@@ -225,7 +227,9 @@ def _sources(result):
         )
 
 
-def _outputs(result, source, changes):
+def _outputs(
+    result: 'TableResult', source: _Source, changes: Sequence[Callable]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """
     Return sensor -> (columns, changes of the output) at the samples of a window.
 

@@ -198,6 +198,12 @@ class SensorModel:
         """Return the effect of a sensor in a place of its equation, or None."""
         return next((e for e in self.effects if e.sensor == sensor and e.role is role), None)
 
+    def effect_of(self, sensor: str, role: Role) -> Effect:
+        """Return the effect that a model is known to have in a place of a sensor's equation."""
+        effect = self.find(sensor, role)
+        assert effect is not None, f'the model must have a {role.name} of the {sensor}'
+        return effect
+
     def part(self, sensor: str, role: Role) -> slice:
         """
         Return the slice of the parameter vector of the effect in a place of a sensor's equation.

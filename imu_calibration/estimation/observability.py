@@ -29,7 +29,7 @@ def sd_excess(sd: np.ndarray, tolerances: np.ndarray) -> np.ndarray:
     return np.log(np.maximum(sd / tolerances, 1.0)).sum(axis=-1)
 
 
-def share_gained(before: float, after: np.ndarray) -> np.ndarray:
+def share_gained(before: float | np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the share of the excess that is removed, 0 to 1."""
     return np.clip((before - after) / before, 0.0, 1.0) if before > 0 else np.zeros_like(after)
 

@@ -54,7 +54,7 @@ def folds_of(kind: np.ndarray) -> np.ndarray:
     return _turn_of(kind, EVIDENCE_FOLDS)
 
 
-def _turn_of(kind, modulus):
+def _turn_of(kind: np.ndarray, modulus: int) -> np.ndarray:
     turn = np.zeros(len(kind), int)
     for offset, name in enumerate(np.unique(kind)):
         turn[kind == name] = (np.arange((kind == name).sum()) + offset) % modulus
@@ -163,15 +163,15 @@ class Evidence:
         left[:, np.append(sorted(used), -1)] = self._left_by_others(tuple(sorted(used)))
         return left
 
-    def _loss(self, used):
+    def _loss(self, used: Sequence[int]) -> float:
         return quadratic(self.total, used, self.fit(used)[0])
 
-    def _heldout(self, used):
+    def _heldout(self, used: tuple[int, ...]) -> float:
         places, left = np.append(used, -1), self._left_by_others(used)
         folds = self.total[np.ix_(places, places)] - self.without[:, places[:, None], places]
         return float(_squares(folds[None], left)[0])
 
-    def _left_by_others(self, used):
+    def _left_by_others(self, used: tuple[int, ...]) -> np.ndarray:
         """
         Return for each fold the map from rows of `used`, sorted, to residuals.
 
@@ -239,7 +239,7 @@ class WindowEvidence(Evidence):
         total = np.sum(parts, axis=0)
         super().__init__(total, total - parts, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
 
-    def _of_sensor(self, sensor):
+    def _of_sensor(self, sensor: str) -> np.ndarray:
         """Return the normal matrices of one sensor, of each fold."""
         found = np.zeros((self.fold.max() + 1, self.space.size + 1, self.space.size + 1))
         for axis, parts in enumerate(self._of_axis[sensor]):
@@ -302,7 +302,7 @@ class WindowEvidence(Evidence):
         return found
 
     @cached_property
-    def _within_whole(self):
+    def _within_whole(self) -> dict[str, list[np.ndarray]]:
         """
         Sensor -> part within the windows of each fold.
 
@@ -374,7 +374,7 @@ class WindowEvidence(Evidence):
         )
 
 
-def _squares(parts, rows):
+def _squares(parts: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """
     Return residual sums of squares from normal matrices of folds.
 

@@ -90,7 +90,7 @@ class Explained:
         together, alone = self._sigmas(sensor, excess)
         return np.maximum(together, alone.max(axis=1))
 
-    def _sigmas(self, sensor, excess):
+    def _sigmas(self, sensor: str, excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
         Return the same of all axes together, shape (n_parts,), and of each axis.
 
@@ -112,7 +112,7 @@ class Explained:
             sum(self._rest(sensor, excess).sum() for sensor, excess in self.excess(chosen).items())
         )
 
-    def _rest(self, sensor, excess):
+    def _rest(self, sensor: str, excess: np.ndarray) -> np.ndarray:
         """Return the same of each part, shape (n_parts,)."""
         together, alone = self._sigmas(sensor, excess)
         left = np.where(alone > SIGNIFICANT_REST, excess, 0.0).sum(axis=1)
@@ -139,7 +139,9 @@ class Explained:
         """Return the excess over noise of the choice, in the parts where the effect shows."""
         return sum(rest for _, rest in self._where_it_shows(chosen, question))
 
-    def _where_it_shows(self, chosen, question):
+    def _where_it_shows(
+        self, chosen: Sequence[Question], question: Question
+    ) -> list[tuple[float, float]]:
         """
         Return (removed by the effect, significant remaining excess) of each sensor.
 

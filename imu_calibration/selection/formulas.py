@@ -1,7 +1,7 @@
 """Formulas of regressors for a residual: grammar, search, and evaluation."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, combinations_with_replacement, product
@@ -41,6 +41,10 @@ UNIT_OF = {
     'time': 's',
 }
 """Quantity -> unit of one factor of it; angles, attitudes and arguments of functions have none."""
+Column = str | tuple[str, ...]
+"""Text of a column for all axes, or of three, one for each axis."""
+Product = tuple[str, tuple[str, ...]]
+"""Text of a product, and the quantities that it is the product of."""
 
 
 @dataclass(frozen=True)
@@ -122,16 +126,16 @@ def grammar(n_joints: int, thermal: bool, duration: float) -> tuple[Formula, ...
     return tuple(found)
 
 
-def _atoms(*letters):
+def _atoms(*letters: str) -> list[Product]:
     kinds = {'f': 'force', 'w': 'rate', 'alpha': 'angular acceleration'}
     return [(f'{letter}_{a}', (kinds[letter],)) for letter in letters for a in AXES]
 
 
-def _sense(text):
+def _sense(text: str) -> str:
     return SOFT_SIGN.format(text) if text.startswith('w') else f'sign({text})'
 
 
-def _times(*parts):
+def _times(*parts: Product) -> Product:
     """Return (text, factors) of a product, powers gathered."""
     texts, factors = (
         [text for text, _ in parts],
@@ -143,7 +147,7 @@ def _times(*parts):
     ), factors
 
 
-def _monomials(degree):
+def _monomials(degree: int) -> list[Product]:
     return [_times(*parts) for parts in combinations_with_replacement(_atoms('f', 'w'), degree)]
 
 
@@ -179,13 +183,13 @@ def _slow(thermal: bool, duration: float) -> Iterator:
     yield from (_times(*warm, *warm, entry) for entry in _monomials(1) if thermal)
 
 
-def _turn(joint, order, before=''):
+def _turn(joint: int, order: int, before: str = '') -> tuple[str, str, str]:
     """Return (cosine, sine, text with a phase) of an order of a joint."""
     inside = f'angle_{joint}' if order == 1 else f'{order} * angle_{joint}'
     return f'{before}cos({inside})', f'{before}sin({inside})', f'{before}cos({inside} - {{phase}})'
 
 
-def _harmonics(n_joints, thermal):
+def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
     joints = range(1, n_joints + 1)
     for joint, order in product(joints, JOINT_ORDERS):
         befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))] + [
@@ -203,7 +207,7 @@ def _harmonics(n_joints, thermal):
         yield Formula(tuple(f'{a} * {b}' for a, b in product(*halves)), ())
 
 
-def _of_joint_rates(n_joints):
+def _of_joint_rates(n_joints: int) -> Iterator[Formula]:
     rates = [(f'joint_rate_{joint}', ('joint rate',)) for joint in range(1, n_joints + 1)]
     for text, own in rates:
         yield Formula((f'abs({text})',), own)
@@ -216,7 +220,7 @@ def _of_joint_rates(n_joints):
     )
 
 
-def _with_the_table(n_joints, thermal):
+def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
     """Yield vectors fixed to the level frame while the sensor turns."""
     joints = range(1, n_joints + 1)
     vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
@@ -252,7 +256,7 @@ class FormulaChoice:
 
 
 @lru_cache(maxsize=64)
-def _function(texts):
+def _function(texts: Iterable[str]) -> Callable:
     return array_function([read(text) for text in texts])
 
 
@@ -310,7 +314,7 @@ class FormulaSearch:
             self._free.append(np.where(new, free, 0.0))
             self.known.append(int((sizes > 1.0).sum()))
 
-    def _worked_out(self, texts, reference_temperature):
+    def _worked_out(self, texts: Sequence[str], reference_temperature: float) -> np.ndarray:
         ref = self.blocks.ref
         known = {
             name: (getattr(ref, field), index) for name, (field, *index) in PLACES.items() if field
@@ -379,10 +383,10 @@ class FormulaSearch:
             self._free[axis] = self._free[axis] - basis @ (basis.T @ self._free[axis])
             self.known[axis] += basis.shape[1]
 
-    def _at(self, column):
+    def _at(self, column: Column) -> list[int]:
         return [self._place[text] for text in _three(column)]
 
-    def _gains(self):
+    def _gains(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (fall of chi-square, number of amplitudes) of each formula, shape (n,) both."""
         gains, counts = np.zeros(len(self.formulas)), np.zeros(len(self.formulas))
         for width in {len(formula.columns) for formula in self.formulas}:
@@ -413,5 +417,5 @@ class FormulaSearch:
         return gains, counts
 
 
-def _three(column):
+def _three(column: Column) -> tuple[str, ...]:
     return (column,) * 3 if isinstance(column, str) else column

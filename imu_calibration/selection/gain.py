@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.selection.linearised_problem import LinearisedProblem
+from imu_calibration.selection.parameter_space import ParameterSpace
 from imu_calibration.selection.questions import Question
 
 WINDOW_RESAMPLES = 1000
@@ -158,7 +159,9 @@ def gain_of(
     return Gain(sensor, measure, before, after, reduction_interval(pair), len(pair[0][0]), of)
 
 
-def _squares(space, values, sensor):
+def _squares(
+    space: ParameterSpace, values: np.ndarray, sensor: str
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """
     Return measure -> (sums of squares, their numbers) per window, each (k,).
 
@@ -192,7 +195,7 @@ def _squares(space, values, sensor):
     )
 
 
-def _certainty(pair):
+def _certainty(pair: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
     """Return by how many standard deviations sums of squares fall from window to window."""
     fall = pair[0][0] - pair[1][0]
     return float(fall.sum() / max(np.sqrt(fall @ fall), 1e-300))

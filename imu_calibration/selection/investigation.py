@@ -4,7 +4,7 @@ The search from windows to named effects.
 Remove clipped samples, linearise, choose, prove, relinearise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import AbstractSet
@@ -19,7 +19,7 @@ from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.explained_share import ExplainedWindows, pruned, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
-from imu_calibration.selection.lag_explanations import lag_explanations
+from imu_calibration.selection.lag_explanations import LagExplanations, lag_explanations
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.onset import Onset, find_onset
 from imu_calibration.selection.questions import (
@@ -176,9 +176,11 @@ def investigate(
     )
 
 
-def _explained(problem, linearised_at, start=()):
+def _explained(
+    problem: LinearisedProblem, linearised_at: Callable, start: Sequence[Question] = ()
+) -> tuple['_Outcome', Sequence[Rival], Callable]:
     """
-    Return (the _Outcome of a search, rivals of its findings, `linearised_at`).
+    Return (the '_Outcome' of a search, rivals of its findings, `linearised_at`).
 
     In `linearised_at` the lags are resolved if there are any.
     """
@@ -213,7 +215,7 @@ class _Outcome:
     unstable: Sequence[Question]
 
     @cached_property
-    def rest(self):
+    def rest(self) -> float:
         """Significant excess over noise with the findings in the model."""
         return self.explained.rest(self.named)
 
@@ -228,7 +230,7 @@ class _Trial:
     rivals: Sequence[Rival]
 
     @property
-    def rank(self):
+    def rank(self) -> tuple[int, int, int]:
         """Numbers of its lags that are named and chosen, then the order of the trials."""
         named, chosen = (
             len(self.lags & {question.name for question in some})
@@ -237,18 +239,20 @@ class _Trial:
         return named, chosen, -self.number
 
     @property
-    def helps(self):
+    def helps(self) -> bool:
         """Whether all of its lags are named."""
         return self.rank[0] == len(self.lags)
 
-    def finished(self, linearised_at):
+    def finished(self, linearised_at: Callable) -> '_Trial':
         """Return the trial relinearised at its choice, without the lags that are not named."""
         return replace(
             self, outcome=_settled(linearised_at, self.outcome.problem, self.outcome.chosen)
         )
 
 
-def _with_lags(explanations, linearised_at):
+def _with_lags(
+    explanations: LagExplanations, linearised_at: Callable
+) -> tuple[_Outcome, Sequence[Rival]]:
     """
     Return (the _Outcome with the simplest explanation of the lags all of which help, its rivals).
 
@@ -274,7 +278,7 @@ def _with_lags(explanations, linearised_at):
     return best.outcome, best.rivals
 
 
-def _best_of(trials, linearised_at):
+def _best_of(trials: Iterable[_Trial], linearised_at: Callable) -> _Trial:
     """
     Return the finished trial with the highest rank.
 
@@ -285,14 +289,17 @@ def _best_of(trials, linearised_at):
         if best is None or trial.rank > best.rank:
             finished = trial.finished(linearised_at)
             best = finished if best is None or finished.rank > best.rank else best
+    assert best is not None, 'there is at least one trial'
     return best
 
 
-def _labels(chosen):
+def _labels(chosen: Sequence[Question]) -> frozenset[str]:
     return frozenset(question.label for question in chosen)
 
 
-def _looked_again(outcome, linearised_at, any_size, tried):
+def _looked_again(
+    outcome: _Outcome, linearised_at: Callable, any_size: bool, tried: set[frozenset[str]]
+) -> _Outcome:
     """
     Return the _Outcome of the searches for the cause of a remaining significant excess.
 
@@ -318,7 +325,9 @@ def _looked_again(outcome, linearised_at, any_size, tried):
     return other if other.rest < LEFT * outcome.rest else outcome
 
 
-def _settled(linearised_at, problem, chosen):
+def _settled(
+    linearised_at: Callable, problem: LinearisedProblem, chosen: Sequence[Question]
+) -> _Outcome:
     """
     Return the _Outcome of a choice.
 
@@ -327,7 +336,9 @@ def _settled(linearised_at, problem, chosen):
     return _without_unnamed(_relinearised(linearised_at, problem, chosen), linearised_at)
 
 
-def _relinearised(linearised_at, problem, chosen):
+def _relinearised(
+    linearised_at: Callable, problem: LinearisedProblem, chosen: Sequence[Question]
+) -> _Outcome:
     """Return the same, linearised at all effects of the choice."""
     for _ in range(LINEARISATIONS - 1):
         if not problem.needs_another(chosen):
@@ -337,7 +348,7 @@ def _relinearised(linearised_at, problem, chosen):
     return _outcome(problem, chosen)
 
 
-def _outcome(problem, chosen):
+def _outcome(problem: LinearisedProblem, chosen: Sequence[Question]) -> _Outcome:
     """Return the _Outcome of a choice where it is linearised."""
     # A warm-up of the bank that appears this late has no columns of its own for the final solution.
     chosen = [question for question in chosen if '@' not in question.label]
@@ -351,7 +362,7 @@ def _outcome(problem, chosen):
     )
 
 
-def _without_unnamed(outcome, linearised_at):
+def _without_unnamed(outcome: _Outcome, linearised_at: Callable) -> _Outcome:
     """
     Return the _Outcome linearised at its findings alone.
 
@@ -376,14 +387,14 @@ def _without_unnamed(outcome, linearised_at):
     return outcome
 
 
-def _searched(problem, chosen):
+def _searched(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
     """
     Return the choice of a search at another linearisation; it starts from the resolved effects.
     """
     return problem.search.run(_resolved(problem, chosen))
 
 
-def _resolved(problem, chosen):
+def _resolved(problem: LinearisedProblem, chosen: Sequence[Question]) -> Sequence[Question]:
     return same_questions(
         problem, [question for question in chosen if question.name in problem.search.resolved]
     )
@@ -398,7 +409,9 @@ def too_few_windows(count: int) -> NotObservableError:
     )
 
 
-def _agreed(problem, explained, named):
+def _agreed(
+    problem: LinearisedProblem, explained: ExplainedWindows, named: Sequence[Question]
+) -> tuple[Sequence[Question], list[Question]]:
     """
     Return (findings that hold, findings on which the two halves disagree).
 
@@ -414,7 +427,9 @@ def _agreed(problem, explained, named):
     )
 
 
-def _that_help(problem, explained, named):
+def _that_help(
+    problem: LinearisedProblem, explained: ExplainedWindows, named: Sequence[Question]
+) -> list[Question]:
     """
     Return the admissible findings that improve cross-validated prediction.
 
@@ -443,7 +458,12 @@ def _that_help(problem, explained, named):
     return kept
 
 
-def _needed_reduction(problem, explained, chosen, question):
+def _needed_reduction(
+    problem: LinearisedProblem,
+    explained: ExplainedWindows,
+    chosen: Sequence[Question],
+    question: Question,
+) -> float:
     """
     Return the required relative reduction of the residual.
 
@@ -454,7 +474,9 @@ def _needed_reduction(problem, explained, chosen, question):
     return 0.0 if clear else LEAST_REDUCTION
 
 
-def _sure_reduction(problem, chosen, question):
+def _sure_reduction(
+    problem: LinearisedProblem, chosen: Sequence[Question], question: Question
+) -> float:
     """
     Return the lower end of the interval of an effect's reduction of the cross-validated residual.
     """

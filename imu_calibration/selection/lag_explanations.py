@@ -11,13 +11,13 @@ first, then a common clock before separate lags, then a delay before a filter. A
 its rivals.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag_name
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.linearised_problem import LinearisedProblem
@@ -231,10 +231,17 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
     return simplest(common) if common else selected
 
 
-def _described(problem, linearised_at, effects, *, rest, clocks):
+def _described(
+    problem: LinearisedProblem,
+    linearised_at: Callable,
+    effects: Mapping[str, Effect],
+    *,
+    rest: Sequence[Question],
+    clocks: dict[str, float] | None,
+) -> list[LagHypothesis]:
     """Return the description of each kind; only the first if no curvature is observable."""
 
-    def at(kind, values=clocks):
+    def at(kind: tuple[str, ...], values: dict[str, float] | None = clocks) -> LagHypothesis:
         asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [
             question.effect for question in rest
         ]
@@ -278,7 +285,9 @@ def _described(problem, linearised_at, effects, *, rest, clocks):
     return found
 
 
-def _explanations(described, judges, names):
+def _explanations(
+    described: Sequence[LagHypothesis], judges: Sequence[LinearisedProblem], names: Sequence[str]
+) -> list[Explanation]:
     """
     Return every Explanation that the descriptions of each sensor make together.
 
@@ -318,23 +327,23 @@ class _Option:
     alike: bool = False
     """Whether its columns equal those of a delay."""
 
-    def own(self, lags):
+    def own(self, lags: Sequence[float] | np.ndarray) -> dict[str, float]:
         return {
             lag_name(self.sensor, ending): float(value) for ending, value in zip(self.kind, lags)
         }
 
-    def with_delay(self, delay):
+    def with_delay(self, delay: float) -> np.ndarray:
         """Return the lags with the first one given, the remaining ones shifted accordingly."""
         return self.lags + self.covariance[:, 0] / self.covariance[0, 0] * (delay - self.lags[0])
 
 
-def _option(hypothesis, judges, sensor):
+def _option(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str) -> _Option:
     cost = _cost(hypothesis, hypothesis.chosen, judges, sensor) + PENALTY * len(hypothesis.kind)
     lags, covariance = hypothesis.lags(sensor)
     return _Option(sensor, hypothesis.kind, cost, lags, covariance, hypothesis.values)
 
 
-def _none(hypothesis, judges, sensor):
+def _none(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str) -> _Option:
     left = hypothesis.without(sensor)
     values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(left)))
     return _Option(
@@ -342,7 +351,12 @@ def _none(hypothesis, judges, sensor):
     )
 
 
-def _cost(hypothesis, chosen, judges, sensor):
+def _cost(
+    hypothesis: LagHypothesis,
+    chosen: Sequence[Question],
+    judges: Sequence[LinearisedProblem],
+    sensor: str,
+) -> float:
     """
     Return the held-out cost of one sensor's windows, nats.
 
@@ -363,7 +377,7 @@ def _cost(hypothesis, chosen, judges, sensor):
     return 0.5 * float(np.mean(losses))
 
 
-def _described_together(one, two, names):
+def _described_together(one: _Option, two: _Option, names: Sequence[str]) -> Iterator[Explanation]:
     """
     Yield the explanations of two sensors' lags.
 
@@ -393,7 +407,9 @@ def _described_together(one, two, names):
             )
 
 
-def _rivals(settled, selected, near):
+def _rivals(
+    settled: LinearisedProblem, selected: Explanation, near: Sequence[Explanation]
+) -> list[Rival]:
     """
     Return the alternatives to a member of an explanation that fit nearly as well.
 

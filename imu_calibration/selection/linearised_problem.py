@@ -205,7 +205,7 @@ class LinearisedProblem:
         return p_value * len(self.questions) < FAMILY_WISE
 
     @cached_property
-    def _halves(self):
+    def _halves(self) -> list[np.ndarray]:
         """Normal matrices of the first and second half of the selection windows."""
         judged = self.evidence.space
         early = np.arange(len(judged.recording.windows)) < len(judged.recording.windows) // 2
@@ -253,7 +253,9 @@ class LinearisedProblem:
                 start[model.slices[effect.key]][: effect.n_amplitudes] = 0.0
         return model.at(start), start
 
-    def _warm_up(self, chosen, question, values):
+    def _warm_up(
+        self, chosen: Sequence[Question], question: Question, values: np.ndarray
+    ) -> np.ndarray:
         """Return amplitudes and time constant of a warm-up, interpolated in the bank."""
         number = int(question.label.split('@')[1])
         place = chosen.index(question)
@@ -263,7 +265,7 @@ class LinearisedProblem:
             other = next(q for q in self.questions if q.label == f'{question.name}@{k}')
             losses.append(
                 self.evidence.loss(
-                    self.search.indices(chosen[:place] + [other] + chosen[place + 1 :])
+                    self.search.indices([*chosen[:place], other, *chosen[place + 1 :]])
                 )
             )
         logs = np.log(self.constants[near])
@@ -278,20 +280,22 @@ class LinearisedProblem:
         return np.append(values[list(question.parameters)], np.exp(logs[1] + shift))
 
 
-def _start(baseline, effects):
+def _start(baseline: SensorModel, effects: Sequence[Effect]) -> tuple[SensorModel, np.ndarray]:
     model = extended_model(baseline, effects)
     values = model.start()
     return model, np.where(np.isfinite(values), values, 0.0)
 
 
-def _at_baseline(recording, baseline, used):
+def _at_baseline(
+    recording: ReducedRecording, baseline: SensorModel, used: Sequence[int]
+) -> ReducedRecording:
     """Move the residual to the baseline's own solution."""
     for _ in range(2 if baseline.arms else 1):
         space = in_trusted_band(parameter_space(recording, baseline))
         values = recording.values.copy()
         values[list(used)] += solve_normal(
             normal_matrix(space, noise_before_fit(space)),
-            used,
+            np.asarray(used),
             space.prior_sd,
             prior_mean=space.prior_mean,
         )[0]
@@ -299,15 +303,16 @@ def _at_baseline(recording, baseline, used):
     return recording
 
 
-def _curvature(question, values, model, duration):
+def _curvature(
+    question: Question, values: np.ndarray, model: SensorModel, duration: float
+) -> float:
     """Return the relative error of the first derivative at the size of the effect."""
     effect = question.effect
     value = values[list(question.parameters)]
     if effect.warp is not None:
         moved = np.max(np.abs(value - model.point_of(effect)))
-        return moved * {'s': DELAY_FREQUENCY, 's/s': DELAY_FREQUENCY * duration}.get(
-            effect.unit, 1.0
-        )
+        sensitivity = {'s': DELAY_FREQUENCY, 's/s': DELAY_FREQUENCY * duration}
+        return moved * sensitivity.get(str(effect.unit), 1.0)
     if effect.time_constant:
         return abs(np.log(max(value[-1], 1e-3) / model.point_of(effect)[-1]))
     return BILINEAR

@@ -2,6 +2,7 @@
 Noise estimated in addition to candidate effects, and the band of frequencies in which it holds.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -173,7 +174,7 @@ def noise_before_fit(space: ParameterSpace) -> dict[str, NoiseModel]:
     return found
 
 
-def _white_without_rest(space, sensor):
+def _white_without_rest(space: ParameterSpace, sensor: str) -> np.ndarray:
     moving = space.recording.moving
     dof = max((space.recording.count[moving] - 1).sum(), 1)
     return np.array(
@@ -184,7 +185,9 @@ def _white_without_rest(space, sensor):
     )
 
 
-def _with_moving_factors(space, sensor, noise, values, look_along):
+def _with_moving_factors(
+    space: ParameterSpace, sensor: str, noise: NoiseModel, values: np.ndarray, look_along: bool
+) -> NoiseModel:
     """
     Return the noise with the scatter of moving windows.
 
@@ -214,7 +217,12 @@ def _with_moving_factors(space, sensor, noise, values, look_along):
     return replace(noise, moving=found)
 
 
-def _with_bias_process(space, sensor, noise, smooth):
+def _with_bias_process(
+    space: ParameterSpace,
+    sensor: str,
+    noise: dict[str, NoiseModel],
+    smooth: Sequence[Sequence[int]],
+) -> NoiseModel:
     """
     Return the noise of a sensor with window offsets and bias process.
 
@@ -281,7 +289,9 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
     return np.minimum(prior_sd, MAX_DRIFT_RATIO * usual / np.maximum(spread, 1e-300))
 
 
-def _needed_smooth(search, options, *, prior_sd):
+def _needed_smooth(
+    search: BiasProcessSearch, options: Sequence[Sequence[int]], *, prior_sd: np.ndarray
+) -> Sequence[int]:
     """
     Return the parameters of the smooth effect that beats the bias process.
 
@@ -294,10 +304,12 @@ def _needed_smooth(search, options, *, prior_sd):
     losses += [
         search.best(option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options
     ]
-    return ([[]] + options)[int(np.argmin(losses))]
+    return [[], *options][int(np.argmin(losses))]
 
 
-def _known_otherwise(space, sensor, noise, own):
+def _known_otherwise(
+    space: ParameterSpace, sensor: str, noise: dict[str, NoiseModel], own: np.ndarray
+) -> np.ndarray:
     """
     Return the information on the parameters `own` (normal matrix).
 

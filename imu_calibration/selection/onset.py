@@ -13,7 +13,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.selection.changes_in_time import ChangeFit, WindowRows
+from imu_calibration.selection.changes_in_time import ChangeFit, ChangingColumns, WindowRows
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
 from imu_calibration.selection.explained_share import MIN_EXPLAINED_SHARE, ExplainedWindows
 from imu_calibration.selection.linearised_problem import LinearisedProblem
@@ -190,7 +190,9 @@ def _groups(model: SensorModel) -> list[_Group]:
     return groups
 
 
-def _candidate(rows, group, kept, *, n_base, allowed):
+def _candidate(
+    rows: WindowRows, group: _Group, kept: np.ndarray, *, n_base: int, allowed: np.ndarray
+) -> _Candidate | None:
     """
     Return the _Candidate of a group, None where its change does not explain the excess.
 
@@ -241,7 +243,9 @@ def _candidate(rows, group, kept, *, n_base, allowed):
     )
 
 
-def _losses_of_moments(rows, own, changing, allowed):
+def _losses_of_moments(
+    rows: WindowRows, own: np.ndarray, changing: ChangingColumns, allowed: np.ndarray
+) -> dict[int, float]:
     """Return last window before a moment -> loss of the fit with a change there."""
     coarse = np.unique(np.linspace(0, len(allowed) - 1, min(COARSE, len(allowed))).astype(int))
     losses = {}
@@ -257,12 +261,16 @@ def _losses_of_moments(rows, own, changing, allowed):
     return losses
 
 
-def _loss_of_step(rows, own, changing, second):
+def _loss_of_step(
+    rows: WindowRows, own: np.ndarray, changing: ChangingColumns, second: np.ndarray
+) -> float:
     """Return the loss with another value of some parameters where `second` (n, 1) is one."""
     return rows.fit(own, changing.along(second)).loss
 
 
-def _follows_temperature(rows, own, changing, loss):
+def _follows_temperature(
+    rows: WindowRows, own: np.ndarray, changing: ChangingColumns, loss: float
+) -> bool:
     """
     Return whether a step where the temperature passes a value fits as well as one at a moment.
 
@@ -279,18 +287,20 @@ def _follows_temperature(rows, own, changing, loss):
     return False
 
 
-def _after(rows, last):
+def _after(rows: WindowRows, last: int) -> np.ndarray:
     """Return 1 in each window after the window `last`, shape (n, 1)."""
     return (np.arange(rows.count) > last).astype(float)[:, None]
 
 
-def _curves(time):
+def _curves(time: np.ndarray) -> np.ndarray:
     """Return the Legendre polynomials of degree 1 to `GRADUAL` over the times, shape (n, m)."""
     middle, half = 0.5 * (time[0] + time[-1]), max(0.5 * (time[-1] - time[0]), 1e-9)
     return np.polynomial.legendre.legvander((time - middle) / half, GRADUAL)[:, 1:]
 
 
-def _onset_of(candidate, problem, *, windows, table):
+def _onset_of(
+    candidate: _Candidate, problem: LinearisedProblem, *, windows: Sequence[Window], table: Table
+) -> Onset:
     """Return the Onset of a _Candidate, with its moment refined to a sample."""
     model, group, fit = problem.recording.model, candidate.group, candidate.fit
     change, sd = fit.change, fit.change_sd
@@ -302,7 +312,7 @@ def _onset_of(candidate, problem, *, windows, table):
     first_state = problem.absolute(values)
     states = [first_state, first_state + changed]
     ends = problem.evidence.space.recording.time[list(candidate.ends)]
-    moment, moment_sd = _refined(windows, table, model, states=states, between=ends)
+    moment, moment_sd = _refined(windows, table, model, states=states, between=(ends[0], ends[1]))
 
     names = [problem.space.names[k] for k in group.parameters]
     units = {}
@@ -331,7 +341,14 @@ def _onset_of(candidate, problem, *, windows, table):
     )
 
 
-def _refined(windows, table, model, *, states, between):
+def _refined(
+    windows: Sequence[Window],
+    table: Table,
+    model: SensorModel,
+    *,
+    states: Sequence[np.ndarray],
+    between: tuple[float, float],
+) -> tuple[float, float]:
     """
     Return (mean, standard deviation) of the posterior of the moment between two times, s.
 

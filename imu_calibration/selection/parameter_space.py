@@ -1,6 +1,6 @@
 """Parameters of a search and their columns, and normal matrices over them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -82,7 +82,7 @@ class ParameterSpace:
         order = np.argsort(kept)
         own = {sensor: [np.isin(index, kept) for index in self.index[sensor]] for sensor in SENSORS}
 
-        def cut(joins):
+        def cut(joins: Mapping[str, Sequence[np.ndarray]]) -> dict[str, list[np.ndarray]]:
             return {
                 sensor: [
                     join[:, np.append(mask, True)] for join, mask in zip(joins[sensor], own[sensor])
@@ -171,11 +171,11 @@ class ParameterSpace:
             found[some] = ((factors @ columns[some, :, None]) ** 2).sum(axis=(1, 2))
         return found
 
-    def _compared(self, sensor, axis):
+    def _compared(self, sensor: str, axis: int) -> str:
         """Return which part of the centred rows is compared on an axis."""
         return 'slow' if self.slow_only[sensor][axis] else 'within'
 
-    def _missing(self, sensor, axis):
+    def _missing(self, sensor: str, axis: int) -> np.ndarray:
         """
         Return the squares that replace the fast part of each window, shape (k,).
 
@@ -248,7 +248,14 @@ def bank_places(recording: ReducedRecording) -> dict[str, slice]:
     return {entry.label: slice(a, b) for entry, a, b in zip(entries, ends, ends[1:])}
 
 
-def _join(jacobian, sensor, axis, recording, removed, smooth):
+def _join(
+    jacobian: np.ndarray,
+    sensor: str,
+    axis: int,
+    recording: ReducedRecording,
+    removed: np.ndarray,
+    smooth: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Return (parameters that act on an axis, matrix for columns, matrix for the part).
 

@@ -4,8 +4,9 @@ A formula for the unexplained residual.
 Search, test on held-out windows, description and a term for a model.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,13 @@ from imu_calibration.effects.base import AXES, PREFIXES, SENSORS, Effect
 from imu_calibration.effects.catalogue import term
 from imu_calibration.estimation.standard_motions import ALL_MOTIONS
 from imu_calibration.selection.explained_share import MIN_SMOOTH_SHARE
-from imu_calibration.selection.formulas import FormulaChoice, FormulaSearch, grammar
+from imu_calibration.selection.formulas import (
+    Column,
+    Formula,
+    FormulaChoice,
+    FormulaSearch,
+    grammar,
+)
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.residual_blocks import (
     BlockFit,
@@ -200,7 +207,7 @@ def propose(
     return _proposal_of(blocks, problem, fits, plain, choices)
 
 
-def _plausible(sensor, problem):
+def _plausible(sensor: str, problem: LinearisedProblem) -> np.ndarray:
     """
     Return a factor of the covariance that the catalogue's parameters may have, shape (q, q).
 
@@ -223,16 +230,16 @@ def _plausible(sensor, problem):
     return plausible
 
 
-def _grammar(blocks):
+def _grammar(blocks: RestBlocks) -> tuple[Formula, ...]:
     duration = float(f'{max(float(np.ptp(blocks.time)), 1.0):.2g}')
     return grammar(blocks.ref.joint_angle.shape[1], blocks.warms, duration)
 
 
-def _joined(choices):
+def _joined(choices: Sequence[FormulaChoice]) -> np.ndarray:
     return np.concatenate([choice.columns for choice in choices], axis=1)
 
 
-def _stable(fits, choices):
+def _stable(fits: BlockFits, choices: Sequence[FormulaChoice]) -> bool:
     """
     Return whether the halves of the recording agree on the last choice within their precision.
     """
@@ -243,7 +250,13 @@ def _stable(fits, choices):
     return bool((apart**2).mean() < 9.0 or (apart**2).sum() < 0.1 * (strength**2).sum())
 
 
-def _proposal_of(blocks, problem, fits, plain, choices):
+def _proposal_of(
+    blocks: RestBlocks,
+    problem: LinearisedProblem,
+    fits: BlockFits,
+    plain: BlockFit,
+    choices: Sequence[FormulaChoice],
+) -> Proposal:
     terms = [entry for choice in choices for entry in _shapes(fits, choices, choice)][:MOST_TERMS]
     columns = np.concatenate([column for column, _, _ in terms], axis=1)
     after = fits.fit(columns)
@@ -284,7 +297,9 @@ def _proposal_of(blocks, problem, fits, plain, choices):
     )
 
 
-def _shapes(fits, choices, choice):
+def _shapes(
+    fits: BlockFits, choices: Sequence[FormulaChoice], choice: FormulaChoice
+) -> list[tuple[np.ndarray, Column, Formula]]:
     """
     Return (column means (b, 1, 3), text or three texts, Formula) of shapes.
 
@@ -318,18 +333,31 @@ def _shapes(fits, choices, choice):
     return found
 
 
-def _summed(columns, weights):
+def _summed(columns: Sequence[Column], weights: Sequence[float] | np.ndarray) -> Column:
     """Return the text, or three texts, of a weighted sum of columns."""
-    if not isinstance(columns[0], str):
-        return tuple(_summed([column[axis] for column in columns], weights) for axis in range(3))
-    return ' + '.join(
-        f'{weight:g} * {column}' if weight != 1.0 else column
-        for column, weight in zip(columns, weights)
-        if weight
-    )
+    if not all(isinstance(column, str) for column in columns):
+        of_axes = zip(*columns, strict=True)
+        return tuple(_weighted_sum(of_axis, weights) for of_axis in of_axes)
+    return _weighted_sum(columns, weights)
 
 
-def _effect(sensor, number, text, formula, values, taken):
+def _weighted_sum(columns: Sequence[Any], weights: Sequence[float] | np.ndarray) -> str:
+    """Return the text of a weighted sum of texts; terms of weight zero are left out."""
+    terms = []
+    for column, weight in zip(columns, weights):
+        if weight:
+            terms.append(f'{weight:g} * {column}' if weight != 1.0 else column)
+    return ' + '.join(terms)
+
+
+def _effect(
+    sensor: str,
+    number: int,
+    text: Column,
+    formula: Formula,
+    values: np.ndarray,
+    taken: Collection[str],
+) -> Effect:
     unit = formula.unit('m/s^2' if sensor == SENSORS[0] else 'rad/s')
     largest = float(np.abs(values).max())
     names = (f'{PREFIXES[sensor]}_proposed_{k}' for k in range(1, 100))
@@ -350,27 +378,28 @@ def _effect(sensor, number, text, formula, values, taken):
     )
 
 
-def _digits(value):
+def _digits(value: float) -> float:
     return float(f'{value:.2g}')
 
 
-def _joined_text(text):
+def _joined_text(text: Column) -> str:
     return text if isinstance(text, str) else f'({", ".join(text)})'
 
 
-def _text_of(effect):
+def _text_of(effect: Effect) -> str:
+    assert effect.definition is not None, 'a proposed effect has a formula'
     column = effect.definition['column']
     return _joined_text(column if isinstance(column, str) else tuple(column))
 
 
-def _size(effect, values, sd):
+def _size(effect: Effect, values: np.ndarray, sd: np.ndarray) -> str:
     k = int(np.argmax(np.abs(values)))
     factor, unit = for_people(effect.unit_of(k), effect.sensor)
     size = ' ± '.join(with_sd(values[k] * factor, sd[k] * factor))
     return f'{size} {unit} on {effect.sensor} {AXES[k]}'
 
 
-def _motion(effects):
+def _motion(effects: Iterable[Effect]) -> str:
     return '; '.join(
         dict.fromkeys(
             ALL_MOTIONS[name]

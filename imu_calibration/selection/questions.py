@@ -12,7 +12,7 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.signal_history import HALF_WIDTH
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import least_variance
-from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window import Window, WindowKind
 
 TURN = 4 * HALF_WIDTH
 """Sufficient reversal of the temperature, K."""
@@ -112,7 +112,7 @@ def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], l
     return known, lacking
 
 
-def _vibrates(windows):
+def _vibrates(windows: Sequence[Window]) -> bool:
     """Return whether vibration differs between rests."""
     rests = [window for window in windows if window.kind == 'static' and len(window) > 3]
     variances = np.array(
@@ -121,14 +121,24 @@ def _vibrates(windows):
             for window in rests
         ]
     )
-    return np.count_nonzero(variances > VIBRATES * variances.min(initial=np.inf)) >= SHAKEN_RESTS
+    shaken = variances > VIBRATES * variances.min(initial=np.inf)
+    return int(np.count_nonzero(shaken)) >= SHAKEN_RESTS
 
 
-def _why_not(effect, have, table, *, kinds, span, turned, shaken):
+def _why_not(
+    effect: Effect,
+    have: set[tuple[str, str]],
+    table: Table,
+    *,
+    kinds: set[WindowKind],
+    span: float | None,
+    turned: bool,
+    shaken: bool,
+) -> tuple[str, str] | None:
     moving = kinds & {'spin', 'dynamic'}
     if 'temperature' in effect.needs and span is None:
         return 'no temperature was recorded with all windows', 'record imu/temperature'
-    if 'temperature' in effect.needs and span < TEMPERATURE_SPAN:
+    if 'temperature' in effect.needs and span is not None and span < TEMPERATURE_SPAN:
         return (
             f'the temperature changed by {span:.2f} K only',
             'record while the sensor warms up by at least some kelvins',
@@ -252,7 +262,7 @@ def at_time_constants(model: SensorModel, effect: Effect, duration: float) -> li
     ]
 
 
-def _cautious(solution):
+def _cautious(solution: Solution) -> np.ndarray:
     """
     Return values to linearise at: those of the solution, except along weakly determined directions.
 

@@ -126,7 +126,9 @@ def columns_with_bank(
     )
 
 
-def _entry(effect, number, constant, model, values):
+def _entry(
+    effect: Effect, number: int, constant: float, model: SensorModel, values: np.ndarray
+) -> BankEntry:
     own = effect.at_time_constant(constant)
     point = {**model.full_point(), effect.name: own}
     slopes = effect_slopes(
@@ -287,11 +289,11 @@ class ReducedRecording:
                 total += stacked.T @ stacked
         return self._sums[key]
 
-    def _width(self, sensor):
+    def _width(self, sensor: str) -> int:
         return len(self.windows[0].sensors[sensor].mean)
 
     @cached_property
-    def _sums(self):
+    def _sums(self) -> Recent:
         return Recent(MOST_SUMS)
 
     @cached_property
@@ -300,10 +302,10 @@ class ReducedRecording:
         return sessions_of(self.windows)
 
     @cached_property
-    def _coefficients(self):
+    def _coefficients(self) -> dict[str, np.ndarray]:
         return {sensor: coefficients(self.model, sensor, self.values) for sensor in SENSORS}
 
-    def _with_residual(self, sensor, rows):
+    def _with_residual(self, sensor: str, rows: np.ndarray) -> np.ndarray:
         own = self._coefficients[sensor]
         rows[..., -3:] -= rows[..., : len(own)] @ own
         return rows
@@ -334,7 +336,7 @@ class ReducedRecording:
             accumulator.add(restricted_window(self._with_factors(k), chosen))
         return accumulator
 
-    def _with_factors(self, k):
+    def _with_factors(self, k: int) -> WindowStatistics:
         """Return a window with its triangular factors."""
         sensors = {
             sensor: replace(
@@ -404,7 +406,7 @@ def reduce_recording(
     )
 
 
-def _describe(window):
+def _describe(window: Window) -> dict[str, float]:
     motion = window.motion
     found = {
         'time': float(window.time.mean()),

@@ -175,7 +175,7 @@ def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variabl
     )
 
 
-def _before_rest(name, rate, starts):
+def _before_rest(name: str, rate: np.ndarray, starts: np.ndarray) -> list[Variable]:
     """Return from which side a joint reached its rest."""
     moving = np.abs(rate) > 0.5 * DEG
     side = np.where(moving, np.sign(rate), 0.0)
@@ -191,10 +191,10 @@ def _before_rest(name, rate, starts):
     )
 
 
-def _cyclic(name, degrees, starts):
+def _cyclic(name: str, degrees: np.ndarray, starts: np.ndarray) -> Variable:
     edges = np.linspace(0.0, 360.0, N_BINS + 1)
 
-    def words(_, bounds):
+    def words(_: str, bounds: tuple[float, float]) -> str:
         low, high = (round(bound % 360.0) % 360 if bound != 360.0 else 360 for bound in bounds)
         return f'while the {name} is {low} to {high} deg'
 
@@ -216,7 +216,7 @@ def ranged(
     if len(edges) < 4 or np.ptp(edges) < least:
         return []
 
-    def words(chosen, bounds):
+    def words(chosen: Sequence[int], bounds: tuple[float, float]) -> str:
         low, high = bounds
         if chosen[0] == 0:
             return f'while the {name} is below {high:.3g} {unit}'
@@ -231,7 +231,9 @@ def ranged(
     return [Variable(name, bins, edges, False, words, values, starts)]
 
 
-def _classes(name, mask, words, starts):
+def _classes(
+    name: str, mask: np.ndarray, words: tuple[str, str], starts: np.ndarray
+) -> list[Variable]:
     if not FEWEST <= block_means(mask.astype(float), starts).sum() <= len(starts) - FEWEST:
         return []
     return [

@@ -4,7 +4,7 @@ Regimes of the motion that contain most of a sensor's residual.
 Permutation test, and comparison with smooth curves and formulas.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -368,7 +368,9 @@ class RegimeSearch:
                 )
         return _largest_share_first(found)
 
-    def _refined(self, rest, white, each, number):
+    def _refined(
+        self, rest: AxisResidual, white: Callable, each: _Ranges, number: int
+    ) -> tuple[np.ndarray, tuple[float, float] | None, str, float, float]:
         """
         Return the description of a range with refined bounds.
 
@@ -376,10 +378,12 @@ class RegimeSearch:
         """
         variable, chosen = each.variable, each.variable.chosen(each.member[number])
         bounds, mark = variable.bounds(chosen), each.marks[:, chosen].sum(axis=1)
-        for end in (0, 1) if bounds else ():
+        for end in (0, 1):
+            if not bounds:
+                break
+            low, high = bounds
             options = [
-                (place, bounds[1]) if end == 0 else (bounds[0], place)
-                for place in variable.near(chosen, end)
+                (place, high) if end == 0 else (low, place) for place in variable.near(chosen, end)
             ]
             if options:
                 tried = np.stack([variable.inside(*option) for option in options], axis=1)
@@ -443,7 +447,7 @@ class RegimeSearch:
             )
             excess, means = np.maximum(energy - count, 0.0), energy / np.maximum(count, 1.0)
             share = excess[0] / max(excess.sum(), TINY)
-            if share >= MOST_OF_IT and _cost(energy, count).sum() < limit - SURE * dispersion:
+            if share >= MOST_OF_IT and np.sum(_cost(energy, count)) < limit - SURE * dispersion:
                 bounds = variable.bounds(chosen)
                 found.append(
                     RestRegime(
@@ -462,7 +466,7 @@ class RegimeSearch:
                 )
         return _largest_share_first(found)
 
-    def _falls(self, rough, weight):
+    def _falls(self, rough: np.ndarray, weight: np.ndarray) -> list[np.ndarray]:
         """
         Return per variable the fall of the cost by a separate variance in each range.
 
@@ -487,7 +491,7 @@ class RegimeSearch:
             )
         return gains
 
-    def _tested(self, gains):
+    def _tested(self, gains: Sequence[np.ndarray]) -> tuple[float, list[tuple[_Ranges, int]]]:
         """
         Return (p-value of the largest gain, the likeliest ranges (_Ranges, number)).
 
@@ -502,13 +506,13 @@ class RegimeSearch:
         ]
 
 
-def _largest_share_first(found):
+def _largest_share_first(found: Iterable[RestRegime]) -> list[RestRegime]:
     """Return regimes in order of their shares; among nearly equal ones the order is kept."""
     alike = max((regime.share for regime in found), default=0.0) - REGIME_SHARE_TIE
     return sorted(found, key=lambda regime: -min(regime.share, alike))
 
 
-def _tightened(chosen, excess):
+def _tightened(chosen: Sequence[int], excess: np.ndarray) -> Sequence[int]:
     """Return the shortest part of a range of bins that holds nearly all of the excess in it."""
     sums = np.append(0.0, np.cumsum(excess[chosen]))
     parts = [
@@ -521,7 +525,7 @@ def _tightened(chosen, excess):
     return chosen[first:last]
 
 
-def _cost(energy, count):
+def _cost(energy: float | np.ndarray, count: float | np.ndarray) -> float | np.ndarray:
     """
     Return minus twice the log likelihood of residuals with one variance, at least that of noise.
     """
@@ -529,7 +533,9 @@ def _cost(energy, count):
     return count * np.log(variance) + energy / variance
 
 
-def _smooth_scatter(columns, variance, weight):
+def _smooth_scatter(
+    columns: np.ndarray, variance: np.ndarray, weight: np.ndarray
+) -> tuple[float, float]:
     """
     Return (minus twice the log likelihood, dispersion) by Fisher scoring.
 

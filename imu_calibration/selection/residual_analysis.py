@@ -185,7 +185,7 @@ class ResidualAnalysis(Investigation):
         """Errors of the stamps from the scatter in motion."""
         return next(iter(self.blocks.values())).jitter
 
-    def _unexplained(self, sensor, rest):
+    def _unexplained(self, sensor: str, rest: Unexplained) -> Unexplained:
         proposal = self.proposals[sensor]
         regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
         first = {regime.axis: regime for regime in reversed(regimes)}
@@ -290,7 +290,7 @@ def superseded(found: ResidualAnalysis) -> list[Question]:
     return [question for question in found.named if _done_without(found, question)]
 
 
-def _done_without(found, question):
+def _done_without(found: ResidualAnalysis, question: Question) -> bool:
     """
     Return whether a finding hardly reduces the residual with a substitute.
 
@@ -329,7 +329,9 @@ def _done_without(found, question):
     return False
 
 
-def _places(found, sensor, chosen):
+def _places(
+    found: 'ResidualAnalysis', sensor: str, chosen: Sequence[Question]
+) -> np.ndarray | None:
     """
     Return an indicator column of the regimes where an offset explains most of an axis' residual.
 

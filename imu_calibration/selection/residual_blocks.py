@@ -14,6 +14,7 @@ from scipy.linalg import cholesky, solve_triangular, svd
 from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.effects.forward_equations import References
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.estimation.session_noise import LEAST_NOISE
 from imu_calibration.kinematics.joint_motion import JointMotion
@@ -234,7 +235,9 @@ def rest_blocks(
     return found
 
 
-def _roughness(residual, inner, edges, *, number, least):
+def _roughness(
+    residual: np.ndarray, inner: np.ndarray, edges: np.ndarray, *, number: np.ndarray, least: float
+) -> np.ndarray:
     """
     Return the variance by the `number` of second differences in blocks, shape (b, 3).
 
@@ -245,14 +248,16 @@ def _roughness(residual, inner, edges, *, number, least):
     return np.maximum(squares / np.maximum(number, 1)[:, None], least**2)
 
 
-def _inner(windows):
+def _inner(windows: Sequence[Window]) -> np.ndarray:
     """Return 1 for samples with two neighbours in their window, 0 for its ends, shape (n,)."""
     inner, ends = np.ones(sum(map(len, windows))), np.cumsum([len(window) for window in windows])
     inner[ends - 1] = inner[np.append(0, ends[:-1])] = 0.0
     return inner
 
 
-def _slope(residual, windows, edges, sensor):
+def _slope(
+    residual: np.ndarray, windows: Sequence[Window], edges: np.ndarray, sensor: str
+) -> np.ndarray:
     """
     Return the mean square of the rate of change of the predicted output in blocks.
 
@@ -268,7 +273,7 @@ def _slope(residual, windows, edges, sensor):
     return block_means(squares, edges)
 
 
-def _some(windows, length):
+def _some(windows: Sequence[Window], length: float) -> np.ndarray:
     """
     Return the numbers of the windows in use: all, or a random part of a long recording, in order.
     """
@@ -285,7 +290,9 @@ def _some(windows, length):
     )
 
 
-def _busier(windows, sensor, floor, kinds, judged):
+def _busier(
+    windows: Sequence[Window], sensor: str, floor: NoiseModel, kinds: np.ndarray, judged: np.ndarray
+) -> np.ndarray:
     """
     Return by how much each window's white noise exceeds that at rest, shape (k, 3).
 
@@ -333,7 +340,13 @@ def residuals(
     }
 
 
-def _block_means(problem, table, motion, temperature, starts):
+def _block_means(
+    problem: LinearisedProblem,
+    table: Table,
+    motion: JointMotion,
+    temperature: np.ndarray | None,
+    starts: np.ndarray,
+) -> dict[str, np.ndarray]:
     """
     Return sensor -> means of all columns over the blocks, shape (b, p).
 
@@ -364,7 +377,7 @@ def block_means(rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.add.reduceat(rows, starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
 
 
-def _cut(window, length):
+def _cut(window: Window, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Return the first sample of each block of a window, its rows, and their number.
 
@@ -525,7 +538,7 @@ class BlockFits:
         """
         return float(self._excess().sum() / np.sqrt(6.0 * (~self.blocks.locked).sum()))
 
-    def _excess(self):
+    def _excess(self) -> np.ndarray:
         """
         Return the sums of squares above the expectation from noise in the selection windows.
 
@@ -537,7 +550,9 @@ class BlockFits:
             excess[axis] = max(float(left @ left) - len(left), 0.0)
         return excess
 
-    def _solved(self, axis, at, columns=None, half=None):
+    def _solved(
+        self, axis: int, at: np.ndarray, columns: np.ndarray | None = None, half: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
         Return (values, covariance, residual) of a fit to the selection windows.
 
@@ -556,7 +571,7 @@ class BlockFits:
         values, covariance = solve_normal(rows.T @ rows, np.arange(len(sd)), sd, prior_mean=mean)
         return values, covariance, rows[:, -1] - rows[:, :-1] @ values
 
-    def _rows(self, part, axis, at, columns):
+    def _rows(self, part: int, axis: int, at: np.ndarray, columns: np.ndarray | None) -> np.ndarray:
         design = self._design[part][axis]
         further = [] if columns is None else [self.blocks.white[part](columns[:, :, axis], axis)]
         return np.concatenate([design[:, at], *further, design[:, -1:]], axis=1)

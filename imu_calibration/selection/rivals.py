@@ -6,7 +6,7 @@ explanations.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations
@@ -130,7 +130,7 @@ def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> li
     return found
 
 
-def _swapped(problem, chosen):
+def _swapped(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[list[Question]]:
     """
     Return the choices with an effect replaced by one that only curvature separates from it.
 
@@ -146,7 +146,9 @@ def _swapped(problem, chosen):
     ]
 
 
-def _cost(problem, chosen, judge):
+def _cost(
+    problem: LinearisedProblem, chosen: Sequence[Question], judge: LinearisedProblem
+) -> float:
     """
     Return the held-out cost of a choice at its own linearisation.
 
@@ -200,7 +202,7 @@ def simpler(
     return kept
 
 
-def _fewer(search, kept, question):
+def _fewer(search: Search, kept: Sequence[Question], question: Question) -> list[Question]:
     """
     Return smaller effects that explain about as much in the place of a finding.
 
@@ -263,7 +265,7 @@ class _Blocks:
     Each question's own block is the unit matrix.
     """
 
-    def __init__(self, search):
+    def __init__(self, search: Search):
         self.questions, (information, right) = search.questions, search.evidence.equations()
         base, free = (
             list(search.baseline),
@@ -284,11 +286,11 @@ class _Blocks:
             right[at] = np.linalg.solve(lower, right[at])
         self.matrix, self.right = matrix, right
 
-    def size(self, number):
+    def size(self, number: int) -> int:
         """Return the number of parameters of a question."""
         return len(self.questions[number].parameters)
 
-    def score(self, pairs: Sequence[tuple[int, int]]):
+    def score(self, pairs: Sequence[tuple[int, int]]) -> Iterator[tuple[float, int, int]]:
         """
         Yield (fall of the loss in nats less the penalty, one, two) of pairs of one shape.
 

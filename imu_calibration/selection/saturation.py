@@ -131,7 +131,7 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     return values + solve_normal(normal, np.arange(len(values)), sd, prior_mean=prior - values)[0]
 
 
-def _thinned(window, most=50):
+def _thinned(window: Window, most: int = 50) -> Window:
     if window.kind == 'static' or len(window.time) <= most:
         return window
     return window.select(slice(None, None, len(window.time) // most))
@@ -249,7 +249,7 @@ def without_clipping(
     """
     locked, piled = locked_windows(np.array([window.kind for window in windows])), _piled(windows)
     limits, noise_sd, values = _limits(windows_at(windows, piled | ~locked), table, model)
-    if not limits:
+    if not limits or values is None:
         return windows, locked, []
     locked &= ~piled
     levels, kept = {limit.sensor: limit.level for limit in limits}, []
@@ -271,7 +271,7 @@ def without_clipping(
     )
 
 
-def _piled(windows):
+def _piled(windows: Sequence[Window]) -> np.ndarray:
     """Return which windows hold the largest output of a sensor, where several samples share it."""
     found = np.zeros(len(windows), bool)
     for sensor in SENSORS:
@@ -281,7 +281,9 @@ def _piled(windows):
     return found
 
 
-def _limits(windows, table, model):
+def _limits(
+    windows: Sequence[Window], table: Table, model: SensorModel
+) -> tuple[list[Saturation], dict[str, np.ndarray], np.ndarray | None]:
     """
     Return (limits found, standard deviation of single samples by sensor, parameters).
 

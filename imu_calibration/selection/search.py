@@ -291,20 +291,21 @@ class Search:
             chosen = other
         return chosen
 
-    def _dropped(self, chosen):
+    def _dropped(self, chosen: Sequence[Question]) -> list[Question] | None:
         for question in sorted(chosen, key=lambda q: -q.penalty):
             rest = [q for q in chosen if q is not question]
             if not self.score(rest, question).significant:
                 return rest
         return None
 
-    def _replaced(self, chosen):
-        best, cost = None, self.cost(chosen) - MIN_REPLACEMENT_NATS
+    def _replaced(self, chosen: Sequence[Question]) -> list[Question] | None:
+        best: list[Question] | None = None
+        cost = self.cost(chosen) - MIN_REPLACEMENT_NATS
         for place, question in enumerate(chosen):
             # It could not be added again, and an effect that cancels it may be in the model.
             if question.name in self.resolved:
                 continue
-            rest = chosen[:place] + chosen[place + 1 :]
+            rest = [*chosen[:place], *chosen[place + 1 :]]
             for other in self.others(rest):
                 if other is question:
                     continue

@@ -124,7 +124,9 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     )
 
 
-def _alike(number, sums, weight, wave):
+def _alike(
+    number: np.ndarray, sums: np.ndarray, weight: np.ndarray, wave: np.ndarray
+) -> np.ndarray:
     """
     Return the share of the windows in phase with a wave.
 
@@ -149,7 +151,9 @@ def long_enough(
             yield place, window, rest
 
 
-def _pieces(windows, rests, joint) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
+def _pieces(
+    windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
+) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
     """Yield (number of the window, rest, time, angle) of pieces of moving windows."""
     for place, window, rest in long_enough(windows, rests, with_joints=True):
         number = max(1, round((window.time[-1] - window.time[0]) / PIECE_S))
@@ -161,7 +165,9 @@ def _pieces(windows, rests, joint) -> Iterator[tuple[int, np.ndarray, np.ndarray
         )
 
 
-def _projected(rest, time, angle, order):
+def _projected(
+    rest: np.ndarray, time: np.ndarray, angle: np.ndarray, order: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return (sum of the rest against each order, shape (k, m), weight, shape (k,)).
 
@@ -332,7 +338,7 @@ def find_tones(
     }
 
 
-def _significant(tones, tests):
+def _significant(tones: Iterable[Tone], tests: int) -> dict[tuple[str, str | None], Tone]:
     """
     Return (axis, joint) -> the most significant tone.
 
@@ -349,7 +355,7 @@ def _significant(tones, tests):
     return first
 
 
-def _without(frequency, time, values):
+def _without(frequency: float, time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values without the waves about a frequency, to the resolution of their duration."""
     waves = np.exp(
         2j * np.pi * np.outer(time - time[0], frequency + 0.5 * np.arange(-2, 3) / np.ptp(time))
@@ -358,7 +364,7 @@ def _without(frequency, time, values):
     return values - basis @ (basis.T @ values)
 
 
-def _whole(sensor, orders, joint) -> Iterator[Tone]:
+def _whole(sensor: str, orders: Orders | None, joint: str) -> Iterator[Tone]:
     """
     Yield the most significant Tone of each axis with a constant phase on a joint, if any.
 
@@ -421,7 +427,7 @@ def _stretches(
             )
 
 
-def _cut(rest, longest):
+def _cut(rest: np.ndarray, longest: int) -> list[np.ndarray]:
     """Return a rest in pieces of equal length, at most `longest`."""
     return np.array_split(rest, -(-len(rest) // longest))
 
@@ -477,7 +483,9 @@ def of_stretches(
             )
 
 
-def _powers(rest, size, inside):
+def _powers(
+    rest: np.ndarray, size: int, inside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Return (power, power around it by octaves, mask of the frequencies).
 
@@ -569,7 +577,7 @@ def find_sway(blocks: RestBlocks, fits: BlockFits) -> Tone | None:
     )
 
 
-def _follows_joints(wave, angles):
+def _follows_joints(wave: np.ndarray, angles: np.ndarray | None) -> bool:
     """Return whether the joints move with the period of a wave."""
     if angles is None:
         return False

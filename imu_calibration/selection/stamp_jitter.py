@@ -103,7 +103,7 @@ def jitter_ratio(rough: np.ndarray, slope: np.ndarray, jitter: float) -> np.ndar
     return 1.0 + jitter**2 * slope / _noise(rough, slope, jitter**2)
 
 
-def _noise(rough, slope, variance):
+def _noise(rough: np.ndarray, slope: np.ndarray, variance: float) -> np.ndarray:
     """
     Return the variance of the noise of each axis, from its blocks with the smaller slopes.
 
@@ -114,7 +114,7 @@ def _noise(rough, slope, variance):
     return np.maximum(np.nanmedian(left, axis=0), 1e-3 * np.median(rough, axis=0))
 
 
-def _variance(rough, slope, freedom):
+def _variance(rough: np.ndarray, slope: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
     """
     Return (variance of the stamps by one sensor, its standard deviation), s^2.
 

@@ -16,6 +16,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
+from imu_calibration.selection.reduced_recording import ReducedRecording
 from imu_calibration.selection.residual_blocks import largest_axes
 
 SIGNIFICANT_SDS = 5.0
@@ -162,7 +163,13 @@ def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dic
     return found
 
 
-def _rest(problem, explained, sensor, excess, values):
+def _rest(
+    problem: LinearisedProblem,
+    explained: ExplainedWindows,
+    sensor: str,
+    excess: np.ndarray,
+    values: np.ndarray,
+) -> Unexplained:
     space, recording = problem.space, problem.recording
     residual = np.stack(
         [space.mean[sensor][axis] @ values[space.places(sensor, axis)] for axis in range(3)], axis=1
@@ -230,7 +237,7 @@ def correlate(explanations: Iterator, residual: np.ndarray) -> tuple[str | None,
     return best
 
 
-def _explanations(recording):
+def _explanations(recording: ReducedRecording) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield (name, columns (k, m), windows where they are known)."""
     describe, every = recording.describe, np.ones(len(recording.kind), bool)
     yield from slow_explanations(describe['time'], describe['temperature'])

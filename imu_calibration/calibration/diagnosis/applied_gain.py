@@ -1,8 +1,9 @@
 """Gain of an extension of the model: errors of the corrected readings of held-out windows."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -19,13 +20,16 @@ from imu_calibration.effects.forward_equations import (
     not_applied,
     sensor_output,
 )
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.estimation.solver import solve
 from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import all_samples, chunks
+from imu_calibration.preprocessing.window import Window, all_samples, chunks
+from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.model_selection import HandInvestigation, gain_of_poses
+from imu_calibration.references.gravity.pose_evidence import Block
 from imu_calibration.selection.gain import (
     APPLIED,
     OF_MODEL,
@@ -126,7 +130,13 @@ def gains_of_formulas(
     return gains
 
 
-def _locked_errors(found, table, sides, *, of=APPLIED):
+def _locked_errors(
+    found: Investigation,
+    table: Table,
+    sides: Sequence[tuple[SensorModel, np.ndarray, np.ndarray]],
+    *,
+    of: str = APPLIED,
+) -> DistanceSums:
     """
     Return the sums over the locked windows of the errors of corrected readings, or of the model.
 
@@ -146,7 +156,9 @@ def _locked_errors(found, table, sides, *, of=APPLIED):
     return sums
 
 
-def _compensated(found, before, after):
+def _compensated(
+    found: Investigation | HandInvestigation, before: Sequence[Question], after: Sequence[Question]
+) -> list[list[Question]] | None:
     """
     Return the findings of two choices that belong into the model.
 
@@ -161,7 +173,9 @@ def _compensated(found, before, after):
     )
 
 
-def _applied_parameters(found, chosen):
+def _applied_parameters(
+    found: Investigation, chosen: Sequence[Question]
+) -> tuple[SensorModel, np.ndarray, np.ndarray]:
     """
     Return (model, values, values to apply) of a choice of effects.
 
@@ -223,7 +237,14 @@ def gain_by_hand(
     )
 
 
-def _pose_errors(found, block, rows, model, values, earth):
+def _pose_errors(
+    found: HandInvestigation,
+    block: Block,
+    rows: np.ndarray,
+    model: HandModel,
+    values: np.ndarray,
+    earth: float,
+) -> np.ndarray:
     """
     Return the errors of some rows of a block after correction.
 
@@ -247,7 +268,13 @@ def _pose_errors(found, block, rows, model, values, earth):
     )
 
 
-def _errors(windows, table, model, values, applied):
+def _errors(
+    windows: Sequence[Window],
+    table: Table,
+    model: SensorModel,
+    values: np.ndarray,
+    applied: np.ndarray,
+) -> Iterator[dict[str, np.ndarray]]:
     """
     Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3).
     """
@@ -275,7 +302,9 @@ def _errors(windows, table, model, values, applied):
         yield {sensor: error[start:stop] for sensor, error in zip(SENSORS, errors)}
 
 
-def _model_errors(windows, table, model, values, _applied):
+def _model_errors(
+    windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray, _applied: Any
+) -> Iterator[dict[str, np.ndarray]]:
     """
     Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3).
     """

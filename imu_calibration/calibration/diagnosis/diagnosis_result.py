@@ -156,7 +156,7 @@ def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
             'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
             'stamp_jitter_s': diagnosis.stamp_jitter.to_mapping().get('sd_s'),
             'findings': [_finding(finding) for finding in diagnosis.findings],
-            'gain': _gain(diagnosis.gain) if diagnosis.findings else None,
+            'gain': None if diagnosis.gain is None else _gain(diagnosis.gain),
             'dead_reckoning': diagnosis.traces.dead_reckoning,
             'simulation_distance': {
                 sensor: each.to_mapping() for sensor, each in diagnosis.traces.distances.items()
@@ -174,7 +174,7 @@ def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     )
 
 
-def _candidate(candidate):
+def _candidate(candidate: Candidate) -> dict[str, Any]:
     beside = {
         'heldout_log_likelihood_gain': candidate.gain_beside,
         'p_value': candidate.p_value_beside,
@@ -189,7 +189,7 @@ def _candidate(candidate):
     }
 
 
-def _baseline(solution, sensor):
+def _baseline(solution: Solution, sensor: str) -> dict[str, Any]:
     model = solution.model
     return {
         'effects': getattr(model, sensor),
@@ -200,7 +200,7 @@ def _baseline(solution, sensor):
     }
 
 
-def _finding(finding):
+def _finding(finding: Finding) -> dict[str, Any]:
     return {
         'effect': finding.effect,
         'sensor': finding.sensor,
@@ -223,7 +223,7 @@ def _finding(finding):
     }
 
 
-def _gain(gain):
+def _gain(gain: Gain) -> dict[str, Any]:
     names = (
         'sensor',
         'of',
@@ -258,12 +258,12 @@ def residual_mapping(sensor: str, rest: Unexplained, formula_gain: Gain | None) 
         'tones': [tone.to_mapping() for tone in rest.tones],
         'proposals': (
             []
-            if rest.proposal is None
+            if rest.proposal is None or formula_gain is None
             else [rest.proposal.to_mapping() | {'gain': _formula_gain(formula_gain)}]
         ),
     }
 
 
-def _formula_gain(gain):
+def _formula_gain(gain: Gain) -> dict[str, Any]:
     before, after = gain.beyond_noise
     return _gain(gain) | {'beyond_noise_before': before, 'beyond_noise_after': after}

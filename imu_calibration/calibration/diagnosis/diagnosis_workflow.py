@@ -27,6 +27,7 @@ from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
 from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
 from imu_calibration.calibration.table_calibration import conclude, solve_recordings
+from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HARM
@@ -41,7 +42,9 @@ from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.gravity.model_selection import too_few_poses
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
+from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.investigation import too_few_windows
+from imu_calibration.selection.onset import Onset
 from imu_calibration.selection.search import MIN_GAIN_NATS
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
@@ -303,7 +306,7 @@ def helpful_formulas(
     return helpful
 
 
-def _is_transferable(effect):
+def _is_transferable(effect: Effect) -> bool:
     """
     Return whether compensation of another recording can undo an effect.
 
@@ -313,7 +316,17 @@ def _is_transferable(effect):
     return effect.compensation == 'exact'
 
 
-def _with_proposals(source, table, options, result, diagnosis, provenance, reader, *, effects):
+def _with_proposals(
+    source: Callable,
+    table: Table,
+    options: CalibrationOptions,
+    result: TableResult,
+    diagnosis: Diagnosis,
+    provenance: dict[str, Any] | None,
+    reader: StoredRecording,
+    *,
+    effects: Sequence[Effect],
+) -> Calibration | None:
     """
     Return the calibration of the extended model with the proposed formulas `effects`.
 
@@ -455,7 +468,7 @@ def timing_lines(diagnosis: Diagnosis) -> list[str]:
     return [*_onset_lines(diagnosis.onset), *diagnosis.stamp_jitter.lines]
 
 
-def _onset_lines(onset):
+def _onset_lines(onset: Onset | None) -> list[str]:
     if onset is None:
         return []
     largest = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))[
@@ -491,9 +504,9 @@ def beyond_lines(sensor: str, rest: Unexplained) -> list[str]:
     return [*lines, *(f'spectrum: {tone.text}' for tone in rest.tones)]
 
 
-def _formula_lines(sensor, rest, gain):
+def _formula_lines(sensor: str, rest: Unexplained, gain: Gain | None) -> list[str]:
     """Return the formula that an unexplained residual follows and its gain, as lines."""
-    if rest.proposal is None:
+    if rest.proposal is None or gain is None:
         return []
     # The interval of the reduction is that of the rms with noise, as for effects of the catalogue.
     share = ' to '.join(f'{100 * end:.2g}' for end in gain.ci95)
@@ -511,7 +524,7 @@ def _formula_lines(sensor, rest, gain):
     ]
 
 
-def _proposed_effects(diagnosis):
+def _proposed_effects(diagnosis: Diagnosis) -> list[Effect]:
     """Return the formulas of a diagnosis as effects."""
     return [
         effect
@@ -550,7 +563,7 @@ def strongest_refused(diagnosis: Diagnosis) -> Candidate | None:
     return max(refused, key=_gain_of, default=None)
 
 
-def _gain_of(row):
+def _gain_of(row: Candidate) -> float:
     return row.gain_alone if row.gain_beside is None else row.gain_beside
 
 

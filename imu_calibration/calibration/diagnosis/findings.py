@@ -4,7 +4,7 @@ From the result of a search to findings, their gains, and motions.
 The search is on a table or by hand. The findings are sentences, and the motions separate effects.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,9 +35,11 @@ from imu_calibration.references.gravity.model_selection import HandInvestigation
 from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_analysis import ResidualAnalysis
-from imu_calibration.selection.search import FAMILY_WISE, Search
+from imu_calibration.selection.saturation import Saturation
+from imu_calibration.selection.search import FAMILY_WISE, Score, Search
 
 MIN_EVIDENCE_GROWTH = 9.0
 """Least growth of the evidence that a motion must promise, in squared standard deviations."""
@@ -155,11 +157,11 @@ def sentence(
     return text
 
 
-def _percent(share):
+def _percent(share: float) -> str:
     return f'{100 * share:.0f} %' if share >= 0.01 else f'{100 * share:.1g} %'
 
 
-def _with_unit(number, unit):
+def _with_unit(number: str, unit: str) -> str:
     return number if unit == '1' else f'{number} {unit}'
 
 
@@ -205,7 +207,14 @@ def candidates_of(
     return tuple(sorted(rows.values(), key=lambda row: -row.gain_alone))
 
 
-def _verdict_of(name, alone, beside, *, found, mates):
+def _verdict_of(
+    name: str,
+    alone: Score,
+    beside: Score | None,
+    *,
+    found: Collection[str],
+    mates: Mapping[str, str],
+) -> str:
     """
     Return the verdict on an effect as text.
 
@@ -275,7 +284,7 @@ def finding(
     """
     question = named[place]
 
-    def in_its_place(mate):
+    def in_its_place(mate: Question) -> dict[str, tuple[float, float, str]]:
         return fitted(search, [*named[:place], mate, *named[place + 1 :]], mate)
 
     score = search.score([q for q in named if q is not question], question)
@@ -369,7 +378,7 @@ def build_diagnosis(
         else baseline
     )
 
-    def gain_of(place):
+    def gain_of(place: int) -> Gain:
         return gain_of_findings(
             found,
             table,
@@ -378,7 +387,7 @@ def build_diagnosis(
             sensors=sensors_of(named[place].effect),
         )
 
-    def shows(place, mate, gain):
+    def shows(place: int, mate: Question, gain: Gain) -> bool:
         if gain.sensor not in sensors_of(mate.effect):
             return False
         own, other = (
@@ -389,7 +398,7 @@ def build_diagnosis(
         )
         return MATE * own <= other
 
-    def motion_of(question, mate):
+    def motion_of(question: Question, mate: Question) -> str:
         if len(table.joint_names) == 1:
             return motions_of_one_joint(question, mate)
         return separating_motion(solution, question, mate, gravity=table.gravity_value)
@@ -432,10 +441,10 @@ def build_diagnosis(
     )
 
 
-def _agreement(problem):
+def _agreement(problem: LinearisedProblem) -> Callable:
     """Return whether windows and both halves of the recording agree on a chosen effect."""
 
-    def agree(chosen, question):
+    def agree(chosen: Sequence[Question], question: Question) -> bool:
         return problem.windows_agree(chosen, question) and problem.agrees_in_halves(
             chosen, question
         )
@@ -443,7 +452,7 @@ def _agreement(problem):
     return agree
 
 
-def _rivals(found, question):
+def _rivals(found: Investigation, question: Question) -> list[Question]:
     """
     Return alternatives to a finding, and doubtful effects that would replace it.
 
@@ -462,8 +471,8 @@ def _rivals(found, question):
     return near
 
 
-def _clipping(limit, solution):
-    effect = solution.model.find(limit.sensor, Role.LIMIT)
+def _clipping(limit: Saturation, solution: Solution) -> Finding:
+    effect = solution.model.effect_of(limit.sensor, Role.LIMIT)
     parameters = parameters_of(solution, limit.sensor, effect.name)
     gain = Gain(
         limit.sensor,
@@ -487,7 +496,7 @@ def _clipping(limit, solution):
     )
 
 
-def _with_residuals(hand):
+def _with_residuals(hand: HandCalibration) -> HandCalibration:
     """Return the HandCalibration with the rms residual of its poses."""
     residuals = {'accelerometer': hand.norm_residuals(), 'gyroscope': hand.rate_rows()[0]}
     return replace(
@@ -499,7 +508,7 @@ def _with_residuals(hand):
     )
 
 
-def _traces_of(baseline, hand):
+def _traces_of(baseline: HandCalibration, hand: HandCalibration) -> Traces:
     """
     Return the `Traces` of two calibrations.
 
@@ -533,7 +542,7 @@ def diagnosis_by_hand(found: HandInvestigation, hand: HandCalibration) -> Diagno
     problem, named = found.problem, list(found.named)
     before, after = _with_residuals(found.baseline), _with_residuals(hand)
 
-    def gain_of(place):
+    def gain_of(place: int) -> Gain:
         return gain_by_hand(
             found, named[:place], after=named[: place + 1], sensor=named[place].sensor
         )

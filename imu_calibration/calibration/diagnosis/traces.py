@@ -4,7 +4,7 @@ Measurement against the simulation of two models.
 Residuals over short blocks, segments, residual power and dead reckoning.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,6 +14,8 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import INPUT_OF, References
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.strapdown import dead_reckoning_errors
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import StoredWindows, Window, all_samples, chunks
@@ -177,7 +179,7 @@ class DistanceSums:
         edge = int(np.max(np.flatnonzero(self._freedom[0]), initial=0)) + 2
         return {sensor: self._distance(sensor, edge) for sensor in SENSORS}
 
-    def _distance(self, sensor, edge):
+    def _distance(self, sensor: str, edge: int) -> Distance:
         known = np.flatnonzero(self._freedom[1])
         density = self._rest[sensor][known] / self._freedom[1][known, None]
         nearest = np.abs(np.arange(edge - 1)[:, None] - known).argmin(axis=1) if len(known) else []
@@ -352,17 +354,19 @@ def residual_traces(
     )
 
 
-def _used(windows, spans):
+def _used(
+    windows: Sequence[Window] | StoredWindows, spans: list[tuple[float, float]]
+) -> Iterator[Window]:
     """
     Yield the windows that are not unused, and append (first, last) time of every window to `spans`.
     """
-    for window in windows:
+    for window in (windows[number] for number in range(len(windows))):
         spans.append((window.time[0], window.time[-1]))
         if window.kind != 'unused':
             yield window
 
 
-def _largest(time, residual):
+def _largest(time: np.ndarray, residual: np.ndarray) -> tuple[float, float]:
     """
     Return start and end of the segment with the largest residual.
 
@@ -374,7 +378,16 @@ def _largest(time, residual):
     return time[first] - PLOT_BLOCK_SECONDS, time[first] + SEGMENT
 
 
-def _segment(windows, spans, table, models, sensor, axis, start, stop):
+def _segment(
+    windows: Sequence[Window] | StoredWindows,
+    spans: Sequence[tuple[float, float]],
+    table: Table,
+    models: Sequence[Solution | Calibration],
+    sensor: str,
+    axis: int,
+    start: float,
+    stop: float,
+) -> OverlaySegment:
     inside = [
         windows[k] for k, (first, last) in enumerate(spans) if last >= start and first <= stop
     ]
@@ -396,7 +409,9 @@ def _segment(windows, spans, table, models, sensor, axis, start, stop):
     )
 
 
-def _variables(windows, table, model):
+def _variables(
+    windows: Sequence[Window], table: Table, model: Solution
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
     """
     Return the state of the reference at the samples, at the values of a model.
 
@@ -412,13 +427,18 @@ def _variables(windows, table, model):
     )
 
 
-def _references(model, table, motion, temperature):
+def _references(
+    model: Solution | Calibration,
+    table: Table,
+    motion: JointMotion,
+    temperature: np.ndarray | None,
+) -> dict[str, Reference]:
     """Return sensor -> the Reference of its samples at the values of a model."""
     references = References(model.model.at(model.values), table, motion, temperature_c=temperature)
     return {sensor: references.at(sensor) for sensor in SENSORS}
 
 
-def _starts(windows):
+def _starts(windows: Sequence[Window]) -> np.ndarray:
     """
     Return the first sample of each block of the windows in one piece; blocks end with their window.
     """
@@ -428,7 +448,12 @@ def _starts(windows):
     return np.flatnonzero(np.concatenate([np.diff(place, prepend=-1) for place in places]))
 
 
-def _dead_reckoning(windows, spans, table, models):
+def _dead_reckoning(
+    windows: Sequence[Window] | StoredWindows,
+    spans: Sequence[tuple[float, float]],
+    table: Table,
+    models: Sequence[Solution | Calibration],
+) -> dict[str, float] | None:
     """Return medians over stretches of 50 s without gaps, or None."""
     stretches, run = [], []
     for number, (first, last) in enumerate(spans):
@@ -456,7 +481,9 @@ def _dead_reckoning(windows, spans, table, models):
     }
 
 
-def _drifts(windows, table, models):
+def _drifts(
+    windows: Sequence[Window], table: Table, models: Sequence[Solution | Calibration]
+) -> list[list[float]]:
     """
     Return the dead-reckoning errors of velocity and position of each model.
 
@@ -469,6 +496,7 @@ def _drifts(windows, table, models):
         reference, felt = _references(model, table, motion, temperature), {}
         for sensor in SENSORS:
             matrix = model.model.value(sensor, Role.LINEAR, model.values)
+            assert matrix is not None, 'each sensor has a matrix'
             felt[sensor] = (
                 getattr(reference[sensor], INPUT_OF[sensor])[rows]
                 + np.linalg.solve(matrix, error[sensor].T).T
@@ -482,5 +510,5 @@ def _drifts(windows, table, models):
         errors = dead_reckoning_errors(
             true.select(some), felt['accelerometer'][some], felt['gyroscope'][some]
         )
-        found.append([np.linalg.norm(error[-1]) for error in errors])
+        found.append([float(np.linalg.norm(error[-1])) for error in errors])
     return found
