@@ -134,7 +134,7 @@ def solve_hand_by_evidence(
     return EvidentHand(hand, found, changes)
 
 
-def _solved(data: HandData, found: HandInvestigation, options: HandOptions) -> HandCalibration:
+def _solved(data: HandData, found: 'HandInvestigation', options: HandOptions) -> HandCalibration:
     """
     Return the calibration with the requested model and the findings.
 
@@ -150,7 +150,7 @@ def _solved(data: HandData, found: HandInvestigation, options: HandOptions) -> H
 
 
 def _faint(
-    hand: HandCalibration, found: HandInvestigation, asked: Mapping[str, Collection[str]]
+    hand: HandCalibration, found: 'HandInvestigation', asked: Mapping[str, Collection[str]]
 ) -> list[Question]:
     """Return the effects that were added and are implausible or have no significant coefficient."""
     faint = []
