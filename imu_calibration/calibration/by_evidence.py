@@ -25,10 +25,10 @@ from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.session_noise import WEIGHTLESS
 from imu_calibration.estimation.solution import CONVENTION_SHARE, SAMPLE_NOISE, Solution
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions, choose_model

@@ -20,12 +20,6 @@ from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
-from imu_calibration.estimation.window_statistics import (
-    SensorStatistics,
-    WindowStatistics,
-    reduce_window,
-)
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
@@ -33,6 +27,7 @@ from imu_calibration.preprocessing.stream_cleaning import NO_RANGES, Watcher
 from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.accumulator import Accumulator, WindowBlock
 from imu_calibration.references.turntable.session_data import (
     KEPT_POSES,
     KEPT_SAMPLES,
@@ -44,6 +39,11 @@ from imu_calibration.references.turntable.session_data import (
     WindowStore,
     naming,
     owned_window,
+)
+from imu_calibration.references.turntable.window_statistics import (
+    SensorStatistics,
+    WindowStatistics,
+    reduce_window,
 )
 
 SAVED_FORMAT = 'imu_calibration/accumulator/4'

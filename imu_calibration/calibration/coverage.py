@@ -12,6 +12,7 @@ from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.observability import added_information, sd_excess, share_gained
+from imu_calibration.estimation.prior import GAUGE_SD, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import DETERMINED, LACKING
 from imu_calibration.estimation.standard_motions import (
@@ -21,7 +22,6 @@ from imu_calibration.estimation.standard_motions import (
     Motion,
     rest_with_up,
 )
-from imu_calibration.estimation.weighted_system import GAUGE_SD, make_prior
 from imu_calibration.kinematics.rotations import unit_rows
 
 

@@ -18,6 +18,7 @@ from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
+from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
     GRAVITY,
@@ -30,7 +31,6 @@ from imu_calibration.estimation.solution import (
     with_term,
 )
 from imu_calibration.estimation.standard_motions import Motion, motions_about
-from imu_calibration.estimation.weighted_system import make_prior
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import unusable, warnings
 from imu_calibration.preprocessing.window_cutter import dropped

@@ -28,12 +28,12 @@ from imu_calibration.effects.forward_equations import (
     not_applied,
 )
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import stack
+from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import scaled_lstsq
 from imu_calibration.estimation.solution import MODEL_ERROR, Solution, with_term
-from imu_calibration.estimation.weighted_system import Prior, fixed_parameters, make_prior
-from imu_calibration.estimation.window_statistics import N_AXES, count_pieces
+from imu_calibration.references.turntable.accumulator import stack
 from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldOut
+from imu_calibration.references.turntable.window_statistics import N_AXES, count_pieces
 
 HARDLY_WORSE = 1.02
 """

@@ -19,11 +19,11 @@ from imu_calibration.document.proof_entry import Proof, ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.forward_equations import Centre, applied_values, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import one_attitude
+from imu_calibration.estimation.accumulated_rows import one_attitude
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.window_statistics import N_AXES, PIECE_TIME, Regime
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.turntable.session_data import HeldOut
+from imu_calibration.references.turntable.window_statistics import N_AXES, PIECE_TIME, Regime
 
 BLOCK_RESAMPLES = 1000
 """Resamples of complete blocks for an interval."""

@@ -49,10 +49,8 @@ from imu_calibration.document.trust import (
 )
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.estimation.solution import Solution, shrunk, tolerances_of, with_weak_replaced
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_units
@@ -60,7 +58,9 @@ from imu_calibration.preprocessing.recording_evidence import with_findings_of
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
+from imu_calibration.references.turntable.accumulator import restrict
 from imu_calibration.references.turntable.session_data import HeldOut, SessionData, join, naming
+from imu_calibration.references.turntable.window_statistics import reduce_window
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
 
 

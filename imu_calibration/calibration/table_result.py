@@ -33,9 +33,9 @@ from imu_calibration.effects.forward_equations import (
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.observability import tolerance_scaled_singular_values
+from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.weighted_system import fixed_parameters, make_prior
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at

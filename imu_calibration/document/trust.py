@@ -21,7 +21,7 @@ from imu_calibration.document.outcome import missing
 from imu_calibration.effects.base import SENSORS, UNITS, Effect
 from imu_calibration.effects.forward_equations import Centre, coefficients, in_time, not_applied
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator
+from imu_calibration.estimation.accumulated_rows import AccumulatedRows
 from imu_calibration.estimation.solution import LACKING
 from imu_calibration.kinematics.rotations import Reference
 
@@ -66,7 +66,7 @@ class Uncorrected:
 def uncorrected_on_table(
     model: SensorModel,
     values: np.ndarray,
-    accumulator: Accumulator,
+    accumulator: AccumulatedRows,
     *,
     gathered: SensorModel,
     latest: SensorModel | None = None,
@@ -79,7 +79,7 @@ def uncorrected_on_table(
     model : SensorModel
         At the point of its `values`.
     values : array, shape (n_params,)
-    accumulator : Accumulator
+    accumulator : AccumulatedRows
         Windows with the columns of `gathered`.
     gathered : SensorModel
     latest : SensorModel, optional
@@ -162,7 +162,7 @@ def uncorrected_in_time(
     return Uncorrected(centre, tuple(sizes))
 
 
-def end_of(accumulator: Accumulator) -> float:
+def end_of(accumulator: AccumulatedRows) -> float:
     """Return the end of the longest recording, s since its start."""
     return max(row.time + row.duration / 2 for row in accumulator.rows)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
+from imu_calibration.estimation.accumulated_rows import MeanRows
 from imu_calibration.estimation.noise_model import (
     BiasProcess,
     MovingFactors,
@@ -14,8 +15,8 @@ from imu_calibration.estimation.noise_model import (
     ReferenceNoise,
 )
 from imu_calibration.estimation.noise_search import estimate_offsets
-from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
-from imu_calibration.estimation.window_statistics import WindowStatistics
+from imu_calibration.estimation.prior import fixed_parameters
+from imu_calibration.estimation.weighted_system import WeightedSystem
 
 MIN_VARIANCE_RATIO = 2.0
 """
@@ -217,9 +218,7 @@ LEAST_MOVING_VARIANCE = 1e-30
 """Least variance of the noise from moving windows, above zero."""
 
 
-def white_noise(
-    rows: Sequence[WindowStatistics], sensor: str
-) -> tuple[np.ndarray, np.ndarray] | None:
+def white_noise(rows: Sequence[MeanRows], sensor: str) -> tuple[np.ndarray, np.ndarray] | None:
     """
     Return (white_variance, inflation) pooled over static windows, each shape (3,).
 
@@ -231,7 +230,7 @@ def white_noise(
 
     Parameters
     ----------
-    rows : sequence of WindowStatistics
+    rows : sequence of MeanRows
 
     """
     static = _rests(rows, sensor)
@@ -266,7 +265,7 @@ def white_noise(
     return np.maximum(pooled, LEAST_NOISE[sensor] ** 2), factors
 
 
-def _rests(rows: Sequence[WindowStatistics], sensor: str) -> list[WindowStatistics]:
+def _rests(rows: Sequence[MeanRows], sensor: str) -> list[MeanRows]:
     """Return the static windows of which the variance of a sensor is known."""
     found = []
     for row in rows:
@@ -292,9 +291,7 @@ def _usual(variances: np.ndarray, inflations: np.ndarray) -> tuple[float, bool]:
     return median, False
 
 
-def shaken_means(
-    rows: Sequence[WindowStatistics], sensor: str
-) -> dict[tuple[int, float], np.ndarray]:
+def shaken_means(rows: Sequence[MeanRows], sensor: str) -> dict[tuple[int, float], np.ndarray]:
     """
     Return `NoiseModel.shaken` of a sensor, for each rest whose vibration exceeds the quiet level.
     """

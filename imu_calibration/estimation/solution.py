@@ -14,7 +14,7 @@ import numpy as np
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
-from imu_calibration.estimation.weighted_system import make_prior
+from imu_calibration.estimation.prior import make_prior
 
 Terms = Mapping[str, np.ndarray]
 """Term -> covariance matrix, shape (n_params, n_params)."""

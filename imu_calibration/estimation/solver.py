@@ -7,7 +7,7 @@ import numpy as np
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator, not_separable
+from imu_calibration.estimation.accumulated_rows import AccumulatedRows, not_separable
 from imu_calibration.estimation.held_parameters import (
     Factors,
     implausible_parameters,
@@ -15,6 +15,7 @@ from imu_calibration.estimation.held_parameters import (
 )
 from imu_calibration.estimation.model_error import model_error
 from imu_calibration.estimation.noise_model import BiasProcess, NoiseModel
+from imu_calibration.estimation.prior import fixed_parameters
 from imu_calibration.estimation.scaled_solve import covariance_with_held, scaled_lstsq
 from imu_calibration.estimation.session_noise import (
     first_noise,
@@ -22,7 +23,7 @@ from imu_calibration.estimation.session_noise import (
     updated_noise,
 )
 from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE, Solution
-from imu_calibration.estimation.weighted_system import WeightedSystem, fixed_parameters
+from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.whitening import predict_session_offsets
 from imu_calibration.estimation.window_outliers import outlier_windows
 
@@ -45,7 +46,7 @@ Noises = dict[str, NoiseModel]
 
 
 def solve(
-    accumulator: Accumulator,
+    accumulator: AccumulatedRows,
     model: SensorModel,
     *,
     allow_holding: bool = True,
@@ -61,8 +62,8 @@ def solve(
 
     Parameters
     ----------
-    accumulator : Accumulator
-        Windows reduced with the columns of `model`.
+    accumulator : AccumulatedRows
+        Rows of windows, reduced with the columns of `model`.
     model : SensorModel
     allow_holding : bool
         Whether parameters that the data do not determine may be fixed at their prior.

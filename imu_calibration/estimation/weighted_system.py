@@ -5,87 +5,18 @@ Accumulated windows with the columns of a model, weighted by a noise model, and 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator, WindowBlock
+from imu_calibration.estimation.accumulated_rows import AccumulatedRows, CentredRows
 from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
+from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.scaled_solve import triangular
 from imu_calibration.estimation.whitening import Whitening
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Gaussian prior as rows: ``root @ (values - mean)`` has unit variance."""
-
-    mean: np.ndarray
-    """Prior values, shape (n_params,)."""
-    root: np.ndarray
-    """Square root of the information, shape (k, n_params)."""
-    sd: np.ndarray
-    """Marginal standard deviations, shape (n_params,)."""
-    gauge: np.ndarray
-    """Rows of `root` that fix an origin and carry no information, shape (k, n_params)."""
-
-
-GAUGE_SD = 1e-12
-"""How exactly a gauge holds, in the unit of its parameters."""
-
-
-def make_prior(model: SensorModel) -> Prior:
-    """
-    Return the prior of a model.
-
-    When an arm for each axis and a common one are estimated, the former sum to zero: the origin is
-    the mean of the sensitive points. Sums of parameters that act as a bias (`Effect.bias_sums`) are
-    zero to their tolerance: this row has information, so that data with another specific force than
-    that of rest determine the sum.
-    """
-    mean, sd = model.prior()
-    mean = np.where(np.isfinite(mean), mean, 0.0)
-    rows, gauge = [np.diag(1 / sd)], np.zeros((0, len(mean)))
-    if {effect.role for effect in model.arms} == {Role.ARMS, Role.ARM}:
-        arms = np.arange(len(mean))[model.part('accelerometer', Role.ARMS)].reshape(3, 3)
-        gauge = np.zeros((3, len(mean)))
-        for component in range(3):
-            gauge[component, arms[:, component]] = 1 / GAUGE_SD
-        rows.append(gauge)
-        sd = sd.copy()
-        sd[arms.ravel()] *= np.sqrt(2 / 3)
-    rows.append(bias_sum_rows(model))
-    return Prior(mean, np.concatenate(rows), sd, gauge)
-
-
-def bias_sum_rows(model: SensorModel) -> np.ndarray:
-    """
-    Return the rows ``sum / tolerance`` of parameters that act as a bias (`Effect.bias_sums`).
-
-    Shape (k, n_params); the sums are zero with a standard deviation of one row unit.
-    """
-    rows = []
-    for effect in model.effects:
-        for group in effect.bias_sums:
-            row = np.zeros(len(model.param_names))
-            row[model.slices[effect.key].start + np.array(group)] = 1 / effect.tolerance
-            rows.append(row)
-    return np.array(rows).reshape(-1, len(model.param_names))
-
-
-def fixed_parameters(model: SensorModel) -> np.ndarray:
-    """
-    Return a mask of parameters that least squares does not estimate.
-
-    Saturation is censoring, not a column.
-    """
-    return np.concatenate(
-        [np.full(e.size, e.coefficients is None and e.warp is None) for e in model.effects]
-    )
-
 
 EXCLUDED_MEAN_SD_FACTOR = 1e3
 """Sd factor of an excluded mean over the largest sd of all means."""
@@ -99,12 +30,12 @@ class WeightedSystem:
 
     Parameters
     ----------
-    accumulator : Accumulator
+    accumulator : AccumulatedRows
     model : SensorModel
 
     """
 
-    def __init__(self, accumulator: Accumulator, model: SensorModel):
+    def __init__(self, accumulator: AccumulatedRows, model: SensorModel):
         self.model, self.prior, self.accumulator = model, make_prior(model), accumulator
         rows = accumulator.rows
         self.dof_within = {
@@ -231,7 +162,7 @@ class WeightedSystem:
         ]
 
     def weighed_rows(
-        self, sensor: str, noise: NoiseModel, part: Accumulator | WindowBlock | None = None
+        self, sensor: str, noise: NoiseModel, part: CentredRows | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """
         Yield (centred rows, weight of each axis (3,)).

@@ -18,7 +18,7 @@ from imu_calibration.core.distributions import chi2_isf
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import all_arms, coefficient_jacobian
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.weighted_system import fixed_parameters, make_prior
+from imu_calibration.estimation.prior import fixed_parameters, make_prior
 from imu_calibration.selection.search import FAMILY_WISE, TIE
 
 KNOWN_SHARE = 1e-4

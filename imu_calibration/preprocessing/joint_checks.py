@@ -232,7 +232,7 @@ class Reduced(Protocol):
 
     @property
     def accumulator(self) -> Any:
-        """The `estimation.accumulator.Accumulator` of its windows."""
+        """The `references.turntable.accumulator.Accumulator` of its windows."""
 
     @property
     def moving(self) -> list:

@@ -11,10 +11,10 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
-from imu_calibration.estimation.window_statistics import references_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.full_scale import MIN_CLIPPED_SAMPLES
 from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.window_statistics import references_of
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS, locked_windows
 
 CLIP_MARGIN_SDS = 4.0

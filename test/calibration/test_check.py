@@ -10,8 +10,8 @@ from imu_calibration.cli.main import main
 from imu_calibration.core.documents import to_text
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.window_statistics import Regime
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
 from worlds.misfit_worlds import make_pair

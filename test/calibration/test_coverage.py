@@ -189,7 +189,7 @@ def test_on_a_table_the_seconds_are_those_of_motions_that_leave_nothing(begun):
     What they would add to the information is added, one after the other; the first is the next one.
     """
     from imu_calibration.estimation.observability import added_information
-    from imu_calibration.estimation.weighted_system import make_prior
+    from imu_calibration.estimation.prior import make_prior
 
     live, result = begun
     shown, solution = live.coverage(), result.solution

@@ -27,10 +27,10 @@ from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.catalogue import term
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.window_statistics import reduce_window
 
 from worlds import misfit_worlds
 from worlds.physics_cause import Cause

@@ -21,8 +21,8 @@ from imu_calibration.estimation.solution import (
     remedy,
 )
 from imu_calibration.estimation.standard_motions import MOTIONS, OTHER_MOUNT, motions_about
-from imu_calibration.estimation.window_statistics import Regime
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable.window_statistics import Regime
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.compensate import compensate_recording
 

@@ -9,12 +9,12 @@ import pytest
 
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel, parse_reference
-from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import shrunk
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.window_statistics import reduce_windows
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import SHAFT, make_pair

@@ -12,12 +12,12 @@ import pytest
 from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.document.verdict import _left_out
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import WindowKind
+from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.session_data import SessionData
+from imu_calibration.references.turntable.window_statistics import reduce_windows
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair

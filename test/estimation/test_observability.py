@@ -14,9 +14,9 @@ from imu_calibration.estimation.observability import (
     tolerance_scaled_singular_values,
     weak_directions,
 )
+from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.estimation.standard_motions import MOTIONS, TABLE_MOTIONS
-from imu_calibration.estimation.weighted_system import make_prior
 
 GRAVITY = 9.81
 MODEL = SensorModel()

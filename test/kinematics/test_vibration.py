@@ -12,10 +12,10 @@ from imu_calibration.compensation.stream import CompensationStream, SampleCompen
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.session_noise import white_noise
-from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.signal_history import BandVariance
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window_finder import MotionGatherer
+from imu_calibration.references.turntable.window_statistics import reduce_windows
 from imu_calibration.selection.questions import testable_effects as asked_of
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import SimulatedNoise

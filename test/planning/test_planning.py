@@ -17,7 +17,6 @@ from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import NAMED_MODELS, SensorModel
 from imu_calibration.estimation.solution import tolerances_of
-from imu_calibration.estimation.window_statistics import batch_statistics
 from imu_calibration.kinematics.motion_limits import limits_of
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import table_from_urdf
@@ -29,6 +28,7 @@ from imu_calibration.planning.planner import GOAL_REACHED, make_planner
 from imu_calibration.planning.planning_problem import LEAST_RESTS, PlanningProblem, noise_of_grade
 from imu_calibration.planning.posterior import SAMPLING, WindowPredictor, exact_information
 from imu_calibration.references.options import CalibrationOptions, choose_model
+from imu_calibration.references.turntable.window_statistics import batch_statistics
 from imu_calibration.simulation.motion_builder import MotionBuilder, Profile
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.sensor_noise import GRADES

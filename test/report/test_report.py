@@ -20,9 +20,9 @@ from imu_calibration.core.units import with_sd
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import coefficients
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import restrict
 from imu_calibration.kinematics import strapdown
 from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.accumulator import restrict
 from imu_calibration.report.calibration_sections import (
     autocorrelation,
     calibration_report,

@@ -21,15 +21,15 @@ from imu_calibration.effects.forward_equations import (
     sensor_output,
 )
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator
 from imu_calibration.estimation.solution import HELD
 from imu_calibration.estimation.solver import solve
-from imu_calibration.estimation.window_statistics import reduce_windows
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, all_samples, chunks
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.model_selection import HandInvestigation, gain_of_poses
 from imu_calibration.references.gravity.pose_evidence import Block
+from imu_calibration.references.turntable.accumulator import Accumulator
+from imu_calibration.references.turntable.window_statistics import reduce_windows
 from imu_calibration.selection.gain import (
     APPLIED,
     OF_MODEL,

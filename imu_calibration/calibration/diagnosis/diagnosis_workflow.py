@@ -35,13 +35,13 @@ from imu_calibration.document.verdict import motion_misfits, unsteady
 from imu_calibration.effects.base import SENSORS, UNITS, Effect, Role
 from imu_calibration.effects.reference_effects import total_lags
 from imu_calibration.effects.sensor_model import BARE
-from imu_calibration.estimation.window_statistics import reduce_window
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.window import StoredWindows
 from imu_calibration.references.gravity.model_selection import too_few_poses
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
+from imu_calibration.references.turntable.window_statistics import reduce_window
 from imu_calibration.selection.gain import Gain
 from imu_calibration.selection.investigation import too_few_windows
 from imu_calibration.selection.onset import Onset

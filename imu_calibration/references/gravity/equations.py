@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.prior import bias_sum_rows
 from imu_calibration.estimation.row_estimate import RowSet
-from imu_calibration.estimation.weighted_system import bias_sum_rows
 from imu_calibration.kinematics.rotations import skew, unit_rows
 from imu_calibration.kinematics.strapdown import Turn, integrate_turn, small_rotation
 from imu_calibration.references.gravity.hand_parameters import HandModel

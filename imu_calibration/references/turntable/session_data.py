@@ -11,25 +11,26 @@ from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import References, columns
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.accumulator import Accumulator, restrict, selected_columns, stack
+from imu_calibration.estimation.prior import Prior, fixed_parameters, make_prior
 from imu_calibration.estimation.scaled_solve import scaled_lstsq, triangular
 from imu_calibration.estimation.solution import Solution
-from imu_calibration.estimation.weighted_system import (
-    Prior,
-    WeightedSystem,
-    fixed_parameters,
-    make_prior,
+from imu_calibration.estimation.weighted_system import WeightedSystem
+from imu_calibration.kinematics.joint_motion import JointMotion
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.window import Window
+from imu_calibration.references.turntable.accumulator import (
+    Accumulator,
+    restrict,
+    selected_columns,
+    stack,
 )
-from imu_calibration.estimation.window_statistics import (
+from imu_calibration.references.turntable.window_statistics import (
     N_AXES,
     WindowStatistics,
     count_pieces,
     pieces_at_rest,
     reduce_window,
 )
-from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window
 
 STATIC_MOST = 4096
 """Static windows kept at most."""
