@@ -36,33 +36,41 @@ class WeightedSystem:
     """
 
     def __init__(self, accumulator: AccumulatedRows, model: SensorModel):
-        self.model, self.prior, self.accumulator = model, make_prior(model), accumulator
+        self.model = model
+        self.prior = make_prior(model)
+        self.accumulator = accumulator
         rows = accumulator.rows
-        self.dof_within = {
-            k: max(accumulator.samples[k] - accumulator.windows[k], 1) for k in accumulator.samples
-        }
-        self.means = {s: np.array([row.sensors[s].mean for row in rows]) for s in SENSORS}
-        """Sensor -> mean rows, shape (n_windows, p + 3)."""
-        self.within = {
-            s: {
-                k: f
-                for (sensor, k), f in sorted(accumulator.within.items())
-                if sensor == s and len(f)
-            }
-            for s in SENSORS
-        }
-        """Sensor -> kind -> factor of the centred rows."""
-        self.times, self.counts, self.durations = np.array(
-            [(row.time, row.count, row.duration) for row in rows]
-        ).T
-        """Middle (s), number of samples and length (s) of each window."""
-        self.kinds, self.keys = (
-            [row.kind for row in rows],
-            [(row.session, row.time) for row in rows],
-        )
-        """Kind, and (recording, middle in s), of each window."""
+
+        self.kinds = [row.kind for row in rows]
+        """Kind of each window."""
+        self.keys = [(row.session, row.time) for row in rows]
+        """(Recording, middle in s) of each window."""
+        self.times = np.array([row.time for row in rows], float)
+        """Middle of each window, s."""
+        self.counts = np.array([row.count for row in rows], float)
+        """Number of samples of each window."""
+        self.durations = np.array([row.duration for row in rows], float)
+        """Length of each window, s."""
         self.sessions = sessions_of(rows)
         """Indices of each recording's windows in order of time."""
+
+        self.means = {}
+        """Sensor -> mean rows, shape (n_windows, p + 3)."""
+        self.within: dict[str, dict[str, np.ndarray]] = {}
+        """Sensor -> kind -> factor of the centred rows."""
+        for sensor in SENSORS:
+            self.means[sensor] = np.array([row.sensors[sensor].mean for row in rows])
+            self.within[sensor] = {}
+        # In a fixed order, so that sums over kinds do not depend on the order of the windows.
+        for (sensor, kind), factor in sorted(accumulator.within.items()):
+            if len(factor):
+                self.within[sensor][kind] = factor
+
+        # Each window has lost one degree of freedom to its mean.
+        self.dof_within = {}
+        """Kind -> degrees of freedom of its centred rows."""
+        for kind, n_samples in accumulator.samples.items():
+            self.dof_within[kind] = max(n_samples - accumulator.windows[kind], 1)
 
     def misfit(self, sensor: str, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return output minus prediction of rows ``[columns | output]``, shape (k, 3)."""
@@ -77,14 +85,12 @@ class WeightedSystem:
         Relative to the bias in the middle of each window, or of the noise within windows and of the
         reference only.
         """
-        variance = (noise.variance_beside_bias if beside_bias else noise.mean_variance)(
-            self.kinds, self.counts, self.durations, keys=self.keys
-        )
+        of_windows = noise.variance_beside_bias if beside_bias else noise.mean_variance
+        variance = of_windows(self.kinds, self.counts, self.durations, keys=self.keys)
         if noise.left_out:
-            out = np.array([key in noise.left_out for key in self.keys])
-            variance[out] = EXCLUDED_MEAN_SD_FACTOR**2 * (
-                variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance
-            )
+            left_out = np.array([key in noise.left_out for key in self.keys])
+            largest = variance.max(axis=0) + noise.offset_sd**2 + noise.bias_variance
+            variance[left_out] = EXCLUDED_MEAN_SD_FACTOR**2 * largest
         return variance
 
     def whitened(self, rows: np.ndarray, noise: NoiseModel) -> np.ndarray:
@@ -112,15 +118,18 @@ class WeightedSystem:
         """
         total = np.zeros((len(values),) * 2)
         for sensor in SENSORS:
-            slope, whitening = (
-                coefficient_jacobian(self.model, sensor, values),
-                self._whitening(noises[sensor]),
-            )
-            white = whitening(np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope))
+            # W A with W' W = V^-1, so that A' V^-1 A is its product with itself.
+            slope = coefficient_jacobian(self.model, sensor, values)
+            design = np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope)
+            whitening = self._whitening(noises[sensor])
+            white = whitening(design)
             information = np.einsum('kap,kaq->pq', white, white)
+
+            # B = V - D with the diagonal D of the noise within windows: subtract A' V^-1 D V^-1 A.
             weighed = whitening.adjoint(white)
-            apart = weighed * self.mean_variance(noises[sensor], beside_bias=False)[:, :, None]
-            total += information - np.einsum('kap,kaq->pq', weighed, apart)
+            within = self.mean_variance(noises[sensor], beside_bias=False)
+            of_noise = np.einsum('kap,kaq->pq', weighed, weighed * within[:, :, None])
+            total += information - of_noise
         return total
 
     def whitened_means(self, sensor: str, noise: NoiseModel) -> np.ndarray:
@@ -129,12 +138,9 @@ class WeightedSystem:
 
         Shape (n_windows, 3, p + 1).
         """
-        return self.whitened(
-            np.stack(
-                [self.means[sensor][:, self.columns_and(sensor, axis)] for axis in range(3)], axis=1
-            ),
-            noise,
-        )
+        means = self.means[sensor]
+        of_axes = [means[:, self.columns_and(sensor, axis)] for axis in range(3)]
+        return self.whitened(np.stack(of_axes, axis=1), noise)
 
     def columns_and(self, sensor: str, axis: int) -> list[int]:
         """Return the places of all columns and of the output of one axis in rows of a sensor."""
@@ -145,21 +151,15 @@ class WeightedSystem:
         """
         Return for each axis the triangular factor of all whitened rows ``[columns | output]``.
         """
-        white, weighed = self.whitened_means(sensor, noise), list(self.weighed_rows(sensor, noise))
-        return [
-            triangular(
-                np.concatenate(
-                    [
-                        white[:, axis],
-                        *(
-                            rows[:, self.columns_and(sensor, axis)] * weight[axis]
-                            for rows, weight in weighed
-                        ),
-                    ]
-                )
-            )
-            for axis in range(3)
-        ]
+        white = self.whitened_means(sensor, noise)
+        centred = list(self.weighed_rows(sensor, noise))
+        found = []
+        for axis in range(3):
+            own = self.columns_and(sensor, axis)
+            parts = [white[:, axis]]
+            parts += [rows[:, own] * weight[axis] for rows, weight in centred]
+            found.append(triangular(np.concatenate(parts)))
+        return found
 
     def weighed_rows(
         self, sensor: str, noise: NoiseModel, part: CentredRows | None = None
@@ -183,19 +183,19 @@ class WeightedSystem:
         """Return the residual rows of both sensors and all axes, the prior's rows last."""
         parts = []
         for sensor in SENSORS:
-            c = coefficients(self.model, sensor, values)
-            parts += [
-                factor[:, :-1] @ c[:, axis] - factor[:, -1]
-                for axis, factor in enumerate(factors[sensor])
-            ]
-        return np.concatenate(parts + [self.prior.root @ (values - self.prior.mean)])
+            of_axes = coefficients(self.model, sensor, values)
+            for axis, factor in enumerate(factors[sensor]):
+                parts.append(factor[:, :-1] @ of_axes[:, axis] - factor[:, -1])
+        parts.append(self.prior.root @ (values - self.prior.mean))
+        return np.concatenate(parts)
 
     def jacobian(self, values: np.ndarray, factors: dict) -> np.ndarray:
         """Return the derivative of the residual rows without the prior's."""
         parts = []
         for sensor in SENSORS:
-            dc = coefficient_jacobian(self.model, sensor, values)
-            parts += [factor[:, :-1] @ dc[:, axis] for axis, factor in enumerate(factors[sensor])]
+            slope = coefficient_jacobian(self.model, sensor, values)
+            for axis, factor in enumerate(factors[sensor]):
+                parts.append(factor[:, :-1] @ slope[:, axis])
         return np.concatenate(parts)
 
     def linearised(
@@ -215,23 +215,30 @@ class WeightedSystem:
             rows and prior, shape (q + 1, q + 1).
 
         """
-        dc = coefficient_jacobian(self.model, sensor, values)
-        own = np.flatnonzero(np.any(dc != 0, axis=(0, 1)))
+        # Coordinates: the parameters of the sensor, without the directions that the gauge fixes.
+        slope = coefficient_jacobian(self.model, sensor, values)
+        own = np.flatnonzero(np.any(slope != 0, axis=(0, 1)))
         gauge = self.prior.gauge[:, own]
-        basis = scipy.linalg.null_space(gauge) if gauge.any() else np.eye(len(own))
-        dc, root = dc[:, :, own] @ basis, self.prior.root[: -len(gauge) or None, own]
+        basis = np.eye(len(own))
+        if gauge.any():
+            basis = scipy.linalg.null_space(gauge)
+        slope = slope[:, :, own] @ basis
+
+        # Mean rows.
         means = self.means[sensor]
-        design = np.einsum('kp,paq->kaq', means[:, :-3], dc)
+        design = np.einsum('kp,paq->kaq', means[:, :-3], slope)
         rows = np.concatenate([design, self.misfit(sensor, means, values)[:, :, None]], axis=2)
+
+        # Rows of the prior, then weighted centred rows of the three axes.
+        root = self.prior.root[: -len(gauge) or None, own]
         used = np.flatnonzero(np.any(root != 0, axis=1))
         offset = self.prior.root[used] @ (self.prior.mean - values)
         parts = [np.concatenate([root[used] @ basis, offset[:, None]], axis=1)]
         for factor, weight in self.weighed_rows(sensor, noise):
-            rest = self.misfit(sensor, factor, values)
-            parts += [
-                np.concatenate([factor[:, :-3] @ dc[:, axis], rest[:, axis : axis + 1]], axis=1)
-                * weight[axis]
-                for axis in range(3)
-            ]
+            misfit = self.misfit(sensor, factor, values)
+            for axis in range(3):
+                columns = factor[:, :-3] @ slope[:, axis]
+                centred = np.concatenate([columns, misfit[:, axis : axis + 1]], axis=1)
+                parts.append(centred * weight[axis])
         stacked = np.concatenate(parts)
         return rows, stacked.T @ stacked

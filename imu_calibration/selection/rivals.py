@@ -8,7 +8,6 @@ explanations.
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -70,36 +69,49 @@ def settle_rivals(
 
     """
     chosen = [question for question in chosen if '@' not in question.label]
-    choices = [chosen, *_swapped(problem, chosen)]
+    choices: list[Sequence[Question]] = [chosen, *_swapped(problem, chosen)]
     if len(choices) == 1:
         return problem, []
-    few = partial(
-        linearised_at,
-        effects=list(
-            {question.name: question.effect for choice in choices for question in choice}.values()
-        ),
-    )
-    start = few()
-    attempts = [few(point=start.point(same_questions(start, choice))) for choice in choices]
-    choices = [same_questions(there, choice) for there, choice in zip(attempts, choices)]
-    costs = np.mean(
-        [[_cost(*each, judge) for each in zip(attempts, choices)] for judge in attempts], axis=0
-    )
+
+    # Linearise each choice at its own estimate, with columns of the compared effects only.
+    effects = {}
+    for choice in choices:
+        for question in choice:
+            effects[question.name] = question.effect
+    compared = list(effects.values())
+    start = linearised_at(effects=compared)
+    attempts = []
+    for number, choice in enumerate(choices):
+        there = linearised_at(effects=compared, point=start.point(same_questions(start, choice)))
+        attempts.append(there)
+        choices[number] = same_questions(there, choice)
+
+    # Mean cost of each choice, judged with the noise of each in turn.
+    costs_of_judges = []
+    for judge in attempts:
+        costs_of_judges.append(
+            [_cost(there, choice, judge) for there, choice in zip(attempts, choices)]
+        )
+    costs = np.mean(costs_of_judges, axis=0)
     best = int(np.argmin(costs))
-    values = [
-        dict(zip(there.space.names, there.values(choice)))
-        for there, choice in zip(attempts, choices)
-    ]
-    near = [k for k in range(len(choices)) if k != best and costs[k] - costs[best] < TIE]
-    settled, found = linearised_at(point=problem.point(same_questions(problem, choices[best]))), []
-    for k in near:
+
+    # The rivals within the resolution of the search, with what they would change.
+    values = []
+    for there, choice in zip(attempts, choices):
+        values.append(dict(zip(there.space.names, there.values(choice))))
+    settled = linearised_at(point=problem.point(same_questions(problem, choices[best])))
+    found = []
+    for k, choice in enumerate(choices):
+        if k == best or costs[k] - costs[best] >= TIE:
+            continue
+        # The question of which both choices have another effect.
         different = next(
-            pair for pair in zip(choices[best], choices[k]) if pair[0].name != pair[1].name
+            pair for pair in zip(choices[best], choice) if pair[0].name != pair[1].name
         )
         taken, other = same_questions(settled, different)
-        moves = {
-            name: values[k][name] - values[best][name] for name in problem.baseline.param_names
-        }
+        moves = {}
+        for name in problem.baseline.param_names:
+            moves[name] = values[k][name] - values[best][name]
         found.append(Rival(taken, other, float(costs[k] - costs[best]), moves))
     return settled, found
 
@@ -114,19 +126,11 @@ def same_questions(problem: LinearisedProblem, chosen: Sequence[Question]) -> li
     for each in chosen:
         asked = [question for question in problem.questions if question.name == each.name]
         same = [question for question in asked if question.label == each.label]
-        found.append(
-            (
-                same
-                or [
-                    min(
-                        asked,
-                        key=lambda question: problem.evidence.loss(
-                            problem.search.indices([question])
-                        ),
-                    )
-                ]
-            )[0]
-        )
+        if same:
+            found.append(same[0])
+            continue
+        losses = [problem.evidence.loss(problem.search.indices([question])) for question in asked]
+        found.append(asked[int(np.argmin(losses))])
     return found
 
 
@@ -136,14 +140,16 @@ def _swapped(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[lis
 
     Where the curvature is observable.
     """
-    return [
-        [other if each is question else each for each in chosen]
-        for question in chosen
-        if question.effect.warp is not None
-        and problem.curvature_shows(chosen, question) > MIN_CURVATURE_NATS
-        for other, _ in problem.search.confounded(chosen, question, most=None)
-        if other.effect.warp is not None
-    ]
+    swapped = []
+    for place, question in enumerate(chosen):
+        if question.effect.warp is None:
+            continue
+        if problem.curvature_shows(chosen, question) <= MIN_CURVATURE_NATS:
+            continue
+        for other, _ in problem.search.confounded(chosen, question, most=None):
+            if other.effect.warp is not None:
+                swapped.append([*chosen[:place], other, *chosen[place + 1 :]])
+    return swapped
 
 
 def _cost(
@@ -160,9 +166,8 @@ def _cost(
         slow_variance=judge.space.slow_variance,
     )
     evidence = WindowEvidence(space, judge.noise, problem.evidence.fold)
-    return 0.5 * evidence.heldout(problem.search.indices(chosen)) + PENALTY * sum(
-        question.penalty for question in chosen
-    )
+    misfit = evidence.heldout(problem.search.indices(chosen))
+    return 0.5 * misfit + PENALTY * sum(question.penalty for question in chosen)
 
 
 AS_MUCH = 0.5
@@ -189,14 +194,13 @@ def simpler(
             continue
         for other in _fewer(problem.search, kept, question):
             instead = [*kept[:place], other, *kept[place + 1 :]]
-            if (
-                problem.search.allowed(instead, other)
-                and explained.share(instead, other) >= needed_share(other)
-                and gain_in_turn(problem, instead, kept, sensors=sensors_of(question.effect)).ci95[
-                    0
-                ]
-                <= LEAST_REDUCTION
-            ):
+            if not problem.search.allowed(instead, other):
+                continue
+            if explained.share(instead, other) < needed_share(other):
+                continue
+            # The finding stays where the residual surely falls from the simpler one to it.
+            gain = gain_in_turn(problem, instead, kept, sensors=sensors_of(question.effect))
+            if gain.ci95[0] <= LEAST_REDUCTION:
                 kept = instead
                 break
     return kept
@@ -245,14 +249,19 @@ def best_pairs(search: Search) -> list[list[Question]]:
         names = {search.questions[one].name, search.questions[two].name}
         if len(names) == 2 and not names & search.resolved:
             shapes[blocks.size(one), blocks.size(two)].append((one, two))
-    scored = [entry for pairs in shapes.values() for entry in blocks.score(pairs)]
-    best = []
+    scored: list[tuple[float, int, int]] = []
+    for pairs in shapes.values():
+        scored += blocks.score(pairs)
+
+    # The best pairs that are possible; of pairs that differ in a time constant only, the best one.
+    best: list[list[Question]] = []
+    known: list[set[str]] = []
     for _, one, two in sorted(scored, reverse=True):
         pair = [search.questions[one], search.questions[two]]
-        if {q.name for q in pair} not in [{q.name for q in known} for known in best] and all(
-            search.allowed(pair, each) for each in pair
-        ):
+        names = {question.name for question in pair}
+        if names not in known and all(search.allowed(pair, each) for each in pair):
             best.append(pair)
+            known.append(names)
         if len(best) == TRIED:
             break
     return best
@@ -266,17 +275,23 @@ class _Blocks:
     """
 
     def __init__(self, search: Search):
-        self.questions, (information, right) = search.questions, search.evidence.equations()
-        base, free = (
-            list(search.baseline),
-            [k for question in search.questions for k in question.parameters],
-        )
+        self.questions = search.questions
+        information, right = search.evidence.equations()
+        base = list(search.baseline)
+        free: list[int] = []
+        self.at = []
+        for question in search.questions:
+            start = len(free)
+            free += question.parameters
+            self.at.append(slice(start, len(free)))
+
+        # Schur complement: M = I_ff - I_fb I_bb^-1 I_bf, and the same of the right side.
         factor = scipy.linalg.cho_factor(information[np.ix_(base, base)])
         cross = information[np.ix_(base, free)]
         matrix = information[np.ix_(free, free)] - cross.T @ scipy.linalg.cho_solve(factor, cross)
         right = right[free] - cross.T @ scipy.linalg.cho_solve(factor, right[base])
-        ends = np.cumsum([0, *(len(question.parameters) for question in search.questions)])
-        self.at = [slice(a, b) for a, b in zip(ends, ends[1:])]
+
+        # Scale rows and columns by L^-1 of each block L L'.
         for at in self.at:
             scale = np.sqrt(np.diag(matrix)[at])
             own = matrix[at, at] / np.outer(scale, scale)
@@ -296,34 +311,25 @@ class _Blocks:
 
         The members of a pair are not collinear.
         """
-        places = np.array(
-            [
-                [
-                    *range(*self.at[a].indices(len(self.right))),
-                    *range(*self.at[b].indices(len(self.right))),
-                ]
-                for a, b in pairs
-            ]
-        )
+        every = np.arange(len(self.right))
+        places = np.array([[*every[self.at[a]], *every[self.at[b]]] for a, b in pairs])
         n_first = self.size(pairs[0][0])
-        systems = self.matrix[places[:, :, None], places[:, None, :]] + 1e4 * JITTER * np.eye(
-            places.shape[1]
-        )
+        systems = self.matrix[places[:, :, None], places[:, None, :]]
+        systems = systems + 1e4 * JITTER * np.eye(places.shape[1])
+
+        # The loss falls by x' b at the solution x of M x = b.
         values = np.linalg.solve(systems, self.right[places][:, :, None])[:, :, 0]
         fall = np.einsum('ki,ki->k', values, self.right[places])
-        cross, parts = systems[:, :n_first, n_first:], (values[:, :n_first], values[:, n_first:])
-        shared = [
-            np.einsum('kij,ki->kj', cross, parts[0]),
-            np.einsum('kij,kj->ki', cross, parts[1]),
-        ]
+        # Share of the signal of each member that its mate cannot imitate.
+        cross = systems[:, :n_first, n_first:]
+        first, second = values[:, :n_first], values[:, n_first:]
+        of_first = np.einsum('kij,ki->kj', cross, first)
+        of_second = np.einsum('kij,kj->ki', cross, second)
         for k, (one, two) in enumerate(pairs):
-            unique = [
-                1 - (other[k] @ other[k]) / max(part[k] @ part[k], 1e-300)
-                for part, other in zip(parts, shared)
-            ]
-            if min(unique) > MIN_UNIQUE_SHARE:
-                yield (
-                    0.5 * fall[k] - PENALTY * sum(self.questions[q].penalty for q in (one, two)),
-                    one,
-                    two,
-                )
+            imitated = max(
+                (of_first[k] @ of_first[k]) / max(first[k] @ first[k], 1e-300),
+                (of_second[k] @ of_second[k]) / max(second[k] @ second[k], 1e-300),
+            )
+            if 1.0 - imitated > MIN_UNIQUE_SHARE:
+                penalty = self.questions[one].penalty + self.questions[two].penalty
+                yield 0.5 * fall[k] - PENALTY * penalty, one, two

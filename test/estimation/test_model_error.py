@@ -12,7 +12,6 @@ import pytest
 from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation import accumulator as accumulator_module
 from imu_calibration.estimation.model_error import (
     MIN_SCATTER_BLOCKS,
     NO_BIAS,
@@ -21,6 +20,7 @@ from imu_calibration.estimation.model_error import (
 )
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.turntable import accumulator as accumulator_module
 from imu_calibration.references.turntable.accumulator import Accumulator, restrict
 from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.references.turntable.window_statistics import reduce_windows

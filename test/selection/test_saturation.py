@@ -121,7 +121,7 @@ def test_a_limit_that_one_window_alone_shows_is_seen(monkeypatch):
     monkeypatch.setattr(
         saturation,
         '_limits',
-        lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, None))[1],
+        lambda some, table, model: (seen.extend(map(id, some)), ([limit], {}, np.zeros(0)))[1],
     )
     monkeypatch.setattr(saturation, 'predictions', lambda *given, **named: None)
     monkeypatch.setattr(saturation, 'without_clipped', lambda some, *given, **named: some)
