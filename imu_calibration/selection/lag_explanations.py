@@ -19,7 +19,6 @@ import numpy as np
 
 from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.effects.reference_effects import CLOCK, CLOCKS, FAMILY, lag_name
-from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question, point_with
 from imu_calibration.selection.rivals import MIN_CURVATURE_NATS, Rival, same_questions
@@ -54,23 +53,22 @@ class LagHypothesis:
     @property
     def values(self) -> dict[str, float]:
         """Parameter of the baseline, of the lags and of clocks that change -> value."""
-        lags = FAMILY | CLOCKS
-        names = {
-            *self.problem.baseline.param_names,
-            *(name for q in self.chosen if q.name in lags for name in q.effect.param_names()),
-        }
-        return {
-            name: value
-            for name, value in zip(self.problem.space.names, self.problem.values(self.chosen))
-            if name in names
-        }
+        wanted = set(self.problem.baseline.param_names)
+        for question in self.chosen:
+            if question.name in FAMILY | CLOCKS:
+                wanted.update(question.effect.param_names())
+        found = {}
+        for name, value in zip(self.problem.space.names, self.problem.values(self.chosen)):
+            if name in wanted:
+                found[name] = value
+        return found
 
     def lags(self, sensor: str) -> tuple[np.ndarray, np.ndarray]:
         """Return (values, covariance) of the lags of one sensor, in the order of the kind."""
-        wanted = [lag_name(sensor, ending) for ending in self.kind]
         used = self.problem.search.indices(self.chosen)
         values, covariance = self.problem.evidence.fit(used)
-        at = [used.index(q.parameters[0]) for name in wanted for q in self.chosen if q.name == name]
+        parameter = {question.name: question.parameters[0] for question in self.chosen}
+        at = [used.index(parameter[lag_name(sensor, ending)]) for ending in self.kind]
         return values[at], covariance[np.ix_(at, at)]
 
     def without(self, sensor: str) -> list[Question]:
@@ -122,11 +120,12 @@ class LagExplanations:
         Without given ones and without those of the same columns and cost.
         """
         costs = {each.cost for each in refused}
-        return [
-            each
-            for each in self.explanations
-            if (most is None or len(each.lags) <= most) and each.cost not in costs
-        ]
+        found = []
+        for each in self.explanations:
+            few_enough = most is None or len(each.lags) <= most
+            if few_enough and each.cost not in costs:
+                found.append(each)
+        return found
 
     def select(self, most: int | None = None, refused: Sequence[Explanation] = ()) -> Explanation:
         """Return the simplest explanation of `others`."""
@@ -140,19 +139,26 @@ class LagExplanations:
 
         The alternatives to the choice's members fit nearly as well.
         """
-        names = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
-        values = selected.values | {names[name]: value for name, value in selected.lags.items()}
+        # Linearise at the lags of the explanation.
+        parameter = {effect.name: effect.param_names()[0] for effect in self.problem.effects}
+        values = dict(selected.values)
+        for name, lag in selected.lags.items():
+            values[parameter[name]] = lag
         there = linearised_at(point=point_with(self.problem.baseline, self.problem.effects, values))
-        lags = [
-            next(question for question in there.questions if question.name == name)
-            for name in selected.lags
-        ]
-        near = [
-            explanation
-            for explanation in self.explanations
-            if explanation.cost < selected.cost + TIE
-        ]
+
+        # Its effects, the other chosen effects, and what fits nearly as well.
+        asked = _questions_by_name(there)
+        lags = [asked[name] for name in selected.lags]
+        near = [each for each in self.explanations if each.cost < selected.cost + TIE]
         return there, [*lags, *same_questions(there, self.rest)], _rivals(there, selected, near)
+
+
+def _questions_by_name(problem: LinearisedProblem) -> dict[str, Question]:
+    """Return effect -> its first question."""
+    found: dict[str, Question] = {}
+    for question in problem.questions:
+        found.setdefault(question.name, question)
+    return found
 
 
 def lag_explanations(
@@ -173,32 +179,32 @@ def lag_explanations(
         effects.
 
     """
-    rest = [
-        question for question in chosen if question.name not in FAMILY and '@' not in question.label
-    ]
     effects = {effect.name: effect for effect in problem.effects}
-    if not {question.name for question in chosen} & FAMILY or not FAMILY <= set(effects):
+    has_lag = any(question.name in FAMILY for question in chosen)
+    if not has_lag or not FAMILY <= set(effects):
         return None
-    values, clocks = (
-        problem.values(chosen),
-        [question for question in chosen if question.name in CLOCKS],
-    )
-    of_clocks = {
-        problem.space.names[k]: float(values[k]) for question in clocks for k in question.parameters
-    }
+    rest = [each for each in chosen if each.name not in FAMILY and '@' not in each.label]
+
     # Lags are nonlinear at a clock of zero where a clock changes.
-    described = _described(problem, linearised_at, effects, rest=rest, clocks=of_clocks or None)
+    values = problem.values(chosen)
+    clocks = {}
+    for question in chosen:
+        if question.name in CLOCKS:
+            for k in question.parameters:
+                clocks[problem.space.names[k]] = float(values[k])
+    described = _described(problem, linearised_at, effects, rest=rest, clocks=clocks or None)
+
     judges = [each.problem for each in described]
     names = [name for name in described[0].values if name.split('.')[1] not in FAMILY]
     explanations = _explanations(described, judges, names)
     if not explanations:
         return None
-    without = [question for question in described[0].chosen if question.name not in FAMILY]
-    silent = (
-        sum(_cost(described[0], without, judges, sensor) for sensor in SENSORS)
-        if problem.recording.moving.all()
-        else None
-    )
+
+    # Without rests the noise is that of the misfit: the cost without a lag is the scale of costs.
+    silent = None
+    if problem.recording.moving.all():
+        without = [question for question in described[0].chosen if question.name not in FAMILY]
+        silent = sum(_cost(described[0], without, judges, sensor) for sensor in SENSORS)
     return LagExplanations(problem, explanations, rest, silent)
 
 
@@ -214,20 +220,17 @@ def simplest(explanations: Sequence[Explanation], silent: float | None = None) -
         a common clock is then accepted within the resolution of the misfit.
 
     """
-    best = min(explanation.cost for explanation in explanations)
-    selected = min(
-        (explanation for explanation in explanations if explanation.cost < best + TIE),
-        key=lambda explanation: explanation.rank,
-    )
+    best = min(each.cost for each in explanations)
+    near = [each for each in explanations if each.cost < best + TIE]
+    selected = min(near, key=lambda each: each.rank)
     if silent is None or len(selected.lags) < 2 or CLOCK in selected.lags:
         return selected
-    common = [
-        explanation
-        for explanation in explanations
-        if CLOCK in explanation.lags
-        and len(explanation.lags) == len(selected.lags)
-        and explanation.cost < best + TIE + MAX_CLOCK_LOSS * (silent - best)
-    ]
+    dearest = best + TIE + MAX_CLOCK_LOSS * (silent - best)
+    common = []
+    for each in explanations:
+        has_as_many = CLOCK in each.lags and len(each.lags) == len(selected.lags)
+        if has_as_many and each.cost < dearest:
+            common.append(each)
     return simplest(common) if common else selected
 
 
@@ -242,45 +245,42 @@ def _described(
     """Return the description of each kind; only the first if no curvature is observable."""
 
     def at(kind: tuple[str, ...], values: dict[str, float] | None = clocks) -> LagHypothesis:
-        asked = [effects[lag_name(sensor, ending)] for ending in kind for sensor in SENSORS] + [
-            question.effect for question in rest
-        ]
-        there = linearised_at(
-            effects=asked,
-            point=None if values is None else point_with(problem.baseline, asked, values),
-        )
-        lags = [
-            q
-            for ending in kind
-            for sensor in SENSORS
-            for q in there.questions
-            if q.name == lag_name(sensor, ending)
-        ]
+        names = [lag_name(sensor, ending) for ending, sensor in product(kind, SENSORS)]
+        asked = [effects[name] for name in names] + [question.effect for question in rest]
+        point = None
+        if values is not None:
+            point = point_with(problem.baseline, asked, values)
+        there = linearised_at(effects=asked, point=point)
+        known = _questions_by_name(there)
+        lags = [known[name] for name in names]
         return LagHypothesis(kind, there, [*lags, *same_questions(there, rest)])
 
+    # Delays only, at zero; without an observable curvature all kinds have the same columns.
     first = at(DELAY)
-    shown = max(
-        first.problem.curvature_shows(first.chosen, q) for q in first.chosen if q.name in FAMILY
-    )
-    if shown < MIN_CURVATURE_NATS:
+    curvatures = []
+    for question in first.chosen:
+        if question.name in FAMILY:
+            curvatures.append(first.problem.curvature_shows(first.chosen, question))
+    if max(curvatures) < MIN_CURVATURE_NATS:
         return [first]
+
+    # Delays at their own estimate, then each other kind from there.
     first = at(DELAY, first.values)
-    found, delays = [first], {sensor: first.lags(sensor)[0][0] for sensor in SENSORS}
+    found = [first]
     for kind in LAG_KINDS[1:]:
         values = dict(first.values)
-        for sensor, delay in delays.items():
-            own = (
-                [delay - FIRST_SHARE * abs(delay), FIRST_SHARE * abs(delay)]
-                if len(kind) == 2
-                else [delay]
-            )
-            values |= {
-                effects[lag_name(sensor, ending)].param_names()[0]: value
-                for ending, value in zip(kind, own)
-            }
+        for sensor in SENSORS:
+            delay = first.lags(sensor)[0][0]
+            own = [delay]
+            if len(kind) == 2:
+                low_pass = FIRST_SHARE * abs(delay)
+                own = [delay - low_pass, low_pass]
+            for ending, value in zip(kind, own, strict=True):
+                values[effects[lag_name(sensor, ending)].param_names()[0]] = value
         hypothesis = at(kind, values)
-        for _ in range(DELAY_LINEARISATIONS - 1 if len(kind) > 1 else 0):
-            hypothesis = at(kind, hypothesis.values)
+        if len(kind) > 1:
+            for _ in range(DELAY_LINEARISATIONS - 1):
+                hypothesis = at(kind, hypothesis.values)
         found.append(hypothesis)
     return found
 
@@ -293,25 +293,26 @@ def _explanations(
 
     Only an Explanation that is better than none is returned.
     """
-    options = {
-        sensor: [
-            _none(described[0], judges, sensor),
-            *(_option(each, judges, sensor) for each in described),
-        ]
-        for sensor in SENSORS
-    }
-    if len(described) == 1:  # without curvature the kinds are one column
-        for some in options.values():
-            some += [
-                replace(some[1], kind=(ending,), alike=True) for ending in ('bandwidth', 'filter')
-            ]
-    found = [
-        each
-        for one, two in product(*options.values())
-        if one.kind or two.kind
-        for each in _described_together(one, two, names)
-    ]
-    return [each for each in found if each.cost < sum(none.cost for none, *_ in options.values())]
+    # Each sensor without a lag, and with one of each kind.
+    options = []
+    cost_without = 0.0
+    for sensor in SENSORS:
+        none = _none(described[0], judges, sensor)
+        cost_without += none.cost
+        own = [none, *(_option(each, judges, sensor) for each in described)]
+        if len(described) == 1:
+            # Without curvature the kinds are one column.
+            for ending in ('bandwidth', 'filter'):
+                own.append(replace(own[1], kind=(ending,), alike=True))
+        options.append(own)
+
+    found = []
+    for one, two in product(*options):
+        if one.kind or two.kind:
+            for each in _described_together(one, two, names):
+                if each.cost < cost_without:
+                    found.append(each)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,9 +347,8 @@ def _option(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sens
 def _none(hypothesis: LagHypothesis, judges: Sequence[LinearisedProblem], sensor: str) -> _Option:
     left = hypothesis.without(sensor)
     values = dict(zip(hypothesis.problem.space.names, hypothesis.problem.values(left)))
-    return _Option(
-        sensor, (), _cost(hypothesis, left, judges, sensor), np.zeros(0), np.zeros((0, 0)), values
-    )
+    cost = _cost(hypothesis, left, judges, sensor)
+    return _Option(sensor, (), cost, np.zeros(0), np.zeros((0, 0)), values)
 
 
 def _cost(
@@ -362,18 +362,10 @@ def _cost(
 
     It is judged with the noise and the band of each linearisation in turn.
     """
-    used, losses = hypothesis.problem.search.indices(chosen), []
+    used = hypothesis.problem.search.indices(chosen)
+    losses = []
     for judge in judges:
-        space = replace(
-            hypothesis.problem.evidence.space,
-            slow_only=judge.space.slow_only,
-            slow_variance=judge.space.slow_variance,
-        )
-        losses.append(
-            WindowEvidence(space, judge.noise, hypothesis.problem.evidence.fold)
-            .heldout_parts(used)[sensor]
-            .sum()
-        )
+        losses.append(hypothesis.problem.judged_by(judge).heldout_parts(used)[sensor].sum())
     return 0.5 * float(np.mean(losses))
 
 
@@ -383,28 +375,34 @@ def _described_together(one: _Option, two: _Option, names: Sequence[str]) -> Ite
 
     Separate lags, or a common clock and the additional lags of each.
     """
-    values = {name: (two if name.startswith(two.sensor) else one).values[name] for name in names}
+    values = {}
+    for name in names:
+        of_its_sensor = two if name.startswith(two.sensor) else one
+        values[name] = of_its_sensor.values[name]
     cost = one.cost + two.cost
+
+    # Separate lags.
     own = one.own(one.lags) | two.own(two.lags)
     if all(value > 0 for value in own.values()):
         yield Explanation(own, cost, values)
     if not (one.kind and two.kind):
         return
+
+    # A common clock with the smaller lag, and the rest of the larger one.
     apart = float(one.lags[0] - two.lags[0])
     late, clock = (one, two) if apart > 0 else (two, one)
     if clock.kind == DELAY and (late.kind == DELAY or late.alike):
         yield Explanation({CLOCK: float(clock.lags[0])} | late.own([abs(apart)]), cost, values)
+
+    # A common clock in place of both delays: a parameter less, for the misfit of their difference.
     if one.kind[0] == two.kind[0] == 'delay':
-        variances = np.array([each.covariance[0, 0] for each in (one, two)])
+        variances = np.array([one.covariance[0, 0], two.covariance[0, 0]])
         shared = float(np.average([one.lags[0], two.lags[0]], weights=1 / variances))
-        beside = one.own(one.with_delay(shared)) | two.own(two.with_delay(shared))
-        beside = {name: value for name, value in beside.items() if not name.endswith('delay')}
-        if all(value > 0 for value in beside.values()):
-            yield Explanation(
-                {CLOCK: shared} | beside,
-                cost - PENALTY + 0.5 * apart**2 / float(variances.sum()),
-                values,
-            )
+        remaining = one.own(one.with_delay(shared)) | two.own(two.with_delay(shared))
+        remaining = {name: lag for name, lag in remaining.items() if not name.endswith('delay')}
+        if all(value > 0 for value in remaining.values()):
+            misfit = 0.5 * apart**2 / float(variances.sum())
+            yield Explanation({CLOCK: shared} | remaining, cost - PENALTY + misfit, values)
 
 
 def _rivals(

@@ -155,6 +155,15 @@ class LinearisedProblem:
         values[: len(change)] += np.where(change, self.recording.values, 0.0)
         return values
 
+    def judged_by(self, judge: 'LinearisedProblem') -> WindowEvidence:
+        """Return the evidence with the noise and the band of another linearisation."""
+        space = replace(
+            self.evidence.space,
+            slow_only=judge.space.slow_only,
+            slow_variance=judge.space.slow_variance,
+        )
+        return WindowEvidence(space, judge.noise, self.evidence.fold)
+
     def needs_another(self, chosen: Sequence[Question]) -> bool:
         """
         Return whether the linearisation is too coarse for the choice: curvature times evidence.

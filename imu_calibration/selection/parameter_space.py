@@ -1,6 +1,6 @@
 """Parameters of a search and their columns, and normal matrices over them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -80,40 +80,37 @@ class ParameterSpace:
     def restricted(self, kept: np.ndarray) -> 'ParameterSpace':
         """Return the space of some of the parameters, in this order."""
         order = np.argsort(kept)
-        own = {sensor: [np.isin(index, kept) for index in self.index[sensor]] for sensor in SENSORS}
-
-        def cut(joins: Mapping[str, Sequence[np.ndarray]]) -> dict[str, list[np.ndarray]]:
-            return {
-                sensor: [
-                    join[:, np.append(mask, True)] for join, mask in zip(joins[sensor], own[sensor])
-                ]
-                for sensor in SENSORS
-            }
-
-        index = {
-            sensor: [
-                order[np.searchsorted(kept, index[mask], sorter=order)]
-                for index, mask in zip(self.index[sensor], own[sensor])
-            ]
-            for sensor in SENSORS
-        }
+        index: dict[str, list[np.ndarray]] = {}
+        join: dict[str, list[np.ndarray]] = {}
+        join_within: dict[str, list[np.ndarray]] = {}
+        for sensor in SENSORS:
+            index[sensor], join[sensor], join_within[sensor] = [], [], []
+            for axis, acting in enumerate(self.index[sensor]):
+                own = np.isin(acting, kept)
+                # The new number of a parameter is its place in `kept`.
+                place = np.searchsorted(kept, acting[own], sorter=order)
+                index[sensor].append(order[place])
+                columns = np.append(own, True)
+                join[sensor].append(self.join[sensor][axis][:, columns])
+                join_within[sensor].append(self.join_within[sensor][axis][:, columns])
         return replace(
             self,
             names=tuple(self.names[k] for k in kept),
             prior_sd=self.prior_sd[kept],
             prior_mean=self.prior_mean[kept],
             index=index,
-            join=cut(self.join),
-            join_within=cut(self.join_within),
+            join=join,
+            join_within=join_within,
         )
 
     @cached_property
     def mean(self) -> dict[str, list[np.ndarray]]:
         """Sensor -> mean rows of the windows for each axis, shape (k, q_a + 1)."""
-        return {
-            sensor: [self.recording.mean(sensor) @ join for join in self.join[sensor]]
-            for sensor in SENSORS
-        }
+        found = {}
+        for sensor in SENSORS:
+            rows = self.recording.mean(sensor)
+            found[sensor] = [rows @ join for join in self.join[sensor]]
+        return found
 
     def within_each(self, sensor: str, axis: int, rows: np.ndarray) -> Iterator[np.ndarray]:
         """
@@ -121,7 +118,8 @@ class ParameterSpace:
 
         Shape (m, q_a + 1, q_a + 1).
         """
-        missing, join = self._missing(sensor, axis), self.join_within[sensor][axis]
+        missing = self._missing(sensor, axis)
+        join = self.join_within[sensor][axis]
         for some, factors in self.recording.factors_of(sensor, self._compared(sensor, axis), rows):
             found = join.T @ (factors.transpose(0, 2, 1) @ factors @ join)
             found[:, -1, -1] += missing[some]
@@ -136,11 +134,8 @@ class ParameterSpace:
         `part` 'within' or 'slow'; default: the part that is compared on this axis.
         """
         join = self.join_within[sensor][axis]
-        found = (
-            join.T
-            @ self.recording.product_sum(sensor, part or self._compared(sensor, axis), rows)
-            @ join
-        )
+        products = self.recording.product_sum(sensor, part or self._compared(sensor, axis), rows)
+        found = join.T @ products @ join
         if part is None:
             found[-1, -1] += self._missing(sensor, axis)[rows].sum()
         return found
@@ -151,12 +146,14 @@ class ParameterSpace:
 
         They are multiplied by `weights` (q_a + 1,), and the shape is (k, q_a + 1).
         """
-        join, recording = self.join_within[sensor][axis], self.recording
+        recording = self.recording
+        join = self.join_within[sensor][axis]
+        weighed = join @ weights
+        compared = self._compared(sensor, axis)
         found = np.zeros((len(recording.kind), join.shape[1]))
-        for some, factors in recording.factors_of(
-            sensor, self._compared(sensor, axis), recording.moving
-        ):
-            found[some] = ((factors @ (join @ weights))[:, None] @ factors)[:, 0] @ join
+        for some, factors in recording.factors_of(sensor, compared, recording.moving):
+            # w' J' F' F J of each window, with the factor F of its centred rows.
+            found[some] = ((factors @ weighed)[:, None] @ factors)[:, 0] @ join
         return found
 
     def squares_within(self, sensor: str, axis: int, weights: np.ndarray) -> np.ndarray:
@@ -165,7 +162,8 @@ class ParameterSpace:
 
         The centred rows are multiplied by the window's `weights` (k, q_a + 1).
         """
-        columns, recording = weights @ self.join[sensor][axis].T, self.recording
+        recording = self.recording
+        columns = weights @ self.join[sensor][axis].T
         found = np.zeros(len(columns))
         for some, factors in recording.factors_of(sensor, 'within', recording.moving):
             found[some] = ((factors @ columns[some, :, None]) ** 2).sum(axis=(1, 2))
@@ -183,9 +181,9 @@ class ParameterSpace:
         """
         if not self.slow_only[sensor][axis]:
             return np.zeros(len(self.recording.count))
-        return self.slow_variance[sensor][axis] * np.maximum(
-            self.recording.count - np.maximum(self.recording.slow_rows, 1), 0.0
-        )
+        n_slow = np.maximum(self.recording.slow_rows, 1)
+        n_fast = np.maximum(self.recording.count - n_slow, 0.0)
+        return self.slow_variance[sensor][axis] * n_fast
 
 
 def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> ParameterSpace:
@@ -205,33 +203,46 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
         The model to be extended.
 
     """
-    model, bank = recording.model, [entry for sensor in SENSORS for entry in recording.bank[sensor]]
-    prior, sd = model.prior()
+    model = recording.model
+    prior, prior_sd = model.prior()
+    # A time constant has no prior of its own: it is where its columns were computed.
     for effect in model.effects:
         if effect.time_constant:
             prior[model.slices[effect.key]][-1] = recording.values[model.slices[effect.key]][-1]
+
+    # Parameters of the baseline count from the linearisation, the other ones from zero: their
+    # share of the prediction is returned to the residual.
     in_baseline = counted_from_values(model, baseline)
     shift = np.where(in_baseline, prior - recording.values, prior)
     removed = np.where(in_baseline, 0.0, recording.values)
-    names = [*model.param_names, *(name for entry in bank for name in entry.param_names)]
-    smooth = np.concatenate(
-        [
-            *(np.full(e.size, e.smooth) for e in model.effects),
-            *(np.full(len(entry.param_names), entry.effect.smooth) for entry in bank),
-        ]
-    )
-    index, join, join_within = {}, {}, {}
+
+    # The parameters of the model, then those of the banks.
+    names = list(model.param_names)
+    smooth = [np.full(effect.size, effect.smooth) for effect in model.effects]
+    sds = [prior_sd]
+    for sensor in SENSORS:
+        for entry in recording.bank[sensor]:
+            names += entry.param_names
+            smooth.append(np.full(len(entry.param_names), entry.effect.smooth))
+            sds.append(entry.prior_sd)
+
+    index: dict[str, list[np.ndarray]] = {}
+    join: dict[str, list[np.ndarray]] = {}
+    join_within: dict[str, list[np.ndarray]] = {}
     for sensor in SENSORS:
         jacobian = coefficient_jacobian(model, sensor, recording.values)
-        parts = [
-            _join(jacobian[:, axis], sensor, axis, recording, removed, smooth) for axis in range(3)
-        ]
-        index[sensor], join[sensor], join_within[sensor] = map(list, zip(*parts))
-    sd = np.concatenate([sd, *(entry.prior_sd for entry in bank)])
+        index[sensor], join[sensor], join_within[sensor] = [], [], []
+        for axis in range(3):
+            joined = _join(
+                jacobian[:, axis], sensor, axis, recording, removed, np.concatenate(smooth)
+            )
+            index[sensor].append(joined.used)
+            join[sensor].append(joined.columns)
+            join_within[sensor].append(joined.within)
     return ParameterSpace(
         recording,
         tuple(names),
-        sd,
+        np.concatenate(sds),
         np.pad(shift, (0, len(names) - len(shift))),
         index,
         join,
@@ -241,11 +252,26 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
 
 def bank_places(recording: ReducedRecording) -> dict[str, slice]:
     """Return label -> parameters of each entry of the banks."""
-    entries = [entry for sensor in SENSORS for entry in recording.bank[sensor]]
-    ends = np.cumsum(
-        [len(recording.model.param_names), *(len(entry.param_names) for entry in entries)]
-    )
-    return {entry.label: slice(a, b) for entry, a, b in zip(entries, ends, ends[1:])}
+    places = {}
+    start = len(recording.model.param_names)
+    for sensor in SENSORS:
+        for entry in recording.bank[sensor]:
+            end = start + len(entry.param_names)
+            places[entry.label] = slice(start, end)
+            start = end
+    return places
+
+
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """How columns of three axes become the design of one."""
+
+    used: np.ndarray
+    """Parameters that act on the axis, shape (q_a,)."""
+    columns: np.ndarray
+    """As in `ParameterSpace.join`, shape (p + 3, q_a + 1)."""
+    within: np.ndarray
+    """As in `ParameterSpace.join_within`, shape (p + 3, q_a + 1)."""
 
 
 def _join(
@@ -255,26 +281,31 @@ def _join(
     recording: ReducedRecording,
     removed: np.ndarray,
     smooth: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Return (parameters that act on an axis, matrix for columns, matrix for the part).
-
-    The first matrix joins columns to the parameters, and the second one is for the part within
-    windows.
-    """
-    bank, places = recording.bank[sensor], bank_places(recording)
+) -> _Joined:
+    """Return the matrices that join the columns of an axis to the parameters."""
+    bank = recording.bank[sensor]
+    places = bank_places(recording)
     p, n_model = jacobian.shape
-    ends = np.cumsum([p, *(len(entry.slopes) for entry in bank)])
-    full = np.zeros((ends[-1] + 3, len(smooth) + 1))
+    n_columns = p + sum(len(entry.slopes) for entry in bank)
+
+    # Rows: columns of the model and of the banks, then the residuals of three axes.
+    full = np.zeros((n_columns + 3, len(smooth) + 1))
     full[:p, :n_model] = jacobian
-    for entry, a, b in zip(bank, ends, ends[1:]):
-        full[a:b, places[entry.label]] = entry.slopes[:, axis]
+    start = p
+    for entry in bank:
+        end = start + len(entry.slopes)
+        full[start:end, places[entry.label]] = entry.slopes[:, axis]
+        start = end
     full[:p, -1] = jacobian @ removed
-    full[ends[-1] + axis, -1] = 1.0
-    used = np.flatnonzero(np.any(full[:, :-1] != 0, axis=0))
+    full[n_columns + axis, -1] = 1.0
+
+    # Within windows, effects that are smooth in time have no columns.
     within = np.where(np.append(smooth, False), 0.0, full)
     within[:p, -1] = jacobian @ np.where(smooth[:n_model], 0.0, removed)
-    return used, full[:, np.append(used, -1)], within[:, np.append(used, -1)]
+
+    used = np.flatnonzero(np.any(full[:, :-1] != 0, axis=0))
+    kept = np.append(used, -1)
+    return _Joined(used, full[:, kept], within[:, kept])
 
 
 def counted_from_values(model: SensorModel, baseline: SensorModel) -> np.ndarray:
@@ -296,27 +327,30 @@ def questions(space: ParameterSpace, effects: Sequence[Effect]) -> Sequence[Ques
 
     One with a time constant gives one per time constant of the bank.
     """
-    model, places, asked = space.recording.model, bank_places(space.recording), []
+    model = space.recording.model
+    places = bank_places(space.recording)
+    asked = []
     for effect in effects:
         if effect.key in model.slices:
-            found = {effect.name: model.slices[effect.key]}
+            parts = {effect.name: model.slices[effect.key]}
         else:
-            found = {
-                entry.label: places[entry.label]
-                for entry in space.recording.bank.get(effect.sensor, ())
-                if entry.effect is effect
-            }
-        asked += [
-            Question(effect, tuple(range(part.start, part.stop)), effect.size, label)
-            for label, part in found.items()
-        ]
+            parts = {}
+            for entry in space.recording.bank.get(effect.sensor, ()):
+                if entry.effect is effect:
+                    parts[entry.label] = places[entry.label]
+        for label, part in parts.items():
+            parameters = tuple(range(part.start, part.stop))
+            asked.append(Question(effect, parameters, effect.size, label))
     return asked
 
 
 def smooth_parameters(asked: Sequence[Question]) -> dict[str, list[tuple[int, ...]]]:
     """Return sensor -> list of the parameters of effects that are smooth in time."""
-    smooth = [q for q in asked if q.effect.smooth]
-    return {sensor: [q.parameters for q in smooth if q.sensor == sensor] for sensor in SENSORS}
+    found: dict[str, list[tuple[int, ...]]] = {sensor: [] for sensor in SENSORS}
+    for question in asked:
+        if question.effect.smooth and question.sensor in found:
+            found[question.sensor].append(question.parameters)
+    return found
 
 
 def normal_matrix(
@@ -330,7 +364,9 @@ def normal_matrix(
     of_means = np.zeros((space.size + 1, space.size + 1))
     for sensor in SENSORS:
         for axis, rows in enumerate(white_means(space, noise, sensor)):
-            rows, at = rows if select is None else rows[select], space.places(sensor, axis)
+            if select is not None:
+                rows = rows[select]
+            at = space.places(sensor, axis)
             of_means[np.ix_(at, at)] += rows.T @ rows
     return within_matrix(space, noise, select) + of_means
 
@@ -362,12 +398,14 @@ def within_of_axis(
     select: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return the same of one axis over its own columns, ``space.places(sensor, axis)``."""
-    total, kind = np.zeros((len(space.places(sensor, axis)),) * 2), space.recording.kind
-    chosen = space.recording.moving if select is None else select & space.recording.moving
+    kind = space.recording.kind
+    chosen = space.recording.moving
+    if select is not None:
+        chosen = select & chosen
+    total = np.zeros((len(space.places(sensor, axis)),) * 2)
     for name in np.unique(kind[chosen]):
-        total += (
-            space.within_sum(sensor, axis, chosen & (kind == name)) / noise.row_variance(name)[axis]
-        )
+        products = space.within_sum(sensor, axis, chosen & (kind == name))
+        total += products / noise.row_variance(name)[axis]
     return total
 
 
@@ -379,18 +417,18 @@ def scatter_of_each(
 
     Shape (k, 3).
     """
-    recording, found, reduced = space.recording, {}, space.reduced(range(space.size), values)
+    recording = space.recording
+    reduced = space.reduced(range(space.size), values)
+    found = {}
     for sensor in SENSORS:
-        usual = (
-            np.array([noise[sensor].row_variance(name) for name in recording.kind])
-            * np.maximum(recording.count - 1, 1)[:, None]
-        )
-        at = [space.places(sensor, axis) for axis in range(3)]
-        own = [
-            space.slopes_within(sensor, axis, reduced[at[axis]]) @ reduced[at[axis]]
-            for axis in range(3)
-        ]
-        found[sensor] = np.maximum(np.stack(own, axis=1) / usual, 1.0)
+        # Squares that the noise of the kind gives, and those of the window.
+        variance = np.array([noise[sensor].row_variance(name) for name in recording.kind])
+        usual = variance * np.maximum(recording.count - 1, 1)[:, None]
+        squares = []
+        for axis in range(3):
+            own = reduced[space.places(sensor, axis)]
+            squares.append(space.slopes_within(sensor, axis, own) @ own)
+        found[sensor] = np.maximum(np.stack(squares, axis=1) / usual, 1.0)
     return found
 
 
@@ -408,11 +446,10 @@ def white_means(
 
     `scatter`: factor of each window's scatter within over its kind, shape (k, 3).
     """
+    whitenings = mean_whitening(space, noise, sensor, scatter=scatter)
     return [
         whitening(rows[:, None])[:, 0]
-        for whitening, rows in zip(
-            mean_whitening(space, noise, sensor, scatter=scatter), space.mean[sensor]
-        )
+        for whitening, rows in zip(whitenings, space.mean[sensor], strict=True)
     ]
 
 
@@ -424,13 +461,12 @@ def mean_whitening(
     scatter: np.ndarray | None = None,
 ) -> list[Whitening]:
     """Return for each axis the Whitening of `white_means`, with its arguments."""
-    recording, own = space.recording, noise[sensor]
-    variance = (
-        own.variance_beside_bias(
-            recording.kind, recording.count, recording.duration, keys=recording.keys
-        )
-        + own.offset_sd**2
+    recording = space.recording
+    own = noise[sensor]
+    variance = own.variance_beside_bias(
+        recording.kind, recording.count, recording.duration, keys=recording.keys
     )
+    variance = variance + own.offset_sd**2
     if scatter is not None:
         variance = variance + (scatter - 1) * own.mean_variance(recording.kind, recording.count)
     return [

@@ -7,14 +7,13 @@ explanations.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.scaled_solve import JITTER
-from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.explained_share import Explained, needed_share, sensors_of
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.linearised_problem import LinearisedProblem
@@ -155,18 +154,8 @@ def _swapped(problem: LinearisedProblem, chosen: Sequence[Question]) -> list[lis
 def _cost(
     problem: LinearisedProblem, chosen: Sequence[Question], judge: LinearisedProblem
 ) -> float:
-    """
-    Return the held-out cost of a choice at its own linearisation.
-
-    It is judged with the noise and the band of another attempt.
-    """
-    space = replace(
-        problem.evidence.space,
-        slow_only=judge.space.slow_only,
-        slow_variance=judge.space.slow_variance,
-    )
-    evidence = WindowEvidence(space, judge.noise, problem.evidence.fold)
-    misfit = evidence.heldout(problem.search.indices(chosen))
+    """Return the held-out cost of a choice at its own linearisation, judged by another one."""
+    misfit = problem.judged_by(judge).heldout(problem.search.indices(chosen))
     return 0.5 * misfit + PENALTY * sum(question.penalty for question in chosen)
 
 
