@@ -161,14 +161,16 @@ def motions_needed(
     is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
     for name in needed:
         index = solution.param_names.index(name)
-        sensor = name.partition('.')[0]
-        of_misfit = []
-        if incomplete_motions(quality, sensor):
+        section = name.partition('.')[0]
+        # Both sensors determine table and clock.
+        sensors = (section,) if section in SENSORS else SENSORS
+        of_misfit: tuple[str, ...] = ()
+        if any(incomplete_motions(quality, sensor) for sensor in sensors):
             # Bias processes describe the error of the model.
-            of_misfit.append(BIAS_PROCESS)
-        if any(each.startswith(sensor) and is_shown[each] for each in solution.not_believed):
-            # A parameter that the motions determine is held for its misfit, not for their lack.
-            of_misfit.append(HELD_PRIORS)
+            of_misfit = (BIAS_PROCESS,)
+        if any(each.startswith(sensors) and is_shown[each] for each in solution.not_believed):
+            # A parameter that the motions determine is held for a misfit, not for their lack.
+            of_misfit = (BIAS_PROCESS, HELD_PRIORS)
         text = remedy(solution.terms, index, tolerances[index], of_misfit=of_misfit)
         if text:
             needed[name] = (text, float('nan'))

@@ -159,6 +159,10 @@ def test_an_effect_that_is_held_for_a_misfit_needs_its_cause_and_no_motions():
         if reason.next and any(name in reason.what for name in ('accelerometer.', *held))
     ]
     assert reasons and {reason.key for reason in reasons} == {'diagnose'}
+    # Those of the table are determined by the same residuals.
+    keys = {name: REMEDY_KEYS.get(need) for name, (need, _) in found.result.needed.items()}
+    of_table = {key for name, key in keys.items() if name.startswith('reference')}
+    assert of_table == {'diagnose'}
 
 
 def test_needs_and_verdict_have_one_rule_for_an_incomplete_model():
