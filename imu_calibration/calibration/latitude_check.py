@@ -84,7 +84,8 @@ def latitude_findings(
 
     ``omega_up = Omega sin(latitude)`` and ``|omega| = Omega`` do not depend on the azimuth. Where
     the table gives the azimuth, the reference contains the Earth's rate, and another latitude
-    leaves ``Omega (sin(true) - sin(stated))`` about the vertical.
+    leaves ``Omega (sin(true) - sin(stated))`` about the vertical. Where the table gives no
+    latitude, a rate ``|omega| > Omega`` has another cause.
 
     Parameters
     ----------
@@ -100,8 +101,6 @@ def latitude_findings(
         When the latitude with the other sign explains the estimate.
 
     """
-    if table.latitude is None:
-        return ()
     model = solution.model
     # The Earth's rate is the effect of which the size is known.
     free = next((effect for effect in model.effects if effect.known_size), None)
@@ -119,18 +118,26 @@ def _of_free_rate(solution, table, part):
         return ()
     rate = solution.values[part]
     covariance = solution.covariance[part, part]
+    if table.latitude is None:
+        length, sd = _length(rate, covariance)
+        return (_excess(length, sd),) if _contradicts_length(length, sd) else ()
     expected_up = _vertical_rate(table)
     up_sd = float(np.sqrt(covariance[2, 2]))
     if _contradicts(rate[2] - expected_up, up_sd):
         if _agrees(rate[2] + expected_up, up_sd, expected_up):
             raise _wrong_sign(table, rate[2], expected_up)
         return (_finding('vertical component', rate[2], up_sd, expected=expected_up),)
-    length = float(np.linalg.norm(rate))
-    direction = rate / length if length > 0 else np.array([1.0, 0.0, 0.0])
-    length_sd = float(np.sqrt(direction @ covariance @ direction))
+    length, length_sd = _length(rate, covariance)
     if _contradicts(length - EARTH_RATE, length_sd):
         return (_finding('magnitude', length, length_sd, expected=EARTH_RATE),)
     return ()
+
+
+def _length(rate, covariance):
+    """Return the length of an estimated rate, and its standard deviation along the estimate."""
+    length = float(np.linalg.norm(rate))
+    direction = rate / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    return length, float(np.sqrt(direction @ covariance @ direction))
 
 
 def _of_windows(windows, table, sds):
@@ -222,6 +229,17 @@ def _finding(name, measured, sd, *, expected):
         f"the latitude must give the {name} of the Earth's rate: {_hourly(expected)} deg/h, the"
         f' gyroscopes measured {_hourly(measured)} ± {_hourly(sd)} deg/h; correct the latitude in'
         ' the table; if it is right, gyro_g_sensitivity or a drift can be the cause',
+        key='latitude',
+    )
+
+
+def _excess(measured, sd):
+    return CheckFinding(
+        CHECK,
+        WARNING,
+        f"the Earth's rate must be {_hourly(EARTH_RATE)} deg/h at most, the gyroscopes measured"
+        f' {_hourly(measured)} ± {_hourly(sd)} deg/h that no bias explains; state latitude and'
+        ' azimuth_deg in the table: the remainder is gyro_g_sensitivity or a drift',
         key='latitude',
     )
 

@@ -255,16 +255,11 @@ def _earth(effect, values, point):
 
 def _earth_known(table):
     """
-    Return why the Earth's rate cannot be tested.
+    Return why the Earth's rate is not estimated: the reference includes it.
 
-    The table's location is unknown, or the reference includes it.
+    Without latitude or azimuth its three components in the level frame are unknowns.
     """
-    if table.latitude is None:
-        return (
-            'the table gives no latitude, so the rotation of the Earth is not modelled',
-            'give latitude and height in the table description',
-        )
-    if table.azimuth_deg is None:
+    if table.latitude is None or table.azimuth_deg is None:
         return None
     return (
         'the reference holds the rotation of the Earth already, from latitude and azimuth',

@@ -116,7 +116,7 @@ class Table:
     gravity_sd: float | None = None
     """Standard deviation of the gravity, m/s^2; None: see `gravity_sd_value`."""
     latitude: float | None = None
-    """Geodetic latitude, degrees; None: Earth rate is not modelled."""
+    """Geodetic latitude, degrees; None: the Earth's rate is estimated, not known."""
     height: float | None = None
     """Height, m; None counts as zero."""
     azimuth_deg: float | None = None

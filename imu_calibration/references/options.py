@@ -33,8 +33,8 @@ class CalibrationOptions:
     """The same; None: bias+matrix."""
     reference_model: str | None = None
     """
-    Effects of table and clock joined by '+', or 'none'; None: table_tilt, and earth_rate when only
-    the azimuth is unknown.
+    Effects of table and clock joined by '+', or 'none'; None: table_tilt, and earth_rate
+    unless latitude and azimuth are known.
     """
     tolerances: dict = field(default_factory=dict)
     """{section: {effect: tolerance}}."""

@@ -75,8 +75,8 @@ class Choices(TypedDict, total=False):
     """The same for the gyroscope; default bias+matrix."""
     reference_model: str | None
     """
-    Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate when only
-    the azimuth is unknown.
+    Effects of table and clock joined by +, or 'none'; default table_tilt, and earth_rate unless
+    latitude and azimuth are known.
     """
     gravity: float | None
     """

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from refusal import refused
 
+from imu_calibration import calibrate
 from imu_calibration.calibration.latitude_check import WindowRates, latitude_findings
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
@@ -14,6 +15,8 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
 from imu_calibration.simulation.session import turning_world
+
+from worlds.physics import make_session
 
 OMEGA = 7.292115e-5
 """rad/s, WGS 84."""
@@ -76,6 +79,19 @@ def test_an_uncertain_estimate_contradicts_nothing():
     assert latitude_findings(earth(-LATITUDE, sd=5e-5), table()) == ()
 
 
+def test_without_a_latitude_only_more_than_the_rate_of_the_earth_is_named():
+    """A length below Omega may be the rate of the Earth in an unknown direction."""
+    nowhere = Table([Joint('a', (0, 0, 1))], gravity=9.8)
+    assert latitude_findings(earth(LATITUDE), nowhere) == ()
+    assert latitude_findings(solution('reference', 'earth_rate', np.zeros(3), 1e-6), nowhere) == ()
+    twice = solution('reference', 'earth_rate', [0.0, 0.0, 2 * OMEGA], 1e-6)
+    (finding,) = latitude_findings(twice, nowhere)
+    assert finding.key == 'latitude'
+    assert re.search(r'measured ([\d.]+)', finding.text)[1] == '30.1'
+    uncertain = solution('reference', 'earth_rate', [0.0, 0.0, 2 * OMEGA], 3e-5)
+    assert latitude_findings(uncertain, nowhere) == ()
+
+
 KNOWN = 20.0
 """deg, azimuth."""
 
@@ -129,3 +145,22 @@ def test_a_simulated_world_turns_wherever_a_latitude_is_given():
     assert turning_world(table(azimuth_deg=30.0), plain).azimuth_deg == 30.0
     free = Table([Joint('a', (0, 0, 1))], gravity=9.8)
     assert turning_world(free, plain) is free
+
+
+@pytest.mark.usefixtures('few_candidates')
+def test_the_earth_below_a_table_without_latitude_is_no_g_sensitivity():
+    session = make_session(8101, {'earth_rate': None}, imu_rate=25.0, joint_rate=25.0)
+    nowhere = Table.from_mapping(
+        session.table
+        | {
+            'gravity': Table.from_mapping(session.table).gravity_value,
+            'latitude': None,
+            'azimuth_deg': None,
+        }
+    )
+    found = calibrate(session.block, nowhere).calibration
+    assert found.model.gyroscope == ('bias', 'matrix')
+    part = found.model.slices['reference', 'earth_rate']
+    rate, sd = found.values[part], found.sd[part]
+    np.testing.assert_allclose(rate, session.truth['values']['earth_rate'], atol=4 * sd.max())
+    assert sd.max() < 0.2 * OMEGA

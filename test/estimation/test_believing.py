@@ -100,16 +100,16 @@ def test_a_wrong_full_scale_setting_is_no_misfit():
     )
 
 
-def test_the_earth_turns_only_where_the_table_says_where_it_stands():
-    """
-    Without a latitude the Earth's rate is not modelled; with one and without an azimuth it is.
-    """
-    table = Table.from_mapping({**TABLES['three_axis'], 'latitude': None, 'gravity': 9.81})
-    somewhere = Table.from_mapping(
-        {**TABLES['three_axis'], 'latitude': 50.0, 'height': 0.0, 'azimuth_deg': None}
-    )
-    assert 'earth_rate' not in parse_reference(None, table)
-    assert 'earth_rate' in parse_reference(None, somewhere)
+def test_the_rate_of_the_earth_is_known_or_estimated():
+    """The Earth turns below every table: without latitude or azimuth, in an unknown direction."""
+    known = {'latitude': 50.0, 'height': 0.0, 'azimuth_deg': 20.0, 'gravity': 9.81}
+    assert 'earth_rate' not in parse_reference(None, three_axis(**known))
+    assert 'earth_rate' in parse_reference(None, three_axis(**{**known, 'azimuth_deg': None}))
+    assert 'earth_rate' in parse_reference(None, three_axis(**{**known, 'latitude': None}))
+
+
+def three_axis(**site):
+    return Table.from_mapping(TABLES['three_axis'] | site)
 
 
 def test_what_nobody_asked_for_shrinks_and_what_is_plain_stays():
