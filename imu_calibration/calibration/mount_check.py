@@ -1,5 +1,7 @@
 """The mount of the table description against a turn that both sensors have in common."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from imu_calibration.core.units import DEG
@@ -8,24 +10,75 @@ from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import nearest_rotation, rotation_vector
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_geometry import mount_rpy_deg
-from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding
 
 CHECK = 'mount'
+NOTED_TURN = 0.3 * DEG
+"""Smallest common turn that is noted, rad."""
 LEAST_TURN = 1.5 * DEG
-"""Smallest common turn that is reported, rad; the axes of a sensor are off by less."""
+"""Smallest common turn that is a warning, rad; the axes of a sensor are off by less."""
 LARGEST_DIFFERENCE = 0.5
-"""Largest difference between the turns of two sensors, as a share of their mean."""
+"""
+Largest difference between the turns of two sensors, as a share of their mean. Axes that are off at
+random have a common turn too, which is as large as this allows in 3 of 100 units.
+"""
 ALONG = np.cos(10 * DEG)
 """Cosine of the angle between a turn and an axis from which the turn is about that axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class CommonTurn:
+    """The turn that the matrices of the sensors have in common, against the stated mount."""
+
+    matrix: np.ndarray
+    """True quantities in the axes of the stated mount to those of the sensors, shape (3, 3)."""
+    vector: np.ndarray
+    """The same as a rotation vector, rad, shape (3,)."""
+    agreed: bool
+    """Whether the turns of the sensors are nearly equal."""
+
+    @property
+    def angle(self) -> float:
+        """Angle of the turn, rad."""
+        return float(np.linalg.norm(self.vector))
+
+
+def common_turn(solution: Solution) -> CommonTurn | None:
+    """
+    Return the common turn of the matrices, or None without a matrix.
+
+    The matrix of a sensor is that of its axes times the turn R of the IMU against its stated mount,
+    ``M = E R``. E differs from sensor to sensor and is nearly the identity, R is common to both. A
+    wrong zero of the last joint is such a turn, about its axis: no recording separates E from R,
+    and the axes of the result are those of the mount as stated (`gauge`).
+    """
+    turns = []
+    for sensor in SENSORS:
+        part = solution.model.part(sensor, Role.LINEAR)
+        if part.stop > part.start and not solution.held[part].any():
+            turns.append(nearest_rotation(solution.values[part].reshape(3, 3)))
+    if not turns:
+        return None
+    common = nearest_rotation(np.sum(turns, axis=0))
+    vector = rotation_vector(common)
+    differences = [np.linalg.norm(rotation_vector(turn @ common.T)) for turn in turns]
+    agreed = max(differences) <= LARGEST_DIFFERENCE * np.linalg.norm(vector) / 2
+    return CommonTurn(common, vector, bool(agreed))
+
+
+def turn_entry(solution: Solution) -> dict[str, list[float]]:
+    """Return the entry of the statistics: the rotation vector of the common turn in degrees."""
+    turn = common_turn(solution)
+    if turn is None:
+        return {}
+    return {'common_turn_deg': [round(float(value), 4) for value in turn.vector / DEG]}
 
 
 def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]:
     """
     Return the finding of a turn of the IMU against the mount of the table, if there is one.
 
-    The matrix of a sensor is that of its axes times the turn R of the IMU against its stated mount,
-    ``M = E R``. E differs from sensor to sensor and is nearly the identity, R is common to both. A
-    wrong zero of the last joint is such a turn, about its axis: no recording separates them.
+    A small turn is a note: it may be the mount, or how the triads lie in their case.
 
     Parameters
     ----------
@@ -34,31 +87,27 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
     table : Table
 
     """
-    matrices = []
-    for sensor in SENSORS:
-        part = solution.model.part(sensor, Role.LINEAR)
-        if part.stop > part.start and not solution.held[part].any():
-            matrices.append(solution.values[part].reshape(3, 3))
-    if not matrices:
+    turn = common_turn(solution)
+    if turn is None or not turn.agreed or turn.angle < NOTED_TURN:
         return ()
-    turns = [nearest_rotation(matrix) for matrix in matrices]
-    common = nearest_rotation(np.sum(turns, axis=0))
-    turn = rotation_vector(common)
-    angle = float(np.linalg.norm(turn))
-    if angle < LEAST_TURN:
-        return ()
-    for one in turns:
-        if np.linalg.norm(rotation_vector(one @ common.T)) > LARGEST_DIFFERENCE * angle / 2:
-            return ()
     # The axis of the last joint is the same in both links that it connects.
     last_axis = table.mat_sl @ np.array(table.joints[-1].axis)
     zero = ''
-    if table.joints[-1].turns and abs(last_axis @ turn) > ALONG * angle:
+    if table.joints[-1].turns and abs(last_axis @ turn.vector) > ALONG * turn.angle:
         zero = f' (or the zero of {table.joint_names[-1]}, which has the same effect)'
-    fits = ', '.join(f'{value + 0.0:.2f}' for value in np.round(mount_rpy_deg(common, table), 2))
+    angles = np.round(mount_rpy_deg(turn.matrix, table), 2)
+    fits = ', '.join(f'{value + 0.0:.2f}' for value in angles)
+    size = f'{turn.angle / DEG:.2f} deg'
+    if turn.angle < LEAST_TURN:
+        text = (
+            'the axes of the matrices are those of the mount as stated, they contain a common turn'
+            f' of {size} against it: mount.rpy_deg [{fits}] would remove it; if the axes of the'
+            f' sensors are wanted, state it{zero}'
+        )
+        return (CheckFinding(CHECK, NOTE, text, key='table'),)
     text = (
         'the IMU must be mounted as in the table description, its readings are turned by'
-        f' {angle / DEG:.2f} deg against it: mount.rpy_deg [{fits}] would fit; correct it{zero}, or'
+        f' {size} against it: mount.rpy_deg [{fits}] would fit; correct it{zero}, or'
         ' the matrices contain this turn'
     )
     return (CheckFinding(CHECK, WARNING, text, key='table'),)

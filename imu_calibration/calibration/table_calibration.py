@@ -313,7 +313,9 @@ def conclude(
         gravity=table.gravity_value,
         gauge=gauge_of(solution.model),
         undetermined=weak_on_table(solution, tolerances, needed),
-        statistics=statistics(solution, gathered) | plain_entries(plain),
+        statistics=statistics(solution, gathered)
+        | mount_check.turn_entry(applied)
+        | plain_entries(plain),
         provenance=provenance,
         proof=proof,
         changes=changes_with(changes, plain),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.document.calibration import Calibration, listed, never_applied
-from imu_calibration.document.decision import HELPS, SensorDecision, reason_of
+from imu_calibration.document.decision import HELPS, WARNING, SensorDecision, reason_of
 from imu_calibration.estimation.solution import DETERMINED
 
 STATED_CHECKS = ('latitude', 'mount')
@@ -81,7 +81,7 @@ def shortcomings(calibration: Calibration) -> list[str]:
     for sensor, why in (calibration.statistics.get('unusable_sensors') or {}).items():
         lines.append(f'{sensor} not calibrated: {why}')
     for entry in calibration.statistics.get('preflight') or ():
-        if entry['check'] in STATED_CHECKS:
+        if entry['check'] in STATED_CHECKS and entry.get('severity', WARNING) == WARNING:
             lines.append(entry['text'])
     for line in (missing(calibration), dropped_text(*dropped_of(calibration))):
         if line:

@@ -6,11 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.mount_check import mount_findings
+from imu_calibration.calibration.mount_check import mount_findings, turn_entry
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.rotations import rotation, rotation_vector
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING
 
 
 def table(mount_rpy_deg=(0.0, 0.0, 0.0)):
@@ -46,6 +47,7 @@ def test_a_zero_of_the_last_joint_is_named_with_the_mount_that_fits(degrees):
     roll, pitch, yaw = (float(x) for x in re.search(r'\[(.*)\]', finding.text)[1].split(','))
     assert abs(pitch + degrees) < 0.6 and max(abs(roll), abs(yaw)) < 0.6
     assert 'zero of r' in finding.text and finding.key == 'table'
+    assert finding.severity == WARNING
 
 
 def test_a_turn_about_another_axis_is_no_zero():
@@ -55,8 +57,31 @@ def test_a_turn_about_another_axis_is_no_zero():
     assert np.abs(shown).max() < 0.6 and 'zero of' not in finding.text
 
 
+def test_a_small_turn_is_a_note_with_its_size():
+    """Axes that are off by 0.05 deg do not hide a turn by 0.5 deg."""
+    rng = np.random.default_rng(8104)
+    turn = rotation(np.radians([0.0, -0.5, 0.0]))
+    triads = [(np.eye(3) + rng.normal(0.0, 1e-3, (3, 3))) @ turn for _ in SENSORS]
+    (finding,) = mount_findings(solution(*triads), table())
+    assert finding.severity == NOTE and finding.check == 'mount'
+    assert float(re.search(r'([\d.]+) deg', finding.text)[1]) == pytest.approx(0.5, abs=0.1)
+    assert turn_entry(solution(*triads))['common_turn_deg'] == pytest.approx([0, -0.5, 0], abs=0.1)
+
+
+def test_usual_units_are_seldom_turned():
+    """Axes that are off by 0.2 to 1 deg at random: few notes, and hardly a warning."""
+    rng = np.random.default_rng(8105)
+    found = []
+    for _ in range(300):
+        size = np.radians(rng.uniform(0.2, 1.0))
+        triads = [np.eye(3) + rng.normal(0.0, size, (3, 3)) for _ in SENSORS]
+        found += [finding.severity for finding in mount_findings(solution(*triads), table())]
+    assert found.count(NOTE) <= 18 and found.count(WARNING) <= 3
+
+
 def test_axes_of_the_sensors_that_are_off_are_no_turn():
-    assert mount_findings(solution(off_axes(3), off_axes(4)), table()) == ()
+    for finding in mount_findings(solution(off_axes(3), off_axes(4)), table()):
+        assert finding.severity == NOTE
     turned, opposite = rotation(np.array([0.05, 0, 0])), rotation(np.array([-0.03, 0, 0]))
     assert mount_findings(solution(turned, opposite), table()) == ()
 

@@ -24,7 +24,7 @@ from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.trust import caveats, refused_sensors
 from imu_calibration.document.verdict import judge
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding
 from imu_calibration.use_cases.inspect import RecordingSummary
 
 PROOF = {
@@ -68,6 +68,12 @@ def test_few_dropped_samples_do_not_change_the_exit_code(count, code):
     assert exit_code(found) == code
     assert [str(count) in line for line in shortcomings(found)] == [True] * (code == 3)
     assert bool(dropped_text({'imu spike': count}, 16_000)) == (code == 3)
+
+
+@pytest.mark.parametrize('severity, code', [(WARNING, 3), (NOTE, 0)])
+def test_a_contradiction_of_the_table_description_is_a_3_and_a_convention_is_not(severity, code):
+    entry = CheckFinding('mount', severity, 'turned by 0.5 deg').to_mapping()
+    assert exit_code(proven(statistics={'preflight': [entry]})) == code
 
 
 def test_a_sensor_that_compensation_refuses_never_helps():
