@@ -86,8 +86,8 @@ def reason_of(entry: ProofEntry | None) -> str:
     """
     Return the reason for `decide`.
 
-    Errors before and after, the interval of their ratio, and where it does not help the likely
-    cause.
+    Errors before and after, the interval of their ratio, the regimes that are excepted where it
+    helps, and the likely cause where it does not.
     """
     if entry is None or not entry.windows:
         return NO_PROOF
@@ -96,8 +96,8 @@ def reason_of(entry: ProofEntry | None) -> str:
         error = error_text(entry.earlier.after, entry.unit)
         more = f', {error} with the earlier calibration'
     cause = same_directions(entry)
-    if not cause and decide(entry) is not HELPS:
-        cause = _cause(entry)
+    if not cause:
+        cause = _exceptions(entry) if decide(entry) is HELPS else _cause(entry)
     return (
         f'{_errors(entry)} on held-out data ({entry.windows} windows, after /'
         f' before {ratio_text(entry)}){more}{cause}'
@@ -122,6 +122,12 @@ def harmed(entry: ProofEntry) -> dict[str, RegimeErrors]:
         if part.after > HARM * part.before and part.ci95[0] > 1.0:
             found[name] = part
     return found
+
+
+def _exceptions(entry: ProofEntry) -> str:
+    """Return the regimes in which a sensor that is helped gets worse, as the end of a sentence."""
+    names = ', '.join(str(name) for name in harmed(entry))
+    return f'; but it grows in the regime {names}' if names else ''
 
 
 def _errors(entry: RegimeErrors) -> str:

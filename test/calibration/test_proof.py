@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.document.decision import HELPS, reason_of, worse_regimes
+from imu_calibration.document.decision import HELPS, decide, reason_of, worse_regimes
 from imu_calibration.document.proof_entry import RegimeErrors
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import applied_values
@@ -134,6 +134,10 @@ def test_a_regime_that_gets_worse_is_named(clean):
     worse = RegimeErrors(1.0, 1.2, (1.1, 1.3), seconds=10.0, unit='rad/s')
     lines = worse_regimes(replace(entry, regimes={**entry.regimes, Regime.FAST: worse}))
     assert len(lines) == 1 and Regime.FAST in lines[0]
+    # The decision excepts it.
+    partly = replace(entry, regimes={**entry.regimes, Regime.FAST: worse})
+    assert decide(partly) is HELPS and Regime.FAST not in reason_of(entry)
+    assert reason_of(partly).endswith(f'regime {Regime.FAST}')
     doubtful = replace(worse, ci95=(0.9, 1.5))
     assert not worse_regimes(replace(entry, regimes={Regime.FAST: doubtful}))
 

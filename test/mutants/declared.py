@@ -968,9 +968,9 @@ SIGNS = _of(
     ),
     (
         'sensors turned differently read as a turned IMU',
-        'mount_findings',
-        '_1 < LEAST_TURN',
-        'False',
+        'common_turn',
+        'max(_1) <= LARGEST_DIFFERENCE * np.linalg.norm(_2) / 2',
+        'True',
         'test_mount_check.py',
     ),
     (
