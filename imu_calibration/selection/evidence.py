@@ -88,11 +88,10 @@ class Evidence:
         prior_sd: np.ndarray,
         prior_mean: np.ndarray,
     ):
-        self.total, self.without, self._prior = (
-            total,
-            without,
-            {'prior_sd': prior_sd, 'prior_mean': prior_mean},
-        )
+        self.total = total
+        self.without = without
+        self._prior_sd = prior_sd
+        self._prior_mean = prior_mean
         self._fits: dict[tuple, tuple] = Recent(MOST_FITS)
         self._losses: dict[tuple, float] = {}
         self._predictions: dict[tuple, np.ndarray] = Recent(MOST_FITS)
@@ -103,11 +102,10 @@ class Evidence:
 
         With the prior.
         """
-        known = 1 / self._prior['prior_sd'] ** 2
-        return (
-            self.total[:-1, :-1] + np.diag(known),
-            self.total[:-1, -1] + known * self._prior['prior_mean'],
-        )
+        known = 1 / self._prior_sd**2
+        matrix = self.total[:-1, :-1] + np.diag(known)
+        right = self.total[:-1, -1] + known * self._prior_mean
+        return matrix, right
 
     def fit(self, used: Sequence[int], number: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -118,7 +116,9 @@ class Evidence:
         ordered = tuple(sorted(used))
         if (ordered, number) not in self._fits:
             normal = self.total if number is None else self.without[number]
-            self._fits[ordered, number] = solve_normal(normal, np.array(ordered), **self._prior)
+            self._fits[ordered, number] = solve_normal(
+                normal, np.array(ordered), self._prior_sd, prior_mean=self._prior_mean
+            )
         values, covariance = self._fits[ordered, number]
         if ordered == tuple(used):
             return values, covariance
@@ -149,9 +149,8 @@ class Evidence:
 
     def p_value(self, smaller: Sequence[int], larger: Sequence[int]) -> float:
         """Return the p-value of `larger` against `smaller` (chi-square of the fall of the loss)."""
-        return float(
-            chi2_sf(max(self.loss(smaller) - self.loss(larger), 0.0), len(larger) - len(smaller))
-        )
+        fall = max(self.loss(smaller) - self.loss(larger), 0.0)
+        return float(chi2_sf(fall, len(larger) - len(smaller)))
 
     def left_by_others(self, used: Sequence[int]) -> np.ndarray:
         """
@@ -167,9 +166,9 @@ class Evidence:
         return quadratic(self.total, used, self.fit(used)[0])
 
     def _heldout(self, used: tuple[int, ...]) -> float:
-        places, left = np.append(used, -1), self._left_by_others(used)
+        places = np.append(used, -1)
         folds = self.total[np.ix_(places, places)] - self.without[:, places[:, None], places]
-        return float(_squares(folds[None], left)[0])
+        return float(_squares(folds[None], self._left_by_others(used))[0])
 
     def _left_by_others(self, used: tuple[int, ...]) -> np.ndarray:
         """
@@ -178,13 +177,13 @@ class Evidence:
         The residuals are of the fit to all other folds, and the shape is (n_folds, n + 1).
         """
         if used not in self._predictions:
-            at, known = np.array(used), 1 / self._prior['prior_sd'][list(used)] ** 2
+            at = np.array(used)
+            known = 1 / self._prior_sd[at] ** 2
             places = np.append(at, -1)
             normal = self.without[:, places[:, None], places]
-            values = solve_scaled(
-                normal[:, :-1, :-1] + np.diag(known),
-                normal[:, :-1, -1] + known * self._prior['prior_mean'][at],
-            )
+            matrix = normal[:, :-1, :-1] + np.diag(known)
+            values = solve_scaled(matrix, normal[:, :-1, -1] + known * self._prior_mean[at])
+            # A residual is the last column less the prediction.
             self._predictions[used] = np.pad(-values, ((0, 0), (0, 1)), constant_values=1.0)
         return self._predictions[used]
 
@@ -214,30 +213,36 @@ class WindowEvidence(Evidence):
         *,
         scatter: dict[str, np.ndarray] | None = None,
     ):
-        self.space, self.noise, self.fold = space, noise, fold
-        self._white = {
-            sensor: white_means(space, noise, sensor, scatter=(scatter or {}).get(sensor))
-            for sensor in SENSORS
-        }
-        folds = [fold == number for number in range(fold.max() + 1)]
-        self._of_axis = {
-            sensor: [
-                np.array(
-                    [
-                        [rows[own].T @ rows[own] for own in folds],
-                        [
-                            within_of_axis(space, noise[sensor], sensor, axis=axis, select=own)
-                            for own in folds
-                        ],
-                    ]
-                )
-                for axis, rows in enumerate(self._white[sensor])
-            ]
-            for sensor in SENSORS
-        }
+        self.space = space
+        self.noise = noise
+        self.fold = fold
+        self._white = {}
+        """Sensor -> white mean rows of each axis."""
+        self._of_axis: dict[str, list[np.ndarray]] = {}
+        """Sensor -> of each axis the products of means and within windows, (2, n_folds, n, n)."""
+        for sensor in SENSORS:
+            own_scatter = None if scatter is None else scatter.get(sensor)
+            self._white[sensor] = white_means(space, noise, sensor, scatter=own_scatter)
+            self._of_axis[sensor] = []
+            for axis, rows in enumerate(self._white[sensor]):
+                of_means = [rows[own].T @ rows[own] for own in self._folds]
+                within = self._within(space, sensor, axis)
+                self._of_axis[sensor].append(np.array([of_means, within]))
         parts = np.sum([self._of_sensor(sensor) for sensor in SENSORS], axis=0)
         total = np.sum(parts, axis=0)
         super().__init__(total, total - parts, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
+
+    @property
+    def _folds(self) -> list[np.ndarray]:
+        """Mask of the windows of each fold."""
+        return [self.fold == number for number in range(self.fold.max() + 1)]
+
+    def _within(self, space: ParameterSpace, sensor: str, axis: int) -> list[np.ndarray]:
+        """Return the normal matrix of an axis from within the windows, of each fold."""
+        found = []
+        for own in self._folds:
+            found.append(within_of_axis(space, self.noise[sensor], sensor, axis=axis, select=own))
+        return found
 
     def _of_sensor(self, sensor: str) -> np.ndarray:
         """Return the normal matrices of one sensor, of each fold."""
@@ -251,7 +256,7 @@ class WindowEvidence(Evidence):
         """Return the covariance of the parameters `used` from one sensor and the prior."""
         at = np.ix_(used, used)
         information = self._of_sensor(sensor).sum(axis=0)[at]
-        return inverse_normal(information + np.diag(1 / self._prior['prior_sd'][list(used)] ** 2))
+        return inverse_normal(information + np.diag(1 / self._prior_sd[list(used)] ** 2))
 
     def heldout_parts(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
@@ -260,16 +265,13 @@ class WindowEvidence(Evidence):
         Of the windows' means and within the windows, of each axis, shape (2, 3).
         """
         left = self.left_by_others(used)
-        return {
-            sensor: np.stack(
-                [
-                    _squares(parts, left[:, self.space.places(sensor, axis)])
-                    for axis, parts in enumerate(axes)
-                ],
-                axis=1,
-            )
-            for sensor, axes in self._of_axis.items()
-        }
+        found = {}
+        for sensor, axes in self._of_axis.items():
+            losses = []
+            for axis, parts in enumerate(axes):
+                losses.append(_squares(parts, left[:, self.space.places(sensor, axis)]))
+            found[sensor] = np.stack(losses, axis=1)
+        return found
 
     def unpredicted(self, used: Sequence[int]) -> dict[str, np.ndarray]:
         """
@@ -282,23 +284,25 @@ class WindowEvidence(Evidence):
         uncertainty of the fit to the other folds. The effect of a drift within windows, which does
         not determine it, is predicted too.
         """
-        left, own, found = (
-            self.left_by_others(used),
-            np.array(sorted(used)),
-            self.heldout_parts(used),
-        )
-        others = self.without[:, own[:, None], own] + np.diag(1 / self._prior['prior_sd'][own] ** 2)
+        own = np.array(sorted(used))
+        left = self.left_by_others(used)
+        found = self.heldout_parts(used)
+        # Information N of the other folds, with the prior.
+        others = self.without[:, own[:, None], own] + np.diag(1 / self._prior_sd[own] ** 2)
         for sensor, axes in self._of_axis.items():
             for axis, (means, _) in enumerate(axes):
                 places = self.space.places(sensor, axis)
                 _, at, of = np.intersect1d(own, places, return_indices=True)
-                slopes, known = np.zeros(others.shape[:2]), others.copy()
+
+                # e' (1 + A N^-1 A')^-1 e = e'e - g' (N + A'A)^-1 g with the slopes g = A'e.
+                slopes = np.zeros(others.shape[:2])
                 slopes[:, at] = np.einsum('fij,fj->fi', means[:, of], left[:, places])
+                known = others.copy()
                 known[:, at[:, None], at] += means[:, of[:, None], of]
                 found[sensor][0, axis] -= (slopes * solve_scaled(known, slopes)).sum()
-                found[sensor][1, axis] = _squares(
-                    self._within_whole[sensor][axis], left[:, places]
-                )[0]
+
+                whole = self._within_whole[sensor][axis]
+                found[sensor][1, axis] = _squares(whole, left[:, places])[0]
         return found
 
     @cached_property
@@ -308,24 +312,11 @@ class WindowEvidence(Evidence):
 
         For each axis, including effects that are smooth in time.
         """
-        whole, folds = (
-            replace(self.space, join_within=self.space.join),
-            [self.fold == number for number in range(self.fold.max() + 1)],
-        )
-        return {
-            sensor: [
-                np.array(
-                    [
-                        [
-                            within_of_axis(whole, self.noise[sensor], sensor, axis=axis, select=own)
-                            for own in folds
-                        ]
-                    ]
-                )
-                for axis in range(3)
-            ]
-            for sensor in SENSORS
-        }
+        whole = replace(self.space, join_within=self.space.join)
+        found = {}
+        for sensor in SENSORS:
+            found[sensor] = [np.array([self._within(whole, sensor, axis)]) for axis in range(3)]
+        return found
 
     def p_value_by_scatter(self, used: Sequence[int], parameters: Sequence[int]) -> float:
         """
@@ -338,21 +329,21 @@ class WindowEvidence(Evidence):
         noise within windows, equal in all of a kind; a bias process within them, and encoders where
         two joints turn fast, violate both (White 1980, Econometrica 48).
         """
+        # Slopes g_k of the windows, shape (n_windows, q + 1).
         values, covariance = self.fit(used)
-        reduced, slopes = (
-            self.space.reduced(used, values),
-            np.zeros((len(self.fold), self.space.size + 1)),
-        )
+        reduced = self.space.reduced(used, values)
         kind = self.space.recording.kind
+        slopes = np.zeros((len(self.fold), self.space.size + 1))
         for sensor in SENSORS:
-            variance = {name: self.noise[sensor].row_variance(name) for name in np.unique(kind)}
+            of_kind = {name: self.noise[sensor].row_variance(name) for name in np.unique(kind)}
+            variance = np.array([of_kind[name] for name in kind])
             for axis, means in enumerate(self._white[sensor]):
                 at = self.space.places(sensor, axis)
-                within = (
-                    self.space.slopes_within(sensor, axis, reduced[at])
-                    / np.array([variance[name][axis] for name in kind])[:, None]
-                )
+                within = self.space.slopes_within(sensor, axis, reduced[at])
+                within = within / variance[:, axis : axis + 1]
                 slopes[:, at] += means * (means @ reduced[at])[:, None] + within
+
+        # Shifts of the estimates by each window, in sds, and their scatter.
         places = [list(used).index(k) for k in parameters]
         sd = np.sqrt(np.diag(covariance)[places])
         moved = slopes[:, list(used)] @ (covariance[:, places] / sd)
@@ -362,16 +353,12 @@ class WindowEvidence(Evidence):
         n_windows, n_own = len(moved), int(observable.sum())
         if n_windows - n_own < LEAST_SCATTER:
             return 0.0
-        t_squared = (
-            (directions.T @ (values[places] / sd))[observable] ** 2 / sizes[observable]
-        ).sum()
-        return float(
-            f_sf(
-                (n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared,
-                n_own,
-                n_windows - n_own,
-            )
-        )
+
+        # T^2 = z' S^-1 z, an F statistic with n_own and n_windows - n_own degrees of freedom.
+        along = (directions.T @ (values[places] / sd))[observable]
+        t_squared = (along**2 / sizes[observable]).sum()
+        ratio = (n_windows - n_own) / (n_own * (n_windows - 1)) * t_squared
+        return float(f_sf(ratio, n_own, n_windows - n_own))
 
 
 def _squares(parts: np.ndarray, rows: np.ndarray) -> np.ndarray:
