@@ -43,6 +43,8 @@ WHITE_BENDS, PER_FREEDOM = 6.0, 35 / 18
 Variance of second differences of unit white noise, and their number for each degree of freedom of a
 mean of their squares.
 """
+SHORT_WINDOW = 8
+"""Samples up to which the white noise of a window is unknown."""
 WITHIN = 5
 """Rows at which the columns of a block are evaluated."""
 
@@ -156,82 +158,90 @@ def rest_blocks(
         Expected loss from noise.
 
     """
-    length = max(
-        MIN_BLOCK_SECONDS,
-        sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1) / MAX_RESIDUAL_BLOCKS,
-    )
+    # Blocks of the windows in use, and the motion at a few rows of each.
+    moving_time = sum(w.time[-1] - w.time[0] for w in windows if len(w.motion) > 1)
+    length = max(MIN_BLOCK_SECONDS, moving_time / MAX_RESIDUAL_BLOCKS)
     which = _some(windows, length)
     windows = [windows[k] for k in which]
-    starts_of, rows_of, per_block = zip(*(_cut(window, length) for window in windows))
+    cuts = [_cut(window, length) for window in windows]
     motion = JointMotion.concatenate(
-        window.motion.select(rows) for window, rows in zip(windows, rows_of)
+        window.motion.select(cut.rows) for window, cut in zip(windows, cuts)
     )
-    warm = [
-        w.temperature_c[rows] if len(rows) > 1 else w.temperature_c.mean(keepdims=True)
-        for w, rows in zip(windows, rows_of)
-        if w.temperature_c is not None
-    ]
-    temperature = np.concatenate(warm) if len(warm) == len(windows) else None
-    place = np.repeat(np.arange(len(windows)), [len(starts) for starts in starts_of])
-    edges = np.concatenate(
-        [
-            starts + first
-            for starts, first in zip(starts_of, np.cumsum([0, *map(len, windows[:-1])]))
-        ]
-    )
+    temperature = _temperatures(windows, cuts)
+    starts = np.cumsum([0, *np.concatenate([cut.per_block for cut in cuts])[:-1]])
+    place = np.repeat(np.arange(len(windows)), [len(cut.starts) for cut in cuts])
+    window = which[place]
+
+    # First sample of each block, and its number of samples.
+    first_samples = np.cumsum([0, *map(len, windows[:-1])])
+    edges = np.concatenate([cut.starts + first for cut, first in zip(cuts, first_samples)])
     count = np.diff(edges, append=sum(map(len, windows))).astype(float)
-    common = {
-        'starts': np.cumsum([0, *np.concatenate(per_block)[:-1]]),
-        'time': block_means(np.concatenate([window.time for window in windows]), edges),
-        'window': which[place],
-        'locked': problem.locked[which[place]],
-    }
+
+    # Columns and residuals.
     references = References(problem.recording.model, table, motion, temperature_c=temperature)
-    columns_of = _block_means(problem, table, motion, temperature, common['starts'])
+    columns_of = _block_means(problem, table, motion, temperature, starts)
     left = residuals(windows, table, problem.recording.model, values=problem.recording.values)
+
+    # Variance within the blocks, without that of errors of the stamps.
     inner = _inner(windows)
     number = np.add.reduceat(inner, edges)
-    rough = {
-        sensor: _roughness(residual, inner, edges, number=number, least=LEAST_NOISE[sensor])
-        for sensor, residual in left.items()
-    }
-    slope = {sensor: _slope(residual, windows, edges, sensor) for sensor, residual in left.items()}
     freedom = number / PER_FREEDOM
+    rough, slope = {}, {}
+    for sensor, residual in left.items():
+        rough[sensor] = _roughness(residual, inner, edges, number=number, least=LEAST_NOISE[sensor])
+        slope[sensor] = _slope(residual, windows, edges, sensor)
     jitter = stamp_jitter(list(rough.values()), list(slope.values()), freedom)
     louder = {sensor: jitter_ratio(rough[sensor], slope[sensor], jitter.sd) for sensor in left}
-    kinds = problem.recording.kind[common['window']]
-    of_kind = {str(kind): kinds == kind for kind in np.unique(kinds) if kind != 'static'}
-    jitter = replace(
-        jitter,
-        ratio={
-            sensor: {kind: float(louder[sensor][own].mean()) for kind, own in of_kind.items()}
-            for sensor in left
-        },
-    )
+    jitter = replace(jitter, ratio=_by_kind(louder, problem.recording.kind[window]))
+
     found = {}
     for sensor, residual in left.items():
         floor = explained.floor.noise[sensor]
         busier = _busier(
             windows, sensor, floor, problem.recording.kind[which], ~problem.locked[which]
         )
-        variance = floor.low_variance * busier[place] / count[:, None]
-        # An estimated bias process would absorb a step or a warm-up; regimes are searched with the
-        # least bias processes.
-        processes = natural_processes(floor, problem.recording.period)
         rows = np.concatenate([columns_of[sensor], block_means(residual, edges)], axis=1)
-        design = tuple(rows @ join for join in problem.space.join[sensor])
         found[sensor] = RestBlocks(
             sensor,
             references.at(sensor),
-            **common,
-            design=design,
+            starts=starts,
+            time=block_means(np.concatenate([each.time for each in windows]), edges),
+            window=window,
+            locked=problem.locked[window],
+            design=tuple(rows @ join for join in problem.space.join[sensor]),
             index=tuple(problem.space.index[sensor]),
-            variance=variance,
-            processes=processes,
+            variance=floor.low_variance * busier[place] / count[:, None],
+            # An estimated bias process would absorb a step or a warm-up; regimes are searched with
+            # the least bias processes.
+            processes=natural_processes(floor, problem.recording.period),
             freedom=freedom,
             rough=rough[sensor] / louder[sensor],
             jitter=jitter,
         )
+    return found
+
+
+def _temperatures(windows: Sequence[Window], cuts: Sequence['_Cut']) -> np.ndarray | None:
+    """Return the temperature at the rows of all windows; None where a window has none."""
+    found = []
+    for window, cut in zip(windows, cuts):
+        if window.temperature_c is None:
+            return None
+        at_rest = len(cut.rows) == 1
+        found.append(
+            window.temperature_c.mean(keepdims=True) if at_rest else window.temperature_c[cut.rows]
+        )
+    return np.concatenate(found)
+
+
+def _by_kind(louder: dict[str, np.ndarray], kinds: np.ndarray) -> dict[str, dict[str, float]]:
+    """Return sensor -> kind of moving window -> mean factor of its blocks."""
+    found: dict[str, dict[str, float]] = {}
+    for sensor, factor in louder.items():
+        found[sensor] = {}
+        for kind in np.unique(kinds):
+            if kind != 'static':
+                found[sensor][str(kind)] = float(factor[kinds == kind].mean())
     return found
 
 
@@ -263,13 +273,14 @@ def _slope(
 
     The blocks begin at the samples `edges`, and the shape is (b, 3).
     """
-    ends, squares = np.cumsum([0, *map(len, windows)]), np.zeros_like(residual)
-    for window, first in zip(windows, ends):
+    squares = np.zeros_like(residual)
+    start = 0
+    for window in windows:
+        part = slice(start, start + len(window))
         if len(window) > 2:
-            part = slice(first, first + len(window))
-            squares[part] = (
-                np.gradient(measured(window, sensor) - residual[part], window.time, axis=0) ** 2
-            )
+            predicted = measured(window, sensor) - residual[part]
+            squares[part] = np.gradient(predicted, window.time, axis=0) ** 2
+        start = part.stop
     return block_means(squares, edges)
 
 
@@ -277,17 +288,18 @@ def _some(windows: Sequence[Window], length: float) -> np.ndarray:
     """
     Return the numbers of the windows in use: all, or a random part of a long recording, in order.
     """
-    blocks = sum(
-        1 if len(w.motion) == 1 else max(1, round((w.time[-1] - w.time[0]) / length))
-        for w in windows
-    )
-    if blocks <= 2 * MAX_RESIDUAL_BLOCKS:
+    n_blocks = 0
+    for window in windows:
+        n_blocks += 1 if len(window.motion) == 1 else _count_blocks(window, length)
+    if n_blocks <= 2 * MAX_RESIDUAL_BLOCKS:
         return np.arange(len(windows))
-    return np.sort(
-        np.random.default_rng(0).permutation(len(windows))[
-            : len(windows) * 2 * MAX_RESIDUAL_BLOCKS // blocks
-        ]
-    )
+    n_used = len(windows) * 2 * MAX_RESIDUAL_BLOCKS // n_blocks
+    return np.sort(np.random.default_rng(0).permutation(len(windows))[:n_used])
+
+
+def _count_blocks(window: Window, length: float) -> int:
+    """Return into how many blocks a moving window is cut."""
+    return max(1, round((window.time[-1] - window.time[0]) / length))
 
 
 def _busier(
@@ -299,25 +311,25 @@ def _busier(
     By kind, from second differences of the windows `judged` (mask), which suppress causes that vary
     with the motion; at most the misfit of the kind.
     """
+    # Variance of the white noise in each window; unknown in short ones.
     place = SENSORS.index(sensor)
-    found = np.ones((len(windows), 3))
-    own = np.array(
-        [
-            window.noise_sd[place] ** 2 if len(window) > 8 else np.full(3, np.nan)
-            for window in windows
-        ]
-    )
-    still = (
-        np.nanmedian(own[judged & (kinds == 'static')], axis=0)
-        if np.any(judged & (kinds == 'static'))
-        else floor.white_variance
-    )
+    own = np.full((len(windows), 3), np.nan)
+    for number, window in enumerate(windows):
+        if len(window) > SHORT_WINDOW:
+            own[number] = window.noise_sd[place] ** 2
+
+    # That at rest.
+    rests = judged & (kinds == 'static')
+    still = floor.white_variance
+    if rests.any():
+        still = np.nanmedian(own[rests], axis=0)
     still = np.maximum(still, LEAST_NOISE[sensor] ** 2)
+
+    found = np.ones((len(windows), 3))
     for kind in np.unique(kinds[kinds != 'static']):
         most = np.maximum(floor.row_variance(kind) / floor.low_variance, 1.0)
-        found[kinds == kind] = np.clip(
-            np.nanmedian(own[judged & (kinds == kind)], axis=0) / still, 1.0, most
-        )
+        usual = np.nanmedian(own[judged & (kinds == kind)], axis=0)
+        found[kinds == kind] = np.clip(usual / still, 1.0, most)
     return found
 
 
@@ -331,13 +343,11 @@ def residuals(
     """
     # Columns need much memory.
     predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
-    return {
-        sensor: (
-            np.concatenate([measured(window, sensor) for window in windows])
-            - np.concatenate([part[sensor] for part in predicted])
-        )
-        for sensor in SENSORS
-    }
+    found = {}
+    for sensor in SENSORS:
+        readings = np.concatenate([measured(window, sensor) for window in windows])
+        found[sensor] = readings - np.concatenate([part[sensor] for part in predicted])
+    return found
 
 
 def _block_means(
@@ -352,22 +362,17 @@ def _block_means(
 
     Some blocks at a time, as their columns need much memory.
     """
-    recording, found, edges = (
-        problem.recording,
-        {sensor: [] for sensor in SENSORS},
-        np.append(starts, len(motion)),
-    )
+    recording = problem.recording
+    edges = np.append(starts, len(motion))
+    found: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
     for first in range(0, len(starts), AT_A_TIME):
         own = edges[first : first + AT_A_TIME + 1]
         rows = slice(own[0], own[-1])
         warmth = None if temperature is None else temperature[rows]
         references = References(recording.model, table, motion.select(rows), temperature_c=warmth)
         for sensor in SENSORS:
-            found[sensor].append(
-                block_means(
-                    columns_with_bank(references, sensor, recording.bank), own[:-1] - own[0]
-                )
-            )
+            columns = columns_with_bank(references, sensor, recording.bank)
+            found[sensor].append(block_means(columns, own[:-1] - own[0]))
     return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
 
 
@@ -377,21 +382,30 @@ def block_means(rows: np.ndarray, starts: np.ndarray) -> np.ndarray:
     return np.add.reduceat(rows, starts, axis=0) / counts.reshape(-1, *[1] * (rows.ndim - 1))
 
 
-def _cut(window: Window, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Return the first sample of each block of a window, its rows, and their number.
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """A window cut into blocks."""
 
-    The rows are the ones of the window's motion in use, and the number is that in each block.
-    """
+    starts: np.ndarray
+    """First sample of each block, shape (b,)."""
+    rows: np.ndarray
+    """Rows of the window's motion at which columns are evaluated, in order of blocks."""
+    per_block: np.ndarray
+    """Number of these rows in each block, shape (b,)."""
+
+
+def _cut(window: Window, length: float) -> _Cut:
+    """Return a window cut into blocks of about this length, s; at rest it is one block."""
     if len(window.motion) == 1:
-        return np.array([0]), np.array([0]), np.array([1])
-    count = max(1, round((window.time[-1] - window.time[0]) / length))
-    edges = np.unique(np.linspace(0, len(window), count + 1).round().astype(int))
-    rows = [
-        np.unique((a + (np.arange(WITHIN) + 0.5) / WITHIN * (b - a)).astype(int))
-        for a, b in zip(edges, edges[1:])
-    ]
-    return edges[:-1], np.concatenate(rows), np.array([len(part) for part in rows])
+        return _Cut(np.array([0]), np.array([0]), np.array([1]))
+    n_blocks = _count_blocks(window, length)
+    edges = np.unique(np.linspace(0, len(window), n_blocks + 1).round().astype(int))
+    # Rows in the middles of equal parts of each block; short blocks have fewer.
+    middles = (np.arange(WITHIN) + 0.5) / WITHIN
+    rows = []
+    for start, end in zip(edges, edges[1:]):
+        rows.append(np.unique((start + middles * (end - start)).astype(int)))
+    return _Cut(edges[:-1], np.concatenate(rows), np.array([len(part) for part in rows]))
 
 
 AMPLITUDE_PRIOR_SD = 1e6
