@@ -69,6 +69,7 @@ SMALLEST: dict[str, Any] = {
     'peers.ON_A_TABLE': 1,
     'peers.SEEDS': 1,
     'peers.TRIAL_SEEDS': 1,
+    'scatter.BY_HAND': 1,
     'scatter.SESSIONS': 2,
     'shaft.SHAFT': 1,
 }

@@ -1,5 +1,5 @@
 """
-Standard deviations on a table against the scatter over many simulated sessions.
+Standard deviations against the scatter over many simulated sessions, on a table and by hand.
 
 White noise and wandering biases; an IMU, a tilt and an arm of each seed.
 """
@@ -7,10 +7,13 @@ White noise and wandering biases; an IMU, a tilt and an arm of each seed.
 from validation.section import Section, text
 
 SESSIONS = 120
+BY_HAND = 100
+"""Sessions by hand, of each kind of sensor."""
 
 
 def run(folder, plots):
     """Return the section."""
+    from worlds.hand_scatter import hand_scatter
     from worlds.scatter import scatter, windows_of_a_short_session
 
     section = Section('Reported standard deviations and the scatter over sessions')
@@ -45,5 +48,22 @@ def run(folder, plots):
         f'{found.over_bound:.3f}',
         found.over_bound <= 1.05,
     )
+    for response, sensitivity in (
+        ('without a response to gravity', 0.0),
+        ('whose gyroscope responds to gravity', 5e-4),
+    ):
+        by_hand = hand_scatter(range(BY_HAND), sensitivity)
+        section.claim(
+            f'{BY_HAND} simulated sessions by hand {response}: normalised squared error',
+            '0.85 to 1.20',
+            f'{by_hand.mean_square:.3f}',
+            0.85 <= by_hand.mean_square <= 1.20,
+        )
+        section.claim(
+            'share of errors within the 95 % interval',
+            '0.93 to 0.97',
+            f'{by_hand.coverage:.4f}',
+            0.93 <= by_hand.coverage <= 0.97,
+        )
     section.say(text('scatter'))
     return section

@@ -183,28 +183,22 @@ def test_clipping_needs_the_same_extreme_again_and_again():
     np.testing.assert_array_equal(clipped(values), np.any(values == 1.5, axis=1))
 
 
-@pytest.mark.long
-@pytest.mark.slow
 def test_sd_are_honest():
     """
-    z scores of 40 seeds x 3 axes.
+    z scores of 20 seeds x 3 axes.
 
-    Their mean square scatters by 0.13 around 1, more for the 15 stretches that each sd comes from.
+    Their mean square scatters by 0.18 around 1, more for the 15 stretches that each sd comes from.
     """
     scores = []
-    for seed in range(40):
+    for seed in range(20):
         imu_a, imu_b, _ = pair(100 + seed, force_sd=0.5, rate_sd=0.02, duration=30.0)
         found = estimate_arm(imu_a, imu_b)
         scores.append((found.arm - ARM) / found.diagnostics['motion_sd'])
         assert not found.diagnostics['calibrated'] and np.all(
             found.diagnostics['calibration_sd'] > np.zeros(3)
         )
-    print(
-        f'mean square z {np.mean(np.square(scores)):.2f}, 95 % intervals hold'
-        f' {100 * np.mean(np.abs(scores) < 1.96):.1f} %'
-    )
-    # 1.15 for these seeds: an sd wrong by a factor of 1.3 gives 0.68 or 1.95.
-    assert 0.75 < np.mean(np.square(scores)) < 1.5
+    # 1.33 for these seeds, 1.15 for 40: an sd wrong by a factor of 1.5 gives 0.59 or 3.0.
+    assert 0.7 < np.mean(np.square(scores)) < 1.9
 
 
 @pytest.mark.slow
