@@ -92,11 +92,12 @@ def pytest_collection_finish():
 
 def _processor_time():
     """
-    Return seconds of this process and of its ended children.
+    Return seconds of this process, of its ended children and of forked nodes that have ended.
 
     Those do not depend on other work of the machine.
     """
-    return sum(os.times()[:4])
+    nodes = sys.modules.get('ros.forked_nodes')
+    return sum(os.times()[:4]) + (nodes.processor_seconds() if nodes else 0.0)
 
 
 @pytest.hookimpl(wrapper=True)

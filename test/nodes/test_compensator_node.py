@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.processes import NodeProcesses
 from imu_calibration.compensation.compensate import Transfer
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.samples import ImuSamples
@@ -17,6 +16,7 @@ from msg_adapters.imu import FIELDS
 from msg_adapters.write import encode_imu
 from validation.imu_messages import parse_imu, patch_imu
 
+from ros.forked_nodes import ForkedNodes
 from ros.harness import Harness
 from ros.live_station import free_domain
 from worlds.compensation_cases import random_calibration
@@ -76,7 +76,7 @@ def bench(tmp_path_factory):
     harness.publisher(String, '/late/imu/calibration', latched_qos()).publish(
         String(data=TEXT['C'])
     )
-    with NodeProcesses(domain_id) as processes:
+    with ForkedNodes(domain_id) as processes:
         harness.processes, harness.by_name = processes, {}
         for name, parameters in NODES.items():
             parameters = dict(parameters)

@@ -98,10 +98,7 @@ def test_every_verb_of_the_plain_command_is_offered(place):
 @pytest.mark.parametrize(
     'line',
     [
-        f'inspect {ROOT}/bags/sample_session',
         f'inspect {ROOT}/bags/sample_session --table {TABLE}',
-        f'compare {TRUTH} {TRUTH}',
-        f'calibrate {ROOT}/bags/sample_session --table {TABLE} --output WHERE --no-report',
         'export --list',
         f'export {TRUTH} --to json --output WHERE.json --force',
         f'compare {TRUTH} nowhere.yaml',
@@ -112,9 +109,7 @@ def test_every_verb_of_the_plain_command_is_offered(place):
 def test_output_and_exit_code_are_those_of_the_plain_command(place, line):
     folder, shell, _ = place
     plain = shell('imu_calibration ' + line.replace('WHERE', 'result'))
-    written = {
-        path: path.read_bytes() for path in [*folder.glob('result/*'), *folder.glob('result.json')]
-    }
+    written = {path: path.read_bytes() for path in folder.glob('result*')}
     by_ros2 = shell('ros2 imu ' + line.replace('WHERE', 'result'))
     assert by_ros2.returncode == plain.returncode and by_ros2.stdout == plain.stdout
     assert by_ros2.stderr.replace('ros2 imu', 'imu_calibration') == plain.stderr

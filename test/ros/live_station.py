@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from examples.processes import NodeProcesses
 from msg_adapters.live import LiveGatherer
+
+from ros.forked_nodes import ForkedNodes
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / 'config' / 'table_simulated.yaml'
@@ -43,17 +44,19 @@ class Station:
     ----------
     output : path-like, optional
         File for what the nodes print.
+    processes : type
+        NodeProcesses or a class with its methods.
 
     """
 
-    def __init__(self, output=None):
+    def __init__(self, output=None, processes=ForkedNodes):
         import rclpy
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
 
         os.environ |= STAY_LOCAL
         domain_id, self._lock = free_domain()
-        self.processes = NodeProcesses(domain_id)
+        self.processes = processes(domain_id)
         self.output = open(output, 'wb') if output else None
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain_id)

@@ -14,6 +14,8 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2])]
 
+from examples.processes import NodeProcesses  # noqa: E402
+
 from ros.live_station import Station  # noqa: E402
 
 GROWTH_MB = 10.0
@@ -63,7 +65,7 @@ def soak(seconds, factor, folder, imu_rate=200.0, joint_rate=100.0, tell=None):
 
     """
     memory = {name: [] for name in LARGEST_MB}
-    with Station() as station:
+    with Station(processes=NodeProcesses) as station:
         station.watch_diagnostics()
         running = {
             'calibration_node': station.calibration_node(

@@ -1,0 +1,125 @@
+"""
+Nodes as processes that are forked from one that has imported most of them: a second less each.
+
+Parameters, signals, exit codes and output are those of a process of its own, which is needed where
+the import of a node, or the end of the interpreter after its main function, is tested.
+"""
+
+import importlib
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from examples.processes import NodeProcesses, node_command
+
+PRELOADED = (
+    'imu_calibration.calibration.diagnosis.live_diagnosis',
+    'imu_calibration.calibration.live',
+    'imu_calibration.calibration.live_poses',
+    'imu_calibration.compensation.health',
+    'imu_calibration.compensation.stream',
+    'imu_calibration.compensation.unit_gate',
+    'imu_calibration.planning.campaign',
+    'imu_calibration.planning.driver',
+    'imu_calibration.planning.planner',
+    'imu_calibration.simulation.profiles',
+    'imu_calibration.simulation.session',
+    'imu_calibration.use_cases.choices',
+    'imu_calibration.use_cases.recordings',
+    'msg_adapters.bag',
+    'msg_adapters.live',
+    'sensor_msgs.msg',
+)
+"""
+What nodes import, except rclpy: its libraries give all processes that are forked afterwards the
+same identity in DDS.
+"""
+
+
+def _server():
+    """Return the context whose processes are forked from one that has imported `PRELOADED`."""
+    context = multiprocessing.get_context('forkserver')
+    context.set_forkserver_preload(list(PRELOADED))
+    return context
+
+
+def _run(command, folder, environment, output):
+    """Run a node in the forked process, which ends with its exit code."""
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    if output:
+        opened = os.open(output, os.O_WRONLY | os.O_APPEND)
+        for number in (1, 2):
+            os.dup2(opened, number)
+    _, _, module, *arguments = command
+    sys.argv = [module, *arguments]
+    sys.exit(importlib.import_module(module).main())
+
+
+_servers = set()
+"""Process ids of the servers, of which there is one."""
+
+
+def processor_seconds():
+    """Return the processor time of the server and of the nodes that have ended."""
+    total = 0
+    for server in _servers:
+        # utime, stime and those of ended children; the name before may contain spaces.
+        fields = Path(f'/proc/{server}/stat').read_text().rpartition(')')[2].split()
+        total += sum(map(int, fields[11:15]))
+    return total / os.sysconf('SC_CLK_TCK')
+
+
+class ForkedNode:
+    """A forked process with the methods of `subprocess.Popen` that tests use."""
+
+    def __init__(self, command, environment, output):
+        self.args = command
+        self._process = _server().Process(
+            target=_run, args=(command, os.getcwd(), environment, output)
+        )
+        self._process.start()
+        self.pid = self._process.pid
+        status = Path(f'/proc/{self.pid}/status').read_text()
+        _servers.add(int(re.search(r'PPid:\s+(\d+)', status)[1]))
+
+    @property
+    def returncode(self):
+        """The exit code, minus the number of a signal, None while it runs."""
+        return self._process.exitcode
+
+    def poll(self):
+        """Return the exit code, None while it runs."""
+        return self.returncode
+
+    def wait(self, timeout=None):
+        """Return the exit code once it has ended."""
+        self._process.join(timeout)
+        if self.returncode is None:
+            raise subprocess.TimeoutExpired(self.args, timeout)
+        return self.returncode
+
+    def send_signal(self, number):
+        """Send a signal unless it has ended."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self):
+        """End it at once."""
+        self.send_signal(signal.SIGKILL)
+
+
+class ForkedNodes(NodeProcesses):
+    """Forked processes of one DDS domain."""
+
+    def start(self, name, parameters=None, output=None, **options):
+        """Start a node and return its ForkedNode; `output` is a file for its output."""
+        command = node_command(name, parameters, **options)
+        process = ForkedNode(command, self.environment, output.name if output else None)
+        self.running.append(process)
+        return process
