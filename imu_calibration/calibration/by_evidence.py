@@ -13,12 +13,16 @@ unexplained residual: by the change of a bias that it may cause.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
-from imu_calibration.calibration.table_calibration import conclude, solve_recordings
+from imu_calibration.calibration.table_calibration import (
+    Solved,
+    TableRecordings,
+    WindowSource,
+    conclude,
+)
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.document.calibration import one_significant
@@ -42,36 +46,26 @@ from imu_calibration.selection.saturation import Saturation
 from imu_calibration.selection.search import FAMILY_WISE
 from imu_calibration.selection.unexplained import biases_off
 
-Solved = tuple[Solution, SessionData, SensorModel]
-"""A solution, the data that it was solved from, and the model of their columns."""
-
 
 @dataclass(frozen=True, eq=False)
-class EvidentSolution:
+class Selected(Solved):
     """
-    A solution with the effects that its recordings support, and the result of the search for them.
+    A solution with the effects that its recordings support, its covariance widened.
+
+    The result of the search for them is included.
     """
 
-    solution: Solution
-    """Solution of the requested model with the added effects, its covariance widened."""
-    gathered: SessionData
-    """The data that were solved."""
-    model: SensorModel
-    """The model of the gathered columns."""
     extension: ModelExtension = ModelExtension()
     """Result of the search that later solutions of the same recordings need."""
-    found: Investigation | None = None
+    found: ResidualAnalysis | None = None
     """Search result; None with too few windows."""
 
-
-@dataclass(frozen=True, eq=False)
-class EvidentResult:
-    """A calibration with the result of the search for its model."""
-
-    result: TableResult
-    """The calibration."""
-    found: Investigation | None
-    """Search result; None with too few windows."""
+    @classmethod
+    def without_search(
+        cls, solved: Solved, extension: ModelExtension = ModelExtension()
+    ) -> 'Selected':
+        """Return a solution as it is."""
+        return cls(solved.solution, solved.gathered, solved.model, extension)
 
 
 def calibrate_by_evidence(
@@ -82,7 +76,7 @@ def calibrate_by_evidence(
     provenance: dict | None = None,
     mapper: Callable = map,
     names: Sequence[str] | None = None,
-) -> EvidentResult:
+) -> TableResult:
     """
     Calibrate from one or several recordings of the same IMU.
 
@@ -99,69 +93,65 @@ def calibrate_by_evidence(
         As `calibrate`.
 
     """
-    solve = partial(solve_recordings, sources, table, mapper=mapper, names=names)
-    found = solve_by_evidence(
-        solve(options, keep_windows=not options.as_asked), table, options, solve_again=solve
+    recordings = TableRecordings.of(
+        sources, table, mapper=mapper, names=names, keep_windows=not options.as_asked
     )
-    return EvidentResult(
-        conclude(
-            found.solution,
-            found.gathered,
-            found.model,
-            table=table,
-            options=found.extension.options(options),
-            provenance=provenance,
-            changes=found.extension.changes,
-        ),
-        found.found,
+    selected = solve_by_evidence(recordings, table, options)
+    result = conclude(
+        selected,
+        table=table,
+        options=selected.extension.options(options),
+        provenance=provenance,
+        changes=selected.extension.changes,
     )
+    return replace(result, found=selected.found)
 
 
-def solve_by_evidence(
-    first: Solved,
-    table: Table,
-    options: CalibrationOptions,
-    *,
-    solve_again: Callable[[CalibrationOptions], Solved],
-) -> EvidentSolution:
+def solve_by_evidence(source: WindowSource, table: Table, options: CalibrationOptions) -> Selected:
     """
     Return the solution of the requested model with the effects that the recordings support.
 
     Parameters
     ----------
-    first : tuple
-        (Solution, SessionData with the windows of the search, SensorModel) of the requested model.
+    source : WindowSource
+        With the windows of the search.
     table : Table
     options : CalibrationOptions
         Options of the requested model.
-    solve_again : callable
-        Returns the same for other options: `added` effects, linearised at their `point`.
 
     """
-    solution, gathered, model = first
-    parts = windows_to_ask(gathered)
+    # Solve the requested model, and search in each recording with enough windows.
+    first = source.solved(options)
+    parts = windows_to_ask(first.gathered)
     if not parts:
-        return EvidentSolution(*first)
-    baseline = _baseline_model(options, table, solution.model)
+        return Selected.without_search(first)
+    baseline = _baseline_model(options, table, first.solution.model)
     found, *others = (
         _examined(inquire(windows, table, baseline, bias_processes=options.bias_processes))
         for windows in parts
     )
     from_others = _named_elsewhere(found, others)
-    requested = model
+    requested = first.model
+
     # An effect of the requested model is judged with the added effects in the solution: the misfit
     # of a missing delay or encoder zero widens every standard deviation.
     while True:
         beyond = _beyond((*found.adopted, *from_others), requested)
         if not beyond:
-            added = ()
-            point = {}
-            solution, gathered, model = first
-            found = _without_faint(found, solution)
+            added: tuple[tuple[str, str], ...] = ()
+            point: dict[str, np.ndarray] = {}
+            solved = first
+            found = _without_faint(found, solved.solution)
             break
-        point = {name: value for each in (*others, found) for name, value in _point(each).items()}
+
+        # Solve again with the added effects, linearised at their estimates.
+        point = {}
+        for each in (*others, found):
+            point |= _point(each)
         added = tuple(question.effect.key for question in beyond)
-        solution, gathered, model = solve_again(replace(options, added=added, point=point))
+        solved = source.solved(replace(options, added=added, point=point))
+        solution = solved.solution
+
         # Possible rivals of the effects found in the largest recording are removed first.
         significant = [question for question in from_others if not _is_faint(solution, question)]
         if len(significant) < len(from_others):
@@ -173,12 +163,13 @@ def solve_by_evidence(
     extension = ModelExtension(
         added, point, _changes([found, *others], added), _moves(found), _clipped(found)
     )
-    return EvidentSolution(extension.applied(solution), gathered, model, extension, found)
+    solution = extension.applied(solved.solution)
+    return Selected(solution, solved.gathered, solved.model, extension, found)
 
 
 def ask_kept(
     solved: Solved, table: Table, options: CalibrationOptions, *, known: ModelExtension
-) -> EvidentSolution:
+) -> Selected:
     """
     Return the supported effects when columns cannot be recomputed.
 
@@ -186,18 +177,18 @@ def ask_kept(
 
     Parameters
     ----------
-    solved : tuple
-        As for `solve_by_evidence`, of the requested model with the added effects.
+    solved : Solved
+        Of the requested model with the added effects.
     table, options
         As for `solve_by_evidence`.
     known : ModelExtension
         The effects that were supported when the columns were computed.
 
     """
-    solution, gathered, model = solved
-    parts = windows_to_ask(gathered)
+    solution, model = solved.solution, solved.model
+    parts = windows_to_ask(solved.gathered)
     if not parts:
-        return EvidentSolution(*solved, known)
+        return Selected.without_search(solved, known)
     found = inquire(
         parts[0],
         table,
@@ -213,7 +204,7 @@ def ask_kept(
     extension = ModelExtension(
         known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found)
     )
-    return EvidentSolution(extension.applied(solution), gathered, model, extension, found)
+    return Selected(extension.applied(solution), solved.gathered, model, extension, found)
 
 
 def windows_to_ask(gathered: SessionData) -> list[list[Window]]:

@@ -103,7 +103,7 @@ class FleetStep:
         provenance = unit.provenance() if unit.provenance is not None else None
         result = calibrate_by_evidence(
             unit.sources, self.table, self.options, provenance=provenance, names=unit.bags or None
-        ).result
+        )
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         report_of = self.report
         if report_of is not None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import (
-    EvidentSolution,
+    Selected,
     Solved,
     ask_kept,
     solve_by_evidence,
@@ -38,7 +38,6 @@ from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import setting
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import local_gravity
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import check_units
@@ -81,38 +80,32 @@ class LiveSnapshot:
 
     def solved(self, options: CalibrationOptions) -> Solved:
         """
-        Return (Solution, SessionData, SensorModel of the columns) for other options.
-
-        As from a recording.
+        Return the solution for other options, as from a recording.
 
         If the windows are no longer kept, the gathered columns are used.
         """
         check_units(self.gathered, self.model, self.table)
         if not self.store.complete:
-            return solve_gathered(self.gathered, self.model, options), self.gathered, self.model
-
-        def solved(model: SensorModel, judged_from: float) -> tuple[Solution, SessionData]:
-            known = model is self.model and judged_from == self.gathered.judged_from
-            total = (
-                self.gathered
-                if known
-                else self.gathered.anew(
-                    self.store.reduced(model, self.table, self.session), judged_from
-                )
-            )
-            return solve_gathered(total, model, options), total
-
+            solution = solve_gathered(self.gathered, self.model, options)
+            return Solved(solution, self.gathered, self.model)
         asked = self.model_for(options)
-        return solve_in_passes(
-            self.model if asked.has_columns_of(self.model) else asked, options, solved
-        )
+        model = self.model if asked.has_columns_of(self.model) else asked
+        return solve_in_passes(self, model, options)
 
-    def evidence(self) -> EvidentSolution:
+    def solved_at(
+        self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
+    ) -> Solved:
+        """Reduce the stored windows once more, if other columns or a part of them are wanted."""
+        total = self.gathered
+        if model is not self.model or judged_from != self.gathered.judged_from:
+            reduced = self.store.reduced(model, self.table, self.session)
+            total = self.gathered.anew(reduced, judged_from)
+        return Solved(solve_gathered(total, model, options), total, model)
+
+    def evidence(self) -> Selected:
         """Return the solution with the supported effects, as `calibrate_by_evidence`."""
         if self.store.complete:
-            return solve_by_evidence(
-                self.solved(self.options), self.table, self.options, solve_again=self.solved
-            )
+            return solve_by_evidence(self, self.table, self.options)
         return ask_kept(
             self.solved(self.extension.options(self.options)),
             self.table,
@@ -432,17 +425,18 @@ class LiveCalibration:
             self._first_temperature_c,
         )
         options = self.extension.options(self.options)
-        solution, total, model = snapshot.solved(options)
+        solved = snapshot.solved(options)
         self.result = conclude(
-            self.extension.applied(solution),
-            total,
-            model,
+            replace(solved, solution=self.extension.applied(solved.solution)),
             table=self.table,
             options=options,
             provenance=provenance,
             changes=self.extension.changes,
         )
-        self.last, self.needs_linearising = snapshot, linearise_again(model, solution) is not None
+        self.last, self.needs_linearising = (
+            snapshot,
+            linearise_again(solved.model, solved.solution) is not None,
+        )
         return self.result
 
     def adopt(self, extension: ModelExtension) -> bool:

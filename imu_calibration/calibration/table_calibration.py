@@ -1,8 +1,9 @@
 """Calibration on a table, and the check of a calibration on another recording."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 
@@ -102,77 +103,122 @@ def calibrate_on_table(
         several.
 
     """
-    return conclude(
-        *solve_recordings(sources, table, options, mapper=mapper, names=names),
-        table=table,
-        options=options,
-        provenance=provenance,
-    )
+    recordings = TableRecordings.of(sources, table, mapper=mapper, names=names)
+    return conclude(recordings.solved(options), table=table, options=options, provenance=provenance)
 
 
-def solve_recordings(
-    sources: Sequence[Callable],
-    table: Table,
-    options: CalibrationOptions = CalibrationOptions(),
-    *,
-    mapper: Callable = map,
-    names: Sequence[str] | None = None,
-    keep_windows: bool = False,
-) -> tuple[Solution, SessionData, SensorModel]:
-    """
-    Return (Solution, SessionData, SensorModel of the gathered columns) of recordings.
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A solution with the data that it was solved from."""
 
-    Arguments as in `calibrate`.
+    solution: Solution
+    """Estimate of the requested model."""
+    gathered: SessionData
+    """Statistics of the windows of all recordings."""
+    model: SensorModel
+    """Model of the gathered columns; it may have more effects."""
 
-    keep_windows : bool
-        Whether windows are kept for the search of effects (`by_evidence`).
-    """
-    names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
-    model = choose_model(options, table)
-    if model.needs_temperature:
-        model = model.with_reference_temperature(_first_temperature(sources))
 
-    def solved(model: SensorModel, judged_from: float) -> tuple[Solution, SessionData]:
+class WindowSource(Protocol):
+    """Windows that are reduced again in each pass: of recordings, or of a live session."""
+
+    def solved(self, options: CalibrationOptions) -> Solved:
+        """Return the solution of the model that options request, at a valid linearisation."""
+
+    def solved_at(
+        self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
+    ) -> Solved:
+        """
+        Return the solution with the columns of a model.
+
+        Windows from the time `judged_from` (s) on are kept for the proof.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class TableRecordings:
+    """Recordings of one IMU on a table, which each pass reads."""
+
+    sources: Sequence[Callable]
+    """Each returns a new iterator of SampleBlock."""
+    table: Table
+    """The reference."""
+    names: tuple[str, ...]
+    """Names of the recordings for messages."""
+    mapper: Callable = map
+    """Applies the map step to the recordings; `map`, or the `map` of a pool."""
+    keep_windows: bool = False
+    """Whether windows are kept for the search of effects."""
+
+    @classmethod
+    def of(
+        cls,
+        sources: Sequence[Callable],
+        table: Table,
+        *,
+        mapper: Callable = map,
+        names: Sequence[str] | None = None,
+        keep_windows: bool = False,
+    ) -> 'TableRecordings':
+        """Return recordings with their numbers as names where none are given."""
+        numbered = [f'recording {number}' for number in range(1, len(sources) + 1)]
+        return cls(sources, table, tuple(names or numbered), mapper, keep_windows)
+
+    def solved(self, options: CalibrationOptions) -> Solved:
+        """Return the solution of the model that options request, at a valid linearisation."""
+        model = choose_model(options, self.table)
+        if model.needs_temperature:
+            model = model.with_reference_temperature(_first_temperature(self.sources))
+        return solve_in_passes(self, model, options)
+
+    def solved_at(
+        self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
+    ) -> Solved:
+        """Read all recordings once; see `WindowSource.solved_at`."""
+        # The search has its windows when effects are added.
+        keep_windows = self.keep_windows and not options.added
         step = GatherStep(
-            table, model, options.windows, options.nominal, names, keep_windows, judged_from
+            self.table,
+            model,
+            options.windows,
+            options.nominal,
+            self.names,
+            keep_windows,
+            judged_from,
         )
-        gathered = join(
-            list(mapper(step, enumerate(sources))),
-            names,
-            partial(check_units, model=model, table=table),
-        )
+        parts = list(self.mapper(step, enumerate(self.sources)))
+        gathered = join(parts, self.names, partial(check_units, model=model, table=self.table))
         report('solving')
-        return solve_gathered(gathered, model, options), gathered
-
-    return solve_in_passes(model, options, solved)
+        return Solved(solve_gathered(gathered, model, options), gathered, model)
 
 
 def solve_in_passes(
-    model: SensorModel, options: CalibrationOptions, solved: Callable
-) -> tuple[Solution, SessionData, SensorModel]:
+    source: WindowSource, model: SensorModel, options: CalibrationOptions
+) -> Solved:
     """
-    Return (Solution, SessionData, SensorModel) at a valid linearisation.
+    Return the solution at a linearisation that is valid at it.
 
-    The SensorModel is that of the gathered columns. The linearisation is valid at the solution.
-
-    ``solved(model, judged_from)`` returns (Solution, SessionData) with the columns of a model, and
-    windows from that time on for the proof.
+    Each pass reduces all windows with the columns of a model. A drift that has settled is judged on
+    the last third, which is known after a pass only.
     """
-    again, judged_from = _at_time_constants(model, options, lambda trial: solved(trial, 0.0)), 0.0
+    again = _at_time_constants(source, model, options)
+    judged_from = 0.0
     for _ in range(MAX_TABLE_PASSES):
         model = again
-        solution, gathered = solved(model, judged_from)
-        again = linearise_again(model, solution)
+        solved = source.solved_at(model, options, judged_from=judged_from)
+        solution = solved.solution
+        linearised = linearise_again(model, solution)
         latest = latest_settling(solution.model, solution.values, solution.sd)
-        last_third = judged_from_of(latest, end_of(gathered.accumulator))
-        if again is None and judged_from == last_third:
+        last_third = judged_from_of(latest, end_of(solved.gathered.accumulator))
+        if linearised is None and judged_from == last_third:
             break
-        again, judged_from = again or model, last_third
-    return solution, gathered, model
+        again = linearised or model
+        judged_from = last_third
+    return solved
 
 
 def _at_time_constants(
-    model: SensorModel, options: CalibrationOptions, solved: Callable
+    source: WindowSource, model: SensorModel, options: CalibrationOptions
 ) -> SensorModel:
     """
     Return the model with the columns of requested warm-ups.
@@ -183,11 +229,13 @@ def _at_time_constants(
     """
     for effect in model.effects:
         if effect.time_constant and effect.name not in options.point:
-            duration = end_of(solved(model)[1].accumulator)
-            model = min(
-                at_time_constants(model, effect, duration),
-                key=lambda trial: solved(trial)[0].residual_rms[effect.sensor][1],
-            )
+            gathered = source.solved_at(model, options, judged_from=0.0).gathered
+            trials = at_time_constants(model, effect, end_of(gathered.accumulator))
+            of_means = []
+            for trial in trials:
+                solution = source.solved_at(trial, options, judged_from=0.0).solution
+                of_means.append(solution.residual_rms[effect.sensor][1])
+            model = trials[int(np.argmin(of_means))]
     return model
 
 
@@ -248,10 +296,9 @@ def calibration_of_saved(
             key='table',
         )
     options = extension.options(options)
+    solution = extension.applied(solve_gathered(gathered, model, options))
     return conclude(
-        extension.applied(solve_gathered(gathered, model, options)),
-        gathered,
-        model,
+        Solved(solution, gathered, model),
         table=table,
         options=options,
         changes=extension.changes,
@@ -259,9 +306,7 @@ def calibration_of_saved(
 
 
 def conclude(
-    solution: Solution,
-    gathered: SessionData,
-    model: SensorModel,
+    solved: Solved,
     *,
     table: Table,
     options: CalibrationOptions = CalibrationOptions(),
@@ -272,9 +317,10 @@ def conclude(
     """
     Judge a solution, name the missing motions, and return the TableResult.
 
-    The solution is of data gathered with `model`. The effects of sensors in `under_test`, and of
+    The effects of sensors in `under_test`, and of
     sensors with an unexplained residual, have to predict better than plain least squares.
     """
+    solution, gathered, model = solved.solution, solved.gathered, solved.model
     tolerances = tolerances_of(solution.model, options.tolerances)
     gathered.findings = with_findings_of(
         mount_check.CHECK, mount_check.mount_findings(solution, table), gathered.findings

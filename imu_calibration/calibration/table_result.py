@@ -42,6 +42,7 @@ from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock
+from imu_calibration.selection.residual_analysis import ResidualAnalysis
 from imu_calibration.selection.residual_blocks import residuals
 
 LEVELLING_SD = 2 * ARCMIN
@@ -271,6 +272,8 @@ class TableResult(CalibrationResult):
     """The model that was solved."""
     gathered_model: SensorModel
     """The model of the gathered columns; it may have more effects."""
+    found: ResidualAnalysis | None = None
+    """Result of the search for the model; None without a search."""
 
     observations: ClassVar[str] = 'windows'
 

@@ -232,7 +232,7 @@ def _side_by_side(sources, table, options, recordings, jobs):
     ]
     advance = counter('recordings', len(recordings) if jobs > 1 else 0)
     mapper = process_mapper(jobs, lambda part: advance(1)) if jobs > 1 else map
-    return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names).result
+    return calibrate_by_evidence(sources, table, options, mapper=mapper, names=names)
 
 
 def check_recording(

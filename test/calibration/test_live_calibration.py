@@ -11,6 +11,7 @@ from refusal import refused
 from imu_calibration.calibration import collector
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings, SolvePacer
 from imu_calibration.calibration.table_calibration import (
+    Solved,
     calibrate_on_table,
     conclude,
     solve_gathered,
@@ -273,7 +274,9 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     again = collector.from_bytes(data)[0]
     assert collector.to_bytes(again, live.model) == data
     found, expected = (
-        conclude(solve_gathered(each, live.model), each, live.model, table=TABLE).calibration
+        conclude(
+            Solved(solve_gathered(each, live.model), each, live.model), table=TABLE
+        ).calibration
         for each in (again, gathered)
     )
     assert_same(found, expected, 1e-12)

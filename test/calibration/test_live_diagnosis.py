@@ -144,7 +144,7 @@ def test_a_delay_is_taken_at_its_size_like_offline():
         live.push(block)
     live.solve(pending=True)
     assert live.adopt(question_about(live).answer().extension)
-    expected = calibrate_by_evidence([lambda: iter([pair.first.block])], table).result.calibration
+    expected = calibrate_by_evidence([lambda: iter([pair.first.block])], table).calibration
     found = live.solve(pending=True).calibration
     assert 'time_offset' in found.statistics['added']
     assert_same(found, expected)

@@ -19,9 +19,9 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
 )
 from imu_calibration.calibration.from_solution import ModelChanges
 from imu_calibration.calibration.table_calibration import (
+    TableRecordings,
     check_on_table,
     conclude,
-    solve_recordings,
 )
 from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, Role
@@ -115,7 +115,8 @@ def world(kind, seed, gyroscope_model='bias+matrix'):
         gyroscope_model=gyroscope_model,
         reference_model='none',
     )
-    return pair, table, solve_recordings([source(pair.first)], table, options), options
+    solved = TableRecordings.of([source(pair.first)], table).solved(options)
+    return pair, table, solved, options
 
 
 def source(session):
@@ -125,7 +126,7 @@ def source(session):
 def calibrated(kind, seed, **changes):
     _, table, solved, options = world(kind, seed)
     return conclude(
-        *solved, table=table, options=options, changes=ModelChanges(**changes)
+        solved, table=table, options=options, changes=ModelChanges(**changes)
     ).calibration
 
 
@@ -187,7 +188,7 @@ def test_applied_values_are_no_worse_than_least_squares_in_a_second_session(kind
 def test_a_drift_with_an_uncertain_time_constant_is_applied_at_its_mean():
     # The hidden heat of motors resembles a warm-up; its value at the end was 13 % worse.
     _, table, solved, options = world('heat', 611, 'bias+matrix+gyro_bias_drift')
-    calibration = conclude(*solved, table=table, options=options).calibration
+    calibration = conclude(solved, table=table, options=options).calibration
     plain = with_plain_values(calibration, 'heat', 611)
     ratio = errors_on_second('heat', 611, calibration) / errors_on_second('heat', 611, plain)
     assert np.all(ratio < 1.05)
@@ -211,7 +212,7 @@ def test_a_formula_is_applied_where_a_second_session_confirms_it(kind, seed, col
     pair, table, solved, options = world(kind, seed)
     effect = formula('bend', column, unit)
     result = conclude(
-        *solved, table=table, options=options, changes=ModelChanges(unexplained=UNEXPLAINED)
+        solved, table=table, options=options, changes=ModelChanges(unexplained=UNEXPLAINED)
     )
     extended = _with_proposals(
         source(pair.first),

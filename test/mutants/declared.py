@@ -1204,8 +1204,8 @@ LIVE = _of(
     (
         'what is denied live does not widen',
         'LiveCalibration.solve',
-        'self.extension.applied(_1)',
-        '_1',
+        'self.extension.applied(_1.solution)',
+        '_1.solution',
         'test_live_diagnosis.py::test_what_cannot_join_is_said_and_widens',
     ),
     (

@@ -26,7 +26,7 @@ from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.calibration.from_solution import ModelExtension
 from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
 from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
-from imu_calibration.calibration.table_calibration import conclude, solve_recordings
+from imu_calibration.calibration.table_calibration import TableRecordings, conclude
 from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
@@ -229,13 +229,12 @@ def diagnose_recording(
 
     """
     reader = StoredRecording()
-    calibrated = calibrate_by_evidence(
+    result = calibrate_by_evidence(
         [source], table, replace(options, as_asked=False), provenance=provenance, mapper=reader
     )
-    if calibrated.found is None:
-        raise too_few_windows(len(calibrated.result.gathered.spreads[0].windows))
-    result = calibrated.result
-    diagnosis = build_diagnosis(table, calibrated.found, calibrated=result.solution)
+    if result.found is None:
+        raise too_few_windows(len(result.gathered.spreads[0].windows))
+    diagnosis = build_diagnosis(table, result.found, calibrated=result.solution)
     calibrate_with = partial(
         _with_proposals, source, table, options, result, diagnosis, provenance, reader
     )
@@ -353,16 +352,14 @@ def _with_proposals(
         catalogue=catalogue,
         as_asked=True,
     )
-    solution, gathered, gathered_model = solve_recordings([source], table, chosen, mapper=reader)
+    solved = TableRecordings.of([source], table, mapper=reader).solved(chosen)
     # A formula determines changes of the output, not its zero: biases of the affected axes keep the
     # uncertainty.
     unsure = ModelExtension(
         moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained))
     )
     return conclude(
-        unsure.applied(solution),
-        gathered,
-        gathered_model,
+        replace(solved, solution=unsure.applied(solved.solution)),
         table=table,
         options=chosen,
         provenance=provenance,
