@@ -14,15 +14,20 @@ import numpy as np
 
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.core.documents import load_arrays
-from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
+from imu_calibration.core.errors import (
+    DocumentError,
+    ImuCalibrationError,
+    InputError,
+    shortened,
+)
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
-from imu_calibration.effects.base import SECTIONS
+from imu_calibration.effects.base import SECTIONS, SENSORS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import Preflight
+from imu_calibration.preprocessing.checks import Preflight, unusable_sensor
 from imu_calibration.preprocessing.stream_cleaning import NO_RANGES, Watcher
 from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
@@ -389,6 +394,23 @@ class Collector:
             self.gathered.spreads[0].add(owned_window(window))
 
 
+def _require_both_sensors(preflight):
+    """Raise an InputError where only one sensor has readings: the other one is the reason."""
+    imu = preflight.streams.get('imu')
+    absent = () if imu is None else imu.absent
+    constant = [finding for finding in preflight.findings if finding.check == 'frozen']
+    dead = unusable_sensor(constant, absent)
+    for sensor in (*absent, *dead):
+        (other,) = (name for name in SENSORS if name != sensor)
+        why = dead.get(sensor, f'the recording has no readings of the {sensor}')
+        raise InputError(
+            f'a calibration on a table needs both sensors: {why}; calibrate the {other} by hand,'
+            ' without the description of a table',
+            key='table',
+            code='one_sensor',
+        )
+
+
 @dataclass(frozen=True)
 class GatherStep:
     """
@@ -441,7 +463,10 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        gathered = self._gather(source(), session, (preflight,), windows=windows)
+        try:
+            gathered = self._gather(source(), session, (preflight,), windows=windows)
+        finally:
+            _require_both_sensors(preflight)
         if len(preflight.without_readings):
             if windows is not None:
                 windows.clear()

@@ -40,7 +40,7 @@ class SensorPresence:
             return self._without_absent(samples)
         if self._held is not None:
             samples = ImuSamples.concatenate([self._held, samples])
-        missing = _missing(samples.select(slice(MIN_ABSENT_SAMPLES)))
+        missing = missing_sensors(samples.select(slice(MIN_ABSENT_SAMPLES)))
         if missing and len(samples) < MIN_ABSENT_SAMPLES:
             self._held = samples
             return samples.select(slice(0))
@@ -50,7 +50,7 @@ class SensorPresence:
         """Return the samples that were held, or None."""
         if self._held is None:
             return None
-        return self._decide(_missing(self._held), self._held)
+        return self._decide(missing_sensors(self._held), self._held)
 
     def _decide(self, missing, samples):
         self._decided, self._held = True, None
@@ -77,7 +77,7 @@ def without_sensor(samples: ImuSamples, sensor: str) -> ImuSamples:
     return replace(samples, rate_s=constant, absent=(sensor,))
 
 
-def _missing(samples):
+def missing_sensors(samples: ImuSamples) -> tuple[str, ...]:
     """Return the sensors without a finite reading."""
     missing = []
     if not np.isfinite(samples.force_s).all(axis=1).any():

@@ -10,7 +10,8 @@ import numpy as np
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from imu_calibration.preprocessing.absent_sensor import SensorPresence
+from imu_calibration.effects.base import SENSORS
+from imu_calibration.preprocessing.absent_sensor import SensorPresence, missing_sensors
 from imu_calibration.preprocessing.counter_overflow import OverflowSearch
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
@@ -57,6 +58,7 @@ class StreamCheck:
         self.counts = Counter()
         self.presence = SensorPresence() if one_sensor else None
         """Which sensors an IMU stream has."""
+        self._unread = set(SENSORS)
         self.sources = TwoSourceSearch()
         """Whether an IMU stream holds the readings of two sensors."""
         self.epoch = 0
@@ -139,10 +141,18 @@ class StreamCheck:
             *self._extent_ns,
             None if self._times is None else self._times.odd_line(self._n_accepted),
             two_sources=self.sources.requirement if self.sources.found else '',
-            absent=() if self.presence is None else self.presence.absent,
+            absent=self._absent(),
             n_late=0 if self.presence is None else self.presence.n_late,
             overflows=self._overflows.count,
         )
+
+    def _absent(self):
+        """Return the sensor without any reading; an accepted sample has readings of both."""
+        if self.presence is not None:
+            return self.presence.absent
+        if self._n_accepted or len(self._unread) == len(SENSORS):
+            return ()
+        return tuple(self._unread)
 
     def _without_spikes(self, accepted, ended=False):
         """Pass the samples of an IMU through the filter; each epoch of the clock is one stream."""
@@ -170,6 +180,8 @@ class StreamCheck:
         if all(np.isfinite(column).all() for column in columns):
             return samples
         finite = np.logical_and.reduce([np.isfinite(column).all(axis=1) for column in columns])
+        if isinstance(samples, ImuSamples):
+            self._unread.intersection_update(missing_sensors(samples))
         self._count('not finite', len(finite) - np.count_nonzero(finite))
         return samples.select(finite)
 
