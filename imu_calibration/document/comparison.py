@@ -5,6 +5,7 @@ The IMU is judged apart from table and clock, in one convention of axes and orig
 """
 
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.special import chdtrc
@@ -129,8 +130,8 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
     With the accelerometer matrix ``M = L Q``, L lower triangular with positive diagonal, Q a
     rotation, and with the true quantities ``Q f``, ``Q w``: matrices M to ``M Q'``, lever arms r to
     ``Q (r - mean of r)``, other effects by the order of their tensor (`Effect.input_order`). The
-    covariance follows by differences. `compare` omits the effects that a rotation mixes with
-    others (`_kept_axes`) where the axes of both files differ too much.
+    covariance follows by differences. Effects that a rotation mixes with others keep their axes:
+    `compare` turns and omits them by the rotation between both files (`_errors_of_turn`).
     """
     model = calibration.model
     values = _turned(model, calibration.values)
@@ -166,7 +167,7 @@ def _turned(model, values):
         if effect.role is Role.ARMS:
             arms = values[part].reshape(3, 3)
             turned[part] = ((arms - arms.mean(axis=0)) @ rotation.T).ravel()
-        else:
+        elif not effect.input_places:
             turned[part] = effect.in_other_axes(values[part], rotation)
     return turned
 
@@ -178,37 +179,69 @@ def _compared_turned(first, second, common, notes):
         matrix = calibration.model.value('accelerometer', Role.LINEAR, calibration.values)
         _, rotation = lower_times_rotation(matrix)
         rotations.append(rotation)
-    # The angle of a rotation R: cos(angle) = (trace(R) - 1) / 2.
-    cosine = 0.5 * (np.trace(rotations[0] @ rotations[1].T) - 1.0)
-    angle = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    # From the axes of the second to those of the first; cos(angle) = (trace(turn) - 1) / 2.
+    turn = rotations[0].T @ rotations[1]
+    angle = float(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0)))
+    errors = _errors_of_turn(first, turn.T, angle)
+    for name, error in _errors_of_turn(second, turn, angle).items():
+        errors[name] = max(error, errors.get(name, 0.0))
     return _compared(
-        in_accelerometer_axes(first), in_accelerometer_axes(second), common, notes, angle=angle
+        in_accelerometer_axes(first),
+        _with_parts_turned(in_accelerometer_axes(second), turn),
+        common,
+        notes,
+        angle=angle,
+        errors=errors,
     )
 
 
-def _kept_axes(calibration):
-    """
-    Return {name: largest value of its effect} of parameters in the axes of their own file.
+def _with_parts_turned(calibration, turn):
+    """Return the calibration with its incomplete tensors (`Effect.input_places`) in other axes."""
+    slope = np.eye(len(calibration.values))
+    for effect in calibration.model.effects:
+        if effect.input_places:
+            part = calibration.model.slices[effect.key]
+            columns = [effect.in_other_axes(unit, turn) for unit in np.eye(effect.size)]
+            slope[part, part] = np.transpose(columns)
+    return replace(
+        calibration,
+        values=slope @ calibration.values,
+        covariance=slope @ calibration.covariance @ slope.T,
+    )
 
-    A rotation of the true motion mixes their columns with columns of other effects.
+
+def _errors_of_turn(calibration, turn, angle):
+    """
+    Return {name: error of a parameter in other axes} of effects that a rotation mixes with others.
+
+    An incomplete tensor, as products of two components without squares, has the components c that
+    it does not contain in the other axes, ``c = O(angle)``. The other calibration, which does not
+    have them either, is in error by ``angle c``. All other effects remain in the axes of their
+    file: a coefficient changes by up to the angle times the largest.
     """
     found = {}
     for effect in calibration.model.effects:
-        used = set().union(*(group.uses for group in effect.groups)) & MOTION_COLUMNS
-        is_mixed = effect.role is Role.TERM and effect.input_order is None and bool(used)
-        if is_mixed and effect.sensor in SENSORS:
-            largest = float(
-                np.max(np.abs(calibration.values[calibration.model.slices[effect.key]]))
-            )
-            found |= dict.fromkeys(effect.param_names(), largest)
+        if effect.role is not Role.TERM or effect.sensor not in SENSORS:
+            continue
+        values = calibration.values[calibration.model.slices[effect.key]]
+        uses_motion = bool(set().union(*(group.uses for group in effect.groups)) & MOTION_COLUMNS)
+        if effect.input_places:
+            size = effect.lost_in_other_axes(values, turn)
+        elif effect.input_order is None and uses_motion:
+            size = float(np.max(np.abs(values)))
+        else:
+            continue
+        found |= dict.fromkeys(effect.param_names(), angle * size)
     return found
 
 
-def _compared(first, second, common, notes, *, angle=0.0):
+def _compared(first, second, common, notes, *, angle=0.0, errors=MappingProxyType({})):
     """
     Compare the common parameters of two calibrations.
 
-    `angle`: rotation, rad, between the axes in which the parameters of `_kept_axes` are.
+    `angle` is the rotation, rad, between the axes of both files, and `errors` has its effect on
+    parameters that cannot be turned (`_errors_of_turn`); those in error by a standard deviation
+    are not compared.
     """
     a, b = ([c.param_names.index(name) for name in common] for c in (first, second))
     difference = second.values[b] - first.values[a]
@@ -221,10 +254,7 @@ def _compared(first, second, common, notes, *, angle=0.0):
     )
     sd = np.sqrt(np.diag(covariance))
 
-    # A rotation by the angle changes a coefficient by at most about the angle times the largest.
-    sizes = [_kept_axes(each) for each in (first, second)]
-    turned = np.array([angle * max(each.get(name, 0.0) for each in sizes) for name in common])
-    in_other_axes = turned > sd
+    in_other_axes = np.array([errors.get(name, 0.0) for name in common]) > sd
     held |= in_other_axes
     units = {
         name: effect.unit_of(k)
@@ -287,7 +317,10 @@ def _compared(first, second, common, notes, *, angle=0.0):
         reference_agree = not rejected_reference
         word = 'agree' if reference_agree else 'differ'
         lines.append(f'table and clock {word}, which is no property of the IMU')
-    lines.append('the calibrations disagree' if rejected else 'the calibrations agree')
+    verdict = 'the calibrations disagree' if rejected else 'the calibrations agree'
+    if in_other_axes.any():
+        verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'
+    lines.append(verdict)
     return Comparison(rows, not rejected, tuple(lines), reference_agree)
 
 

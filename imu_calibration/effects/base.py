@@ -227,6 +227,11 @@ class Effect:
     to the output, as along its own axis; 1 a vector; 2 a symmetric tensor (xx, yy, zz, xy, yz, xz).
     None where a rotation of the axes of the true input mixes them with other effects.
     """
+    input_places: tuple[int, ...] = ()
+    """
+    Places of the values among the components of the tensors of all outputs, where the effect has
+    only some of them; empty: all. The other components are zero in the axes of the effect.
+    """
     nuisance: bool = False
     """Whether it is a nuisance parameter, estimated but not requested."""
     definition: dict | None = None
@@ -332,8 +337,28 @@ class Effect:
         """
         Return the values for a true input ``rotation v`` in place of v, shape (size,).
 
-        For a row u and a tensor T of one output: ``u rotation'`` and ``rotation T rotation'``.
+        For a row u and a tensor T of one output: ``u rotation'`` and ``rotation T rotation'``. Of
+        an effect with `input_places` only these components are kept.
         """
+        if self.input_places:
+            return self._all_components(values, rotation)[list(self.input_places)]
+        return self._turned(values, rotation)
+
+    def lost_in_other_axes(self, values: np.ndarray, rotation: np.ndarray) -> float:
+        """Return the largest component that `in_other_axes` does not keep."""
+        components = np.abs(self._all_components(values, rotation))
+        components[list(self.input_places)] = 0.0
+        return float(components.max())
+
+    def _all_components(self, values, rotation):
+        """Return all components of the tensors of `input_places` in other axes."""
+        width = 3 if self.input_order == 1 else len(PRODUCT_PAIRS)
+        components = np.zeros(len(AXES) * width)
+        components[list(self.input_places)] = values
+        return self._turned(components, rotation)
+
+    def _turned(self, values, rotation):
+        """Return complete tensors in other axes."""
         if self.input_order == 1:
             return (values.reshape(-1, 3) @ rotation.T).ravel()
         if self.input_order == 2:
@@ -360,6 +385,20 @@ class Effect:
 
 
 PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+MIXED_PRODUCTS = tuple(
+    len(PRODUCT_PAIRS) * row + place
+    for row in range(len(AXES))
+    for place, (j, k) in enumerate(PRODUCT_PAIRS)
+    if j != k
+)
+"""Places of `PRODUCTS` among the six products of each output."""
+OTHER_AXES = tuple(
+    len(AXES) * row + column
+    for row in range(len(AXES))
+    for column in range(len(AXES))
+    if row != column
+)
+"""Places of `OTHERS` among the three inputs of each output."""
 TRIPLES = (
     (0, 0, 0),
     (1, 1, 1),

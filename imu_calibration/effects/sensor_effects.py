@@ -265,6 +265,8 @@ def _pair(sensor):
             needs=('rotation',),
             moot=_one_axis,
             groups=(own['CHANGE'],),
+            input_order=1,
+            input_places=base.OTHER_AXES,
             coefficients=cross_axis_coefficients,
         ),
         Effect(
@@ -374,6 +376,8 @@ ACCELEROMETER = _pair('accelerometer') + (
         plausible=('consumer', 1e-3 / STANDARD_GRAVITY, 'Avrutov 2017, sample 2: 1 mV/g^2'),
         motion=('static_dense',),
         groups=(base.SQUARES['accelerometer'],),
+        input_order=2,
+        input_places=base.MIXED_PRODUCTS,
         coefficients=product_coefficients,
     ),
     Effect(
@@ -493,6 +497,8 @@ GYROSCOPE = _pair('gyroscope') + (
         motion=('two_axis',),
         needs=('rotation',),
         groups=(base.SQUARES['gyroscope'],),
+        input_order=2,
+        input_places=base.MIXED_PRODUCTS,
         coefficients=product_coefficients,
     ),
 )
