@@ -70,60 +70,77 @@ def error_budget(result: 'TableResult') -> ErrorBudget:
 
     """
     table = result.table
-    gravity_sd = (
-        GRAVITY_SD
-        if table.gravity is not None and table.gravity_sd is None
-        else table.gravity_sd_value
-    )
-    causes, texts = (
-        {'noise': result.solution.sd},
-        {'noise': 'noise and wander of the sensors, as this recording shows them'},
-    )
-    declared = _causes(result, gravity_sd)
-    shifts = parameter_shifts(
-        result, [change for _, _, _, changes in declared for change in changes]
-    )
+    gravity_sd = table.gravity_sd_value
+    if table.gravity is not None and table.gravity_sd is None:
+        gravity_sd = GRAVITY_SD
+    errors = _errors_of_reference(result, gravity_sd)
+    changes: list[Callable] = []
+    for error in errors:
+        changes += error.changes
+    shifts = parameter_shifts(result, changes)
+
+    causes = {'noise': result.solution.sd}
+    texts = {'noise': 'noise and wander of the sensors, as this recording shows them'}
     start = 0
-    for name, text, scattered, changes in declared:
-        moved = shifts[start : start + len(changes)]
-        total = moved**2 if scattered else moved.sum(axis=1, keepdims=True) ** 2
-        causes[name], texts[name] = np.sqrt(total.sum(axis=(0, 1))), text
-        start += len(changes)
+    for error in errors:
+        moved = shifts[start : start + len(error.changes)]
+        start += len(error.changes)
+        # Independent shifts of the windows add as squares, a common one as it is.
+        if not error.scattered:
+            moved = moved.sum(axis=1, keepdims=True)
+        causes[error.name] = np.sqrt((moved**2).sum(axis=(0, 1)))
+        texts[error.name] = error.text
     return ErrorBudget(tuple(result.solution.param_names), causes, texts)
 
 
-def _causes(
-    result: 'TableResult', gravity_sd: float
-) -> list[tuple[str, str, bool, Sequence[Callable]]]:
-    """
-    Return (name, text, scattered, changes).
+@dataclass(frozen=True)
+class _ReferenceError:
+    """One cause of error of the reference."""
 
-    A change maps (table, motion) to values that differ by one sd.
-    """
-    found: list[tuple[str, str, bool, Sequence[Callable]]] = []
+    name: str
+    """Cause."""
+    text: str
+    """Its size for people."""
+    changes: tuple[Callable, ...]
+    """Each maps (table, motion) to values that differ by one standard deviation."""
+    scattered: bool = False
+    """Whether it is independent in every window, or common to all."""
+
+
+def _errors_of_reference(result: 'TableResult', gravity_sd: float) -> list[_ReferenceError]:
+    """Return the errors of the reference that the solution does not estimate."""
+    found = []
     if result.solution.model.find('reference', Role.TILT) is None:
-        text = f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated'
+        tilts = LEVELLING_SD * np.eye(2)
         found.append(
-            (
+            _ReferenceError(
                 'levelling',
-                text,
-                False,
-                [partial(_tilted, angles) for angles in LEVELLING_SD * np.eye(2)],
+                f'levelling {LEVELLING_SD / ARCMIN:.2g} arcmin in each direction, not estimated',
+                tuple(partial(_tilted, angles) for angles in tilts),
             )
         )
-    text = (
-        f'joint positions {JOINT_POSITION_SD / ARCMIN * 60:.2g} arcsec, independent in every window'
-    )
+    arcsec = JOINT_POSITION_SD / ARCMIN * 60
     turns = JOINT_POSITION_SD * np.eye(len(result.table.joints))
-    found.append(('joint position', text, True, [partial(_turned, angles) for angles in turns]))
-    text = f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows'
-    found.append(('table rate', text, False, [partial(_faster, 1 + TABLE_RATE_SD)]))
     found.append(
-        (
+        _ReferenceError(
+            'joint position',
+            f'joint positions {arcsec:.2g} arcsec, independent in every window',
+            tuple(partial(_turned, angles) for angles in turns),
+            scattered=True,
+        )
+    )
+    found.append(
+        _ReferenceError(
+            'table rate',
+            f'rate wrong by {TABLE_RATE_SD:.2g} of itself in all windows',
+            (partial(_faster, 1 + TABLE_RATE_SD),),
+        )
+    )
+    found.append(
+        _ReferenceError(
             'gravity',
             f'gravity known to {gravity_sd:.2g} m/s²',
-            False,
-            [partial(_heavier, gravity_sd)],
+            (partial(_heavier, gravity_sd),),
         )
     )
     return found
@@ -156,34 +173,37 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
     Summed over windows: the shift of the estimate when all windows err together. A shift is
     estimate minus truth.
     """
-    solution, sources = result.solution, list(_sources(result))
+    solution = result.solution
+    sources = list(_sources(result))
     outputs = [_outputs(result, source, changes) for source in sources]
+    kinds = [source.kind for source in sources]
+    counts = np.array([source.samples for source in sources])
+    times = np.array([source.time for source in sources])
+
+    # Normal equations of the solver: A' V^-1 A, and A' V^-1 dA c of each window and change.
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(sources), len(solution.values)))
-    counts, times = (
-        np.array([getattr(source, name) for source in sources]) for name in ('samples', 'time')
-    )
     for sensor in SENSORS:
-        slope, noise = (
-            coefficient_jacobian(solution.model, sensor, solution.values),
-            solution.noise[sensor],
-        )
-        designs = [np.einsum('nq,qap->nap', own[sensor][0], slope) for own in outputs]
+        slope = coefficient_jacobian(solution.model, sensor, solution.values)
+        noise = solution.noise[sensor]
+        designs = [np.einsum('nq,qap->nap', own[sensor].columns, slope) for own in outputs]
+
+        # The means of all windows, correlated through the bias.
         means = np.array([design.mean(axis=0) for design in designs])
-        variance = (
-            noise.mean_variance([source.kind for source in sources], counts) + noise.offset_sd**2
-        )
+        variance = noise.mean_variance(kinds, counts) + noise.offset_sd**2
         whitening = Whitening(variance, times, sessions_of(sources), processes=noise.bias_processes)
         weighted = whitening.adjoint(whitening(means))
         normal = normal + np.tensordot(weighted, means, ([0, 1], [0, 1]))
+
+        # The samples about the mean of their window.
         for k, (source, design, own) in enumerate(zip(sources, designs, outputs)):
-            centred, moved = design - means[k], own[sensor][1]
+            moved = own[sensor].changes
+            centred = design - means[k]
             within = centred / (noise.row_variance(source.kind) / source.stride)[:, None]
             normal += np.tensordot(within, centred, ([0, 1], [0, 1]))
-            right[:, k] += moved.mean(axis=1) @ weighted[k] + np.tensordot(
-                moved, within, ([1, 2], [0, 1])
-            )
+            right[:, k] += moved.mean(axis=1) @ weighted[k]
+            right[:, k] += np.tensordot(moved, within, ([1, 2], [0, 1]))
     index = np.flatnonzero(~fixed_parameters(solution.model) & ~solution.held)
     shifts = np.zeros_like(right)
     shifts[:, :, index] = right[:, :, index] @ inverse_normal(normal[np.ix_(index, index)])
@@ -228,35 +248,35 @@ def _sources(result: 'TableResult') -> Iterator[_Source]:
         )
 
 
+class _Outputs(NamedTuple):
+    """Samples of one sensor in one window."""
+
+    columns: np.ndarray
+    """Columns of the model, shape (n, n_columns)."""
+    changes: np.ndarray
+    """Changes of the output by each error, shape (n_changes, n, 3)."""
+
+
 def _outputs(
     result: 'TableResult', source: _Source, changes: Sequence[Callable]
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """
-    Return sensor -> (columns, changes of the output) at the samples of a window.
-
-    The changes have shape (n_changes, n, 3).
-    """
-    model, temperature, known = (
-        result.solution.model,
-        source.temperature_c,
-        (result.table, source.motion),
-    )
+) -> dict[str, _Outputs]:
+    """Return sensor -> its columns and changes of the output at the samples of a window."""
+    model = result.solution.model
+    temperature = source.temperature_c
     if model.needs_temperature and temperature is None:  # the mean at rest is not kept
         temperature = np.full(len(source.motion), model.temperature_ref_c)
-    references = [
-        References(model, *pair, temperature_c=temperature)
-        for pair in (known, *(change(*known) for change in changes))
-    ]
+    references = [References(model, result.table, source.motion, temperature_c=temperature)]
+    for change in changes:
+        table, motion = change(result.table, source.motion)
+        references.append(References(model, table, motion, temperature_c=temperature))
     found = {}
     for sensor in SENSORS:
-        output, *moved = (
+        outputs = [
             sensor_output(model, sensor, result.solution.values, ref=each.at(sensor))
             for each in references
-        )
-        found[sensor] = (
-            columns(references[0], sensor),
-            np.array(moved).reshape(-1, *output.shape) - output,
-        )
+        ]
+        moved = np.array(outputs[1:]).reshape(-1, *outputs[0].shape) - outputs[0]
+        found[sensor] = _Outputs(columns(references[0], sensor), moved)
     return found
 
 
