@@ -138,7 +138,7 @@ def steps_from(up: np.ndarray | None) -> tuple[tuple[HandStep, ...], np.ndarray]
 
 
 @lru_cache(maxsize=256)  # plans revisit the same directions
-def _steps_from(up):
+def _steps_from(up: tuple[float, ...] | None) -> tuple[tuple[HandStep, ...], np.ndarray]:
     start = None if up is None else np.array(up)
     steps = tuple(
         HandStep(to) if start is None else HandStep(to, *shortest_turn(start, to))
@@ -149,7 +149,7 @@ def _steps_from(up):
     return steps, rows
 
 
-def _rotation_slopes(about, angle=np.pi):
+def _rotation_slopes(about: np.ndarray, angle: float = np.pi) -> np.ndarray:
     """
     Return the derivative of the rotation error by the gyroscope's matrix.
 
@@ -312,7 +312,7 @@ def foretold(knowledge: HandKnowledge) -> list[HandStep]:
     return min(plans, key=lambda plan: (plan[1], sum(step.seconds for step in plan[0])))[0]
 
 
-def _rollout(knowledge, weight):
+def _rollout(knowledge: HandKnowledge, weight: float) -> tuple[list[HandStep], float]:
     """Return (the steps by greedy choice, the remaining excess)."""
     steps: list[HandStep] = []
     while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_STEPS:
@@ -365,12 +365,11 @@ def missing_motion(hand: HandCalibration) -> tuple[dict, ...]:
     }
     plan = foretold(knowledge)[:1] if parts else []
 
-    def gain(part, step):
-        after = knowledge.then(step).information
-        return (
-            float(knowledge.missing(knowledge.information, part) - knowledge.missing(after, part))
-            / step.seconds
-        )
+    def gain(part: list[int], step: HandStep) -> float:
+        """Return the excess of some parameters that a step removes in a second."""
+        before = knowledge.missing(knowledge.information, part)
+        after = knowledge.missing(knowledge.then(step).information, part)
+        return float(before - after) / step.seconds
 
     found = []
     for sensor, part in parts.items():

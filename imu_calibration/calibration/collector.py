@@ -394,7 +394,7 @@ class Collector:
             self.gathered.spreads[0].add(owned_window(window))
 
 
-def _require_both_sensors(preflight):
+def _require_both_sensors(preflight: Preflight) -> None:
     """Raise an InputError where only one sensor has readings: the other one is the reason."""
     imu = preflight.streams.get('imu')
     absent = () if imu is None else imu.absent

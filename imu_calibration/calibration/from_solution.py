@@ -292,20 +292,24 @@ def gauge_of(model: SensorModel) -> dict[str, Any]:
     return gauge
 
 
-def _need(weights, needed):
-    texts = [
-        needed[name][0]
-        for name in sorted(weights, key=lambda n: -abs(weights[n]))
-        if name in needed
-    ]
-    return texts[0] if texts else 'more of the same motion'
+def _need(weights: Mapping[str, float], needed: Mapping[str, tuple[str, float]]) -> str:
+    """Return the motion for the parameter of a direction with the largest weight."""
+    for name in sorted(weights, key=lambda name: -abs(weights[name])):
+        if name in needed:
+            return needed[name][0]
+    return 'more of the same motion'
 
 
-def _besides(directions, needed, in_tolerances):
+def _besides(
+    directions: Sequence[Mapping[str, float]],
+    needed: Mapping[str, tuple[str, float]],
+    in_tolerances: Mapping[str, float],
+) -> list[tuple[dict[str, float], str]]:
     """
     Return (sds in tolerances, motion) of the parameters that none of the worst directions names.
     """
-    named, others = set().union(*directions), {}
+    named: set[str] = set().union(*directions)
+    others: dict[str, dict[str, float]] = {}
     for name, (text, _) in needed.items():
         if name not in named:
             others.setdefault(text, {})[name] = round(float(in_tolerances[name]), 3)

@@ -112,7 +112,7 @@ def latitude_findings(
     return ()
 
 
-def _of_free_rate(solution, table, part):
+def _of_free_rate(solution: Solution, table: Table, part: slice) -> tuple[CheckFinding, ...]:
     """Compare the vertical component and the length of the estimated Earth's rate."""
     if solution.held[part].any():
         return ()
@@ -133,14 +133,14 @@ def _of_free_rate(solution, table, part):
     return ()
 
 
-def _length(rate, covariance):
+def _length(rate: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
     """Return the length of an estimated rate, and its standard deviation along the estimate."""
     length = float(np.linalg.norm(rate))
     direction = rate / length if length > 0 else np.array([1.0, 0.0, 0.0])
     return length, float(np.sqrt(direction @ covariance @ direction))
 
 
-def _of_windows(windows, table, sds):
+def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFinding, ...]:
     """Compare the rate about the vertical that the reference leaves with that of the latitude."""
     # Biases and their drift, c + d t for each recording.
     drifts = np.zeros((len(windows.time), 0))
@@ -181,7 +181,7 @@ def _of_windows(windows, table, sds):
     return (_finding('vertical component', measured_up, vertical_sd, expected=expected_up),)
 
 
-def _weights_of_kinds(windows, design):
+def _weights_of_kinds(windows: WindowRates, design: np.ndarray) -> np.ndarray:
     """Return the inverse rms of what rests, spins and other motions leave, for each window."""
     solved = np.linalg.lstsq(design, windows.measured, rcond=1e-6)[0]
     squares = ((windows.measured - design @ solved) ** 2).mean(axis=1)
@@ -192,26 +192,27 @@ def _weights_of_kinds(windows, design):
     return weight
 
 
-def _contradicts_length(rate, sd):
+def _contradicts_length(rate: float, sd: float) -> bool:
     """Return whether one component is larger than the rate of the Earth."""
     return abs(rate) > EARTH_RATE and _contradicts(abs(rate) - EARTH_RATE, sd)
 
 
-def _vertical_rate(table):
+def _vertical_rate(table: Table) -> float:
     """Return the vertical component of the Earth's rate at the latitude, rad/s."""
+    assert table.latitude is not None, 'the latitude was given'
     return float(earth_rate_n(table.latitude, 0.0)[2])
 
 
-def _contradicts(difference, sd, sds=CONTRADICTING_SDS):
+def _contradicts(difference: float, sd: float, sds: float = CONTRADICTING_SDS) -> bool:
     return abs(difference) > max(sds * sd, LEAST_SHARE * EARTH_RATE)
 
 
-def _agrees(difference, sd, size):
+def _agrees(difference: float, sd: float, size: float) -> bool:
     tolerated = max(AGREEING_SDS * sd, AGREEING_SHARE * abs(size))
     return abs(difference) < min(tolerated, FARTHEST_SHARE * abs(size))
 
 
-def _wrong_sign(table, measured, expected):
+def _wrong_sign(table: Table, measured: float, expected: float) -> InputError:
     return InputError(
         f"the latitude must give the vertical component of the Earth's rate, {table.latitude:g} deg"
         f' gives {_hourly(expected)} deg/h and the gyroscopes measured {_hourly(measured)} deg/h:'
@@ -222,7 +223,7 @@ def _wrong_sign(table, measured, expected):
     )
 
 
-def _finding(name, measured, sd, *, expected):
+def _finding(name: str, measured: float, sd: float, *, expected: float) -> CheckFinding:
     return CheckFinding(
         CHECK,
         WARNING,
@@ -233,7 +234,7 @@ def _finding(name, measured, sd, *, expected):
     )
 
 
-def _excess(measured, sd):
+def _excess(measured: float, sd: float) -> CheckFinding:
     return CheckFinding(
         CHECK,
         WARNING,
@@ -244,5 +245,5 @@ def _excess(measured, sd):
     )
 
 
-def _hourly(rate):
+def _hourly(rate: float) -> str:
     return significant(rate / DEG_H, 3)

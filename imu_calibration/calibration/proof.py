@@ -297,9 +297,8 @@ class _Correction:
 
     def __init__(self, model: SensorModel, sensor: str, values: np.ndarray):
         total = coefficients(model, sensor, values)
-        matrix = model.value(sensor, Role.LINEAR, values)
-        assert matrix is not None, 'each sensor has a matrix'
-        self.matrix, self.inverse = matrix, np.linalg.inv(matrix)
+        self.matrix = model.matrix(sensor, values)
+        self.inverse = np.linalg.inv(self.matrix)
         self.total, self.arms = total, []
         arm = model.part(sensor, Role.ARM)
         for index in range(arm.start, arm.stop):

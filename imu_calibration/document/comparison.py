@@ -4,6 +4,7 @@ Whether two calibrations of the same IMU agree.
 The IMU is judged apart from table and clock, in one convention of axes and origin.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -15,6 +16,7 @@ from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.document.calibration import HAND_AXES, Calibration, listed
 from imu_calibration.document.exports.affine import lower_times_rotation
 from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import FIXED, HELD
 
 COMPARISON_P_VALUE = 0.01
@@ -23,6 +25,10 @@ MOTION_COLUMNS = {'force', 'rate', 'angular acceleration', 'joint rate', 'vibrat
 """Quantities with components along the axes of the sensor (`ColumnGroup.uses`)."""
 TABLE_AXES = 'mount'
 """Axes of a calibration on a table: those of the mount."""
+
+
+Group = tuple[str, float, int, float]
+"""SENSOR.EFFECT, chi-square, degrees of freedom, probability by chance."""
 
 
 @dataclass(frozen=True)
@@ -157,10 +163,10 @@ def in_accelerometer_axes(calibration: Calibration) -> Calibration:
     )
 
 
-def _turned(model, values):
+def _turned(model: SensorModel, values: np.ndarray) -> np.ndarray:
     """Return the values in the axes of the accelerometer."""
     turned = values.copy()
-    matrix = model.value('accelerometer', Role.LINEAR, values)
+    matrix = model.matrix('accelerometer', values)
     _, rotation = lower_times_rotation(matrix)
     for effect in model.effects:
         part = model.slices[effect.key]
@@ -172,11 +178,13 @@ def _turned(model, values):
     return turned
 
 
-def _compared_turned(first, second, common, notes):
+def _compared_turned(
+    first: Calibration, second: Calibration, common: Sequence[str], notes: list[str]
+) -> Comparison:
     """Compare the common parameters of two calibrations in the axes of the accelerometer."""
     rotations = []
     for calibration in (first, second):
-        matrix = calibration.model.value('accelerometer', Role.LINEAR, calibration.values)
+        matrix = calibration.model.matrix('accelerometer', calibration.values)
         _, rotation = lower_times_rotation(matrix)
         rotations.append(rotation)
     # From the axes of the second to those of the first; cos(angle) = (trace(turn) - 1) / 2.
@@ -195,7 +203,7 @@ def _compared_turned(first, second, common, notes):
     )
 
 
-def _with_parts_turned(calibration, turn):
+def _with_parts_turned(calibration: Calibration, turn: np.ndarray) -> Calibration:
     """Return the calibration with its incomplete tensors (`Effect.input_places`) in other axes."""
     slope = np.eye(len(calibration.values))
     for effect in calibration.model.effects:
@@ -210,7 +218,7 @@ def _with_parts_turned(calibration, turn):
     )
 
 
-def _errors_of_turn(calibration, turn, angle):
+def _errors_of_turn(calibration: Calibration, turn: np.ndarray, angle: float) -> dict[str, float]:
     """
     Return {name: error of a parameter in other axes} of effects that a rotation mixes with others.
 
@@ -235,7 +243,15 @@ def _errors_of_turn(calibration, turn, angle):
     return found
 
 
-def _compared(first, second, common, notes, *, angle=0.0, errors=MappingProxyType({})):
+def _compared(
+    first: Calibration,
+    second: Calibration,
+    common: Sequence[str],
+    notes: list[str],
+    *,
+    angle: float = 0.0,
+    errors: Mapping[str, float] = MappingProxyType({}),
+) -> Comparison:
     """
     Compare the common parameters of two calibrations.
 
@@ -324,11 +340,15 @@ def _compared(first, second, common, notes, *, angle=0.0, errors=MappingProxyTyp
     return Comparison(rows, not rejected, tuple(lines), reference_agree)
 
 
-def _ratio(difference, sd):
-    return float(abs(difference) / sd) if sd > 0 else (0.0 if difference == 0 else float('inf'))
+def _ratio(difference: float, sd: float) -> float:
+    """Return a difference in standard deviations; without one, zero or infinite."""
+    if sd > 0:
+        return float(abs(difference) / sd)
+    return 0.0 if difference == 0 else float('inf')
 
 
-def _notes(first, second):
+def _notes(first: Calibration, second: Calibration) -> list[str]:
+    """Return the conventions in which two calibrations differ, a line each."""
     notes = []
     if first.frame_id != second.frame_id:
         notes.append(f"note: the frames differ: '{first.frame_id}' and '{second.frame_id}'")
@@ -344,7 +364,9 @@ def _notes(first, second):
     return notes
 
 
-def _groups(names, difference, covariance, held):
+def _groups(
+    names: Sequence[str], difference: np.ndarray, covariance: np.ndarray, held: np.ndarray
+) -> list[Group]:
     """Return (group, chi-square, number, probability) for each SENSOR.EFFECT."""
     keys = [name.rpartition('.')[0] for name in names]
     found = []
@@ -363,7 +385,7 @@ def _groups(names, difference, covariance, held):
     return found
 
 
-def _holm(groups):
+def _holm(groups: Sequence[Group]) -> set[str]:
     """Return the groups that are rejected at COMPARISON_P_VALUE, all groups accounted for."""
     rejected = set()
     ordered = sorted(groups, key=lambda g: g[3])

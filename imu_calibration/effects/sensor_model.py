@@ -198,6 +198,10 @@ class SensorModel:
         """Return the effect of a sensor in a place of its equation, or None."""
         return next((e for e in self.effects if e.sensor == sensor and e.role is role), None)
 
+    def matrix(self, sensor: str, values: np.ndarray) -> np.ndarray:
+        """Return the matrix of a sensor, shape (3, 3); every model has one."""
+        return values[self.slices[self.effect_of(sensor, Role.LINEAR).key]].reshape(3, 3)
+
     def effect_of(self, sensor: str, role: Role) -> Effect:
         """Return the effect that a model is known to have in a place of a sensor's equation."""
         effect = self.find(sensor, role)

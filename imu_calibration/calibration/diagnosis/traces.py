@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import INPUT_OF, References
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import Solution
@@ -495,8 +495,7 @@ def _drifts(
         error = residuals(windows, table, model.model, values=model.values)
         reference, felt = _references(model, table, motion, temperature), {}
         for sensor in SENSORS:
-            matrix = model.model.value(sensor, Role.LINEAR, model.values)
-            assert matrix is not None, 'each sensor has a matrix'
+            matrix = model.model.matrix(sensor, model.values)
             felt[sensor] = (
                 getattr(reference[sensor], INPUT_OF[sensor])[rows]
                 + np.linalg.solve(matrix, error[sensor].T).T
