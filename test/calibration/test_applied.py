@@ -47,7 +47,6 @@ FORMULA = CATALOGUE.with_effects(
     )
 )
 SESSIONS = {
-    'bias and matrix': {},
     'findings': {'effects': ['accel_quadratic', 'gyro_g_sensitivity', 'gyro_bias_drift']},
     'thermal': {'effects': ['accel_thermal_bias', 'gyro_thermal_scale']},
     'formula': {'effects': ['warm_force'], 'catalogue': FORMULA},
@@ -146,7 +145,7 @@ def drifting(size=0.5 * DEG, time_constant=35.0):
 
     It is (samples, table, bias at the end, bias at the start, duration in s).
     """
-    session = imu.simulate('random_short', seed=7, imu_rate=50.0)
+    session = imu.simulate('random_short', seed=7, **RATES)
     time = 1e-9 * (session.samples.imu.stamp_ns - session.samples.imu.stamp_ns[0])
     course = (
         -size * np.expm1(-time / time_constant)
@@ -195,7 +194,10 @@ def test_a_drift_is_applied_as_its_value_at_the_end_and_proven_on_the_last_third
 
 @pytest.mark.parametrize(
     'name, size, time_constant',
-    [('gyro_bias_drift', 1.5 * DEG, 400.0), ('gyro_bias_trend', 0.4 * DEG, np.inf)],
+    [
+        pytest.param('gyro_bias_drift', 1.5 * DEG, 400.0, marks=pytest.mark.long),
+        ('gyro_bias_trend', 0.4 * DEG, np.inf),
+    ],
 )
 def test_a_drift_that_has_not_settled_is_applied_as_its_mean_and_proven_on_all_windows(
     name, size, time_constant

@@ -87,7 +87,7 @@ def test_diagnose_hands_over_what_calibrate_does(late, asked):
 
 
 def test_a_clean_session_adds_nothing():
-    pair = make_pair(None, 12)
+    pair = make_pair(None, 12, **COARSE)
     found = imu.calibrate(pair.first.block, Table.from_mapping(pair.table))
     assert not set(found.calibration.statistics) & {'added', 'denied'}
 
@@ -98,7 +98,7 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
 
     The halves disagree, the model stays, its parameters are less certain.
     """
-    windows, rng = calibrated(make_pair(None, 11).first).windows, np.random.default_rng(5)
+    windows, rng = calibrated(make_pair(None, 11, **COARSE).first).windows, np.random.default_rng(5)
     model = SensorModel(gyroscope=('bias', 'matrix', 'gyro_g_sensitivity'), joint_names=NAMES)
 
     def measured(share):
@@ -147,7 +147,7 @@ def test_windows_for_the_search_are_spread_and_bounded():
 
     Of a short one all.
     """
-    windows = calibrated(make_pair(None, 11).first).windows
+    windows = calibrated(make_pair(None, 11, **COARSE).first).windows
     every = DecimatedWindows()
     for window in windows:
         every.add(window)
@@ -306,6 +306,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     assert faint.sd[place] > 5 * asked.calibration.sd[was]
 
 
+@pytest.mark.long
 def test_an_effect_that_is_removed_as_faint_leaves_an_unexplained_residual(monkeypatch):
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
     session = make_session(5, {'accel_quadratic': 2e-4}, 'realistic', **COARSE)
@@ -324,7 +325,9 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     """
     # Another guard, which sees to it here too.
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *some: True)
-    session = make_session(141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141))
+    session = make_session(
+        141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141), **COARSE
+    )
     found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
     assert not {'added', 'denied'} & set(found.statistics)
     bias = [found.param_names.index(f'gyroscope.bias.{axis}') for axis in 'xyz']

@@ -53,6 +53,7 @@ def test_what_the_turns_demand_is_taken_in_and_said_in_one_line(bent, asked):
     )
 
 
+@pytest.mark.long
 def test_diagnose_hands_over_what_calibrate_does(bent, asked):
     found = imu.diagnose(SampleBlock(bent[0]), gravity=GRAVITY)
     assert found.calibration.param_names == asked.calibration.param_names
@@ -75,6 +76,7 @@ def test_live_it_is_in_the_model_as_well(bent, asked):
     assert np.abs(residual.rate_s).max() < 5e-3
 
 
+@pytest.mark.long
 def test_what_only_one_half_shows_is_left_out_and_widens():
     """
     What goes with the square of the rate grows threefold after the middle.
@@ -101,6 +103,7 @@ def test_what_only_one_half_shows_is_left_out_and_widens():
     assert grown.min() >= 1.0 and grown.max() > 1.2
 
 
+@pytest.mark.long
 def test_a_warm_up_is_not_sold_as_an_answer_to_gravity(seed=0):
     samples, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0, still=3.0)
     warm, _ = warmed_up(samples, seed, rate=0.01, time_constant=60.0)

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures('few_candidates')
 
 @pytest.fixture(scope='module')
 def pair():
-    return make_pair(None, 1)
+    return make_pair(None, 1, imu_rate=50.0, joint_rate=50.0)
 
 
 @pytest.fixture(scope='module')
@@ -43,7 +43,7 @@ def test_a_good_file_helps_in_another_session_of_its_imu(pair, calibrated):
 
 
 def test_a_file_of_another_imu_does_not_help(pair, calibrated):
-    other = make_pair(None, 4)
+    other = make_pair(None, 4, imu_rate=50.0, joint_rate=50.0)
     found = check_recording(
         other.second.block, calibrated.calibration, Table.from_mapping(other.table)
     )

@@ -9,7 +9,9 @@ from worlds.physics import make_session
 
 
 def test_noise_that_is_larger_in_motion_is_no_error_of_the_model():
-    session = make_session(8, None, 'white', cause=LouderInMotion(4e-3))
+    session = make_session(
+        8, None, 'white', cause=LouderInMotion(4e-3), imu_rate=50.0, joint_rate=50.0
+    )
     result = imu.calibrate(
         session.block,
         Table.from_mapping(session.table),

@@ -25,7 +25,9 @@ VERTICAL = {**SHAFT, 'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0,
 @pytest.fixture(scope='module')
 def vertical():
     """Return two sessions of a shaft with motor ripple and the calibration of the first."""
-    pair = make_pair('motor_ripple', 3, table=VERTICAL, profile='sweeps')
+    pair = make_pair(
+        'motor_ripple', 3, table=VERTICAL, profile='sweeps', imu_rate=50.0, joint_rate=50.0
+    )
     return pair, calibrate_recordings(pair.first.block, Table.from_mapping(pair.table)).calibration
 
 
@@ -74,7 +76,7 @@ def test_one_attitude_is_never_called_harmful():
 
 
 def test_a_horizontal_shaft_has_many_attitudes():
-    pair = make_pair(None, 3, table='shaft', profile='sweeps')
+    pair = make_pair(None, 3, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0)
     calibration = calibrate_recordings(pair.first.block, Table.from_mapping(pair.table)).calibration
     assert not calibration.proof['accelerometer'].one_attitude
     assert set(calibration.status[calibration.model.part('accelerometer', Role.LINEAR)]) != {HELD}

@@ -31,13 +31,13 @@ def calibrated(pair, **choices):
 
 @pytest.fixture(scope='module')
 def clean():
-    return calibrated(make_pair(None, 1))
+    return calibrated(make_pair(None, 1, imu_rate=50.0, joint_rate=50.0))
 
 
 @pytest.fixture(scope='module')
 def late():
     return calibrated(
-        make_pair('driver_lag', 1, table='shaft', profile='sweeps'),
+        make_pair('driver_lag', 1, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0),
         reference_model='table_tilt',
         model_as_asked=True,
     )
@@ -72,7 +72,7 @@ def test_a_good_calibration_is_proven_in_every_motion(clean):
 
 def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, tmp_path):
     true = (
-        make_pair('driver_lag', 1, table='shaft', profile='sweeps')
+        make_pair('driver_lag', 1, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0)
         .first.truth['gyroscope']
         .matrix[0, 0]
     )

@@ -14,7 +14,7 @@ FEW = ('gyro_force_squared', 'gyro_g_sensitivity', 'gyro_quadratic', 'time_offse
 pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
-@pytest.mark.parametrize('components', [(1,), (1, 7, 13), (2,), (3,)])
+@pytest.mark.parametrize('components', [(1,), (1, 7, 13), (3,)])
 def test_a_response_to_one_square_of_the_force_is_found_beside_the_bias(components):
     """
     The sum of the squares is that of gravity at rest, which is a bias.
@@ -23,7 +23,13 @@ def test_a_response_to_one_square_of_the_force_is_found_beside_the_bias(componen
     """
     hidden = np.zeros(SQUARES.size)
     hidden[list(components)] = 12.0 * SQUARES.tolerance
-    session = make_session(52, {'gyro_force_squared': hidden.reshape(3, 6)}, 'white')
+    session = make_session(
+        52,
+        {'gyro_force_squared': hidden.reshape(3, 6)},
+        'white',
+        imu_rate=50.0,
+        joint_rate=50.0,
+    )
     result = diagnose(session.block, Table.from_mapping(session.table)).result
     assert [finding.effect for finding in result.diagnosis.findings] == ['gyro_force_squared']
 

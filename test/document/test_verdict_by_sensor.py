@@ -47,7 +47,14 @@ def block():
 
     Its accelerometer is as its data sheet has it, and its gyroscope is not.
     """
-    session = make_session(7, table=VERTICAL, profile=sweeps(seconds=50.0), noise='realistic')
+    session = make_session(
+        7,
+        table=VERTICAL,
+        profile=sweeps(seconds=50.0),
+        noise='realistic',
+        imu_rate=50.0,
+        joint_rate=50.0,
+    )
     triad = session.truth['accelerometer']
     force = (session.imu.force_s - triad.bias) @ np.linalg.inv(triad.matrix).T
     return SampleBlock(replace(session.imu, force_s=force), session.joints)

@@ -160,6 +160,7 @@ def values_of(station, name):
 
 
 @pytest.mark.long
+@pytest.mark.long
 def test_a_hidden_effect_is_named_live(tmp_path):
     """
     Quadratic terms that the model lacks.

@@ -229,7 +229,14 @@ def test_three_terminals_calibrate_and_compensate_and_answer(terminals, home):
         assert 'Traceback' not in terminal.shown(), terminal.shown()
 
 
-@pytest.mark.parametrize('command', STARTING[3:])
+FURTHER = [
+    STARTING[3],
+    *(pytest.param(command, marks=pytest.mark.long) for command in STARTING[4:]),
+]
+"""`make test` has the launch file of the demonstration only."""
+
+
+@pytest.mark.parametrize('command', FURTHER)
 def test_what_runs_starts_as_printed_and_ends_on_ctrl_c(terminals, command):
     terminal = terminals(command)
     terminal.wait(*(rf'\[{name}\]: ' for name in nodes_of(command)))

@@ -130,7 +130,7 @@ def test_a_limit_that_one_window_alone_shows_is_seen(monkeypatch):
 
 
 def test_what_is_always_at_its_limit_does_not_empty_the_recording(monkeypatch):
-    pair = make_pair(None, 1, table='shaft', profile='sweeps')
+    pair = make_pair(None, 1, table='shaft', profile='sweeps', imu_rate=50.0, joint_rate=50.0)
     table = Table.from_mapping(pair.table)
     gatherer = MotionGatherer(table)
     windows = gatherer.push(pair.first.block) + gatherer.finish()
