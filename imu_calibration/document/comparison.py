@@ -67,6 +67,8 @@ class Comparison:
     """The verdict as text."""
     reference_agree: bool | None = None
     """The same for table and clock; None when undecided, or without common parameters."""
+    differences: tuple[str, ...] = ()
+    """The groups of the IMU that differ significantly, a line each."""
 
     @property
     def exit_code(self) -> int:
@@ -76,7 +78,7 @@ class Comparison:
     @property
     def reasons(self) -> list[str]:
         """Why the exit code is 3, a line each."""
-        return [line for line in self.lines if self.agree is False]
+        return [*self.differences, self.lines[-1]] if self.agree is False else []
 
 
 def moved_beyond_sd(first: Calibration, second: Calibration) -> bool:
@@ -302,11 +304,17 @@ def _compared(
             of_imu.append(group)
     rejected_reference = _holm(of_reference)
     rejected = _holm(of_imu)
-    lines = notes + [
-        f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}'
-        for name, chi2, k, p in groups
-        if name in rejected | rejected_reference
-    ]
+    lines = list(notes)
+    differences = []
+    for name, chi2, k, p in groups:
+        if name not in rejected | rejected_reference:
+            continue
+        text = (
+            f'{name}: differs by {np.sqrt(chi2 / k):.1f} combined sd (rms of {k}), chance {p:.1g}'
+        )
+        lines.append(text)
+        if name in rejected:
+            differences.append(text)
     linear = {'.'.join(effect.key) for effect in first.model.effects if effect.role == Role.LINEAR}
     if rejected & linear and TABLE_AXES in (first.gauge.get('axes'), second.gauge.get('axes')):
         lines.append(
@@ -337,7 +345,7 @@ def _compared(
     if in_other_axes.any():
         verdict += f'; {int(in_other_axes.sum())} parameters in other axes were not compared'
     lines.append(verdict)
-    return Comparison(rows, not rejected, tuple(lines), reference_agree)
+    return Comparison(rows, not rejected, tuple(lines), reference_agree, tuple(differences))
 
 
 def _ratio(difference: float, sd: float) -> float:

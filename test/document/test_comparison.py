@@ -200,6 +200,11 @@ def test_the_encoder_zero_of_another_session_is_no_disagreement_of_the_imu():
     found = compare(one, moved(one, name, 3897 * np.sqrt(2) * sd))
     assert (found.agree, found.reference_agree, found.exit_code) == (True, False, 0)
     assert next(row for row in found.rows if row.name == name).ratio == pytest.approx(3897)
+    assert found.reasons == []
+    # Where the IMU differs as well, table and clock are no reason for the exit code.
+    both = compare(one, moved(moved(one, name, 1.0), 'accelerometer.bias.x', 1.0))
+    assert both.exit_code == 3
+    assert [line.split(':')[0] for line in both.reasons[:-1]] == ['accelerometer.bias']
 
 
 QUADRATIC = SensorModel(
