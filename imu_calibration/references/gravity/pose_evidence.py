@@ -114,46 +114,73 @@ def build_rows(
         Time constants of warm-ups under test, s.
 
     """
-    sets: list[tuple[Effect, str, float | None]] = [
-        (effect, effect.name, None) for effect in effects if not effect.time_constant
-    ]
-    sets += [
-        (e, f'{e.name}@{k}', float(tau))
-        for e in effects
-        if e.time_constant
-        for k, tau in enumerate(constants)
-    ]
-    base = hand.hand_model.size
-    sizes = [len(effect.amplitudes(effect.components)) for effect, _, _ in sets]
-    ends = np.cumsum([base + 1] + sizes)
-    widths = np.concatenate(
-        [
-            1e3 * hand.hand_model.priors,
-            [EARTH_UPWARDS_SD],
-            *(s[0].prior_sds()[:n] for s, n in zip(sets, sizes)),
-        ]
-    )
-    parts = {label: slice(a, b) for (_, label, _), a, b in zip(sets, ends, ends[1:])}
-    space = HandSpace(parts, widths, int(ends[-1]))
-    true, zero = hand.gravity * hand.state.up, np.zeros_like(hand.state.up)
-    at_rest = {
-        sensor: {
-            label: _columns(
-                hand, effect, tau, true, zero, hand.poses.time, hand.poses.temperature_c
-            )[:, :, :size]
-            for (effect, label, tau), size in zip(sets, sizes)
-            if effect.sensor == sensor
-        }
-        for sensor in SENSORS
-    }
+    # Runs of columns: one for each effect, then for each warm-up one for each time constant.
+    runs = [_Run(effect, effect.name) for effect in effects if not effect.time_constant]
+    for effect in effects:
+        if effect.time_constant:
+            for number, tau in enumerate(constants):
+                runs.append(_Run(effect, f'{effect.name}@{number}', float(tau)))
+
+    # Places of the parameters: baseline, Earth's rate, runs.
+    parts = {}
+    widths = [FREE_SD_FACTOR * hand.hand_model.priors, np.array([EARTH_UPWARDS_SD])]
+    start = hand.hand_model.size + 1
+    for run in runs:
+        parts[run.label] = slice(start, start + run.size)
+        widths.append(run.effect.prior_sds()[: run.size])
+        start += run.size
+    space = HandSpace(parts, np.concatenate(widths), start)
+
+    # Columns at rest in the poses.
+    true = hand.gravity * hand.state.up
+    still = np.zeros_like(true)
+    at_rest: dict[str, dict[str, np.ndarray]] = {sensor: {} for sensor in SENSORS}
+    for run in runs:
+        if run.effect.sensor in at_rest:
+            columns = _columns(
+                hand,
+                run.effect,
+                run.time_constant,
+                true,
+                still,
+                hand.poses.time,
+                hand.poses.temperature_c,
+            )
+            at_rest[run.effect.sensor][run.label] = columns[:, :, : run.size]
+
     blocks = [
         _norm_block(hand, space, at_rest['accelerometer']),
         _rest_block(hand, space, at_rest['gyroscope']),
     ]
-    if between := gravity_turns(turns):
-        moving = [effect for effect, _, tau in sets if effect.sensor == 'gyroscope' and tau is None]
+    between = gravity_turns(turns)
+    if between:
+        moving = []
+        for run in runs:
+            if run.effect.sensor == 'gyroscope' and run.time_constant is None:
+                moving.append(run.effect)
         blocks.append(_turn_block(hand, between, space, at_rest['gyroscope'], moving))
     return blocks, space
+
+
+FREE_SD_FACTOR = 1e3
+"""Factor on the prior sds of the baseline, which is linearised at its own solution."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Columns of one effect, of a warm-up at one time constant."""
+
+    effect: Effect
+    """The effect under test."""
+    label: str
+    """Its name, for a warm-up with the number of the time constant."""
+    time_constant: float | None = None
+    """Time constant, s."""
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return len(self.effect.amplitudes(self.effect.components))
 
 
 def gravity_turns(turns: Sequence[TurnData]) -> list[TurnData]:
@@ -176,15 +203,8 @@ def _columns(
     Shape (m, 3, p), at the baseline's solution.
     """
     point = {} if tau is None else {effect.name: effect.at_time_constant(tau)}
-    names = {
-        sensor: BASE + ((effect.name,) if effect.sensor == sensor else ()) for sensor in SENSORS
-    }
-    sensors = replace(
-        hand.model,
-        accelerometer=names['accelerometer'],
-        gyroscope=names['gyroscope'],
-        point=point,
-    )
+    sensors = replace(hand.model, accelerometer=BASE, gyroscope=BASE, point=point)
+    sensors = sensors.with_effect(effect.sensor, effect.name)
     model = HandModel(sensors, hand.gravity)
     values = model.model.start_from(hand.model, hand.values)
     return model.further(
@@ -201,11 +221,14 @@ def _norm_block(
     hand: HandCalibration, space: HandSpace, at_rest: Mapping[str, np.ndarray]
 ) -> Block:
     """One row per pose: ``|true force| - gravity``."""
-    poses, count = hand.poses, len(hand.poses.start)
+    poses = hand.poses
+    count = len(poses.start)
     residual, base = hand.hand_model.norm_rows(hand.values, poses.force, **poses.conditions)
+    # The derivative of the norm by the reading, as by the bias.
     back = base[:, 0:3]
     rows = np.zeros((count, space.size + 1))
-    rows[:, : base.shape[1]], rows[:, -1] = base, residual
+    rows[:, : base.shape[1]] = base
+    rows[:, -1] = residual
     for label, columns in at_rest.items():
         rows[:, space.parts[label]] = np.einsum('ki,kip->kp', back, columns)
     known = np.sum((back * poses.force_sem) ** 2, axis=1)
@@ -225,14 +248,14 @@ def _rest_block(
     hand: HandCalibration, space: HandSpace, at_rest: Mapping[str, np.ndarray]
 ) -> Block:
     """Three rows per pose: the rate at rest, with the Earth's rate about the vertical."""
-    poses, count = hand.poses, len(hand.poses.start)
+    poses = hand.poses
+    count = len(poses.start)
     residual, base = hand.rate_rows()
+    earth = base.shape[2]
     rows = np.zeros((count, 3, space.size + 1))
-    rows[:, :, : base.shape[2]], rows[:, :, base.shape[2]], rows[:, :, -1] = (
-        base,
-        hand.state.up,
-        residual,
-    )
+    rows[:, :, :earth] = base
+    rows[:, :, earth] = hand.state.up
+    rows[:, :, -1] = residual
     for label, columns in at_rest.items():
         rows[:, :, space.parts[label]] = columns
     known = poses.rate_sem**2
@@ -260,33 +283,38 @@ def _turn_block(
     """
     bias_f, matrix_f = hand.accelerometer
     matrix = hand.gyroscope[1]
-    across, rows, known, durations = tangent(hand.state.up), [], [], []
+    across = tangent(hand.state.up)
+    rows, known, durations = [], [], []
     for turn in turns:
+        # True inputs during the turn, and the columns of further effects less those at rest.
         i, j = turn.first, turn.last
         bias = 0.5 * (hand.poses.rate[i] + hand.poses.rate[j])
-        force, rate = (
-            np.linalg.solve(matrix_f, (turn.force - bias_f).T).T,
-            np.linalg.solve(matrix, (turn.rate - bias).T).T,
-        )
-        further = [
-            _columns(hand, e, None, force, rate, turn.time, turn.temperature_c)
-            - 0.5 * (at_rest[e.name][i] + at_rest[e.name][j])
-            for e in moving
-        ]
-        stacked = np.concatenate([np.zeros((len(force), 3, 0)), *further], axis=2)
+        force = np.linalg.solve(matrix_f, (turn.force - bias_f).T).T
+        rate = np.linalg.solve(matrix, (turn.rate - bias).T).T
+        further = [np.zeros((len(force), 3, 0))]
+        for effect in moving:
+            columns = _columns(hand, effect, None, force, rate, turn.time, turn.temperature_c)
+            own = at_rest[effect.name]
+            further.append(columns - 0.5 * (own[i] + own[j]))
+
+        # The direction carried through the turn, and its derivative by a rotation psi.
         found = integrate_turn(
-            turn.time, turn.rate, bias=bias, matrix=matrix, further=(np.zeros_like(force), stacked)
+            turn.time,
+            turn.rate,
+            bias=bias,
+            matrix=matrix,
+            further=(np.zeros_like(force), np.concatenate(further, axis=2)),
         )
         carried = between_middles(hand.poses, turn, found.mat_ji) @ hand.state.up[i]
         by_psi = across[j].T @ skew(carried) / found.duration
+
         row = np.zeros((2, space.size + 1))
         row[:, hand.hand_model.gyro_matrix] = by_psi @ found.by_matrix.reshape(3, 9)
-        place = 0
+        start = 0
         for effect in moving:
-            row[:, space.parts[effect.name]] = (
-                by_psi @ found.by_further[:, place : place + effect.size]
-            )
-            place += effect.size
+            end = start + effect.size
+            row[:, space.parts[effect.name]] = by_psi @ found.by_further[:, start:end]
+            start = end
         row[:, -1] = -across[j].T @ carried / found.duration
         rows.append(row)
         durations.append(found.duration)
@@ -313,6 +341,8 @@ BIASES = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Candidate bias processes, in units of offset and noise together."""
 BIAS_TIMES = (100.0, 300.0)
 """Its correlation times, s."""
+FEWEST_SPARE_ROWS = 3
+"""Fewest degrees of freedom of a test."""
 DEPENDENT = 1e-9
 """
 Singular value of scaled columns, over the largest, up to which one of them depends on the others.
@@ -349,23 +379,28 @@ class HandEvidence(Evidence):
         *,
         baseline: Sequence[int],
     ):
-        self.blocks, self.space = blocks, space
-        self._noise = [
-            _noise(block, [*baseline, *(k for k in smooth if np.any(block.rows[:, :, k]))])
-            for block in blocks
-        ]
+        self.blocks = blocks
+        self.space = space
+        # Smooth effects are included: the noise is not estimated from what they explain.
+        self._noise = []
+        for block in blocks:
+            acting = [k for k in smooth if np.any(block.rows[:, :, k])]
+            self._noise.append(_noise(block, [*baseline, *acting]))
         poses = np.unique(np.concatenate([block.pose for block in blocks]))
         n_folds = len(poses) if len(poses) <= ONE_BY_ONE else POSE_FOLDS
         self.folds = [np.searchsorted(poses, block.pose) % n_folds for block in blocks]
         self._white = self._whitened()
         self._bases: dict[tuple[int, ...], np.ndarray] = {}
-        total, *without = (
-            sum(rows.T @ rows for rows in white)
-            for white in (self._white, *map(self._whitened, range(n_folds)))
-        )
+        total = self._products(self._white)
+        without = [self._products(self._whitened(number)) for number in range(n_folds)]
         super().__init__(
             total, np.array(without), prior_sd=space.prior_sd, prior_mean=np.zeros(space.size)
         )
+
+    @staticmethod
+    def _products(white: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the normal matrix of white rows, shape (q + 1, q + 1)."""
+        return np.sum([rows.T @ rows for rows in white], axis=0)
 
     def _whitened(self, number: int | None = None) -> list[np.ndarray]:
         """
@@ -407,17 +442,10 @@ class HandEvidence(Evidence):
 
         Shape (n_blocks, 1).
         """
-        left = self.heldout_residuals(used)
-        return {
-            sensor: np.array(
-                [
-                    [np.sum(r**2 / block.floor)]
-                    for block, r in zip(self.blocks, left)
-                    if block.sensor == sensor
-                ]
-            )
-            for sensor in SENSORS
-        }
+        found: dict[str, list[list[float]]] = {sensor: [] for sensor in SENSORS}
+        for block, residual in zip(self.blocks, self.heldout_residuals(used)):
+            found[block.sensor].append([np.sum(residual**2 / block.floor)])
+        return {sensor: np.array(squares) for sensor, squares in found.items()}
 
     @property
     def numbers(self) -> dict[str, np.ndarray]:
@@ -428,16 +456,18 @@ class HandEvidence(Evidence):
         }
 
     def _heldout(self, used: Sequence[int]) -> float:
-        squares = [
-            r**2 / (variance + sum(process.sd**2 for process in processes))
-            for r, (variance, processes) in zip(self.heldout_residuals(used), self._noise)
-        ]
-        return float(sum(s.size * np.log(s.mean()) for s in squares))
+        loss = 0.0
+        for residual, noise in zip(self.heldout_residuals(used), self._noise):
+            variance, processes = noise
+            squares = residual**2 / (variance + sum(process.sd**2 for process in processes))
+            loss += squares.size * np.log(squares.mean())
+        return float(loss)
 
     def _loss(self, used: Sequence[int]) -> float:
-        return float(
-            sum(len(white) * np.log(np.mean(self._left(white, used) ** 2)) for white in self._white)
-        )
+        loss = 0.0
+        for white in self._white:
+            loss += len(white) * np.log(np.mean(self._left(white, used) ** 2))
+        return float(loss)
 
     def _left(self, white: np.ndarray, used: Sequence[int]) -> np.ndarray:
         return white[:, -1] - white[:, list(used)] @ self.fit(used)[0]
@@ -449,21 +479,21 @@ class HandEvidence(Evidence):
         F test on the blocks that contain the new columns.
         """
         added = [k for k in larger if k not in set(smaller)]
-        concerned = [white for white in self._white if np.any(white[:, added])]
-        squares = [
-            sum(np.sum(self._left(white, used) ** 2) for white in concerned)
-            for used in (smaller, larger)
-        ]
+        of_smaller = of_larger = 0.0
+        n_rows = 0
+        in_use = np.zeros(len(larger), bool)
+        for white in self._white:
+            if np.any(white[:, added]):
+                of_smaller += np.sum(self._left(white, smaller) ** 2)
+                of_larger += np.sum(self._left(white, larger) ** 2)
+                n_rows += len(white)
+                in_use |= np.any(white[:, list(larger)] != 0, axis=0)
         rank = max(self.rank(added, smaller), 1)
-        in_use = np.any(
-            [np.any(white[:, list(larger)] != 0, axis=0) for white in concerned], axis=0
-        ).sum()
-        spare = sum(map(len, concerned)) - int(in_use)
-        if spare < 3 or squares[1] <= 0:
+        spare = n_rows - int(in_use.sum())
+        if spare < FEWEST_SPARE_ROWS or of_larger <= 0:
             return 1.0
-        return float(
-            f_sf(max(squares[0] - squares[1], 0.0) / rank / (squares[1] / spare), rank, spare)
-        )
+        fall = max(of_smaller - of_larger, 0.0)
+        return float(f_sf(fall / rank / (of_larger / spare), rank, spare))
 
     def rank(self, added: Sequence[int], smaller: Sequence[int]) -> int:
         """
