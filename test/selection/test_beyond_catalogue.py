@@ -310,7 +310,13 @@ def test_the_formula_goes_into_a_model_that_simulates_calibrates_compensates_and
     tmp_path, capsys
 ):
     session = physics.make_session(
-        5, None, 'white', cause=Beyond('scale_under_load', 5), profile='quick'
+        5,
+        None,
+        'white',
+        cause=Beyond('scale_under_load', 5),
+        profile='quick',
+        imu_rate=50.0,
+        joint_rate=50.0,
     )
     physics.write_bag(session, tmp_path / 'bag')
     from imu_calibration.core import documents
@@ -409,7 +415,13 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
 @pytest.mark.long
 def test_a_formula_of_the_session_is_not_written_into_a_model_for_other_sessions(tmp_path, capsys):
     session = physics.make_session(
-        5, None, 'white', cause=Beyond('gyro_scale_settling', 5), profile='quick'
+        5,
+        None,
+        'white',
+        cause=Beyond('gyro_scale_settling', 5),
+        profile='quick',
+        imu_rate=50.0,
+        joint_rate=50.0,
     )
     physics.write_bag(session, tmp_path / 'bag')
     from imu_calibration.core import documents

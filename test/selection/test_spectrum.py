@@ -211,7 +211,7 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
 @pytest.mark.usefixtures('few_candidates')
 def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
     """Tones and the scatter of one axis were tested by `diagnose` only."""
-    session = make_session(5, None, 'realistic', cause=Loud(1.0))
+    session = make_session(5, None, 'realistic', cause=Loud(1.0), imu_rate=50.0, joint_rate=50.0)
     reported = imu.calibrate(
         session.block, Table.from_mapping(session.table)
     ).calibration.statistics['unexplained']
@@ -227,7 +227,7 @@ def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
         'accelerometer': ['z'],
         'gyroscope': ['y'],
     }
-    empty = make_session(5, None, 'realistic')
+    empty = make_session(5, None, 'realistic', imu_rate=50.0, joint_rate=50.0)
     assert (
         'unexplained'
         not in imu.calibrate(empty.block, Table.from_mapping(empty.table)).calibration.statistics
