@@ -1,10 +1,11 @@
 """Evaluation of a calibration by hand on held-out poses and turns."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from imu_calibration.calibration.plain_fit import PlainFit, with_plain_fits
 from imu_calibration.calibration.proof import compared
 from imu_calibration.compensation.compensate import Corrected, compensated_samples
 from imu_calibration.document.calibration import Calibration
@@ -50,7 +51,9 @@ TURN_ANGLE_UNIT = 'rad per turn'
 """Unit of the angle between rotated and observed gravity."""
 
 
-def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> Proof:
+def prove_by_hand(
+    hand: HandCalibration, turns: Sequence[TurnData], fits: Sequence[PlainFit] = ()
+) -> Proof:
     """
     Return the proof of a calibration by hand.
 
@@ -66,38 +69,28 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> Proof:
     hand : HandCalibration
     turns : sequence of TurnData
         Turns of the estimate.
+    fits : sequence of PlainFit
+        Plain fits that are applied in place of its parameters.
 
     """
-    poses, model, uncorrected = hand.poses, hand.hand_model, uncorrected_by_hand(hand)
-    plain = replace(model, gyro_factor=1.0).nominal
-    latest = latest_settling(hand.model, hand.values, hand.sd)
-    judged = poses.time >= judged_from_of(latest, end_by_hand(poses))
-    norms, angles = [], []
-    for out, without in held_out_values(hand, turns):
-        values, part = (
-            applied_values(model.model, without, uncorrected.centre),
-            _selected(poses, out & judged),
-        )
-        left = [
-            turn
-            for turn in turns
-            if turn.rotation is None and (out[turn.first] or out[turn.last]) and judged[turn.first]
-        ]
+    poses, model = hand.poses, hand.hand_model
+    nominal = replace(model, gyro_factor=1.0).nominal
+    held_out = held_out_by_hand(with_plain_fits(hand, fits), turns, folds_by_hand(poses))
+    applied = applied_by_hand(hand, turns, [part.out for part in held_out])
+    for fit in fits:
+        applied = fit.merged(applied)
+
+    norms = []
+    angles = []
+    for part, values in zip(held_out, applied, strict=True):
         norms.append(
-            [
-                np.linalg.norm(
-                    corrected_with(model, each, part.force, temperature_c=part.temperature_c).force,
-                    axis=1,
-                )
-                - hand.gravity
-                for each in (plain, values)
-            ]
+            [norm_errors(hand, nominal, part.judged), norm_errors(hand, values, part.judged)]
         )
-        if left and len(turns) - len(left) >= TURNS_LEAST:
+        if part.turns and part.n_turns_left >= TURNS_LEAST:
             angles.append(
                 [
-                    turn_errors(model, values, poses, turns=left, gyroscope=gyroscope)
-                    for gyroscope in (plain, values)
+                    turn_errors(model, values, poses, turns=part.turns, gyroscope=gyroscope)
+                    for gyroscope in (nominal, values)
                 ]
             )
     if not norms:
@@ -110,16 +103,53 @@ def prove_by_hand(hand: HandCalibration, turns: Sequence[TurnData]) -> Proof:
     return proof
 
 
-def held_out_values(
-    hand: HandCalibration, turns: Sequence[TurnData]
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """
-    Return (mask of the held-out poses, parameters estimated without them) of each fold.
+@dataclass(frozen=True, eq=False)
+class HeldOutPoses:
+    """Poses that are held out together, with the turns that begin or end there."""
 
-    None with too few poses.
-    """
-    folds = _folds(hand.poses)
-    return list(zip(folds, values_without(hand, turns, folds)))
+    out: np.ndarray
+    """True for the poses that are held out, shape (n_poses,)."""
+    judged: np.ndarray
+    """True for those that are evaluated: effects that settle have settled, shape (n_poses,)."""
+    turns: list[TurnData]
+    """Turns against gravity that are held out and evaluated."""
+    n_turns_left: int
+    """Number of the remaining turns."""
+
+
+def held_out_by_hand(
+    hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]
+) -> list[HeldOutPoses]:
+    """Return the poses and turns to evaluate, for each mask of poses in `folds`."""
+    latest = latest_settling(hand.model, hand.values, hand.sd)
+    judged = hand.poses.time >= judged_from_of(latest, end_by_hand(hand.poses))
+    parts = []
+    for out in folds:
+        own = []
+        for turn in turns:
+            is_held_out = out[turn.first] or out[turn.last]
+            if turn.rotation is None and is_held_out and judged[turn.first]:
+                own.append(turn)
+        parts.append(HeldOutPoses(out, out & judged, own, len(turns) - len(own)))
+    return parts
+
+
+def applied_by_hand(
+    hand: HandCalibration, turns: Sequence[TurnData], folds: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return the parameters without the poses of each mask, as compensation applies them."""
+    centre = uncorrected_by_hand(hand).centre
+    without = values_without(hand, turns, folds)
+    return [applied_values(hand.model, values, centre) for values in without]
+
+
+def norm_errors(hand: HandCalibration, values: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return ``|corrected force| - gravity`` of the poses of a mask, m/s^2."""
+    poses = _selected(hand.poses, mask)
+    corrected = corrected_with(
+        hand.hand_model, values, poses.force, temperature_c=poses.temperature_c
+    )
+    return np.linalg.norm(corrected.force, axis=1) - hand.gravity
 
 
 def values_without(
@@ -157,7 +187,7 @@ def values_without(
     return found
 
 
-def _folds(poses: Poses) -> list[np.ndarray]:
+def folds_by_hand(poses: Poses) -> list[np.ndarray]:
     """
     Return masks of the poses to hold out in turn.
 

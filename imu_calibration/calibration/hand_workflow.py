@@ -17,11 +17,19 @@ from imu_calibration.calibration.hand_proof import (
     TURN_ANGLE_UNIT,
     TURNS_LEAST,
     entry_of,
-    held_out_values,
+    folds_by_hand,
     prove_by_hand,
     turn_error,
     uncorrected_by_hand,
+    values_without,
 )
+from imu_calibration.calibration.plain_fit import (
+    PlainFit,
+    changes_with,
+    plain_entries,
+    with_plain_fits,
+)
+from imu_calibration.calibration.plain_fit_by_hand import better_plain_fits_by_hand
 from imu_calibration.calibration.result import (
     GRAVITY_SD,
     CalibrationResult,
@@ -204,7 +212,11 @@ class HandResult(CalibrationResult):
     """A calibration by hand with the data for its report."""
 
     hand: HandCalibration
-    """Parameters, poses, noise and residuals."""
+    """Parameters as applied, poses, noise and residuals."""
+    solution: HandCalibration
+    """The same with the parameters of the estimate by weights."""
+    fits: tuple[PlainFit, ...] = ()
+    """Plain fits that are applied in place of it."""
 
     observations: ClassVar[str] = 'poses'
 
@@ -220,7 +232,11 @@ class HandResult(CalibrationResult):
         corrected_force, corrected_rate = hand.compensate(
             force, rate, poses.time, temperature_c=poses.temperature_c
         )
-        for out, values in held_out_values(hand, hand.used_turns):
+        folds = folds_by_hand(poses)
+        without = values_without(self.solution, hand.used_turns, folds)
+        for fit in self.fits:
+            without = fit.merged(without)
+        for out, values in zip(folds, without, strict=True):
             corrected = hand.hand_model.compensate(values, force, rate, **poses.conditions)
             corrected_force[out], corrected_rate[out] = (part[out] for part in corrected)
         samples = max(int(poses.stop[-1]), 1)
@@ -472,8 +488,16 @@ def hand_result(
         When the specific force at rest is clearly in another unit.
 
     """
-    hand = with_weak_replaced(evident.hand, evident.hand.tolerances)
-    check_force(float(np.median(np.linalg.norm(hand.poses.force, axis=1))))
+    solution = with_weak_replaced(evident.hand, evident.hand.tolerances)
+    check_force(float(np.median(np.linalg.norm(solution.poses.force, axis=1))))
+    used_turns = solution.used_turns if turns else ()
+    fits = better_plain_fits_by_hand(
+        solution,
+        used_turns,
+        under_test=evident.changes.unexplained,
+        as_asked=options.as_asked,
+    )
+    hand = with_plain_fits(solution, fits)
     gathered = recording.gathered
     gathered.findings = (
         *recording.findings,
@@ -492,10 +516,10 @@ def hand_result(
         gravity=hand.gravity,
         gauge=dict(GAUGE),
         undetermined=advice,
-        statistics=statistics,
+        statistics=statistics | plain_entries(fits),
         provenance=provenance,
-        proof=prove_by_hand(hand, hand.used_turns if turns else ()),
-        changes=evident.changes,
+        proof=prove_by_hand(solution, used_turns, fits),
+        changes=changes_with(evident.changes, fits),
         uncorrected=uncorrected_by_hand(hand),
         tested=CROSS_TERMS,
         absent=hand.hand_model.absent,
@@ -516,6 +540,8 @@ def hand_result(
         gravity=hand.gravity,
         period=float(hand.statistics['period']),
         hand=hand,
+        solution=solution,
+        fits=fits,
     )
 
 

@@ -8,6 +8,7 @@ cause move bias and matrix away from the values with the smallest error in motio
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -47,6 +48,8 @@ FITTED = (Role.OFFSET, Role.LINEAR)
 PARTS_OF_TIME = 3
 """Parts of a session that are held out in turn: an effect in time is applied at one moment."""
 
+Fitted = TypeVar('Fitted', bound=Solution)
+
 
 @dataclass(frozen=True, eq=False)
 class PlainEstimate:
@@ -59,9 +62,9 @@ class PlainEstimate:
     dropped: tuple[str, ...]
     """Names of the effects that it leaves at their prior."""
     values: np.ndarray
-    """Parameters from all pieces, shape (n_params,); of use where `replaced`."""
+    """Parameters from all data, shape (n_params,); of use where `replaced`."""
     folds: list[np.ndarray]
-    """The same without the pieces of each fold."""
+    """The same without the data of each fold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +76,16 @@ class PlainFit:
     estimate: PlainEstimate
     """Its bias and matrix."""
     error: float
-    """Rms error on held-out pieces, SI."""
+    """Rms error on held-out data, SI; by hand of a gyroscope rad per turn."""
     error_of_solution: float
-    """Rms error of the solution on the same pieces, SI."""
+    """Rms error of the solution on the same data."""
+    unit: str = ''
+    """Unit of both errors; empty: that of the sensor."""
+
+    @property
+    def is_close(self) -> bool:
+        """Whether the plain fit is better than the solution, or hardly worse."""
+        return self.error < HARDLY_WORSE * self.error_of_solution
 
     def merged(self, folds: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return parameters of folds with those of the fit."""
@@ -117,10 +127,7 @@ def better_plain_fits(
     """
     regimes, counts = judged_regimes(held_out)
     model = solution.model
-    # An effect that compensation does not apply is a residual of each other session.
-    replaceable = set(under_test)
-    if not as_asked:
-        replaceable |= {effect.sensor for effect in not_applied(model)}
+    replaceable = replaceable_sensors(model, under_test, as_asked=as_asked)
     if not regimes or not replaceable:
         return ()
     nominal = nominal_values(model)
@@ -147,16 +154,35 @@ def better_plain_fits(
             chosen, of_plain = estimates[1], with_estimated
 
         errors = compared(of_solution, of_plain, counts.sum(axis=1), unit=UNITS[sensor])
-        error, error_of_solution = errors.after, errors.before
-        is_close = error / max(error_of_solution, 1e-300) < HARDLY_WORSE
-        if (is_close and sensor in under_test) or _misses_other_regimes(
+        fit = PlainFit(sensor, chosen, errors.after, errors.before)
+        if (sensor in under_test and fit.is_close) or _misses_other_regimes(
             held_out, solution, chosen, sensor, centre=centre
         ):
-            better.append(PlainFit(sensor, chosen, error, error_of_solution))
+            better.append(fit)
     return tuple(better)
 
 
-def with_plain_fits(solution: Solution, fits: Sequence[PlainFit]) -> Solution:
+def replaceable_sensors(
+    model: SensorModel, under_test: Collection[str], *, as_asked: bool
+) -> set[str]:
+    """
+    Return the sensors with a solution that has to predict better than a plain fit.
+
+    Arguments as for `better_plain_fits`.
+    """
+    replaceable = set(under_test)
+    if not as_asked:
+        # An effect that compensation does not apply is a residual of each other session.
+        replaceable |= {effect.sensor for effect in not_applied(model)}
+    return replaceable
+
+
+def misses(error: float, error_of_plain: float) -> bool:
+    """Return whether a solution predicts data of another kind worse than a plain fit."""
+    return error > HARDLY_WORSE * error_of_plain
+
+
+def with_plain_fits(solution: Fitted, fits: Sequence[PlainFit]) -> Fitted:
     """
     Return the solution with the values of plain fits.
 
@@ -179,13 +205,17 @@ def with_plain_fits(solution: Solution, fits: Sequence[PlainFit]) -> Solution:
     return solution
 
 
-def plain_entries(fits: Sequence[PlainFit]) -> dict[str, dict[str, dict[str, float]]]:
+def plain_entries(fits: Sequence[PlainFit]) -> dict[str, dict[str, dict[str, Any]]]:
     """Return the part of a document's statistics: sensor -> held-out errors of both estimates."""
     if not fits:
         return {}
     return {
         'least_squares': {
-            fit.sensor: {'error': fit.error, 'error_of_model': fit.error_of_solution}
+            fit.sensor: {
+                'error': fit.error,
+                'error_of_model': fit.error_of_solution,
+                'unit': fit.unit or UNITS[fit.sensor],
+            }
             for fit in fits
         }
     }
@@ -209,6 +239,20 @@ def _plain_estimate(
 ) -> PlainEstimate:
     """Return the estimate of a sensor with the table and the clock of `reference`."""
     model = solution.model
+    plan = plan_of(solution, sensor, reference)
+    start = plan.values
+    rows, targets = _equations(held_out, model, sensor, start=start, fitted=plan.fitted)
+    folds = []
+    for fold in range(TABLE_FOLDS):
+        others = [k for k in range(len(rows)) if k % TABLE_FOLDS != fold]
+        folds.append(_solved(start, plan.fitted, rows, targets, others))
+    values = _solved(start, plan.fitted, rows, targets, range(len(rows)))
+    return replace(plan, values=values, folds=folds)
+
+
+def plan_of(solution: Solution, sensor: str, reference: np.ndarray) -> PlainEstimate:
+    """Return which parameters a plain fit estimates and replaces, at the values of `reference`."""
+    model = solution.model
     replaced = np.zeros(len(reference), bool)
     fitted = np.zeros(len(reference), bool)
     dropped = []
@@ -226,14 +270,7 @@ def _plain_estimate(
     fitted &= ~uninformed
     replaced &= ~uninformed
     start = np.where(uninformed, solution.values, reference)
-
-    rows, targets = _equations(held_out, model, sensor, start=start, fitted=fitted)
-    folds = []
-    for fold in range(TABLE_FOLDS):
-        others = [k for k in range(len(rows)) if k % TABLE_FOLDS != fold]
-        folds.append(_solved(start, fitted, rows, targets, others))
-    values = _solved(start, fitted, rows, targets, range(len(rows)))
-    return PlainEstimate(replaced, fitted, tuple(dropped), values, folds)
+    return PlainEstimate(replaced, fitted, tuple(dropped), start, [])
 
 
 def _misses_other_regimes(
@@ -277,7 +314,7 @@ def _misses_other_regimes(
             n_pieces=n_pieces,
         )
         of_plain = _error_on_groups(groups, model, sensor, values=plain.values, free=plain.fitted)
-        if of_model > HARDLY_WORSE * of_plain:
+        if misses(of_model, of_plain):
             return True
     return False
 

@@ -246,7 +246,9 @@ def _first_temperature(sources: Sequence[Callable]) -> float:
             return float(block.temperature.temperature_c[0])
     raise InputError(
         'a thermal effect needs temperatures, the recording has none; record imu/temperature or'
-        ' omit the effect'
+        ' omit the effect',
+        key='temperature_topic',
+        code='temperature_missing',
     )
 
 

@@ -185,6 +185,8 @@ class TemperatureSamples(AlignedArrays):
     """
     Thermal branch (`kinematics.signal_history`), in [-1, 1], shape (n,); None if not computed.
     """
+    rate: np.ndarray | None = None
+    """Slope (`kinematics.signal_history`), K/s, shape (n,); None if not computed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -227,7 +227,8 @@ def _least_squares(calibration: Calibration) -> list[Reason]:
     reasons = []
     for sensor, entry in (calibration.statistics.get('least_squares') or {}).items():
         error, of_model = (
-            error_text(entry[name], UNITS[sensor]) for name in ('error', 'error_of_model')
+            error_text(entry[name], entry.get('unit') or UNITS[sensor])
+            for name in ('error', 'error_of_model')
         )
         reasons.append(
             Reason(

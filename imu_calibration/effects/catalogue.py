@@ -30,6 +30,7 @@ QUANTITY_MOTIONS = (
     ('thermal branch', ('warm_and_cool',)),
     ('vibration', ('shake',)),
     ('temperature', ('warm_up',)),
+    ('temperature rate', ('warm_up',)),
     ('time', ('warm_up',)),
     ('rate', ('two_axis', 'three_speeds')),
     ('force', ('static_dense', 'centrifuge')),
@@ -39,6 +40,7 @@ DRAWN_AGAINST = {
     'joint angle': 'angle',
     'joint rate': 'angle',
     'temperature': 'temperature',
+    'temperature rate': 'temperature',
     'thermal branch': 'temperature',
     'time': 'time',
     'force': 'force',
@@ -151,6 +153,7 @@ def term(
     if not settles:
         del definition['time_constant']
     spread = PRIOR_TOLERANCES * tolerance if prior_sd is None else prior_sd
+    thermal |= 'temperature rate' in group.uses
     needs = ('temperature',) * (thermal or turns) + ('cooling',) * turns
     needs += ('vibration',) * ('vibration' in group.uses)
     needs += ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
@@ -183,11 +186,20 @@ def term(
             (motions for quantity, motions in QUANTITY_MOTIONS if quantity in group.uses),
             ('static_poses',),
         ),
-        compensation='none' if group.uses & {'time', 'attitude', *JOINT_INPUTS} else 'exact',
+        compensation='none'
+        if group.uses & {'time', 'attitude', 'temperature rate', *JOINT_INPUTS}
+        else 'exact',
         groups=(group,),
         coefficients=partial(amplitude_coefficients, own_axis=len(columns) == 3),
         smooth=not group.uses
-        - {'time', 'temperature', 'thermal branch', 'reference temperature', 'time constant'},
+        - {
+            'time',
+            'temperature',
+            'temperature rate',
+            'thermal branch',
+            'reference temperature',
+            'time constant',
+        },
         plausible=('such', largest, 'its definition') if largest else (),
         definition={key: value for key, value in definition.items() if value is not None},
         against=tuple(drawn for quantity, drawn in DRAWN_AGAINST.items() if quantity in group.uses)[

@@ -30,6 +30,7 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
     'joint rate': {f'joint_rate_{k + 1}': ('joint_rate', k) for k in range(MAX_COLUMN_JOINTS)},
     'time': {'time': ('time',)},
     'temperature': {'temperature_c': ('temperature_c',)},
+    'temperature rate': {'temperature_rate': ('temperature_rate',)},
     'thermal branch': {'thermal_branch': ('thermal_branch',)},
     'vibration': {f'vibration_{a}': ('vibration', k) for k, a in enumerate('xyz')},
     'reference temperature': {'temperature_ref_c': (None,)},
@@ -41,7 +42,7 @@ acceleration in s, level frame to s, joints from the base outwards.
 """
 VOCABULARY = (
     'f_x .. z, w_x .. z, alpha_x .. z, c_xx .. zz, angle_1 .. 7, joint_rate_1 .. 7, time,'
-    ' temperature_c, thermal_branch, vibration_x .. z, temperature_ref_c, tau'
+    ' temperature_c, temperature_rate, thermal_branch, vibration_x .. z, temperature_ref_c, tau'
 )
 """The names, for messages."""
 PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}

@@ -148,11 +148,13 @@ def columns(references: References, sensor: str) -> np.ndarray:
     model, ref, parts = references.model, references.at(sensor), []
     layout = model.layout(sensor)
     if ref.temperature_c is None and any(
-        'temperature' in group.uses for group in layout.groups.values()
+        group.uses & {'temperature', 'temperature rate'} for group in layout.groups.values()
     ):
         raise InputError(
             'a thermal effect needs temperatures, none were received; record imu/temperature or'
-            ' omit the effect'
+            ' omit the effect',
+            key='temperature_topic',
+            code='temperature_missing',
         )
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
     for name in layout.rows:

@@ -112,6 +112,29 @@ def with_term(terms: Terms, name: str, covariance: np.ndarray) -> dict[str, np.n
     return {**terms, name: terms.get(name, 0.0) + covariance}
 
 
+def bounded_by_prior(terms: Terms, held: np.ndarray, prior_sd: np.ndarray) -> dict:
+    """
+    Return the terms with no more than the variance of the prior for held parameters.
+
+    The value of a held parameter is that of its prior, so that errors of the data, such as a bias
+    that moves, do not add to its variance. With s the standard deviation of the sum of the terms
+    and p that of the prior, rows and columns are multiplied by ``min(1, p / s)``.
+
+    Parameters
+    ----------
+    terms : mapping
+        Name -> covariance, shape (n_params, n_params).
+    held : ndarray of bool, shape (n_params,)
+    prior_sd : ndarray, shape (n_params,)
+
+    """
+    sd = np.sqrt(np.diag(total(terms)))
+    factor = np.ones(len(sd))
+    wide = held & (sd > prior_sd)
+    factor[wide] = prior_sd[wide] / sd[wide]
+    return {name: term * np.outer(factor, factor) for name, term in terms.items()}
+
+
 def of_fit(terms: Terms) -> np.ndarray:
     """Return the posterior covariance of the fit, without allowances: noise and bias processes."""
     return total({name: terms[name] for name in (SAMPLE_NOISE, BIAS_PROCESS) if name in terms})

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.effects.sensor_effects import VIBRATION_VARIANCE
 from imu_calibration.kinematics.rotations import Reference, rotation
-from imu_calibration.kinematics.signal_history import ThermalBranch
+from imu_calibration.kinematics.signal_history import TemperatureSlope, ThermalBranch
 
 REST, WAY = 5.0, 3.0
 """s; a rest, and the time from one rest to the next."""
@@ -60,6 +60,8 @@ class _Surroundings:
     """Shape (n,)."""
     branch: np.ndarray | None = None
     """Thermal branch, shape (n,)."""
+    warming: np.ndarray | None = None
+    """Slope of the temperature, K/s, shape (n,)."""
     shaking: np.ndarray | None = None
     """Variance of vibration, (m/s^2)^2, shape (3,)."""
 
@@ -111,6 +113,7 @@ def _turn(
         surroundings.temperature_c,
         surroundings.branch,
         None if shaking is None else np.tile(shaking, (len(time), 1)),
+        warming=surroundings.warming,
     )
 
 
@@ -212,11 +215,19 @@ def _poses(directions: Iterable[np.ndarray], temperatures: Sequence[float] = ())
     def make(gravity: float) -> list[Reference]:
         if not temperatures:
             return [_rest(up, number, gravity) for number, up in enumerate(directions)]
-        pieces, branch = [], ThermalBranch()
-        for temperature_c in temperatures:
+        rests = list(enumerate(directions))
+        pieces = []
+        branch = ThermalBranch()
+        slope = TemperatureSlope()
+        for step, temperature_c in enumerate(temperatures):
             temperature = np.full(1, temperature_c)
-            warmth = _Surroundings(temperature_c=temperature, branch=branch.of(temperature))
-            pieces += [_rest(up, number, gravity, warmth) for number, up in enumerate(directions)]
+            stamp_ns = np.array([step * len(rests) * 60 * 10**9])
+            warmth = _Surroundings(
+                temperature_c=temperature,
+                branch=branch.of(temperature),
+                warming=slope.of(stamp_ns, temperature),
+            )
+            pieces += [_rest(up, number, gravity, warmth) for number, up in rests]
         return pieces
 
     return make

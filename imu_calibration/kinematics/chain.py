@@ -291,6 +291,7 @@ def reference_motion(
         branch=motion.thermal_branch,
         shaking=motion.vibration,
         motion=motion,
+        warming=motion.temperature_rate,
     )
 
 

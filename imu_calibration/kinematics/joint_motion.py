@@ -36,6 +36,8 @@ class JointMotion(AlignedArrays):
     """
     Variance of vibration (`kinematics.signal_history`), (m/s^2)^2, shape (n, 3); None: unknown.
     """
+    temperature_rate: np.ndarray | None = None
+    """Slope of the temperature (`kinematics.signal_history`), K/s, shape (n,); None: unknown."""
 
 
 def with_encoder_harmonics(

@@ -44,6 +44,8 @@ class Reference(AlignedArrays):
     """
     motion: Any = None
     """The joints' motion (`JointMotion`), when there is a table."""
+    warming: np.ndarray | None = None
+    """Slope of the temperature at the samples, K/s, shape (n,); None: unknown."""
 
     @property
     def thermal_branch(self) -> np.ndarray:
@@ -54,6 +56,11 @@ class Reference(AlignedArrays):
     def vibration(self) -> np.ndarray:
         """Variance of vibration, (m/s^2)^2, shape (n, 3); zero if unknown."""
         return np.zeros((len(self), 3)) if self.shaking is None else self.shaking
+
+    @property
+    def temperature_rate(self) -> np.ndarray:
+        """Slope of the temperature, K/s, shape (n,); zero if unknown."""
+        return np.zeros(len(self)) if self.warming is None else self.warming
 
     @property
     def joint_angle(self) -> np.ndarray:

@@ -1,7 +1,8 @@
 """
 Inputs of effects that depend on past samples.
 
-The branch of a thermal hysteresis, and the running variance of vibration.
+The branch of a thermal hysteresis, the slope of the temperature, and the running variance of
+vibration.
 """
 
 import math
@@ -128,3 +129,42 @@ class ThermalBranch:
     def of(self, temperature_c: np.ndarray) -> np.ndarray:
         """Return the branch at each of the next readings, shape (n,)."""
         return np.array([self.push(each) for each in np.asarray(temperature_c, float).tolist()])
+
+
+SLOPE_SECONDS = 5.0
+"""
+Time constant of the slope of the temperature, s: readings of a thermometer each second, with noise
+of 0.02 K, give it to 4 mK/s; a slope that changes within a minute is hardly late.
+"""
+
+
+class TemperatureSlope:
+    """
+    Slope of the temperature over the last `SLOPE_SECONDS`.
+
+    With T_k the reading at t_k and ``a = exp(-(t_k - t_(k-1)) / SLOPE_SECONDS)``::
+
+        rise_k = a rise_(k-1) + T_k - T_(k-1)
+        span_k = a span_(k-1) + t_k - t_(k-1)
+        slope_k = rise_k / span_k
+
+    A steady change has its slope from the second reading on; a changing one is late by the time
+    constant. It starts at 0, and is causal.
+    """
+
+    def __init__(self) -> None:
+        self._before: tuple[int, float] | None = None
+        self._rise = self._span = 0.0
+
+    def of(self, stamp_ns: np.ndarray, temperature_c: np.ndarray) -> np.ndarray:
+        """Return the slope at each of the next readings, K/s, shape (n,)."""
+        slopes = []
+        for stamp, reading in zip(stamp_ns.tolist(), temperature_c.tolist(), strict=True):
+            last_stamp, last_reading = self._before or (stamp, reading)
+            seconds = 1e-9 * max(stamp - last_stamp, 0)
+            kept = math.exp(-seconds / SLOPE_SECONDS)
+            self._rise = kept * self._rise + reading - last_reading
+            self._span = kept * self._span + seconds
+            self._before = (stamp, reading)
+            slopes.append(self._rise / self._span if self._span > 0.0 else 0.0)
+        return np.array(slopes)

@@ -13,7 +13,11 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, runs_of
 from imu_calibration.kinematics.joint_motion import JointMotion
-from imu_calibration.kinematics.signal_history import BandVariance, ThermalBranch
+from imu_calibration.kinematics.signal_history import (
+    BandVariance,
+    TemperatureSlope,
+    ThermalBranch,
+)
 from imu_calibration.preprocessing import window_cutter
 from imu_calibration.preprocessing.rest_detection import (
     QUIETNESS_REACH,
@@ -104,6 +108,7 @@ class MotionChunks:
         self._settings, self._noise_rad, self._floors = settings, noise_rad, floors
         self._imu, self._joints, self._temperature = SampleBuffer(), SampleBuffer(), SampleBuffer()
         self._branch, self._vibration = ThermalBranch(), BandVariance()
+        self._slope = TemperatureSlope()
         self.margin = max(settings.overlap, _LEAST_MARGIN)
         self._chunk_ns, self._margin_ns = _ns(settings.chunk), _ns(self.margin)
         self._start_ns: int | None = None
@@ -154,7 +159,11 @@ class MotionChunks:
             self._joints.add(self._not_late(joints, None))
         if temperature is not None and len(temperature):
             self._temperature.add(
-                replace(temperature, branch=self._branch.of(temperature.temperature_c))
+                replace(
+                    temperature,
+                    branch=self._branch.of(temperature.temperature_c),
+                    rate=self._slope.of(temperature.stamp_ns, temperature.temperature_c),
+                )
             )
 
     def take(self, final: bool = False) -> Iterator[PhasedSamples]:
@@ -261,7 +270,7 @@ class MotionChunks:
         motion = np.zeros((4,) + level[core].shape)
         motion[0] = level[core]
         self._draw_curves(motion, time[core], phase[core], runs)
-        temperature, branch = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
+        temperature, branch, rate = self._warmth(imu.stamp_ns[core], stop_ns + self._margin_ns)
         vibration = self._vibration.of(period, imu.force_s[core])
         corrected = None if imu.corrected is None else imu.corrected[core]
         return self._without_lost(
@@ -277,6 +286,7 @@ class MotionChunks:
                     motion[3],
                     branch,
                     vibration,
+                    rate,
                 ),
                 temperature,
                 phase[core],
@@ -361,12 +371,13 @@ class MotionChunks:
         return np.diff(np.concatenate([[before], stamp_ns])) > _ns(limit)
 
     def _warmth(self, stamp_ns, last_ns):
-        """Return (temperatures, thermal branches) at the stamps."""
+        """Return (temperatures, thermal branches, slopes of the temperature) at the stamps."""
         readings = self._temperature.between(-NEVER, last_ns)
         if readings is None or not len(readings):
-            return np.full((2, len(stamp_ns)), np.nan)
+            return np.full((3, len(stamp_ns)), np.nan)
         at, known = (stamp_ns - self._start_ns) / 1e9, (readings.stamp_ns - self._start_ns) / 1e9
-        return np.interp(at, known, readings.temperature_c), np.interp(at, known, readings.branch)
+        series = (readings.temperature_c, readings.branch, readings.rate)
+        return [np.interp(at, known, values) for values in series]
 
     def _at_edge(self, stamp_ns, limit, final):
         """

@@ -143,7 +143,8 @@ def make_window(
     """Return the `Window` of a kind that holds all of `samples`."""
     motion, temperature = samples.motion, samples.temperature_c
     if np.isnan(temperature).any():
-        motion, temperature = replace(motion, thermal_branch=None), None
+        temperature = None
+        motion = replace(motion, thermal_branch=None, temperature_rate=None)
     motion = _mean_motion(motion) if kind == WindowKind.STATIC else motion
     return Window(
         kind,
@@ -267,7 +268,7 @@ def _mean_motion(motion):
     # one encoder step in mid-window is 1.5 steps of distance and a quarter of a step of scatter: no
     # creep
     slope = np.where((distance > 8 * rest) & (distance > 1e-6), slope, 0.0)
-    zero, branch = np.zeros((1, len(mean))), motion.thermal_branch
+    zero, branch, warming = np.zeros((1, len(mean))), motion.thermal_branch, motion.temperature_rate
     return JointMotion(
         motion.time.mean(keepdims=True),
         mean[None],
@@ -276,6 +277,7 @@ def _mean_motion(motion):
         zero,
         None if branch is None else branch.mean(keepdims=True),
         motion.vibration.mean(axis=0, keepdims=True),
+        None if warming is None else warming.mean(keepdims=True),
     )
 
 

@@ -37,6 +37,7 @@ UNIT_OF = {
     'rate': 'rad/s',
     'angular acceleration': 'rad/s^2',
     'temperature': 'K',
+    'temperature rate': 'K/s',
     'joint rate': 'rad/s',
     'time': 's',
 }
@@ -76,7 +77,7 @@ class Formula:
     @property
     def smooth(self) -> bool:
         """Whether it changes slowly, as every bias does."""
-        return self.family <= {'time', 'temperature'}
+        return self.family <= {'time', 'temperature', 'temperature rate'}
 
     @property
     def complexity(self) -> tuple[int, int]:
@@ -167,6 +168,8 @@ def _of_motion() -> Iterator:
 
 def _slow(thermal: bool, duration: float) -> Iterator:
     warm = [(TEMPERATURE_FACTOR, ('temperature',))] if thermal else []
+    if thermal:
+        yield 'temperature_rate', ('temperature rate',)
     settles = [(f'(1 - exp(-time / {share * duration:.3g}))', ()) for share in CONSTANTS] + [
         ('time', ('time',))
     ]

@@ -24,6 +24,7 @@ from worlds.hand_sessions import FACES, GRAVITY, PARAM_NAMES, random_truth
 from worlds.physics_hand import clipped, hold_and_turn
 
 CROSS = [PARAM_NAMES.index(name) for name in CROSS_TERMS]
+PRIOR_SD = 0.1
 
 
 def board(seed, *, placements, rests, shared, cross=0.0, turns=False):
@@ -94,6 +95,8 @@ def test_errors_of_placements_do_not_demand_cross_terms():
     faces = board(722, placements=12, rests=3, shared=0.01, cross=-0.0231)
     values, sd, proof = calibrated(*faces)
     assert np.all(np.abs(values + 0.0231) < 3 * sd) and decide(proof['accelerometer']) is UNPROVEN
+    # Their standard deviation is that of the prior: a bias that moves does not add to it.
+    np.testing.assert_allclose(sd, PRIOR_SD, rtol=0.02)
 
 
 def test_a_wandering_bias_estimated_with_cross_terms_does_not_demand_them():

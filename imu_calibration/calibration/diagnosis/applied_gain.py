@@ -1,9 +1,8 @@
 """Gain of an extension of the model: errors of the corrected readings of held-out windows."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,12 @@ from imu_calibration.calibration.hand_proof import corrected_with, end_by_hand, 
 from imu_calibration.calibration.proof import nominal_values, with_reference
 from imu_calibration.compensation.compensate import compensated_samples
 from imu_calibration.document.calibration import Calibration
-from imu_calibration.document.trust import judged_from_of, uncorrected_in_time, uncorrected_on_table
+from imu_calibration.document.trust import (
+    judged_from_of,
+    latest_settling,
+    uncorrected_in_time,
+    uncorrected_on_table,
+)
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import (
     References,
@@ -26,7 +30,11 @@ from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window, all_samples, chunks
 from imu_calibration.references.gravity.hand_parameters import HandModel
-from imu_calibration.references.gravity.model_selection import HandInvestigation, gain_of_poses
+from imu_calibration.references.gravity.model_selection import (
+    HandInvestigation,
+    HandProblem,
+    gain_of_poses,
+)
 from imu_calibration.references.gravity.pose_evidence import Block
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.window_statistics import reduce_windows
@@ -39,10 +47,25 @@ from imu_calibration.selection.gain import (
     heldout_gain,
 )
 from imu_calibration.selection.investigation import Investigation
+from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
 from imu_calibration.selection.saturation import measured
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """A model with its parameters, as estimated and as compensation applies them."""
+
+    model: SensorModel
+    """At the point of `values`."""
+    values: np.ndarray
+    """Shape (n_params,)."""
+    applied: np.ndarray
+    """Effects that compensation cannot undo are at their centre, shape (n_params,)."""
+    latest: SensorModel
+    """At the largest probable time constants: what has settled (`trust.latest_settling`)."""
 
 
 def gain_of_findings(
@@ -99,7 +122,8 @@ def gains_of_formulas(
     if not proposals:
         return {}
     problem = found.problem
-    before = model, values, applied = _applied_parameters(found, found.adopted)
+    before = _applied_parameters(found, found.adopted)
+    model, values = before.model, before.values
 
     # The model with the formulas, linearised at their amplitudes.
     for proposal in proposals:
@@ -111,13 +135,15 @@ def gains_of_formulas(
     for group in chunks(unlocked):
         for window in reduce_windows(group, model, table):
             accumulator.add(window)
-    estimated = solve(accumulator, model, noise=problem.noise).values
+    solution = solve(accumulator, model, noise=problem.noise)
+    estimated = solution.values
 
     # Compensation fixes the effects of the model that it does not undo as on the first side.
     after = applied_values(model, estimated)
-    for effect in not_applied(before[0]):
-        after[model.slices[effect.key]] = applied[before[0].slices[effect.key]]
-    sides = [before, (model.at(estimated), estimated, after)]
+    for effect in not_applied(before.model):
+        after[model.slices[effect.key]] = before.applied[before.model.slices[effect.key]]
+    latest = latest_settling(model, estimated, solution.sd)
+    sides = [before, _Side(model.at(estimated), estimated, after, latest)]
     sums, gains = {}, {}
     for proposal in proposals:
         undone = any(effect.compensation == 'exact' for effect in proposal.effects)
@@ -133,17 +159,17 @@ def gains_of_formulas(
 def _locked_errors(
     found: Investigation,
     table: Table,
-    sides: Sequence[tuple[SensorModel, np.ndarray, np.ndarray]],
+    sides: Sequence[_Side],
     *,
     of: str = APPLIED,
 ) -> DistanceSums:
     """
     Return the sums over the locked windows of the errors of corrected readings, or of the model.
 
-    Each side is (model, values, values to apply).
+    The windows are those of `hand_proof` and the documents: after effects have settled.
     """
     problem, sums = found.problem, DistanceSums()
-    start = max(judged_from_of(model, problem.duration) for model, *_ in sides)
+    start = max(judged_from_of(side.latest, problem.duration) for side in sides)
     held_out = [
         window
         for window, locked in zip(found.used, problem.locked)
@@ -151,7 +177,7 @@ def _locked_errors(
     ]
     errors_of = _errors if of == APPLIED else _model_errors
     for group in chunks(held_out):
-        for window, *errors in zip(group, *(errors_of(group, table, *side) for side in sides)):
+        for window, *errors in zip(group, *(errors_of(group, table, side) for side in sides)):
             sums.add(window, errors, problem.noise)
     return sums
 
@@ -173,13 +199,11 @@ def _compensated(
     )
 
 
-def _applied_parameters(
-    found: Investigation, chosen: Sequence[Question]
-) -> tuple[SensorModel, np.ndarray, np.ndarray]:
+def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Side:
     """
-    Return (model, values, values to apply) of a choice of effects.
+    Return a choice of effects as compensation applies it.
 
-    The last values are as compensation applies them. All are estimated without the locked windows.
+    It is estimated without the locked windows.
     """
     problem, wide = found.problem, found.problem.recording.model
     model = replace(problem.baseline, temperature_ref_c=wide.temperature_ref_c)
@@ -187,14 +211,32 @@ def _applied_parameters(
         model = model.with_effect(question.sensor, question.name)
     values = model.start_from(wide, problem.values(chosen))
     model = model.at(values)
-    centre = (
-        uncorrected_on_table(
-            model, values, problem.recording.accumulated(wide), gathered=wide
-        ).centre
-        if not_applied(model)
-        else {}
-    )
-    return model, values, applied_values(model, values, centre)
+    latest = latest_settling(model, values, _sd_of(problem, model, chosen))
+    centre: Mapping[str, np.ndarray] = {}
+    if not_applied(model):
+        accumulator = problem.recording.accumulated(wide)
+        uncorrected = uncorrected_on_table(model, values, accumulator, gathered=wide, latest=latest)
+        centre = uncorrected.centre
+    return _Side(model, values, applied_values(model, values, centre), latest)
+
+
+def _sd_of(
+    problem: LinearisedProblem | HandProblem, model: SensorModel, chosen: Sequence[Question]
+) -> np.ndarray:
+    """
+    Return the standard deviations of the parameters of some effects; of other ones zero.
+
+    A warm-up that was only tried at a bank of time constants has none for its own.
+    """
+    used = problem.search.indices(chosen)
+    covariance = problem.evidence.fit(used)[1]
+    known = dict(zip(used, np.sqrt(np.diag(covariance)), strict=True))
+    sd = np.zeros(len(model.param_names))
+    for question in chosen:
+        start = model.slices[question.effect.key].start
+        for place, index in enumerate(question.parameters):
+            sd[start + place] = known[index]
+    return sd
 
 
 def gain_by_hand(
@@ -227,10 +269,11 @@ def gain_by_hand(
                 smaller, [question for question in named if question.name in names]
             )
             moved = model.model.at(values)
-            start = max(start, judged_from_of(moved, end))
-            values = applied_values(
-                moved, values, uncorrected_in_time(moved, values, poses.time, end=end).centre
-            )
+            additional = [question for question in named if question.name in names]
+            latest = latest_settling(moved, values, _sd_of(smaller, moved, additional))
+            start = max(start, judged_from_of(latest, end))
+            uncorrected = uncorrected_in_time(moved, values, poses.time, end=end, latest=latest)
+            values = applied_values(moved, values, uncorrected.centre)
             errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, values, earth)
     return gain_of_poses(
         block.select(late := block.time >= start), [errors[late] for errors in pair], APPLIED
@@ -269,15 +312,12 @@ def _pose_errors(
 
 
 def _errors(
-    windows: Sequence[Window],
-    table: Table,
-    model: SensorModel,
-    values: np.ndarray,
-    applied: np.ndarray,
+    windows: Sequence[Window], table: Table, side: _Side
 ) -> Iterator[dict[str, np.ndarray]]:
     """
     Yield sensor -> error of the corrected readings of each window, m/s^2 and rad/s, shape (n, 3).
     """
+    model, values = side.model, side.values
     motion, temperature, rows = all_samples(windows)
     ideal = with_reference(model, nominal_values(model), values)
     at_ideal = model.at(ideal)
@@ -285,7 +325,8 @@ def _errors(
     refs = [references.at(sensor) for sensor in SENSORS]
     ref = refs[1].select(rows)
     raw = [np.concatenate([measured(window, sensor) for window in windows]) for sensor in SENSORS]
-    known = Calibration(model, applied, np.zeros((len(values),) * 2), (HELD,) * len(values))
+    count = len(values)
+    known = Calibration(model, side.applied, np.zeros((count, count)), (HELD,) * count)
     corrected = compensated_samples(
         known,
         *raw,
@@ -303,11 +344,11 @@ def _errors(
 
 
 def _model_errors(
-    windows: Sequence[Window], table: Table, model: SensorModel, values: np.ndarray, _applied: Any
+    windows: Sequence[Window], table: Table, side: _Side
 ) -> Iterator[dict[str, np.ndarray]]:
     """
     Yield sensor -> residual of the model in each window, m/s^2 and rad/s, shape (n, 3).
     """
-    left = residuals(windows, table, model, values=values)
+    left = residuals(windows, table, side.model, values=side.values)
     for start, stop in pairwise(np.cumsum([0, *map(len, windows)])):
         yield {sensor: rest[start:stop] for sensor, rest in left.items()}

@@ -22,6 +22,7 @@ from imu_calibration.estimation.solution import (
     SAMPLE_NOISE,
     Solution,
     Status,
+    bounded_by_prior,
     statuses,
     tolerances_of,
     total,
@@ -412,6 +413,7 @@ def _solved(
         with_movement(covariance := total(found.terms), model, movements) - covariance,
     )
     terms = with_term(terms, DRIFT, _hidden_covariance(model, poses))
+    terms = bounded_by_prior(terms, found.held, model.priors)
     # The result has all poses unchanged, also excluded and drifting ones.
     used, poses = (
         poses,

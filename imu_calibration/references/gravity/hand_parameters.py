@@ -24,7 +24,13 @@ CROSS_TERMS = tuple(linear_names('accelerometer')[np.tril_indices(3, -1)].tolist
 """Estimated off-diagonal entries of the accelerometer matrix."""
 CONVENTION_SD = 1e-12
 """Sd of a parameter that a convention fixes."""
-UNKNOWN_BY_HAND = {'angular acceleration', 'attitude', 'joint angle', 'joint rate'}
+UNKNOWN_BY_HAND = {
+    'angular acceleration',
+    'attitude',
+    'joint angle',
+    'joint rate',
+    'temperature rate',
+}
 """Quantities that cannot be determined from gravity in poses and the rates between them."""
 REPEATS = 4
 """
