@@ -27,6 +27,15 @@ CROSS = [PARAM_NAMES.index(name) for name in CROSS_TERMS]
 PRIOR_SD = 0.1
 
 
+def shortest_turn(up):
+    """Return the rotation by the smallest angle that turns z to a coordinate axis `up`."""
+    z = np.array([0.0, 0.0, 1.0])
+    if z @ up < 0:  # every horizontal axis fits
+        return Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    axis = np.cross(z, up)
+    return Rotation.from_rotvec(np.pi / 2 * axis)
+
+
 def board(seed, *, placements, rests, shared, cross=0.0, turns=False):
     """
     A board placed on its faces within 1 to 3 deg of the axes, with several rests each.
@@ -38,7 +47,7 @@ def board(seed, *, placements, rests, shared, cross=0.0, turns=False):
     faces = [*range(6), *rng.integers(0, 6, placements - 6)]
     attitudes, errors = [], []
     for face in faces:
-        base, _ = Rotation.align_vectors([FACES[face]], [[0, 0, 1]])
+        base = shortest_turn(FACES[face])
         tilt, along = np.radians(rng.uniform(1, 3)), rng.uniform(0, 2 * np.pi)
         error = rng.normal(0, shared, 3)
         for _ in range(rests):
