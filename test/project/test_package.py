@@ -24,6 +24,9 @@ from imu_calibration.cli.parser import VERBS
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.use_cases import resources
+from msg_adapters.bag import DEFAULT_TOPICS
+from msg_adapters.definitions import standard_definition
+from msg_adapters.imu import IMU_TYPE
 
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = {
@@ -344,6 +347,47 @@ def test_node_parameter_files_hold_one_documented_set_for_any_node_name():
             assert lines[row - 1].strip().startswith('#') or '#' in lines[row], (
                 f'{path.name}: {parameter} has no comment'
             )
+
+
+def test_the_groups_of_diagnostics_have_each_publishing_node_once():
+    """A status is named NODE: SUBJECT, hence its group by the beginning of its name."""
+    nodes = ROOT / 'imu_calibration' / 'nodes'
+    publishing = []
+    for name in sorted(EXECUTABLES - {'imu_calibration'}):
+        text = (nodes / f'{name}.py').read_text()
+        if re.search(r'^from imu_calibration\.nodes\.\w*diagnostics import', text, re.MULTILINE):
+            publishing.append(name)
+    period = re.search(
+        r'^DIAGNOSTICS_SECONDS = ([\d.]+)$', (nodes / 'diagnostics.py').read_text(), re.MULTILINE
+    )
+    document = yaml.safe_load((ROOT / 'config/diagnostic_aggregator.yaml').read_text())
+    groups = document['/**']['ros__parameters']
+    assert groups.pop('path') == 'IMU'
+    grouped = []
+    for group in groups.values():
+        assert group['type'] == 'diagnostic_aggregator/GenericAnalyzer'
+        assert group['timeout'] > 2 * float(period.group(1))
+        grouped += group['startswith']
+    assert sorted(grouped) == publishing
+
+
+@pytest.mark.parametrize('layout', ['imu.plotjuggler.xml', 'coverage.foxglove.json'])
+def test_a_layout_shows_fields_of_topics_that_the_nodes_have(layout):
+    """Each path of a layout is a topic of type Imu and a field of its definition."""
+    topics = {DEFAULT_TOPICS[IMU_TYPE]}
+    for path in (ROOT / 'imu_calibration/nodes').glob('*.py'):
+        for topic in re.findall(r"create_publisher\(Imu, '([\w/]+)'", path.read_text()):
+            topics.add(f'/{topic}')
+    fields = set()
+    for sensor in ('linear_acceleration', 'angular_velocity'):
+        assert f'geometry_msgs/Vector3 {sensor}' in standard_definition(IMU_TYPE).text
+        fields |= {f'{sensor}/{axis}' for axis in 'xyz'}
+    text = (ROOT / 'config' / layout).read_text()
+    paths = re.findall(r'"(/imu/\w+[./]\w+[./][xyz])"', text)
+    assert len(paths) >= 6
+    for path in paths:
+        topic, field = re.fullmatch(r'(/imu/\w+)[./](.+)', path).groups()
+        assert topic in topics and field.replace('.', '/') in fields, path
 
 
 def test_links_of_the_documents_lead_somewhere():
