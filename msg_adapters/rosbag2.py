@@ -6,6 +6,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path, PurePath
 from tempfile import mkdtemp
@@ -251,19 +252,26 @@ def read_metadata(folder: Path) -> dict[str, Any]:
     try:
         with open_regular(folder / 'metadata.yaml') as file:
             text = file.read(documents.MAX_DOCUMENT_CHARACTERS + 1).decode()
-        information = documents.parsed(text, 'metadata', aliases=True)[
-            'rosbag2_bagfile_information'
-        ]
-        for entry in information['topics_with_message_count']:
-            topic, entry['message_count'] = entry['topic_metadata'], int(entry['message_count'])
-            topic['name'], topic['type'] = clean_name(topic['name']), clean_name(topic['type'])
-        information['relative_file_paths'] = [
-            str(name) for name in information['relative_file_paths']
-        ]
-        if 'duration' in information:
-            int(information['duration']['nanoseconds'])
+        return _information(text)
     except (OSError, InputError, KeyError, TypeError, ValueError, AttributeError, OverflowError):
         return {}
+
+
+@lru_cache(maxsize=1)
+def _information(text: str) -> dict[str, Any]:
+    """
+    Return the checked content of metadata.yaml, which nothing changes.
+
+    One verb opens a recording several times.
+    """
+    document = documents.parsed(text, 'metadata', aliases=True)
+    information = document['rosbag2_bagfile_information']
+    for entry in information['topics_with_message_count']:
+        topic, entry['message_count'] = entry['topic_metadata'], int(entry['message_count'])
+        topic['name'], topic['type'] = clean_name(topic['name']), clean_name(topic['type'])
+    information['relative_file_paths'] = [str(name) for name in information['relative_file_paths']]
+    if 'duration' in information:
+        int(information['duration']['nanoseconds'])
     return information
 
 

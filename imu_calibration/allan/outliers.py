@@ -4,7 +4,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter1d
 
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.preprocessing.stream_cleaning import CleanedBlock, EpochFilters
@@ -103,6 +102,8 @@ def outliers(values: np.ndarray) -> np.ndarray:
     values : ndarray, shape (n, n_columns)
 
     """
+    from scipy.ndimage import median_filter, uniform_filter1d  # here, because its import is slow
+
     if len(values) < 4 * CONTEXT:
         return np.zeros(len(values), bool)
     deviation = np.abs(values - median_filter(values, (MEDIAN_SAMPLES, 1), mode='nearest'))

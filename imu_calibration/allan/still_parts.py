@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter
 
 from imu_calibration.allan.outliers import RestOutliers, without_outliers
 from imu_calibration.core.readings import RawReadings
@@ -123,6 +122,8 @@ def _at_the_usual_rate(chunks, period):
     A chunk with a lost sample is longer, its neighbours are not. Where outliers were dropped from
     most chunks, the median step between stamps is still the period.
     """
+    from scipy.ndimage import median_filter  # here, because its import is slow
+
     if not len(chunks):
         return np.zeros(0, bool)
     mean_step = median_filter(chunks.duration / chunks.size, PERIOD_MEDIAN_CHUNKS, mode='nearest')
@@ -164,6 +165,8 @@ def _stepping(mean, still, width):
 
     The means of `width` chunks before and after differ by more than they usually do.
     """
+    from scipy.ndimage import maximum_filter1d  # here, because its import is slow
+
     sums, count = (
         np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
         for values in (np.where(still[:, None], mean - mean[0], 0.0), still[:, None].astype(float))

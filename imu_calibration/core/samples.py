@@ -288,6 +288,20 @@ def runs_of(flags: ArrayLike, broken: ArrayLike = False) -> np.ndarray:
     return np.column_stack([np.flatnonzero(starts), np.flatnonzero(stops) + 1])
 
 
+def any_within(flags: np.ndarray, before: int, after: int) -> np.ndarray:
+    """
+    Return for each place whether a flag is true from `before` places before it to `after` after it.
+
+    Places beyond the ends count as false; shape (n,).
+    """
+    # n_true[i] is the number of true flags before place i.
+    n_true = np.concatenate([[0], np.cumsum(flags)])
+    place = np.arange(len(flags))
+    start = np.maximum(place - before, 0)
+    stop = np.minimum(place + after + 1, len(flags))
+    return n_true[stop] > n_true[start]
+
+
 def smallest_step(readings: np.ndarray, least: float = 1e-9) -> np.ndarray:
     """
     Return the smallest step from one reading to the next in each column.

@@ -7,7 +7,6 @@ A smooth curve through the readings, its motion, and small errors of it.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import vstack
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
@@ -39,6 +38,8 @@ def _with_velocity(spline, fit, position, velocity, *, knots, time, trend):
 
     `fit`, that to the positions, if the velocities disagree or are much noisier.
     """
+    from scipy.sparse import vstack  # here, because its import is slow
+
     pieces = piece_coefficients(fit.coefficients[:, None])
     trend.add_to(pieces, knots)
     _, rate, acceleration = evaluate_pieces(knots, pieces, time, derivatives=2)[:, :, 0]

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.sparse import csr_matrix
 
 from imu_calibration.core.samples import runs_of
 
@@ -86,6 +85,8 @@ def design_values(
 
 def design_matrix(knots: Knots, interval: np.ndarray, values: np.ndarray) -> Any:
     """Return the sparse design, shape (n, n_coefficients)."""
+    from scipy.sparse import csr_matrix  # here, because its import is slow
+
     columns = interval[:, None] + np.arange(SPLINE_ORDER)
     return csr_matrix(
         (

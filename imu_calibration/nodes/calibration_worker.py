@@ -287,6 +287,7 @@ class CalibrationWorker(threading.Thread):
         """Run the steps until `end`."""
         # 11 MB and 0.2 s, which the first fit of a bias process would need later.
         import_module('scipy.optimize')
+        import_module('scipy.ndimage')
         try:
             while not self._ending:
                 self._wake.wait(MESSAGE_CHECK_SECONDS)

@@ -11,10 +11,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import runs_of
+from imu_calibration.core.samples import any_within, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import two_sources, value_checks
 from imu_calibration.preprocessing.recording_evidence import (
@@ -122,7 +121,7 @@ def without_readings(evidence: RecordingEvidence) -> np.ndarray:
         flags |= (chunks.time - half >= part.start) & (chunks.time + half <= part.stop)
     if not len(flags):
         return NO_RANGES
-    runs = runs_of(maximum_filter1d(flags, 3))
+    runs = runs_of(any_within(flags, 1, 1))
     ranges = runs * chunks.size
     # samples after the last full chunk belong to no chunk
     ranges[runs[:, 1] == len(chunks), 1] = evidence.n_samples

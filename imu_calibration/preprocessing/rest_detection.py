@@ -3,10 +3,9 @@
 from collections import deque
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.core.samples import ImuSamples, runs_of
+from imu_calibration.core.samples import ImuSamples, any_within, runs_of
 from imu_calibration.preprocessing.window import WindowSettings
 
 SPANS = (0.25, 1.0)
@@ -99,10 +98,19 @@ def quiet_beside_joints(
 
 
 def low_passed(values: np.ndarray, width: int) -> np.ndarray:
-    """Return the running mean over an odd number of samples, applied three times, shape (n, 3)."""
+    """
+    Return the running mean over an odd number of samples, applied three times, shape (n, 3).
+
+    The first and the last value continue beyond the ends.
+    """
+    half = width // 2
+    # Sums of the deviations from one value, so that gravity causes no rounding.
+    origin = values[:1]
+    means = values - origin
     for _ in range(3):
-        values = uniform_filter1d(values, width, axis=0, mode='nearest')
-    return values
+        sums = _running(np.pad(means, ((half, half), (0, 0)), mode='edge').T)
+        means = (sums[:, width:] - sums[:, :-width]).T / width
+    return means + origin
 
 
 def _low_passed_piece(values, first, last, width):
@@ -118,6 +126,8 @@ def _steady(cells, *, ratio, resting):
 
     The variance of the span is about the minimum of the spans around.
     """
+    from scipy.ndimage import minimum_filter1d  # here, because its import is slow
+
     width = cells.width(SPANS[0])
     variance, at_rest = cells.variance(width), _free_of(~cells.all_of(resting), width)
     around = 2 * int(round(cells.cells_in(STEADY_SECONDS))) + 1
@@ -290,7 +300,7 @@ def _running(values):
 def _covered(calm, width):
     """Return for each cell whether one of the calm spans of `width` cells contains it."""
     padded = np.concatenate([calm, np.zeros(width - 1, bool)])
-    return maximum_filter1d(padded, width, origin=(width - 1) // 2, mode='constant')
+    return any_within(padded, width - 1, 0)
 
 
 def shrunk_mask(mask: np.ndarray, margin: int) -> np.ndarray:
@@ -299,7 +309,7 @@ def shrunk_mask(mask: np.ndarray, margin: int) -> np.ndarray:
 
     Cells beyond the ends count as True.
     """
-    return minimum_filter1d(mask, 2 * margin + 1, mode='constant', cval=1)
+    return ~any_within(~mask, margin, margin)
 
 
 _TURNING_SD = 30.0

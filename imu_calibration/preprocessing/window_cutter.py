@@ -6,10 +6,9 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from scipy.special import ndtri
 
-from imu_calibration.core.samples import runs_of
+from imu_calibration.core.samples import any_within, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.kinematics.joint_curve import fit_joint_curve
 from imu_calibration.kinematics.joint_motion import JointMotion, encoder_step
@@ -142,10 +141,15 @@ def _slow(rate, static_rate, half, period, step, noise):
 
 
 def _steady(rate, settings, half, allowance, ripple, ripple_half, noise):
-    size = 2 * half + 1
-    high, low = (
-        f(rate, size, axis=1, mode='nearest') for f in (maximum_filter1d, minimum_filter1d)
+    from scipy.ndimage import (  # here, because its import is slow
+        maximum_filter1d,
+        minimum_filter1d,
+        uniform_filter1d,
     )
+
+    size = 2 * half + 1
+    high = maximum_filter1d(rate, size, axis=1, mode='nearest')
+    low = minimum_filter1d(rate, size, axis=1, mode='nearest')
     change = np.maximum(settings.spin_rate_variation * np.abs(high + low) / 2, settings.static_rate)
     # a rate that swings by `change` within the span moves the readings by this
     swing = change * RATE_SPAN / (2 * np.pi)
@@ -157,7 +161,7 @@ def _steady(rate, settings, half, allowance, ripple, ripple_half, noise):
 
 
 def _widened(mask, half):
-    return maximum_filter1d(mask.view(np.int8), 2 * half + 1, mode='constant').astype(bool)
+    return any_within(mask, half, half)
 
 
 def _slopes(time, rows, half):

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.hand_workflow import (
     EvidentHand,
     HandResult,
@@ -31,7 +30,6 @@ from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import hand_options
 from imu_calibration.references.options import CalibrationOptions
-from imu_calibration.references.turntable.session_data import SessionData
 from imu_calibration.use_cases.recordings import (
     Source,
     Topics,
@@ -44,7 +42,9 @@ from msg_adapters.csv_log import autopilot_of
 from msg_adapters.imu import IMU_TYPE
 
 if TYPE_CHECKING:
+    from imu_calibration.calibration.collector import GatherStep
     from imu_calibration.calibration.table_result import TableResult
+    from imu_calibration.references.turntable.session_data import SessionData
 
 MOST_IMUS = 64
 """Imu topics and frames of a recording that are inspected at most; each needs a few scans."""

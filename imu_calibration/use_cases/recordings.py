@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
-from multiprocessing import resource_tracker
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -384,6 +382,10 @@ def process_mapper(jobs: int, done: Callable = lambda item: None) -> Callable:
         items = list(items)
         if min(jobs, len(items)) <= 1:
             return [_reported(function(item), done) for item in items]
+        # Here, because most verbs need no pool, and the imports are slow.
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor
+
         # Spawned, not forked: a fork of a process with threads can stop for ever.
         with ProcessPoolExecutor(
             min(jobs, len(items)), mp_context=multiprocessing.get_context('spawn')
@@ -400,6 +402,8 @@ def _interruptions_blocked():
 
     This process ends them.
     """
+    from multiprocessing import resource_tracker  # here, because its import is slow
+
     resource_tracker.ensure_running()  # its start would end the block
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

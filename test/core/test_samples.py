@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imu_calibration.core.samples import ImuSamples, JoinedParts, runs_of
+from imu_calibration.core.samples import ImuSamples, JoinedParts, any_within, runs_of
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -48,3 +48,11 @@ def test_joined_parts_are_their_concatenation():
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
     found.stamp_ns[:] = -1
     np.testing.assert_array_equal(parts[0].stamp_ns, first)
+
+
+@pytest.mark.parametrize('before, after', [(0, 0), (1, 1), (4, 0), (0, 3), (50, 50)])
+def test_any_within_is_the_largest_flag_of_each_span(before, after):
+    flags = np.random.default_rng(3).random(40) < 0.1
+    expected = [flags[max(i - before, 0) : i + after + 1].any() for i in range(len(flags))]
+    np.testing.assert_array_equal(any_within(flags, before, after), expected)
+    assert len(any_within(flags[:0], before, after)) == 0

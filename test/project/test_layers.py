@@ -33,7 +33,7 @@ ROS = {
     'std_srvs',
 }
 LATE = {'yaml', 'matplotlib', 'jinja2', 'tqdm', 'urdf_parser_py', 'xacro'}
-LATE_OF_SCIPY = ('scipy.optimize', 'scipy.signal', 'scipy.stats')
+LATE_OF_SCIPY = ('scipy.ndimage', 'scipy.optimize', 'scipy.signal', 'scipy.sparse', 'scipy.stats')
 NOT_IN_CALIBRATE = ('allan', 'planning')
 """They would take half of the time in which a command or a node starts."""
 
