@@ -346,3 +346,20 @@ def test_what_stays_unexplained_is_said(expected):
         and state.message.startswith('unexplained: ')
         and 'gyroscope' in state.message
     )
+
+
+def test_a_session_is_solved_before_the_next_rest_when_its_columns_were_extended(hidden):
+    """Rests had no centred rows, of the former width: a solution before the next rest failed."""
+    live = LiveCalibration(Table.from_mapping(hidden.table))
+    every = list(blocks(hidden.imu, hidden.joints))
+    for block in every[: len(every) // 2]:
+        live.push(block)
+    collector = live._collector
+    wide = replace(collector.model, gyroscope=(*collector.model.gyroscope, 'gyro_g_sensitivity'))
+    collector.take_model(wide)
+    accumulator = collector.gathered.accumulator
+    width = accumulator.rows[0].sensors['gyroscope'].mean.size
+    assert accumulator.rows[0].kind == 'static'
+    assert {each.sensors['gyroscope'].within.shape[1] for each in accumulator.rows} == {width}
+    assert accumulator.within['gyroscope', 'static'].shape[1] == width
+    live.solve()

@@ -101,12 +101,11 @@ def _again(
     """Return a static window's statistics with recomputed columns."""
     reduced, motion, temperature = entry
     references = References(model, table, motion, temperature_c=temperature)
-    sensors = {
-        name: replace(
-            known, mean=np.concatenate([columns(references, name).mean(axis=0), known.mean[-3:]])
-        )
-        for name, known in reduced.sensors.items()
-    }
+    sensors = {}
+    for name, known in reduced.sensors.items():
+        mean = np.concatenate([columns(references, name).mean(axis=0), known.mean[-3:]])
+        # At rest there are no centred rows, but their width is that of the columns.
+        sensors[name] = replace(known, mean=mean, within=np.zeros((0, len(mean))))
     return replace(
         reduced,
         sensors=sensors,
