@@ -905,13 +905,20 @@ def _guess(table, stated=frozenset()):
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
         # acc x raw, x acc
         without_raw = re.sub(r'^([xyz]) (.*)$', r'\2 \1', words.removesuffix(' raw'))
-        axis = re.fullmatch(r'(.*?) ?([xyz])', without_raw)
+        # The number of one of several IMUs: imu1 ax, ax 1, or acc1 x.
+        device = re.fullmatch(r'((?:imu|sensor|mpu|device) ?\d+) (.*)', without_raw)
+        bare, of_imu = (device[2], device[1]) if device else (without_raw, '')
+        numbered = re.fullmatch(r'(\D+?) ?(\d+) ?([xyz]?)', bare)
+        if numbered:
+            bare = f'{numbered[1]} {numbered[3]}'.strip()
+            of_imu += numbered[2]
+        axis = re.fullmatch(r'(.*?) ?([xyz])', bare)
         suffix = words[len(words.removesuffix(' raw')) :]
         for quantity, pattern in COLUMN_PATTERNS:
             if quantity in axes:
                 if axis and re.fullmatch(pattern, axis.group(1)):
                     # Numbers distinguish sensors, and "raw" columns from converted ones.
-                    group = re.sub(r'[^a-z0-9]', '', axis.group(1) + suffix)
+                    group = re.sub(r'[^a-z0-9]', '', of_imu + axis.group(1) + suffix)
                     unit = _unit(quantity, unit_text)
                     axes[quantity].setdefault(group, {})[axis.group(2)] = (name, unit)
             elif (
@@ -932,10 +939,11 @@ def _guess(table, stated=frozenset()):
         if len(complete) > 1:
             raise InputError(
                 f'{table.path} must have one column of {quantity} per axis, got {len(complete)}'
-                ' sets:'
+                ' sets, as of several IMUs:'
                 f' {"; ".join(", ".join(group[axis][0] for axis in "xyz") for group in complete)};'
                 f' {REMEDY}',
                 key='columns',
+                code='several_sets',
             )
         if complete:
             units = {group[axis][1] for group in complete for axis in 'xyz'}

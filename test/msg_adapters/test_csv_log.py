@@ -54,6 +54,25 @@ def assert_read(log, imu):
 
 
 @pytest.mark.parametrize(
+    'name', ('imu{}_a{}', 'a{1}{0}', 'acc{}_{}', 'sensor_{}_accel_{}', 'a{1}_{0}')
+)
+def test_numbered_columns_of_two_imus_are_named(tmp_path, name):
+    sets = [[name.format(number, axis) for axis in 'xyz'] for number in (1, 2)]
+    rows = np.random.default_rng(8112).normal(0.0, 0.1, (50, 6)) + [0, 0, 9.8, 0, 0, 9.8]
+    lines = [','.join(['time', *sets[0], *sets[1], 'wx', 'wy', 'wz'])]
+    for k, row in enumerate(rows):
+        lines.append(','.join(map(str, [0.01 * k, *row, 0.1, 0.2, -0.1])))
+    path = tmp_path / 'log.csv'
+    path.write_text('\n'.join(lines))
+    with refused(InputError, 'several_sets', ', '.join(sets[0]), ', '.join(sets[1])) as caught:
+        read_csv(path)
+    assert caught.value.key == 'columns'
+    # One of the sets is read.
+    columns = [f'force={",".join(sets[1])}:m/s^2', 'rate=wx,wy,wz:rad/s']
+    assert read_csv(path, columns).imu.force_s == pytest.approx(rows[:, 3:])
+
+
+@pytest.mark.parametrize(
     ('force_size', 'force_unit'),
     [(1.0, 'm/s^2'), (STANDARD_GRAVITY, 'g'), (1e-3 * STANDARD_GRAVITY, 'mg')],
 )
