@@ -44,7 +44,7 @@ def test_what_is_handed_over_helps_in_another_session(cause, world):
             continue
         worst = max(part.after / part.before for part in entry.regimes.values())
         print(
-            f'{cause}, {sensor}: error after / before {entry["after"] / entry["before"]:.3f} wanted'
+            f'{cause}, {sensor}: error after / before {entry.after / entry.before:.3f} wanted'
             f' below 1, worst motion {worst:.3f} wanted at most {WORSE}'
         )
         assert entry.after < entry.before and worst <= WORSE

@@ -127,6 +127,7 @@ UNREACHABLE = {
         'up': 'of transforms in a bag',
         'force': 'results of verbs',
         'increments': 'no readings are compared',
+        'temperature_topic': 'the simulated temperatures are known',
     },
     'compensator_node': {
         'increments': 'the calibration states the unit',
