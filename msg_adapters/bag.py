@@ -14,7 +14,7 @@ from imu_calibration.core.errors import InputError, did_you_mean, shortened
 from imu_calibration.core.exit_codes import UNKNOWN_EXTENT
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from msg_adapters.compression import LARGEST_CHUNK, decompress
-from msg_adapters.csv_log import SUFFIXES, CsvBag, is_text_log, require_no_rows
+from msg_adapters.csv_log import SUFFIXES, CsvBag, is_log_folder, is_text_log, require_no_rows
 from msg_adapters.decode import OTHER_FRAME, Decoder, FrameChoice, JointDecoder, taken_counts
 from msg_adapters.definitions import DEFAULT_TOPICS, deserializer, is_standard, rosbags_missing
 from msg_adapters.imu import IMU_TYPE, TEMPERATURE_TYPE
@@ -394,7 +394,7 @@ def _open_source(path, raw=(), where=()):
             ' device; give a file'
         )
     try:
-        if is_text_log(path):
+        if is_text_log(path) or is_log_folder(path):
             return CsvBag(path, raw, where)
         require_no_rows(where, path)
         if path.suffix == '.bag':

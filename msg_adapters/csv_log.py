@@ -37,6 +37,7 @@ from imu_calibration.preprocessing.sensor_join import (
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from imu_calibration.preprocessing.value_checks import force_error, samples_per_second
 from msg_adapters.rosbag2 import Rosbag2
+from msg_adapters.storages import suffixes
 from msg_adapters.write import write_session
 
 SUFFIXES = ('.csv', '.tsv', '.txt')
@@ -1111,6 +1112,16 @@ def is_text_log(path: str | PathLike[str]) -> bool:
     return Path(path).suffix.lower() in SUFFIXES
 
 
+def is_log_folder(path: str | PathLike[str]) -> bool:
+    """Return whether a path is a folder of text logs, as phones export it, and no bag."""
+    folder = Path(path)
+    if not folder.is_dir() or (folder / 'metadata.yaml').exists():
+        return False
+    inner = list(folder.iterdir())
+    of_bag = [each for each in inner if each.suffix in suffixes()]
+    return any(map(is_text_log, inner)) and not of_bag
+
+
 def require_no_rows(where: Sequence[str], path: str | PathLike[str]) -> None:
     """Refuse conditions on rows for a recording without rows."""
     if where:
@@ -1122,8 +1133,20 @@ def require_no_rows(where: Sequence[str], path: str | PathLike[str]) -> None:
 
 
 def read_directly(path: Path, raw: Sequence[str] = (), where: Sequence[str] = ()) -> CsvLog:
-    """Read a text log without `convert`, and report how it is read; see `read_csv`."""
-    log = read_csv(path, where=where, raw=raw)
+    """
+    Read a text log or a folder of them without `convert`, and report how it is read.
+
+    See `read_csv` and `read_logs`.
+    """
+    if not path.is_dir():
+        log = read_csv(path, where=where, raw=raw)
+    elif raw:
+        raise InputError(
+            f'units are stated for one text log, got the folder {path}; convert it first',
+            code='several_logs',
+        )
+    else:
+        log = read_logs([path], where=where)
     remark(f'{path.name} is read as {"; ".join(map(str, log.columns))}')
     if log.joined is not None:
         remark(f'{path.name}: {log.joined.text}')
@@ -1136,7 +1159,7 @@ def read_directly(path: Path, raw: Sequence[str] = (), where: Sequence[str] = ()
 
 class CsvBag(Rosbag2):
     """
-    A text log, converted into a temporary bag.
+    A text log, or a folder of one per sensor, converted into a temporary bag.
 
     Raises
     ------
@@ -1147,8 +1170,11 @@ class CsvBag(Rosbag2):
     """
 
     def __init__(self, path: Path, raw: tuple[str, ...] = (), where: tuple[str, ...] = ()):
-        status = path.stat()
-        self.converted = _converted(path, status.st_mtime_ns, status.st_size, raw, where)
+        logs = filter(is_text_log, path.iterdir()) if path.is_dir() else [path]
+        status = [log.stat() for log in logs]
+        modified_ns = max(each.st_mtime_ns for each in status)
+        size = sum(each.st_size for each in status)
+        self.converted = _converted(path, modified_ns, size, raw, where)
         super().__init__(self.converted.bag)
         self.path = path
 

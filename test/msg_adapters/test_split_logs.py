@@ -111,6 +111,18 @@ def test_convert_writes_them(folder, tmp_path, capsys):
     assert np.isfinite(samples.force_s).all() and np.isfinite(samples.rate_s).all()
 
 
+def test_every_verb_reads_a_folder_of_logs_directly(folder, tmp_path):
+    with open_recording(folder, want_joints=False) as recording:
+        samples = next(recording.blocks()).imu
+    whole = read_logs([folder]).imu
+    assert samples.force_s == pytest.approx(whole.force_s[: len(samples)])
+    assert samples.rate_s == pytest.approx(whole.rate_s[: len(samples)])
+    assert main(['inspect', str(folder)]) != 1
+    # A folder without any log is no recording.
+    with pytest.raises(InputError):
+        open_recording(tmp_path, want_joints=False)
+
+
 def test_the_overflow_of_a_counter_in_two_logs_is_undone(streams, tmp_path):
     """Stamps of 32 bits in microseconds; the readings after the overflow were left out."""
     overflow_us = 2**32
