@@ -23,6 +23,7 @@ from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
     GRAVITY,
     HELD_PRIORS,
+    PLACE_REMEDY,
     REJECTED,
     Solution,
     reasons_held,
@@ -159,7 +160,14 @@ def motions_needed(
     )
     data_sd = observability.sd_of_data(solution, prior_sd)
     is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
+    of_known_size: set[str] = set()
+    for effect in solution.model.effects:
+        if effect.known_size:
+            of_known_size.update(effect.param_names())
     for name in needed:
+        if name in of_known_size:
+            needed[name] = (PLACE_REMEDY, float('nan'))
+            continue
         index = solution.param_names.index(name)
         section = name.partition('.')[0]
         # Both sensors determine table and clock.

@@ -51,7 +51,10 @@ TURNS_REMEDY = (
 """Remedy where the rates of most turns by hand contradict gravity before and after them."""
 MOVED_REMEDY = 'put the IMU down in each attitude, with engines and fans off, and record again'
 """Remedy where a sensor moved although it was held still."""
+PLACE_REMEDY = 'give latitude and azimuth_deg in the description of the table'
+"""Remedy for the Earth's rate, which motions determine worse than the place gives it."""
 REMEDY_KEYS = {
+    PLACE_REMEDY: 'table',
     REMEDIES[GRAVITY,]: 'gravity',
     REMEDIES[MODEL_ERROR, DRIFT, REJECTED]: 'diagnose',
     EXCESS_REMEDY: 'diagnose',

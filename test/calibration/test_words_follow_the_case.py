@@ -15,6 +15,7 @@ from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
     GRAVITY,
     MODEL_ERROR,
+    PLACE_REMEDY,
     REMEDIES,
     REMEDY_KEYS,
     SAMPLE_NOISE,
@@ -47,7 +48,7 @@ def test_a_single_shaft_is_told_to_be_mounted_at_another_angle():
     ).result
     needs = {text for text, _ in needed_motions(result, table).values()}
     possible = {motion.text for motion in motions_about((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))}
-    assert OTHER_MOUNT in needs and needs <= {OTHER_MOUNT} | possible
+    assert OTHER_MOUNT in needs and needs - {PLACE_REMEDY} <= {OTHER_MOUNT} | possible
     assert possible == {
         motion.text for motion in MOTIONS if motion.name in ('spin_x', 'oscillate_x')
     }
@@ -161,8 +162,19 @@ def test_an_effect_that_is_held_for_a_misfit_needs_its_cause_and_no_motions():
     assert reasons and {reason.key for reason in reasons} == {'diagnose'}
     # Those of the table are determined by the same residuals.
     keys = {name: REMEDY_KEYS.get(need) for name, (need, _) in found.result.needed.items()}
-    of_table = {key for name, key in keys.items() if name.startswith('reference')}
+    of_table = {key for name, key in keys.items() if name.startswith('reference.table_tilt')}
     assert of_table == {'diagnose'}
+
+
+def test_a_weak_rate_of_the_earth_needs_the_place_and_no_motion():
+    session = make_session(8113, {'earth_rate': None}, profile='quick', noise='realistic')
+    known = Table.from_mapping(session.table)
+    nowhere = replace(
+        known, gravity=known.gravity_value, latitude=None, height=None, azimuth_deg=None
+    )
+    found = calibrate_recordings(session.block, nowhere, model_as_asked=True)
+    weak = {name: need for name, need in found.result.needed.items() if 'earth_rate' in name}
+    assert weak and {REMEDY_KEYS[need] for need, _ in weak.values()} == {'table'}
 
 
 def test_needs_and_verdict_have_one_rule_for_an_incomplete_model():
