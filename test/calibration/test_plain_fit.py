@@ -33,6 +33,7 @@ from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.window_statistics import reduce_window
 
 from worlds import misfit_worlds
+from worlds.compensation_cases import with_values
 from worlds.physics_cause import Cause
 from worlds.physics_draw import DEG
 
@@ -161,19 +162,7 @@ def with_plain_values(calibration, kind, seed):
     """Return the calibration with the values of `plain_values`."""
     pair, table, *_ = world(kind, seed)
     model, values = plain_values(pair.first, table)
-    count = len(values)
-    return replace(
-        calibration,
-        model=model,
-        values=values,
-        covariance=1e-12 * np.eye(count),
-        status=('determined',) * count,
-        covariance_terms={},
-        held_reason={},
-        judgement=None,
-        proof={},
-        statistics={},
-    )
+    return with_values(calibration, model, values)
 
 
 @pytest.mark.parametrize(('kind', 'seed'), [('losses', 615), ('heat', 501), ('cable', 604)])

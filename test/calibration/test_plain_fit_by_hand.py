@@ -4,8 +4,6 @@ By hand too, plain least squares where it predicts other parts of a session bett
 The world has a cause that no effect of the catalogue describes: a cable that winds up.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -19,6 +17,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
 from imu_calibration.references.options import CalibrationOptions
 
+from worlds.compensation_cases import with_values
 from worlds.hand_sessions import GRAVITY, simulate
 
 DEG = np.pi / 180
@@ -76,19 +75,7 @@ def with_plain_values(calibration, imu):
     values[model.part('accelerometer', Role.LINEAR)] = lower.ravel()
     values[model.part('gyroscope', Role.OFFSET)] = bias
     values[model.part('gyroscope', Role.LINEAR)] = matrix
-    count = len(values)
-    return replace(
-        calibration,
-        model=model,
-        values=values,
-        covariance=1e-12 * np.eye(count),
-        status=('determined',) * count,
-        covariance_terms={},
-        held_reason={},
-        judgement=None,
-        proof={},
-        statistics={},
-    )
+    return with_values(calibration, model, values)
 
 
 def test_turns_of_a_second_session_are_no_worse_than_with_least_squares():

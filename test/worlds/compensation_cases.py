@@ -4,6 +4,8 @@ Random calibrations for the tests of compensation.
 Every effect that can be inverted, at sizes that still converge.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from imu_calibration.core.readings import RawReadings
@@ -98,4 +100,21 @@ def random_motion(n=50, seed=0):
         rng.uniform(-5, 5, (n, 3)),
         rng.uniform(-20, 20, (n, 3)),
         rng.uniform(5, 45, n),
+    )
+
+
+def with_values(calibration, model, values):
+    """Return the calibration with other values that are known, and no statements about its own."""
+    count = len(values)
+    return replace(
+        calibration,
+        model=model,
+        values=values,
+        covariance=1e-12 * np.eye(count),
+        status=('determined',) * count,
+        covariance_terms={},
+        held_reason={},
+        judgement=None,
+        proof={},
+        statistics={},
     )
