@@ -18,17 +18,12 @@ def run(folder, plots):
 
     section = Section('Reported standard deviations and the scatter over sessions')
     found = scatter(windows_of_a_short_session(), range(SESSIONS))
-    section.claim(
+    claim_errors(
+        section,
         f'{SESSIONS} simulated sessions on a table: mean square of errors over reported sd',
-        '0.95 to 1.05',
-        f'{found.mean_square:.3f}',
-        0.95 <= found.mean_square <= 1.05,
-    )
-    section.claim(
-        'share of errors within the 95 % interval',
-        '0.935 to 0.965',
-        f'{found.coverage:.4f}',
-        0.935 <= found.coverage <= 0.965,
+        found,
+        mean_square=(0.95, 1.05),
+        coverage=(0.935, 0.965),
     )
     section.claim(
         'sd of the errors of each parameter over its median reported sd',
@@ -53,17 +48,34 @@ def run(folder, plots):
         ('whose gyroscope responds to gravity', 5e-4),
     ):
         by_hand = hand_scatter(range(BY_HAND), sensitivity)
-        section.claim(
+        claim_errors(
+            section,
             f'{BY_HAND} simulated sessions by hand {response}: normalised squared error',
-            '0.85 to 1.20',
-            f'{by_hand.mean_square:.3f}',
-            0.85 <= by_hand.mean_square <= 1.20,
-        )
-        section.claim(
-            'share of errors within the 95 % interval',
-            '0.93 to 0.97',
-            f'{by_hand.coverage:.4f}',
-            0.93 <= by_hand.coverage <= 0.97,
+            by_hand,
+            mean_square=(0.85, 1.20),
+            coverage=(0.93, 0.97),
         )
     section.say(text('scatter'))
     return section
+
+
+def claim_errors(section, claim, found, *, mean_square, coverage):
+    """
+    Claim the errors of some sessions in reported standard deviations.
+
+    `found` has a mean square and a coverage, and the limits of each are (lowest, highest).
+    """
+    low, high = mean_square
+    section.claim(
+        claim,
+        f'{low:.2f} to {high:.2f}',
+        f'{found.mean_square:.3f}',
+        low <= found.mean_square <= high,
+    )
+    low, high = coverage
+    section.claim(
+        'share of errors within the 95 % interval',
+        f'{low} to {high}',
+        f'{found.coverage:.4f}',
+        low <= found.coverage <= high,
+    )
