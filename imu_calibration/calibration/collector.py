@@ -466,6 +466,7 @@ class GatherStep:
         try:
             gathered = self._gather(source(), session, (preflight,), windows=windows)
         finally:
+            # Where a sensor is absent, that is also the reason why nothing could be gathered.
             _require_both_sensors(preflight)
         if len(preflight.without_readings):
             if windows is not None:

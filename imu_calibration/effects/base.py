@@ -385,19 +385,10 @@ class Effect:
 
 
 PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
-MIXED_PRODUCTS = tuple(
-    len(PRODUCT_PAIRS) * row + place
-    for row in range(len(AXES))
-    for place, (j, k) in enumerate(PRODUCT_PAIRS)
-    if j != k
-)
+_IS_MIXED = [first != second for first, second in PRODUCT_PAIRS]
+MIXED_PRODUCTS = tuple(np.flatnonzero(np.tile(_IS_MIXED, len(AXES))).tolist())
 """Places of `PRODUCTS` among the six products of each output."""
-OTHER_AXES = tuple(
-    len(AXES) * row + column
-    for row in range(len(AXES))
-    for column in range(len(AXES))
-    if row != column
-)
+OTHER_AXES = tuple(np.flatnonzero(~np.eye(len(AXES), dtype=bool)).tolist())
 """Places of `OTHERS` among the three inputs of each output."""
 TRIPLES = (
     (0, 0, 0),
