@@ -54,6 +54,10 @@ def triangular_of_band(rows: np.ndarray) -> np.ndarray:
         # The rows that begin in this band, and the remainder of the rows before it.
         own = np.concatenate([carried, rows[band == number]])
         used = np.flatnonzero(own.any(axis=0))
+        if not len(used):
+            # no row has an element in this band
+            carried = rows[:0]
+            continue
         part = triangular(own[:, used])
         reflected = np.zeros((len(part), width))
         reflected[:, used] = part

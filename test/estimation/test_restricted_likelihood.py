@@ -243,3 +243,12 @@ def test_factor_along_a_band_is_that_of_all_rows():
     np.testing.assert_allclose(factor.T @ factor, rows.T @ rows, rtol=1e-12, atol=1e-12 * n_poses)
     assert not np.tril(factor, -1).any()
     assert max(largest) < 0.05 * rows.size
+
+
+def test_a_band_without_an_element_has_a_factor_of_zeros():
+    # Without its first poses a session by hand has rows of zeros only in their columns.
+    size = scaled_solve.BAND_COLUMNS
+    rows = np.zeros((6 * size, 3 * size))
+    rows[3 * size :, size:] = np.random.default_rng(9210).normal(size=(3 * size, 2 * size))
+    factor = triangular_of_band(rows)
+    np.testing.assert_allclose(factor.T @ factor, rows.T @ rows, rtol=1e-12, atol=1e-10)
