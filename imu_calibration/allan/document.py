@@ -621,7 +621,7 @@ def _fault_lines(recording):
     found = []
     for name, entry in (recording.get('faults') or {}).items():
         share = entry['white_noise_too_high_by'] - 1.0
-        cause = 'outliers (heavy tails)'
+        cause = 'outliers (heavy tails, torn register reads)'
         if 'repeated' in entry:
             cause = f'{entry["repeated"]:.0%} repeated readings'
         found.append(

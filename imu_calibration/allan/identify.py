@@ -459,9 +459,10 @@ def _fault_entries(faults, sensors):
                 'repeated': float(faults.repeated[k]),
                 'white_noise_too_high_by': float(faults.repetition[k]),
             }
-        for letter, ratio in zip(AXES, faults.tails[3 * k : 3 * k + 3]):
-            if ratio > 1.0:
-                entries[f'{sensor} {letter}'] = {'white_noise_too_high_by': float(ratio)}
+        for axis, letter in enumerate(AXES, start=3 * k):
+            if faults.named[axis]:
+                ratio = float(faults.tails[axis])
+                entries[f'{sensor} {letter}'] = {'white_noise_too_high_by': ratio}
     return entries
 
 

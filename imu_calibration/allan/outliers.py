@@ -110,8 +110,15 @@ def outliers(values: np.ndarray) -> np.ndarray:
     # The quantile is for readings that repeat, of which many deviate by zero.
     middle = np.median(deviation, axis=0) / NORMAL_QUARTILE
     tail = np.quantile(deviation, TAIL_QUANTILE, axis=0) / TAIL_SD
-    # A column whose readings hardly ever change has no known scatter.
-    scatter = np.where(middle > 0, np.maximum(middle, tail), np.inf)
+    scatter = np.maximum(middle, tail)
+    # Most readings are equal: the scatter of those that change, such as by one step.
+    for column in np.flatnonzero(middle == 0):
+        changes = np.abs(np.diff(values[:, column]))
+        changes = changes[changes > 0]
+        typical_change = np.inf
+        if len(changes):
+            typical_change = np.median(changes)
+        scatter[column] = max(scatter[column], typical_change)
     far = deviation > FAR * scatter
     around = uniform_filter1d(far.astype(float), 2 * CONTEXT + 1, axis=0, mode='constant')
     single = far & (around * (2 * CONTEXT + 1) < MOST_AROUND + 0.5)

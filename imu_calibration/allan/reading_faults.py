@@ -5,17 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.allan.outliers import NORMAL_QUARTILE
+from imu_calibration.allan.torn_reads import HIGH_BYTE, Excess, excess_of_torn_reads
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
 LEAST_STEPS = 4.0
 """Steps of the converter within the scatter, at least: below, its quantiles are those of steps."""
-LEAST_EXCESS, EXCESS_SDS = 0.015, 4.5
-"""Least excess of the standard deviation over that of a core, as a share and in its sds."""
+WIDENING_SDS = 1.0
+"""sds of an excess from which on it widens the interval of the white noise."""
+NAMED_EXCESS, NAMED_SDS = 0.015, 3.0
+"""Excess from which on it is named, as a share and in its sds."""
 CORE_STEPS = 40
 """Iterations of the scale of a core; each reduces its error by a third or more."""
-HIGH_BYTE = 256
-"""Steps of the converter by which a torn register read differs."""
 SMALLEST_TORN, LARGEST_TORN = 2.5, 10.0
 """
 Standard deviations of an error by a torn read that tails can have: smaller errors lie in the
@@ -23,8 +24,11 @@ core, and larger ones are outliers, which are excluded before.
 """
 MEAN_DEVIATION = 0.8
 """Mean of the absolute value of a standard normal variable."""
-BLOCK = 8
-"""Neighbouring readings whose mean is subtracted: motion and drift are slower."""
+BLOCK = 32
+"""
+Neighbouring readings whose mean is subtracted: motion and drift are slower, and an outlier moves
+the mean by 3 % of its size.
+"""
 REPEATED = 0.05
 """Share of repeated readings above which they are named."""
 TOGETHER = 0.9
@@ -80,7 +84,9 @@ class ReadingFaults:
     """What makes the white noise of readings appear larger than that of the sensor."""
 
     tails: np.ndarray
-    """By how much tails raise the noise of means, at least 1, shape (6,); 1: Gaussian."""
+    """By how much tails and torn reads raise the noise of means, at least 1, shape (6,)."""
+    named: np.ndarray
+    """Whether this excess is significant, shape (6,)."""
     repeated: np.ndarray
     """Share of readings that repeat the reading before, accelerometer and gyroscope, shape (2,)."""
     repetition: np.ndarray
@@ -94,7 +100,7 @@ class ReadingFaults:
         return float(self.tails[column] * self.repetition[column // 3])
 
 
-NO_FAULTS = ReadingFaults(np.ones(6), np.zeros(2), np.ones(2))
+NO_FAULTS = ReadingFaults(np.ones(6), np.zeros(6, bool), np.zeros(2), np.ones(2))
 
 
 class FaultSearch:
@@ -102,8 +108,8 @@ class FaultSearch:
 
     def __init__(self) -> None:
         self._last: np.ndarray | None = None
-        # Readings of blocks minus the mean of their block, and the readings of the next block.
-        self._deviations: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
+        # Readings of complete blocks, and the readings of the next block.
+        self._readings: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
         self._n_kept = dict.fromkeys(SENSORS, 0)
         self._next_block = dict.fromkeys(SENSORS, np.zeros((0, 3)))
         self._smallest_step = np.full(6, np.inf)
@@ -142,15 +148,13 @@ class FaultSearch:
             self._add_blocks(sensor, rows[1:][~held][:, SENSOR_COLUMNS[sensor]])
 
     def _add_blocks(self, sensor, readings):
-        """Add the deviations of the complete blocks of a sensor; the last one is continued."""
+        """Add the complete blocks of a sensor; the last one is continued."""
         if self._n_kept[sensor] >= MOST_READINGS:
             return
         readings = np.vstack([self._next_block[sensor], readings])
         n_complete = len(readings) // BLOCK
         self._next_block[sensor] = readings[n_complete * BLOCK :].copy()
-        blocks = readings[: n_complete * BLOCK].reshape(n_complete, BLOCK, 3)
-        deviations = blocks - blocks.mean(axis=1, keepdims=True)
-        self._deviations[sensor].append(deviations.reshape(-1, 3))
+        self._readings[sensor].append(readings[: n_complete * BLOCK].copy())
         self._n_kept[sensor] += n_complete * BLOCK
 
     def _add_runs(self, k, changes, n_pairs):
@@ -183,43 +187,56 @@ class FaultSearch:
         mean_square = np.maximum(self._run_squares, 1.0) / n_runs
         mean = np.maximum(self._run_sum, 1.0) / n_runs
         repetition = np.sqrt(mean_square) / mean
+        ratios = np.ones(6)
+        named = np.zeros(6, bool)
+        for column, excesses in enumerate(self._excesses()):
+            for excess in excesses:
+                if excess.sds > WIDENING_SDS:
+                    ratios[column] = max(ratios[column], excess.ratio)
+                if excess.sds > NAMED_SDS and excess.ratio > 1.0 + NAMED_EXCESS:
+                    named[column] = True
         return ReadingFaults(
-            self._tails(),
+            ratios,
+            named,
             np.where(repeats, share, 0.0),
             np.where(repeats, np.maximum(repetition, 1.0), 1.0),
         )
 
-    def _tails(self):
-        """Return by how much tails raise the noise of means, shape (6,)."""
-        tails = np.ones(6)
+    def _excesses(self):
+        """Return the list of `Excess` of each axis, by tails and by torn reads."""
+        of_axes: list[list[Excess]] = []
         for sensor, columns in SENSOR_COLUMNS.items():
-            n_kept = self._n_kept[sensor]
-            if n_kept < LEAST_READINGS:
+            if self._n_kept[sensor] < LEAST_READINGS:
+                of_axes += [[], [], []]
                 continue
-            of_sensor = []
-            for deviation, step in zip(
-                np.concatenate(self._deviations[sensor]).T,
-                self._smallest_step[columns],
-                strict=True,
-            ):
-                of_sensor.append(_excess_of_tails(deviation, step))
-            tails[columns] = of_sensor
-        return tails
+            of_sensor = np.concatenate(self._readings[sensor]).T
+            for readings, step in zip(of_sensor, self._smallest_step[columns], strict=True):
+                if not np.isfinite(step):  # constant readings
+                    of_axes.append([])
+                    continue
+                tails = _excesses_of_tails(readings, step)
+                of_axes.append([*tails, excess_of_torn_reads(readings, step)])
+        return of_axes
 
 
-def _excess_of_tails(deviation, smallest_step):
-    """Return by how much the tails of an axis raise the noise of means, at least 1."""
+def _excesses_of_tails(readings, smallest_step):
+    """Return the `Excess` that the tails of an axis give, one for each core with known scale."""
+    blocks = readings.reshape(-1, BLOCK)
+    deviation = (blocks - blocks.mean(axis=1, keepdims=True)).ravel()
     sd = float(np.sqrt(np.mean(deviation**2)))
-    largest = 1.0
+    excesses = []
     for core in CORES:
         core_sd = core.sd(deviation)
         # The quantiles of few steps are those of the steps.
         if core_sd < LEAST_STEPS * smallest_step:
             continue
         excess = sd / core_sd - 1.0
-        if excess > max(LEAST_EXCESS, EXCESS_SDS * core.ratio_sd / len(deviation) ** 0.5):
-            largest = max(largest, excess_of_means(1.0 + excess, core_sd / smallest_step))
-    return largest
+        if excess <= 0.0:
+            continue
+        n_sds = excess / core.ratio_sd * len(deviation) ** 0.5
+        ratio = excess_of_means(1.0 + excess, core_sd / smallest_step)
+        excesses.append(Excess(ratio, n_sds))
+    return excesses
 
 
 def excess_of_means(ratio: float, noise_steps: float) -> float:
