@@ -31,6 +31,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_force()
     parser.add_recording('a table or robot is required, the same for all units')
     parser.add_gyroscope_topic()
+    parser.add_exclusion('of every unit, s from the first stamp; or NAME=A:B, of a unit or bag')
     parser.add_rows()
     parser.add_model()
 

@@ -18,6 +18,12 @@ from imu_calibration.core.units import for_people, significant, with_sd
 from imu_calibration.document import files
 from imu_calibration.document.decision import HARMS, HELPS, UNPROVEN
 from imu_calibration.kinematics.joint import JointNames
+from imu_calibration.preprocessing.exclusion import (
+    Exclusion,
+    exclusions_of_units,
+    parse_exclusions,
+    without_excluded,
+)
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.calibration_sections import calibration_report
 from imu_calibration.report.page import render
@@ -100,12 +106,25 @@ def fleet_unit(
     *,
     joint_names: JointNames,
     options: dict[str, Any],
+    exclusions: Sequence[Sequence[Exclusion]] | None = None,
 ) -> Unit:
-    """Return the Unit with sources that read the bags without reporting progress."""
+    """
+    Return the Unit with sources that read the bags without reporting progress.
+
+    `exclusions`: times of each recording that are not used.
+    """
     paths = [path.resolve() for path in paths]
-    sources = tuple(source_of(path, topics, joint_names, quiet=True) for path in paths)
+    sources = []
+    for number, path in enumerate(paths):
+        source = source_of(path, topics, joint_names, quiet=True)
+        if exclusions and exclusions[number]:
+            source = partial(without_excluded, source, exclusions[number])
+        sources.append(source)
     return Unit(
-        name, sources, tuple(path.name for path in paths), partial(provenance_of, paths, options)
+        name,
+        tuple(sources),
+        tuple(path.name for path in paths),
+        partial(provenance_of, paths, options),
     )
 
 
@@ -130,8 +149,19 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     table = _table(options, [path for _, paths in found for path in paths])
     choices = options.choices()
     used = provenance_with('fleet', (), choices, stand=options.stand())['options']
+    exclusions = exclusions_of_units(
+        parse_exclusions(options.exclude) if options.exclude else (),
+        {name: [path.name for path in paths] for name, paths in found},
+    )
     units = [
-        fleet_unit(name, paths, topics_of(choices), joint_names=table.joint_names, options=used)
+        fleet_unit(
+            name,
+            paths,
+            topics_of(choices),
+            joint_names=table.joint_names,
+            options=used,
+            exclusions=exclusions[name],
+        )
         for name, paths in found
     ]
     if not options.force:

@@ -154,13 +154,9 @@ class OneLineParser(argparse.ArgumentParser):
             help='default /imu/temperature, else the only one',
         )
 
-    def add_exclusion(self) -> None:
-        """Add the option of times that are not used."""
-        self.common(
-            '--exclude',
-            metavar='A:B,...',
-            help='unused times, s from the first stamp; or NAME=A:B',
-        )
+    def add_exclusion(self, text: str = 's from the first stamp; or NAME=A:B') -> None:
+        """Add the option of times that are not used, with the meaning of a time."""
+        self.common('--exclude', metavar='A:B,...', help=f'unused times, {text}')
 
     def add_rows(self) -> None:
         """Add the option of the rows of a text log."""

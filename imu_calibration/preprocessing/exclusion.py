@@ -1,11 +1,11 @@
 """Times of a recording that its user excludes."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.core.errors import InputError
+from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.core.samples import SampleBlock
 
 EXCLUDED = 'imu excluded'
@@ -82,6 +82,42 @@ def exclusions_by_recording(
         [exclusion for exclusion in exclusions if exclusion.recording in ('', name)]
         for name in names
     ]
+
+
+def exclusions_of_units(
+    exclusions: Sequence[Exclusion], recordings_of: Mapping[str, Sequence[str]]
+) -> dict[str, list[list[Exclusion]]]:
+    """
+    Return the excluded times of each recording of several units: unit -> a list per recording.
+
+    A time without a name is excluded in all recordings; the name is that of a recording or of a
+    unit, for all its recordings.
+
+    Raises
+    ------
+    InputError
+        When a time names neither.
+
+    """
+    names = set(recordings_of)
+    for recordings in recordings_of.values():
+        names.update(recordings)
+    for exclusion in exclusions:
+        if exclusion.recording and exclusion.recording not in names:
+            raise InputError(
+                'an excluded time must name a unit or a recording of one'
+                f" ({shortened(', '.join(sorted(names)), 200)}), got '{exclusion}'; write NAME=A:B,"
+                ' or A:B for all',
+                key='exclude',
+                code='exclude_recording',
+            )
+    found = {}
+    for unit, recordings in recordings_of.items():
+        found[unit] = [
+            [each for each in exclusions if each.recording in ('', unit, recording)]
+            for recording in recordings
+        ]
+    return found
 
 
 class ExclusionMask:

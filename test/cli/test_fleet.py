@@ -162,6 +162,23 @@ def test_a_unit_has_the_word_of_each_sensor(result):
 
 @pytest.mark.live
 @pytest.mark.long
+@pytest.mark.slow
+def test_a_fleet_excludes_the_times_of_all_units_and_of_one(recordings, tmp_path, capsys):
+    folder, _ = recordings
+    arguments = ['fleet', str(folder), '--table', str(TABLE_FILE), '--no-report', '--jobs', '1']
+    arguments += ['--model-as-asked', '--output', str(tmp_path / 'fleet')]
+    main([*arguments, '--exclude', '0:2,unit_b=4:7'])
+    dropped = {}
+    for unit in ('unit_a', 'unit_b'):
+        calibration = read_calibration(tmp_path / 'fleet' / unit / 'calibration.yaml')
+        dropped[unit] = calibration.statistics['dropped']['imu excluded']
+    # 100 Hz, two recordings of unit_b
+    assert dropped == {'unit_a': 200, 'unit_b': 1000}
+    capsys.readouterr()
+    assert main([*arguments, '--exclude', 'unit_d=4:7']) == 1
+    assert "'unit_d=4:7'" in capsys.readouterr().err
+
+
 def test_processes_give_the_same_bytes(recordings, result, tmp_path):
     """Two units at a time write what one after the other writes."""
     assert run_fleet(recordings[0], tmp_path, '--jobs', '2') == result[0]

@@ -10,6 +10,7 @@ from imu_calibration.preprocessing.exclusion import (
     EXCLUDED,
     Exclusion,
     exclusions_by_recording,
+    exclusions_of_units,
     parse_exclusions,
     without_excluded,
 )
@@ -47,6 +48,18 @@ def test_a_time_belongs_to_one_recording():
     for text in ('c=1:2', '1:2'):
         with refused(InputError, 'exclude_recording', text):
             exclusions_by_recording(parse_exclusions(text), ['a', 'b'])
+
+
+def test_a_time_of_a_fleet_belongs_to_all_units_a_unit_or_a_recording():
+    units = {'a': ['day.mcap', 'night.mcap'], 'b': ['day.mcap']}
+    everywhere, of_unit, of_recording = times = parse_exclusions('0:5,b=7:9,night.mcap=1:2')
+    assert exclusions_of_units(times, units) == {
+        'a': [[everywhere], [everywhere, of_recording]],
+        'b': [[everywhere, of_unit]],
+    }
+    with refused(InputError, 'exclude_recording', 'c=1:2') as caught:
+        exclusions_of_units(parse_exclusions('c=1:2'), units)
+    assert caught.value.key == 'exclude'
 
 
 @pytest.mark.parametrize('cut', [400, 37])
