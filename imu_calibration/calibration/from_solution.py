@@ -33,7 +33,7 @@ from imu_calibration.estimation.solution import (
 )
 from imu_calibration.estimation.standard_motions import Motion, motions_about
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import unusable, warnings
+from imu_calibration.preprocessing.checks import unusable, visible_findings
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
@@ -242,7 +242,7 @@ def document(
     moved = replace(solution, values=values, terms=terms)
     found = {
         **statistics,
-        'preflight': [finding.to_mapping() for finding in warnings(gathered.findings)],
+        'preflight': [finding.to_mapping() for finding in visible_findings(gathered.findings)],
         'unusable': unusable(gathered.findings),
         **changes.to_mapping(),
         **uncorrected.to_mapping(),

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import fdtrc
 
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import SENSORS, Role
@@ -13,15 +14,20 @@ from imu_calibration.preprocessing.joint_geometry import mount_rpy_deg
 from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding
 
 CHECK = 'mount'
-NOTED_TURN = 0.3 * DEG
-"""Smallest common turn that is noted, rad."""
 LEAST_TURN = 1.5 * DEG
 """Smallest common turn that is a warning, rad; the axes of a sensor are off by less."""
 LARGEST_DIFFERENCE = 0.5
 """
-Largest difference between the turns of two sensors, as a share of their mean. Axes that are off at
-random have a common turn too, which is as large as this allows in 3 of 100 units.
+Largest difference between the turns of two sensors, as a share of their mean, for a warning. Axes
+that are off at random have a common turn too, which is as large as this allows in 3 of 100 units.
 """
+LEAST_SPREAD = 0.07 * DEG
+"""
+Smallest sd of the turn of a triad about one axis, rad. The axes of the best sensors are off by a
+tenth of a degree, and a turn is the mean of two of these angles.
+"""
+NOTED_CHANCE = 0.025
+"""Probability of a turn by usual axes below which a common turn is noted."""
 ALONG = np.cos(10 * DEG)
 """Cosine of the angle between a turn and an axis from which the turn is about that axis."""
 
@@ -36,11 +42,30 @@ class CommonTurn:
     """The same as a rotation vector, rad, shape (3,)."""
     agreed: bool
     """Whether the turns of the sensors are nearly equal."""
+    sd: np.ndarray
+    """Sd of the vector by the estimate and by the spread of usual axes, rad, shape (3,)."""
+    freedom: int
+    """Number of independent angles from which the spread of the axes is estimated."""
 
     @property
     def angle(self) -> float:
         """Angle of the turn, rad."""
         return float(np.linalg.norm(self.vector))
+
+    def noted(self, axis: np.ndarray) -> bool:
+        """
+        Return whether the turn is larger than usual axes allow, as a whole or about an axis.
+
+        Parameters
+        ----------
+        axis : ndarray, shape (3,)
+            Unit vector of the last joint in the axes of the stated mount.
+
+        """
+        whole = np.sum((self.vector / self.sd) ** 2) / len(self.vector)
+        about_axis = (axis @ self.vector) ** 2 / (axis**2 @ self.sd**2)
+        chance = min(fdtrc(3, self.freedom, whole), fdtrc(1, self.freedom, about_axis))
+        return bool(chance < NOTED_CHANCE)
 
 
 def common_turn(solution: Solution) -> CommonTurn | None:
@@ -51,19 +76,45 @@ def common_turn(solution: Solution) -> CommonTurn | None:
     ``M = E R``. E differs from sensor to sensor and is nearly the identity, R is common to both. A
     wrong zero of the last joint is such a turn, about its axis: no recording separates E from R,
     and the axes of the result are those of the mount as stated (`gauge`).
+
+    Where each of the six angles of E has the variance e^2, a turn (the half difference of two
+    angles) and an angle between axes (their half sum) both have e^2 / 2. The angles between axes,
+    and the differences of the turns between sensors, do not depend on R: they give e.
     """
-    turns = []
+    # The axes of each triad: rows of its matrix, without their scales.
+    triads = []
+    variances = []
     for sensor in SENSORS:
         part = solution.model.part(sensor, Role.LINEAR)
         if part.stop > part.start and not solution.held[part].any():
-            turns.append(nearest_rotation(solution.values[part].reshape(3, 3)))
-    if not turns:
+            matrix = solution.values[part].reshape(3, 3)
+            triads.append(matrix / np.linalg.norm(matrix, axis=1, keepdims=True))
+            variances.append(np.diag(solution.covariance)[part].reshape(3, 3))
+    if not triads:
         return None
+    turns = [nearest_rotation(triad) for triad in triads]
     common = nearest_rotation(np.sum(turns, axis=0))
     vector = rotation_vector(common)
-    differences = [np.linalg.norm(rotation_vector(turn @ common.T)) for turn in turns]
-    agreed = max(differences) <= LARGEST_DIFFERENCE * np.linalg.norm(vector) / 2
-    return CommonTurn(common, vector, bool(agreed))
+    differences = np.array([rotation_vector(turn @ common.T) for turn in turns])
+    largest = np.max(np.linalg.norm(differences, axis=1))
+    agreed = largest <= LARGEST_DIFFERENCE * np.linalg.norm(vector) / 2
+
+    # Variance of the turn of one triad about one axis, from all angles that do not depend on R.
+    squares = float(np.sum(differences**2))
+    for triad in triads:
+        axes = triad @ common.T
+        half_sums = (axes + axes.T)[np.triu_indices(3, 1)] / 2
+        squares += float(half_sums @ half_sums)
+    freedom = 3 * (len(triads) - 1) + 3 * len(triads)
+    spread = max(squares / freedom, LEAST_SPREAD**2)
+
+    # Variance of the mean of the turns: of the axes, and of their estimates.
+    estimates = np.zeros(3)
+    for variance in variances:
+        off_diagonal = (variance + variance.T)[[1, 2, 0], [2, 0, 1]]
+        estimates += off_diagonal / 4 / len(triads) ** 2
+    sd = np.sqrt(spread / len(triads) + estimates)
+    return CommonTurn(common, vector, bool(agreed), sd, freedom)
 
 
 def turn_entry(solution: Solution) -> dict[str, list[float]]:
@@ -88,17 +139,20 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
 
     """
     turn = common_turn(solution)
-    if turn is None or not turn.agreed or turn.angle < NOTED_TURN:
+    if turn is None:
         return ()
     # The axis of the last joint is the same in both links that it connects.
     last_axis = table.mat_sl @ np.array(table.joints[-1].axis)
+    severe = turn.agreed and turn.angle >= LEAST_TURN
+    if not severe and not turn.noted(last_axis):
+        return ()
     zero = ''
     if table.joints[-1].turns and abs(last_axis @ turn.vector) > ALONG * turn.angle:
         zero = f' (or the zero of {table.joint_names[-1]}, which has the same effect)'
     angles = np.round(mount_rpy_deg(turn.matrix, table), 2)
     fits = ', '.join(f'{value + 0.0:.2f}' for value in angles)
     size = f'{turn.angle / DEG:.2f} deg'
-    if turn.angle < LEAST_TURN:
+    if not severe:
         text = (
             'the axes of the matrices are those of the mount as stated, they contain a common turn'
             f' of {size} against it: mount.rpy_deg [{fits}] would remove it; if the axes of the'

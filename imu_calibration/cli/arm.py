@@ -37,7 +37,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.calibration.hand_workflow import read_by_hand
     from imu_calibration.cli.show import warn
     from imu_calibration.core.units import with_sd
-    from imu_calibration.preprocessing.checks import Preflight, warnings
+    from imu_calibration.preprocessing.checks import Preflight, visible_findings
     from imu_calibration.use_cases.choices import raw_columns, readings_of
     from imu_calibration.use_cases.recordings import Topics, open_bag, source_of, sources_without
 
@@ -72,7 +72,8 @@ def run(options: Options) -> VerbResult:
         (source,) = sources_without([source_of(options.bag, topic)], [options.bag], options.exclude)
         recording = read_by_hand(source(), readings, Preflight())
         imus.append(recording.imu)
-        warn({'text': f'{topic.imu}: {finding.text}'} for finding in warnings(recording.findings))
+        findings = visible_findings(recording.findings)
+        warn(finding.named(str(topic.imu)).to_mapping() for finding in findings)
     first, second = imus
     result = estimate_arm(first, second)
     for axis, value, sd in zip('xyz', result.arm, result.arm_sd):

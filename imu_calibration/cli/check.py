@@ -40,7 +40,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.cli.show import show_table, warn
     from imu_calibration.cli.terminal import Terminal
     from imu_calibration.document import files
-    from imu_calibration.preprocessing.checks import warnings
+    from imu_calibration.preprocessing.checks import visible_findings
     from imu_calibration.report.answer_page import answer_page
     from imu_calibration.use_cases.calibrate import check_recording
 
@@ -52,7 +52,7 @@ def run(options: Options) -> VerbResult:
         change=options.change,
         **options.choices(),
     )
-    warn([finding.to_mapping() for finding in warnings(found.findings)])
+    warn([finding.to_mapping() for finding in visible_findings(found.findings)])
     out, table = Terminal.of(), _table(found)
     show_table(out, table.columns, list(table.rows), numbers=table.numbers)
     out.print(str(found))

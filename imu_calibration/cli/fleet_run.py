@@ -364,7 +364,7 @@ def show_fleet(
         )
         if result.calibration is not None:
             warn(
-                {'text': f'{result.name}: {found["text"]}'}
+                {**found, 'text': f'{result.name}: {found["text"]}'}
                 for found in result.calibration.statistics['preflight']
             )
     calibrated = sum(result.calibration is not None for result in results)

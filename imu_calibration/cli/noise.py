@@ -3,7 +3,7 @@
 from itertools import groupby
 from pathlib import Path
 
-from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, complain, print_line
+from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 
 EXAMPLES = ('still_hour --output noise', 'still_hour --rate 200 --output noise')
 
@@ -44,6 +44,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Options) -> VerbResult:
     """Identify into a folder that can be written, print the figures, return the exit code."""
     from imu_calibration.allan.document import noise_mapping
+    from imu_calibration.cli.show import warn
     from imu_calibration.document import files
     from imu_calibration.use_cases.choices import require_same_inputs
     from imu_calibration.use_cases.noise import identify_recording, noise_provenance
@@ -59,8 +60,7 @@ def run(options: Options) -> VerbResult:
         require_same_inputs(options.output, found, 'noise.yaml')
     with files.output_folder(options.output) as folder:
         found = identify_recording(options.bag, **choices)
-        for warning in found.warnings:
-            complain(f'warning: {warning}')
+        warn(finding.to_mapping() for finding in found.findings)
         found.save(folder, report=not options.no_report, force=True)
         _show(
             found,

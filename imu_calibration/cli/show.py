@@ -9,7 +9,7 @@ from imu_calibration.cli.parser import complain
 from imu_calibration.cli.terminal import STYLES, Terminal
 from imu_calibration.core.errors import printable, with_hint
 from imu_calibration.document.calibration import NUMBER_COLUMNS, PARAMETER_HEADINGS, parameter_rows
-from imu_calibration.preprocessing.recording_evidence import CheckFinding, Severity
+from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding, Severity
 
 if TYPE_CHECKING:
     from imu_calibration.use_cases.calibrate import Calibrated
@@ -46,12 +46,13 @@ def show_table(
 
 def warn(found: Sequence[dict[str, Any]] | Iterator) -> None:
     """
-    Print the warnings about a recording on standard error, a line each.
+    Print warnings and notes about a recording on standard error, a line each.
 
-    The warnings are `preflight` in the statistics of a calibration.
+    They are `preflight` in the statistics of a calibration.
     """
     for item in found:
-        complain(f'warning: {printable(item["text"])}')
+        word = NOTE if item['severity'] == NOTE else WARNING
+        complain(f'{word}: {printable(item["text"])}')
 
 
 def show_findings(out: Terminal, findings: tuple[CheckFinding, ...], hints: dict[str, str]) -> None:

@@ -464,8 +464,24 @@ def refuse(findings: tuple[CheckFinding, ...]) -> None:
 
 
 def warnings(findings: Sequence[CheckFinding]) -> list[CheckFinding]:
-    """Return the findings that a user must see."""
+    """Return the findings that degrade a result."""
     return [finding for finding in findings if finding.severity in (REFUSE, WARNING)]
+
+
+DESCRIPTIVE = frozenset({'jitter', 'resolution'})
+"""
+Checks of which a note only describes the recording. All other notes state which readings are used,
+and how, or what a result contains.
+"""
+
+
+def visible_findings(findings: Sequence[CheckFinding]) -> list[CheckFinding]:
+    """Return the findings that a user must see with a result of the recording."""
+    visible = warnings(findings)
+    for finding in findings:
+        if finding.severity == NOTE and finding.check not in DESCRIPTIVE:
+            visible.append(finding)
+    return visible
 
 
 def unusable(findings: Sequence[CheckFinding]) -> int:

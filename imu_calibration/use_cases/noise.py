@@ -17,7 +17,8 @@ from imu_calibration.core.progress import report
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
-from imu_calibration.preprocessing.checks import warnings
+from imu_calibration.preprocessing.checks import visible_findings
+from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.report.figures import Drawn
 from imu_calibration.use_cases.choices import raw_columns, readings_of, require_same_inputs
 from imu_calibration.use_cases.recordings import Topics, provenance_of, source_of, sources_without
@@ -49,9 +50,9 @@ class IdentifiedNoise:
         return noise_shortcomings(self.figures)
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """Faults of the recording."""
-        return tuple(finding.text for finding in warnings(self.result.record.survey.findings))
+    def findings(self) -> tuple[CheckFinding, ...]:
+        """Faults of the recording, and how it was read."""
+        return tuple(visible_findings(self.result.record.survey.findings))
 
     def plot(self, sensor: str = 'accelerometer') -> Drawn:
         """Return the Allan deviations of one sensor with their model as a figure for a notebook."""

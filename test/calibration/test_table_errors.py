@@ -1,14 +1,17 @@
 """`inspect` on a table fits a delay and zeros of encoders, or reports a residual unlike noise."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from imu_calibration.cli.show import warn
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import DETERMINED
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import NOTE
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import (
@@ -16,6 +19,7 @@ from imu_calibration.simulation.session import (
     random_values,
     simulate_session,
 )
+from imu_calibration.use_cases.calibrate import calibrate_recordings
 from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics
 
@@ -98,3 +102,17 @@ def test_another_cause_is_a_residual_that_is_not_noise(session):
         replace(session, imu=replace(session.imu, rate_s=rate)), CalibrationOptions(as_asked=True)
     )
     assert named(plain) == {}
+
+
+def test_a_small_zero_of_the_last_joint_is_a_note_with_its_size(session, capsys):
+    """It exits with 0: the result is complete, and contains the turn."""
+    position = session.joints.position + np.radians([0.0, 0.0, 0.9])
+    block = replace(session, joints=replace(session.joints, position=position))
+    found = calibrate_recordings([block], TABLE, model_as_asked=True)
+    (note,) = [
+        each for each in found.calibration.statistics['preflight'] if each['check'] == 'mount'
+    ]
+    assert note['severity'] == NOTE
+    assert float(re.search(r'turn of ([\d.]+) deg', note['text'])[1]) == pytest.approx(0.9, abs=0.2)
+    warn([note])
+    assert capsys.readouterr().err == f'note: {note["text"]}\n'

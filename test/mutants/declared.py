@@ -628,7 +628,7 @@ BEYOND = _of(
 HAND = _of(
     (
         'gravity enters the gyroscope by chance',
-        'shown',
+        'visible_findings',
         "_1['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE",
         "_1['g_sensitivity_p_value'] < 0.9",
         (
@@ -969,9 +969,23 @@ SIGNS = _of(
     (
         'sensors turned differently read as a turned IMU',
         'common_turn',
-        'max(_1) <= LARGEST_DIFFERENCE * np.linalg.norm(_2) / 2',
+        '_1 <= LARGEST_DIFFERENCE * np.linalg.norm(_2) / 2',
         'True',
         'test_mount_check.py',
+    ),
+    (
+        'angles between axes do not limit a common turn',
+        'common_turn',
+        'squares += float(_1 @ _1)',
+        'pass',
+        'test_mount_check.py',
+    ),
+    (
+        'notes about the result are not shown',
+        'visible_findings',
+        'finding.severity == NOTE and finding.check not in DESCRIPTIVE',
+        'False',
+        'test_table_errors.py',
     ),
     (
         'centripetal term with the other sign',
