@@ -408,6 +408,9 @@ def _by_default(model: SensorModel, options: CalibrationOptions) -> list[slice]:
     Levelling, the Earth's rate, arms of the accelerometers.
     """
     arms = options.accelerometer_model is None
+    # A model with an error of table or clock that the recordings support is that of a request for
+    # it: levelling and the Earth's rate are estimated in both.
+    as_described = not any(sensor == 'reference' for sensor, _ in options.added)
     return [
         model.slices[effect.key]
         for effect in model.effects
@@ -416,7 +419,7 @@ def _by_default(model: SensorModel, options: CalibrationOptions) -> list[slice]:
         or effect.sensor == 'reference'
         and effect.nuisance
         and options.reference_model is None
-        and effect.key not in options.added
+        and as_described
     ]
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.cli.show import warn
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.sensor_model import SensorModel
@@ -116,3 +117,21 @@ def test_a_small_zero_of_the_last_joint_is_a_note_with_its_size(session, capsys)
     assert float(re.search(r'turn of ([\d.]+) deg', note['text'])[1]) == pytest.approx(0.9, abs=0.2)
     warn([note])
     assert capsys.readouterr().err == f'note: {note["text"]}\n'
+
+
+def test_an_added_delay_gives_the_result_of_a_requested_one(session):
+    """Levelling is not shrunk in one of them only: values within 0.05 standard deviations."""
+    imu = replace(session.imu, stamp_ns=session.imu.stamp_ns + 6_000_000)
+    block = replace(session, imu=imu)
+    results = []
+    for options in (
+        CalibrationOptions(added=(('reference', 'time_offset'),)),
+        CalibrationOptions(reference_model='table_tilt+earth_rate+time_offset'),
+    ):
+        found = calibrate_on_table([lambda: iter([block])], TABLE, options).calibration
+        results.append({n: (v, sd) for n, v, sd in zip(found.param_names, found.values, found.sd)})
+    added, requested = results
+    assert added.keys() == requested.keys()
+    for name, (value, sd) in requested.items():
+        assert added[name][1] == pytest.approx(sd, rel=1e-3)
+        assert abs(added[name][0] - value) <= 0.05 * sd
