@@ -11,14 +11,17 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.rotations import EARTH_RATE, earth_rate_n
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
+from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding, Severity
 from imu_calibration.references.turntable.session_data import SessionData
 
 CHECK = 'latitude'
 CONTRADICTING_SDS = 5.0
 """Standard deviations beyond which the estimate contradicts the latitude."""
 NAMED_SDS = 3.0
-"""The same where a g-sensitivity is in the model, which may stand for another latitude."""
+"""
+The same where a g-sensitivity is in the model, which may stand for another latitude; without one, a
+note from here on.
+"""
 LEAST_SHARE = 0.1
 """The same as a share of the Earth's rate: below, small errors of the model explain it."""
 AGREEING_SDS = 4.0
@@ -123,13 +126,16 @@ def _of_free_rate(solution: Solution, table: Table, part: slice) -> tuple[CheckF
         return (_excess(length, sd),) if _contradicts_length(length, sd) else ()
     expected_up = _vertical_rate(table)
     up_sd = float(np.sqrt(covariance[2, 2]))
-    if _contradicts(rate[2] - expected_up, up_sd):
-        if _agrees(rate[2] + expected_up, up_sd, expected_up):
+    severity = _severity(rate[2] - expected_up, up_sd)
+    if severity is not None:
+        if severity == WARNING and _agrees(rate[2] + expected_up, up_sd, expected_up):
             raise _wrong_sign(table, rate[2], expected_up)
-        return (_finding('vertical component', rate[2], up_sd, expected=expected_up),)
+        return (
+            _finding('vertical component', rate[2], up_sd, expected=expected_up, severity=severity),
+        )
     length, length_sd = _length(rate, covariance)
     if _contradicts(length - EARTH_RATE, length_sd):
-        return (_finding('magnitude', length, length_sd, expected=EARTH_RATE),)
+        return (_finding('magnitude', length, length_sd, expected=EARTH_RATE, severity=WARNING),)
     return ()
 
 
@@ -167,7 +173,8 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
     precision = 1.0 / np.maximum(dependence_sd.diagonal() ** 2, 1e-300)
     vertical = float(precision @ dependence.diagonal() / precision.sum())
     vertical_sd = float(1.0 / np.sqrt(precision.sum()))
-    if not _contradicts(vertical, vertical_sd, sds):
+    severity = _severity(vertical, vertical_sd, sds)
+    if severity is None:
         return ()
     # A g-sensitivity has other entries too, and no latitude gives more than the Earth's rate.
     remaining = np.abs(dependence - vertical * np.eye(3))
@@ -176,9 +183,13 @@ def _of_windows(windows: WindowRates, table: Table, sds: float) -> tuple[CheckFi
     measured_up = expected_up + vertical
     if np.any(remaining > tolerated) or _contradicts_length(measured_up, vertical_sd):
         return ()
-    if _agrees(measured_up + expected_up, vertical_sd, expected_up):
+    if severity == WARNING and _agrees(measured_up + expected_up, vertical_sd, expected_up):
         raise _wrong_sign(table, measured_up, expected_up)
-    return (_finding('vertical component', measured_up, vertical_sd, expected=expected_up),)
+    return (
+        _finding(
+            'vertical component', measured_up, vertical_sd, expected=expected_up, severity=severity
+        ),
+    )
 
 
 def _weights_of_kinds(windows: WindowRates, design: np.ndarray) -> np.ndarray:
@@ -207,6 +218,13 @@ def _contradicts(difference: float, sd: float, sds: float = CONTRADICTING_SDS) -
     return abs(difference) > max(sds * sd, LEAST_SHARE * EARTH_RATE)
 
 
+def _severity(difference: float, sd: float, sds: float = CONTRADICTING_SDS) -> Severity | None:
+    """Return WARNING beyond `sds` standard deviations, NOTE where it may be chance, or None."""
+    if _contradicts(difference, sd, sds):
+        return WARNING
+    return NOTE if _contradicts(difference, sd, NAMED_SDS) else None
+
+
 def _agrees(difference: float, sd: float, size: float) -> bool:
     tolerated = max(AGREEING_SDS * sd, AGREEING_SHARE * abs(size))
     return abs(difference) < min(tolerated, FARTHEST_SHARE * abs(size))
@@ -223,10 +241,12 @@ def _wrong_sign(table: Table, measured: float, expected: float) -> InputError:
     )
 
 
-def _finding(name: str, measured: float, sd: float, *, expected: float) -> CheckFinding:
+def _finding(
+    name: str, measured: float, sd: float, *, expected: float, severity: Severity
+) -> CheckFinding:
     return CheckFinding(
         CHECK,
-        WARNING,
+        severity,
         f"the latitude must give the {name} of the Earth's rate: {_hourly(expected)} deg/h, the"
         f' gyroscopes measured {_hourly(measured)} ± {_hourly(sd)} deg/h; correct the latitude in'
         ' the table; if it is right, gyro_g_sensitivity or a drift can be the cause',

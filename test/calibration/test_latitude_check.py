@@ -14,6 +14,7 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import NOTE
 from imu_calibration.simulation.session import turning_world
 
 from worlds.physics import make_session
@@ -131,6 +132,21 @@ def test_another_sign_or_latitude_is_no_g_sensitivity():
         shown = float(re.search(r'measured ([\d.]+)', finding.text)[1]) * np.radians(1 / 3600)
         assert shown == pytest.approx(OMEGA * np.sin(np.radians(latitude)), rel=0.1, abs=1e-6)
     assert of_windows(windows_of(-LATITUDE, noise=1e-3)) == ()
+
+
+def test_a_latitude_of_the_same_sign_is_noted_where_the_data_show_it():
+    """25 for 37 deg at 3 to 5 sds; the right latitude is noted as often as 3 sds are exceeded."""
+    severities = []
+    n_false = 0
+    for seed in range(60):
+        found = of_windows(windows_of(25.0, noise=2e-5, seed=seed))
+        severities.append([finding.severity for finding in found])
+        n_false += len(of_windows(windows_of(LATITUDE, noise=2e-5, seed=seed)))
+    assert severities.count([NOTE]) > 20 and severities.count([]) < 6
+    assert n_false <= 1
+    # Without an azimuth the estimated rate is compared: 4 sds.
+    (finding,) = latitude_findings(earth(25.0, sd=3.4e-6), table())
+    assert finding.severity == NOTE
 
 
 def test_a_g_sensitivity_is_no_latitude():

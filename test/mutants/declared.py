@@ -628,7 +628,7 @@ BEYOND = _of(
 HAND = _of(
     (
         'gravity enters the gyroscope by chance',
-        'visible_findings',
+        'shown',
         "_1['g_sensitivity_p_value'] < G_SENSITIVITY_P_VALUE",
         "_1['g_sensitivity_p_value'] < 0.9",
         (
@@ -979,6 +979,13 @@ SIGNS = _of(
         'squares += float(_1 @ _1)',
         'pass',
         'test_mount_check.py',
+    ),
+    (
+        'another latitude of the same sign is not noted',
+        '_severity',
+        '_contradicts(_1, _2, NAMED_SDS)',
+        'False',
+        'test_latitude_check.py',
     ),
     (
         'notes about the result are not shown',
