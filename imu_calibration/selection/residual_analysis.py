@@ -4,7 +4,7 @@ The search of `calibrate` and `diagnose`.
 Supported effects, without findings that a formula or a regime replaces.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -189,6 +189,8 @@ class ResidualAnalysis(Investigation):
         proposal = self.proposals[sensor]
         regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
         first = {regime.axis: regime for regime in reversed(regimes)}
+        if not rest.significant and proposal is None and _is_noise_of_motion(first.values()):
+            first = {}
         if not rest.significant and proposal is None and not first:
             return beyond_noise(self.problem, sensor, rest)
         axes = rest.axes or (self.fits(sensor).axes() if proposal is not None else tuple(first))
@@ -271,6 +273,21 @@ def without_superseded(found: ResidualAnalysis) -> ResidualAnalysis:
     while found.named and (gone := superseded(found)):
         found = found.without(gone)
     return found
+
+
+def _is_noise_of_motion(regimes: Collection[RestRegime]) -> bool:
+    """
+    Return whether regimes are noise that grows with the speed: scatter of all axes, no offset.
+
+    The speed of the sensor or of a joint. Vibration of the drives, no error of the model: a cause
+    in the sensor acts on one axis, a place of the table at an angle.
+    """
+    if {regime.axis for regime in regimes} != set(AXES):
+        return False
+    for regime in regimes:
+        if regime.offset or regime.variable.split(' ')[0] != 'speed':
+            return False
+    return True
 
 
 def superseded(found: ResidualAnalysis) -> list[Question]:

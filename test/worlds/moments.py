@@ -42,6 +42,23 @@ class LouderInMotion(Cause):
         return [outputs[0], outputs[1] + moving * noise]
 
 
+class LouderWithSpeed(Cause):
+    """White noise of both sensors in proportion to the speed up to 1 rad/s, m/s^2 and rad/s."""
+
+    def __init__(self, sd):
+        super().__init__()
+        self.sd = sd
+
+    def delivered(self, time, outputs, rate_s):
+        """Add the noise of the motion."""
+        rng = np.random.default_rng(12)
+        speed = np.minimum(np.linalg.norm(rate_s, axis=1, keepdims=True), 1.0)
+        return [
+            output + sd * speed * rng.normal(size=output.shape)
+            for output, sd in zip(outputs, self.sd, strict=True)
+        ]
+
+
 class Moment(Cause):
     """
     After a share of the session the sensor or the table changes.
