@@ -80,7 +80,7 @@ def prepare(folder, name, arm_from, *, seconds, pair=PAIR):
     for topic in topics:
         with open_recording(folder / name, topic, want_joints=False) as recording:
             result = calibrate_without_table([recording.blocks])
-            found.append((result.calibration, result.hand))
+            found.append((result.calibration, result.applied))
     arm = estimate_arm(*(load(folder, arm_from, topic) for topic in topics))
     a, b = imus
     part = a.select(a.stamp_ns > a.stamp_ns[-1] - int(seconds * 1e9))

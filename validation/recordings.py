@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from imu_calibration.calibration.hand_workflow import read_by_hand
+from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.units import STANDARD_GRAVITY
 from msg_adapters.bag import open_recording

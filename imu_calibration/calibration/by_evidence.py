@@ -12,18 +12,18 @@ unexplained residual: by the change of a bias that it may cause.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.calibration.table_calibration import (
-    Solved,
+    SolvedWindows,
     TableRecordings,
     WindowSource,
-    conclude,
 )
-from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.document.calibration import one_significant
 from imu_calibration.effects.base import SENSORS, Role
@@ -45,27 +45,6 @@ from imu_calibration.selection.residual_analysis import ResidualAnalysis, inquir
 from imu_calibration.selection.saturation import Saturation
 from imu_calibration.selection.search import FAMILY_WISE
 from imu_calibration.selection.unexplained import biases_off
-
-
-@dataclass(frozen=True, eq=False)
-class Selected(Solved):
-    """
-    A solution with the effects that its recordings support, its covariance widened.
-
-    The result of the search for them is included.
-    """
-
-    extension: ModelExtension = ModelExtension()
-    """Result of the search that later solutions of the same recordings need."""
-    found: ResidualAnalysis | None = None
-    """Search result; None with too few windows."""
-
-    @classmethod
-    def without_search(
-        cls, solved: Solved, extension: ModelExtension = ModelExtension()
-    ) -> 'Selected':
-        """Return a solution as it is."""
-        return cls(solved.solution, solved.gathered, solved.model, extension)
 
 
 def calibrate_by_evidence(
@@ -97,17 +76,12 @@ def calibrate_by_evidence(
         sources, table, mapper=mapper, names=names, keep_windows=not options.as_asked
     )
     selected = solve_by_evidence(recordings, table, options)
-    result = conclude(
-        selected,
-        table=table,
-        options=selected.extension.options(options),
-        provenance=provenance,
-        changes=selected.extension.changes,
-    )
-    return replace(result, found=selected.found)
+    return conclude(selected, selected.extension.options(options), provenance=provenance)
 
 
-def solve_by_evidence(source: WindowSource, table: Table, options: CalibrationOptions) -> Selected:
+def solve_by_evidence(
+    source: WindowSource, table: Table, options: CalibrationOptions
+) -> SolvedWindows:
     """
     Return the solution of the requested model with the effects that the recordings support.
 
@@ -122,16 +96,16 @@ def solve_by_evidence(source: WindowSource, table: Table, options: CalibrationOp
     """
     # Solve the requested model, and search in each recording with enough windows.
     first = source.solved(options)
-    parts = windows_to_ask(first.gathered)
+    parts = windows_to_ask(first.data.gathered)
     if not parts:
-        return Selected.without_search(first)
+        return first
     baseline = _baseline_model(options, table, first.solution.model)
     found, *others = (
         _examined(inquire(windows, table, baseline, bias_processes=options.bias_processes))
         for windows in parts
     )
     from_others = _named_elsewhere(found, others)
-    requested = first.model
+    requested = first.data.model
 
     # An effect of the requested model is judged with the added effects in the solution: the misfit
     # of a missing delay or encoder zero widens every standard deviation.
@@ -163,13 +137,14 @@ def solve_by_evidence(source: WindowSource, table: Table, options: CalibrationOp
     extension = ModelExtension(
         added, point, _changes([found, *others], added), _moves(found), _clipped(found)
     )
-    solution = extension.applied(solved.solution)
-    return Selected(solution, solved.gathered, solved.model, extension, found)
+    return replace(
+        solved, solution=extension.applied(solved.solution), extension=extension, found=found
+    )
 
 
 def ask_kept(
-    solved: Solved, table: Table, options: CalibrationOptions, *, known: ModelExtension
-) -> Selected:
+    solved: SolvedWindows, table: Table, options: CalibrationOptions, *, known: ModelExtension
+) -> SolvedWindows:
     """
     Return the supported effects when columns cannot be recomputed.
 
@@ -177,7 +152,7 @@ def ask_kept(
 
     Parameters
     ----------
-    solved : Solved
+    solved : SolvedWindows
         Of the requested model with the added effects.
     table, options
         As for `solve_by_evidence`.
@@ -185,10 +160,10 @@ def ask_kept(
         The effects that were supported when the columns were computed.
 
     """
-    solution, model = solved.solution, solved.model
-    parts = windows_to_ask(solved.gathered)
+    solution, model = solved.solution, solved.data.model
+    parts = windows_to_ask(solved.data.gathered)
     if not parts:
-        return Selected.without_search(solved, known)
+        return replace(solved, extension=known)
     found = inquire(
         parts[0],
         table,
@@ -204,7 +179,7 @@ def ask_kept(
     extension = ModelExtension(
         known.added, known.point, changes, (*known.moves, *_moves(found, lacking)), _clipped(found)
     )
-    return Selected(extension.applied(solution), solved.gathered, model, extension, found)
+    return replace(solved, solution=extension.applied(solution), extension=extension, found=found)
 
 
 def windows_to_ask(gathered: SessionData) -> list[list[Window]]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.calibration.from_solution import possible_motions
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
@@ -220,7 +220,8 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
 
     after = np.array([left(base + added(rest_with_up(up))) for up in DIRECTIONS])
     worth = share_gained(left(base), after)
-    possible = possible_motions(result.table)
+    assert result.data.table is not None, 'the result is of a table'
+    possible = possible_motions(result.data.table)
     motions = [
         motion
         for motion in (MOTIONS if possible is None else possible)

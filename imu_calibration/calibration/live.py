@@ -9,12 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.by_evidence import (
-    Selected,
-    Solved,
-    ask_kept,
-    solve_by_evidence,
-)
+from imu_calibration.calibration.by_evidence import ask_kept, solve_by_evidence
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.collector import (
     LiveCollector,
     copied,
@@ -31,8 +27,12 @@ from imu_calibration.calibration.coverage import (
     waiting_groups,
 )
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.table_calibration import conclude, solve_gathered, solve_in_passes
-from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.calibration.table_calibration import (
+    SolvedWindows,
+    solve_in_passes,
+    solved_windows,
+)
+from imu_calibration.calibration.window_observations import TableResult, WindowObservations
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -78,7 +78,7 @@ class LiveSnapshot:
             else model
         )
 
-    def solved(self, options: CalibrationOptions) -> Solved:
+    def solved(self, options: CalibrationOptions) -> SolvedWindows:
         """
         Return the solution for other options, as from a recording.
 
@@ -86,23 +86,23 @@ class LiveSnapshot:
         """
         check_units(self.gathered, self.model, self.table)
         if not self.store.complete:
-            solution = solve_gathered(self.gathered, self.model, options)
-            return Solved(solution, self.gathered, self.model)
+            data = WindowObservations(self.table, self.gathered, self.model)
+            return solved_windows(data, options)
         asked = self.model_for(options)
         model = self.model if asked.has_columns_of(self.model) else asked
         return solve_in_passes(self, model, options)
 
     def solved_at(
         self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
-    ) -> Solved:
+    ) -> SolvedWindows:
         """Reduce the stored windows once more, if other columns or a part of them are wanted."""
         total = self.gathered
         if model is not self.model or judged_from != self.gathered.judged_from:
             reduced = self.store.reduced(model, self.table, self.session)
             total = self.gathered.anew(reduced, judged_from)
-        return Solved(solve_gathered(total, model, options), total, model)
+        return solved_windows(WindowObservations(self.table, total, model), options)
 
-    def evidence(self) -> Selected:
+    def evidence(self) -> SolvedWindows:
         """Return the solution with the supported effects, as `calibrate_by_evidence`."""
         if self.store.complete:
             return solve_by_evidence(self, self.table, self.options)
@@ -287,7 +287,7 @@ class LiveCalibration:
         if known is not None or not asked.needs_temperature:
             self._begin(asked)
 
-    observations = TableResult.observations
+    observations = WindowObservations.unit
     needs_joints = True
 
     @property
@@ -426,17 +426,12 @@ class LiveCalibration:
         )
         options = self.extension.options(self.options)
         solved = snapshot.solved(options)
-        self.result = conclude(
-            replace(solved, solution=self.extension.applied(solved.solution)),
-            table=self.table,
-            options=options,
-            provenance=provenance,
-            changes=self.extension.changes,
+        extended = replace(
+            solved, solution=self.extension.applied(solved.solution), extension=self.extension
         )
-        self.last, self.needs_linearising = (
-            snapshot,
-            linearise_again(solved.model, solved.solution) is not None,
-        )
+        self.result = conclude(extended, options, provenance=provenance)
+        self.last = snapshot
+        self.needs_linearising = linearise_again(solved.data.model, solved.solution) is not None
         return self.result
 
     def adopt(self, extension: ModelExtension) -> bool:

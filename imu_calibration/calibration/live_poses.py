@@ -31,13 +31,10 @@ from imu_calibration.calibration.coverage import (
     group_states,
     waiting_groups,
 )
-from imu_calibration.calibration.hand_workflow import (
-    HandRecording,
-    HandResult,
-    evident_result,
-    late_gyroscope,
-)
+from imu_calibration.calibration.hand_recording import HandRecording, late_gyroscope
+from imu_calibration.calibration.hand_workflow import calibrate_poses
 from imu_calibration.calibration.live import LiveByHandSettings, LiveSettings, SolvePacer
+from imu_calibration.calibration.pose_observations import HandResult, PoseObservations
 from imu_calibration.core.errors import InputError, NotObservableError, with_hint
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
@@ -226,7 +223,7 @@ def knowledge_of(found: PoseScan, result: HandResult | None, options: HandOption
     Before the first solution from its poses, then from the solution.
     """
     if result is not None:
-        return knowledge_after(result.hand)
+        return knowledge_after(result.applied)
     model = HandModel(
         SensorModel(
             options.accelerometer or BASE, options.gyroscope or BASE, catalogue=options.catalogue
@@ -251,7 +248,7 @@ def hand_coverage(
     knowledge = knowledge_of(found, result, options)
     steps = (
         []
-        if result is not None and not set(LACKING) & set(result.hand.statuses)
+        if result is not None and not set(LACKING) & set(result.applied.statuses)
         else foretold(knowledge)
     )
     if not steps:
@@ -345,7 +342,7 @@ class LiveByHand:
             asked.accelerometer or BASE, asked.gyroscope or BASE, catalogue=asked.catalogue
         )
 
-    observations = HandResult.observations
+    observations = PoseObservations.unit
     needs_joints, on_table = False, None
     needs_linearising = False  # the solution is iterated to its end
     needs_temperature = False  # no temperatures are kept with the poses
@@ -474,9 +471,7 @@ class LiveByHand:
         self._search(store)
         delay = delay_of(imu)
         recording = HandRecording(imu, None, self.counts, tuple(late_gyroscope(delay)), delay)
-        self.result = evident_result(recording, self.options, provenance, stills=self.found.rests)[
-            0
-        ]
+        self.result = calibrate_poses(recording, self.options, provenance, stills=self.found.rests)
         return self.result
 
     def saved(self, pending: bool = False) -> bytes:
@@ -496,7 +491,7 @@ class LiveByHand:
         """
         if self.result is None or not poses:
             return None
-        mean, hand = ImuSamples.concatenate(poses), self.result.hand
+        mean, hand = ImuSamples.concatenate(poses), self.result.applied
         time = 1e-9 * (mean.stamp_ns - self.result.gathered.first_stamp_ns)
         true, turning = hand.compensate(mean.force_s, mean.rate_s, time)
         gravity_s = true * (hand.gravity / np.linalg.norm(true, axis=1))[:, None]

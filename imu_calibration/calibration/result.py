@@ -1,18 +1,25 @@
 """
-A finished calibration with the data for a report, for any kind of reference.
+A finished calibration with the data for a report, the same for any reference.
 
-With its summary.
+A reference contributes the data that it gathered (`Observations`) and predictions of held-out data
+(`HeldOutData`); what follows from a solution is concluded once, in `calibrate.conclude`.
 """
 
-from abc import ABC, abstractmethod
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from imu_calibration.calibration.plain_fit import PlainFit
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import Verdict
-from imu_calibration.document.trust import usage
+from imu_calibration.document.proof_entry import Proof
+from imu_calibration.document.trust import Uncorrected, usage
+from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import CheckFinding
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import SessionData
@@ -22,6 +29,8 @@ GRAVITY_SD = 5e-4
 Standard deviation of the local gravity where a table description or the options give it without
 one, m/s^2.
 """
+Estimate = TypeVar('Estimate', bound=Solution)
+"""Solution of a reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,34 +73,173 @@ class ErrorBudget:
         return np.sqrt(sum(part**2 for part in self.causes.values()))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CalibrationResult(ABC):
-    """
-    A calibration with the data for a report: on a table a `TableResult`, by hand a `HandResult`.
-    """
+@dataclass(frozen=True, eq=False)
+class Needs:
+    """What a recording does not determine, and what would."""
 
-    calibration: Calibration
-    """The document's content."""
-    gathered: SessionData
-    """Windows, counts, kept samples."""
-    tolerances: np.ndarray
-    """Tolerance of each parameter."""
-    needed: dict[str, tuple[str, float]]
+    motions: dict[str, tuple[str, float]]
     """
     Parameter that is not determined -> (the motion that would serve it best, its sd after a minute
     of that motion, NaN when unknown).
     """
+    undetermined: tuple[dict[str, Any], ...]
+    """Entries of the document: parameters with their sds in tolerances, and the need."""
+
+
+class HeldOutData(Protocol):
+    """Data in folds, with the parameters of a solution without each fold."""
+
+    def better_plain_fits(
+        self, *, under_test: Collection[str], as_asked: bool
+    ) -> tuple[PlainFit, ...]:
+        """
+        Return the fits of bias and matrix that predict held-out data better than the solution.
+
+        The effects of the sensors `under_test` have to predict better than a plain fit; in a model
+        that was stated (`as_asked`) only these.
+        """
+
+    def proof(self, fits: Sequence[PlainFit]) -> Proof:
+        """Return the errors before and after the solution with plain fits."""
+
+
+class Observations(Protocol[Estimate]):
+    """What a reference gathered in recordings of one IMU, and what it knows of its own errors."""
+
+    unit: ClassVar[str]
+    """Unit of the data: 'windows' or 'poses'."""
+
+    @property
+    def gathered(self) -> SessionData:
+        """Counts, conditions and stored windows of the recordings."""
+
+    @property
+    def table(self) -> Table | None:
+        """The table; None by hand."""
+
+    @property
+    def reference(self) -> str:
+        """Short description of the reference."""
+
+    @property
+    def gravity(self) -> float:
+        """Gravity of the reference, m/s^2."""
+
+    @property
+    def period(self) -> float:
+        """Sampling period, s."""
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Sensors without readings."""
+
+    @property
+    def tested(self) -> tuple[str, ...]:
+        """Parameters that a likelihood-ratio test holds at their prior."""
+
+    def gauge(self, solution: Estimate) -> dict[str, Any]:
+        """Return the conventions of origin and axes."""
+
+    def findings(self, solution: Estimate) -> tuple[CheckFinding, ...]:
+        """
+        Return the findings of the recordings and those that a solution adds to them.
+
+        Raises
+        ------
+        InputError
+            When the readings are clearly in another unit.
+
+        """
+
+    def with_reference_errors(self, solution: Estimate) -> Estimate:
+        """Return the solution with errors of the reference in its covariance."""
+
+    def held_out(self, solution: Estimate) -> HeldOutData:
+        """Return the data in folds, with the parameters of a solution without each fold."""
+
+    def uncorrected(self, solution: Estimate) -> Uncorrected:
+        """Return the errors that compensation leaves uncorrected."""
+
+    def statistics(self, solution: Estimate) -> dict[str, Any]:
+        """Return the statistics of the document."""
+
+    def needs(
+        self, solution: Estimate, tolerances: np.ndarray, *, quality: dict[str, Any]
+    ) -> Needs:
+        """
+        Return the needs of a solution.
+
+        `quality`: statistics of the document, from which it follows whether the model is complete.
+        """
+
+    def singular_values(self, result: 'CalibrationResult[Estimate]') -> np.ndarray:
+        """
+        Return the singular values of the design in units of the tolerances, descending.
+
+        None where directions are estimated too.
+        """
+
+    def window_errors(self, result: 'CalibrationResult[Estimate]') -> WindowErrors:
+        """Return the errors of window means before and after."""
+
+    def residuals_of(
+        self, result: 'CalibrationResult[Estimate]', window: Window
+    ) -> dict[str, np.ndarray]:
+        """Return sensor -> measured minus predicted of a window that was kept, shape (n, 3)."""
+
+    def error_budget(self, result: 'CalibrationResult[Estimate]') -> ErrorBudget:
+        """Return the standard deviation of each parameter by cause."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibrationResult(Generic[Estimate]):
+    """A calibration with the data for a report."""
+
+    calibration: Calibration
+    """The document's content."""
+    data: Observations[Estimate]
+    """What the reference gathered."""
+    gathered: SessionData
+    """Counts, conditions and stored windows of the recordings, with all findings."""
+    tolerances: np.ndarray
+    """Tolerance of each parameter."""
+    needed: dict[str, tuple[str, float]]
+    """`Needs.motions` of the parameters that are not determined."""
     options: CalibrationOptions = CalibrationOptions()
     """Options of the requested model."""
-    reference: str
-    """Short description of the reference of the sensor."""
-    gravity: float
-    """Gravity of the reference, m/s^2."""
-    period: float
-    """Sampling period, s."""
+    solution: Estimate
+    """The estimate by weights."""
+    applied: Estimate
+    """The estimate that the document has: with the plain fits that predict better."""
+    fits: tuple[PlainFit, ...] = ()
+    """These fits."""
+    found: Any = None
+    """Result of the search for the model; None without a search."""
 
-    observations: ClassVar[str]
-    """Unit of the data: 'windows' or 'poses'."""
+    @property
+    def model(self) -> SensorModel:
+        """The model that was solved."""
+        return self.solution.model
+
+    @property
+    def reference(self) -> str:
+        """Short description of the reference."""
+        return self.data.reference
+
+    @property
+    def gravity(self) -> float:
+        """Gravity of the reference, m/s^2."""
+        return self.data.gravity
+
+    @property
+    def period(self) -> float:
+        """Sampling period, s."""
+        return self.data.period
+
+    @property
+    def observations(self) -> str:
+        """Unit of the data: 'windows' or 'poses'."""
+        return self.data.unit
 
     @property
     def verdict(self) -> Verdict:
@@ -103,27 +251,23 @@ class CalibrationResult(ABC):
 
     @property
     def singular_values(self) -> np.ndarray:
-        """
-        Singular values of the design in units of the tolerances, descending.
+        """Singular values of the design (`Observations.singular_values`)."""
+        return self.data.singular_values(self)
 
-        None by hand, where directions are estimated too.
-        """
-        return np.zeros(0)
-
-    @abstractmethod
     def window_errors(self) -> WindowErrors:
         """Return the errors of window means before and after."""
+        return self.data.window_errors(self)
 
-    @abstractmethod
     def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
         """Return sensor -> measured minus predicted of a window that was kept, shape (n, 3)."""
+        return self.data.residuals_of(self, window)
 
-    @abstractmethod
     def error_budget(self) -> ErrorBudget:
         """Return the standard deviation of each parameter by cause."""
+        return self.data.error_budget(self)
 
 
-def summary(result: CalibrationResult, hints: dict[str, str] | None = None) -> list[str]:
+def summary(result: CalibrationResult[Any], hints: dict[str, str] | None = None) -> list[str]:
     """
     Return the lines for the user: decisions, parameters, warnings, notes and next steps.
 

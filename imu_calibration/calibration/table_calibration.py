@@ -1,38 +1,21 @@
 """Calibration on a table, and the check of a calibration on another recording."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
 import numpy as np
 
-from imu_calibration.calibration import latitude_check, mount_check
+from imu_calibration.calibration.calibrate import Solved, conclude
 from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.collector import GatherStep, from_bytes
-from imu_calibration.calibration.from_solution import (
-    ModelChanges,
-    document,
-    gauge_of,
-    motions_needed,
-    statistics,
-    weak_on_table,
-    with_gravity_uncertainty,
-)
-from imu_calibration.calibration.plain_fit import (
-    better_plain_fits,
-    changes_with,
-    plain_entries,
-    with_plain_fits,
-)
 from imu_calibration.calibration.proof import (
-    applied_folds,
     prove_readings,
-    prove_solution,
     reference_model,
     reference_values,
 )
-from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.calibration.window_observations import TableResult, WindowObservations
 from imu_calibration.compensation.compensate import invertible
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
@@ -42,20 +25,17 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import (
-    Uncorrected,
     end_of,
     judged_from_of,
     latest_settling,
-    uncorrected_on_table,
 )
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.solution import Solution, shrunk, tolerances_of, with_weak_replaced
+from imu_calibration.estimation.solution import Solution, shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_units
-from imu_calibration.preprocessing.recording_evidence import with_findings_of
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
@@ -104,30 +84,31 @@ def calibrate_on_table(
 
     """
     recordings = TableRecordings.of(sources, table, mapper=mapper, names=names)
-    return conclude(recordings.solved(options), table=table, options=options, provenance=provenance)
+    return conclude(recordings.solved(options), options, provenance=provenance)
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """A solution with the data that it was solved from."""
+class SolvedWindows(Solved[Solution]):
+    """A solution of windows on a table."""
 
-    solution: Solution
-    """Estimate of the requested model."""
-    gathered: SessionData
-    """Statistics of the windows of all recordings."""
-    model: SensorModel
-    """Model of the gathered columns; it may have more effects."""
+    data: WindowObservations
+    """The windows."""
+
+
+def solved_windows(data: WindowObservations, options: CalibrationOptions) -> SolvedWindows:
+    """Return the solution of windows (`solve_gathered`)."""
+    return SolvedWindows(solve_gathered(data.gathered, data.model, options), data)
 
 
 class WindowSource(Protocol):
     """Windows that are reduced again in each pass: of recordings, or of a live session."""
 
-    def solved(self, options: CalibrationOptions) -> Solved:
+    def solved(self, options: CalibrationOptions) -> SolvedWindows:
         """Return the solution of the model that options request, at a valid linearisation."""
 
     def solved_at(
         self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
-    ) -> Solved:
+    ) -> SolvedWindows:
         """
         Return the solution with the columns of a model.
 
@@ -164,7 +145,7 @@ class TableRecordings:
         numbered = [f'recording {number}' for number in range(1, len(sources) + 1)]
         return cls(sources, table, tuple(names or numbered), mapper, keep_windows)
 
-    def solved(self, options: CalibrationOptions) -> Solved:
+    def solved(self, options: CalibrationOptions) -> SolvedWindows:
         """Return the solution of the model that options request, at a valid linearisation."""
         model = choose_model(options, self.table)
         if model.needs_temperature:
@@ -173,7 +154,7 @@ class TableRecordings:
 
     def solved_at(
         self, model: SensorModel, options: CalibrationOptions, *, judged_from: float
-    ) -> Solved:
+    ) -> SolvedWindows:
         """Read all recordings once; see `WindowSource.solved_at`."""
         # The search has its windows when effects are added.
         keep_windows = self.keep_windows and not options.added
@@ -189,12 +170,12 @@ class TableRecordings:
         parts = list(self.mapper(step, enumerate(self.sources)))
         gathered = join(parts, self.names, partial(check_units, model=model, table=self.table))
         report('solving')
-        return Solved(solve_gathered(gathered, model, options), gathered, model)
+        return solved_windows(WindowObservations(self.table, gathered, model), options)
 
 
 def solve_in_passes(
     source: WindowSource, model: SensorModel, options: CalibrationOptions
-) -> Solved:
+) -> SolvedWindows:
     """
     Return the solution at a linearisation that is valid at it.
 
@@ -209,7 +190,7 @@ def solve_in_passes(
         solution = solved.solution
         linearised = linearise_again(model, solution)
         latest = latest_settling(solution.model, solution.values, solution.sd)
-        last_third = judged_from_of(latest, end_of(solved.gathered.accumulator))
+        last_third = judged_from_of(latest, end_of(solved.data.gathered.accumulator))
         if linearised is None and judged_from == last_third:
             break
         again = linearised or model
@@ -229,7 +210,7 @@ def _at_time_constants(
     """
     for effect in model.effects:
         if effect.time_constant and effect.name not in options.point:
-            gathered = source.solved_at(model, options, judged_from=0.0).gathered
+            gathered = source.solved_at(model, options, judged_from=0.0).data.gathered
             trials = at_time_constants(model, effect, end_of(gathered.accumulator))
             of_means = []
             for trial in trials:
@@ -299,106 +280,8 @@ def calibration_of_saved(
         )
     options = extension.options(options)
     solution = extension.applied(solve_gathered(gathered, model, options))
-    return conclude(
-        Solved(solution, gathered, model),
-        table=table,
-        options=options,
-        changes=extension.changes,
-    ).calibration
-
-
-def conclude(
-    solved: Solved,
-    *,
-    table: Table,
-    options: CalibrationOptions = CalibrationOptions(),
-    provenance: dict | None = None,
-    changes: ModelChanges = ModelChanges(),
-    under_test: Collection[str] = (),
-) -> TableResult:
-    """
-    Judge a solution, name the missing motions, and return the TableResult.
-
-    The effects of sensors in `under_test`, and of
-    sensors with an unexplained residual, have to predict better than plain least squares.
-    """
-    solution, gathered, model = solved.solution, solved.gathered, solved.model
-    tolerances = tolerances_of(solution.model, options.tolerances)
-    gathered.findings = with_findings_of(
-        mount_check.CHECK, mount_check.mount_findings(solution, table), gathered.findings
-    )
-    windows = latitude_check.window_rates(gathered, model, table)
-    gathered.findings = with_findings_of(
-        latitude_check.CHECK,
-        latitude_check.latitude_findings(solution, table, windows),
-        gathered.findings,
-    )
-    solution = with_weak_replaced(with_gravity_uncertainty(solution, table), tolerances)
-    quality = {**statistics(solution, gathered), **changes.to_mapping()}
-    needed = motions_needed(solution, tolerances, table, quality=quality)
-    uncorrected = _uncorrected(solution, gathered, model)
-    held_out = gathered.held_out.restricted(model, solution.model)
-    folds = applied_folds(held_out, solution, centre=uncorrected.centre)
-    plain = better_plain_fits(
-        held_out,
-        solution,
-        folds,
-        under_test={*changes.unexplained, *under_test},
-        centre=uncorrected.centre,
-        as_asked=options.as_asked,
-    )
-    applied = with_plain_fits(solution, plain)
-    for fit in plain:
-        folds = fit.merged(folds)
-    if plain:
-        # The effects that a plain fit replaces do not remain uncorrected.
-        uncorrected = _uncorrected(applied, gathered, model)
-    proof = prove_solution(held_out, applied, folds)
-    calibration = document(
-        applied,
-        tolerances,
-        gathered,
-        gravity=table.gravity_value,
-        gauge=gauge_of(solution.model),
-        undetermined=weak_on_table(solution, tolerances, needed),
-        statistics=statistics(solution, gathered)
-        | mount_check.turn_entry(applied)
-        | plain_entries(plain),
-        provenance=provenance,
-        proof=proof,
-        changes=changes_with(changes, plain),
-        uncorrected=uncorrected,
-        readings=options.nominal,
-    )
-    period = float(
-        np.median([row.duration / max(row.count - 1, 1) for row in gathered.accumulator.rows])
-    )
-    return TableResult(
-        calibration=calibration,
-        gathered=gathered,
-        tolerances=tolerances,
-        needed=needed,
-        options=options,
-        reference=f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})',
-        gravity=table.gravity_value,
-        period=period,
-        solution=solution,
-        table=table,
-        model=solution.model,
-        gathered_model=model,
-    )
-
-
-def _uncorrected(solution: Solution, gathered: SessionData, model: SensorModel) -> Uncorrected:
-    """Return the errors that a solution of data with the columns of `model` leaves uncorrected."""
-    values = solution.values
-    return uncorrected_on_table(
-        solution.model.at(values),
-        values,
-        gathered.accumulator,
-        gathered=model,
-        latest=latest_settling(solution.model, values, solution.sd),
-    )
+    data = WindowObservations(table, gathered, model)
+    return conclude(SolvedWindows(solution, data, extension), options).calibration
 
 
 def _by_default(model: SensorModel, options: CalibrationOptions) -> list[slice]:

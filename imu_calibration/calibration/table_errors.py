@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.document.verdict import incomplete_motions
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import Status

@@ -236,7 +236,7 @@ def _moving_runs(result, window, length):
     """Return the Growth of one stretch, raw and corrected."""
     some = slice(0, int(np.searchsorted(window.time, window.time[0] + length, 'right')))
     time, motion = window.time[some], window.motion.select(some)
-    truth = _at_origin(result.calibration, reference_motion(result.table, motion))
+    truth = _at_origin(result.calibration, reference_motion(result.data.table, motion))
     reference_c = result.calibration.model.temperature_ref_c
     temperature = (
         np.full(len(time), reference_c)

@@ -13,12 +13,10 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from imu_calibration.calibration.hand_workflow import (
-    EvidentHand,
-    HandResult,
-    hand_result,
-    read_by_hand,
-)
+from imu_calibration.calibration.calibrate import Solved, conclude
+from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.pose_observations import PoseObservations
+from imu_calibration.calibration.result import CalibrationResult
 from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock
@@ -27,7 +25,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
-from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
+from imu_calibration.references.gravity.hand_calibration import solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import hand_options
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.use_cases.recordings import (
@@ -43,7 +41,6 @@ from msg_adapters.imu import IMU_TYPE
 
 if TYPE_CHECKING:
     from imu_calibration.calibration.collector import GatherStep
-    from imu_calibration.calibration.table_result import TableResult
     from imu_calibration.references.turntable.session_data import SessionData
 
 MOST_IMUS = 64
@@ -62,9 +59,9 @@ class RecordingSummary:
     """Detected faults."""
     lost: dict[str, int]
     """Reason -> messages that could not be read."""
-    calibrated: TableResult | ImuCalibrationError | None
+    calibrated: CalibrationResult | ImuCalibrationError | None
     """Result of a calibration on the motions, or the error; None without a table."""
-    by_hand: HandResult | ImuCalibrationError | None = None
+    by_hand: CalibrationResult | ImuCalibrationError | None = None
     """
     Result of a calibration by hand, or the error; None with a table, and where a calibration would
     be wrong.
@@ -86,7 +83,7 @@ class RecordingSummary:
         return 1 if self.refused else exit_code_of(self.reasons)
 
     @property
-    def result(self) -> TableResult | HandResult | None:
+    def result(self) -> CalibrationResult | None:
         """Result of the calibration on a table or by hand; None without one."""
         for result in (self.calibrated, self.by_hand):
             if result is not None and not isinstance(result, ImuCalibrationError):
@@ -290,8 +287,8 @@ def _by_hand(source, options, preflight):
         if any(finding.severity == REFUSE for finding in recording.findings):
             return None
         asked = hand_options(options)
-        data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
-        return hand_result(EvidentHand(solve_by_hand(data, asked)), recording, options)
+        poses = PoseObservations.of(recording, asked)
+        return conclude(Solved(solve_by_hand(poses.data, asked), poses), options)
     except ImuCalibrationError as error:
         return error
 

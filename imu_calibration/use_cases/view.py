@@ -21,10 +21,8 @@ from imu_calibration.calibration.coverage import (
     table_coverage,
 )
 from imu_calibration.calibration.diagnosis.traces import Traces
-from imu_calibration.calibration.hand_workflow import HandResult
 from imu_calibration.calibration.live_poses import EMPTY_SCAN, hand_coverage
 from imu_calibration.calibration.result import CalibrationResult
-from imu_calibration.calibration.table_result import TableResult
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document import files
@@ -512,13 +510,12 @@ def _document_of(path):
 
 
 def _coverage(result: CalibrationResult) -> Coverage:
-    if isinstance(result, HandResult):
+    if result.data.table is None:
         found = hand_coverage(
-            replace(EMPTY_SCAN, poses=result.hand.poses),
+            replace(EMPTY_SCAN, poses=result.applied.poses),
             result,
             HandOptions(tolerances=result.options.tolerances),
         )
     else:
-        assert isinstance(result, TableResult), 'a calibration is made by hand or on a table'
         found = table_coverage(result)
     return found.with_done(group_states(result))

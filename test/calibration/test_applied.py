@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import imu_calibration as imu
-from imu_calibration.calibration.hand_workflow import prove_hand_readings, read_by_hand
+from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.hand_workflow import prove_hand_readings
 from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import DEG
@@ -132,7 +133,7 @@ def test_the_proof_from_window_statistics_differs_by_the_square_of_the_errors():
         result.solution.model,
         applied_values(result.solution.model, result.solution.values),
     )
-    dealt = result.gathered.held_out.restricted(result.gathered_model, model)
+    dealt = result.gathered.held_out.restricted(result.data.model, model)
     found = prove(model, before=(dealt, ([nominal_values(model)],)), after=(dealt, ([values],)))
     checked = imu.check(session.samples, result.calibration, session.table)
     for sensor, entry in checked.proof.items():

@@ -10,13 +10,13 @@ from test_diagnosis_by_hand import HIDDEN, NOTHING
 from test_live_by_hand import assert_same, make_live, run
 
 import imu_calibration as imu
-from imu_calibration.calibration.hand_workflow import solve_hand_by_evidence
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
 
 from worlds.hand_sessions import GRAVITY, PARAM_NAMES, simulate
 from worlds.physics_hand import hold_and_turn, warmed_up
+from worlds.searched_by_hand import searched
 
 QUADRATIC = 'gyro_quadratic'
 ROWS = slice(12, 21)
@@ -93,16 +93,14 @@ def test_what_only_one_half_shows_is_left_out_and_widens():
         )
 
     samples, ranges, _ = simulate(31, n_poses=36, spoil=spoil)
-    data, options = gather_by_hand(samples, ranges), HandOptions(GRAVITY)
-    evident = solve_hand_by_evidence(data, options)
-    assert (
-        set(evident.changes.unstable) <= {QUADRATIC, 'gyro_scale_asymmetry'}
-        and evident.changes.unstable
-        and evident.changes.added == ()
-    )
-    plain = solve_by_hand(data, options)
-    np.testing.assert_array_equal(evident.hand.values, plain.values)
-    grown = evident.hand.sd[ROWS] / plain.sd[ROWS]
+    data = gather_by_hand(samples, ranges)
+    solved = searched(data)
+    changes = solved.extension.changes
+    assert changes.unstable and set(changes.unstable) <= {QUADRATIC, 'gyro_scale_asymmetry'}
+    assert changes.added == ()
+    plain = solve_by_hand(data, HandOptions(GRAVITY))
+    np.testing.assert_array_equal(solved.solution.values, plain.values)
+    grown = solved.solution.sd[ROWS] / plain.sd[ROWS]
     assert grown.min() >= 1.0 and grown.max() > 1.2
 
 
@@ -110,9 +108,7 @@ def test_what_only_one_half_shows_is_left_out_and_widens():
 def test_a_warm_up_is_not_sold_as_an_answer_to_gravity(seed=0):
     samples, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0, still=3.0)
     warm, _ = warmed_up(samples, seed, rate=0.01, time_constant=60.0)
-    names = solve_hand_by_evidence(
-        gather_by_hand(warm, ranges), HandOptions(GRAVITY)
-    ).hand.param_names
+    names = searched(gather_by_hand(warm, ranges)).solution.param_names
     assert not any('gyro_g_sensitivity' in name for name in names)
 
 
@@ -120,8 +116,8 @@ def test_a_warm_up_is_not_sold_as_an_answer_to_gravity(seed=0):
 def test_nothing_is_added_where_nothing_is_hidden(seed):
     samples, ranges, _ = hold_and_turn(seed, n_poses=24, rate_hz=50.0)
     data = gather_by_hand(samples, ranges)
-    evident = solve_hand_by_evidence(data, HandOptions(GRAVITY))
-    assert evident.changes.to_mapping() == {}
+    solved = searched(data)
+    assert solved.extension.changes.to_mapping() == {}
     np.testing.assert_array_equal(
-        evident.hand.values, solve_by_hand(data, HandOptions(GRAVITY)).values
+        solved.solution.values, solve_by_hand(data, HandOptions(GRAVITY)).values
     )

@@ -126,7 +126,7 @@ def by_the_picture(person, most=40):
     live.push(SampleBlock(person.hold()))
     for _ in range(most):
         shown = live.coverage()
-        if live.result is not None and set(live.result.hand.statuses) == {'determined', 'fixed'}:
+        if live.result is not None and set(live.result.applied.statuses) == {'determined', 'fixed'}:
             break
         live.push(SampleBlock(person.go(shown.next.axis, shown.next.angle)))
         try:

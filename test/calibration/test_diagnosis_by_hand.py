@@ -16,7 +16,7 @@ from refusal import refused
 from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnosis_lines
 from imu_calibration.calibration.diagnosis.findings import diagnosis_by_hand
-from imu_calibration.calibration.hand_workflow import extended_by_hand, solve_hand_by_evidence
+from imu_calibration.calibration.hand_workflow import extended_by_hand
 from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import EARTH_RATE
@@ -32,6 +32,7 @@ from imu_calibration.simulation.session import random_values
 from imu_calibration.simulation.session import simulate_session as simulate_session
 
 from worlds.hand_sessions import GRAVITY, simulate
+from worlds.searched_by_hand import searched
 
 NOTHING = np.zeros(3)
 MG, DEG = 9.80665e-3, np.pi / 180
@@ -130,9 +131,8 @@ def test_the_attitudes_at_which_a_rest_appears_are_told():
     )
     # Calibrate and diagnose use one test of the unexplained residual.
     imu, ranges, _ = simulate(21500, n_poses=24, spoil=spoil)
-    assert solve_hand_by_evidence(
-        gather_by_hand(imu, ranges), HandOptions(GRAVITY)
-    ).changes.unexplained == {'gyroscope': rest.entry}
+    solved = searched(gather_by_hand(imu, ranges))
+    assert solved.extension.changes.unexplained == {'gyroscope': rest.entry}
     assert rest.entry['rms'] == rest.rms > 0 and rest.entry['axes'] == ['y']
     everywhere = diagnosed(21500, stops).diagnosis.unexplained['accelerometer']
     assert everywhere.significant and not everywhere.regimes

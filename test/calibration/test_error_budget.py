@@ -12,7 +12,7 @@ import pytest
 
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.table_calibration import calibrate_on_table
-from imu_calibration.calibration.table_result import (
+from imu_calibration.calibration.window_observations import (
     JOINT_POSITION_SD,
     _faster,
     _heavier,
@@ -78,8 +78,8 @@ def moved(recording, result, false_table):
 @pytest.mark.parametrize('axis', (0, 1))
 def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, result, axis):
     angle = 1e-3 * np.eye(2)[axis]
-    shift = parameter_shifts(result, [partial(_tilted, angle)])[0].sum(axis=0)
-    actual = -moved(recording, result, tilt(result.table, angle))
+    shift = parameter_shifts(result.data, result.solution, [partial(_tilted, angle)])[0].sum(axis=0)
+    actual = -moved(recording, result, tilt(result.data.table, angle))
     assert np.linalg.norm(shift[:12]) > 1e-4
     for effect in result.solution.model.effects[:3]:
         part = result.solution.model.slices[effect.sensor, effect.name]
@@ -89,14 +89,16 @@ def test_a_table_that_is_not_level_moves_the_parameters_as_predicted(recording, 
 
 
 def test_a_wrong_gravity_scales_the_accelerometer_matrix(recording, result):
-    shift = parameter_shifts(result, [partial(_heavier, 0.01)])[0].sum(axis=0)
+    shift = parameter_shifts(result.data, result.solution, [partial(_heavier, 0.01)])[0].sum(axis=0)
     assert shift[3:12] == pytest.approx(result.solution.values[3:12] * 0.01 / 9.81, abs=3e-7)
-    actual = -moved(recording, result, replace(result.table, gravity=9.82))
+    actual = -moved(recording, result, replace(result.data.table, gravity=9.82))
     assert actual[:21] == pytest.approx(shift[:21], abs=5e-6)
 
 
 def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
-    shift = parameter_shifts(result, [partial(_faster, 1 + 1e-3)])[0].sum(axis=0)
+    shift = parameter_shifts(result.data, result.solution, [partial(_faster, 1 + 1e-3)])[0].sum(
+        axis=0
+    )
     names = result.solution.param_names
     arms, matrix = (
         result.solution.model.slices[key]
@@ -109,9 +111,9 @@ def test_a_fast_table_clock_scales_the_gyroscope_matrix_and_the_arms(result):
 
 def test_joint_errors_are_drawn_anew_in_every_window(result):
     """The sd of the budget is that of random joint errors put through the same shifts."""
-    budget = error_budget(result)
+    budget = result.error_budget()
     changes = [partial(_turned, angles) for angles in JOINT_POSITION_SD * np.eye(3)]
-    shifts = parameter_shifts(result, changes)
+    shifts = parameter_shifts(result.data, result.solution, changes)
     rng = np.random.default_rng(5)
     draws = np.einsum('dkw,kwp->dp', rng.normal(size=(4000, *shifts.shape[:2])), shifts)
     own = budget.causes['joint position']
@@ -121,22 +123,22 @@ def test_joint_errors_are_drawn_anew_in_every_window(result):
 
 
 def test_levelling_counts_only_where_tilt_is_not_estimated(recording, result):
-    without = error_budget(result)
+    without = result.error_budget()
     assert list(without.causes) == ['noise', 'levelling', 'joint position', 'table rate', 'gravity']
     matrix = result.solution.model.slices['accelerometer', 'matrix']
     assert np.max(without.causes['levelling'][matrix]) > 10 * np.max(
         without.causes['noise'][matrix]
     )
-    with_tilt = error_budget(calibrated(recording, TABLE, CalibrationOptions()))
+    with_tilt = calibrated(recording, TABLE, CalibrationOptions()).error_budget()
     assert 'levelling' not in with_tilt.causes
 
 
 def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result, monkeypatch):
-    small = error_budget(result)
+    small = result.error_budget()
     monkeypatch.setattr(
-        'imu_calibration.calibration.table_result.JOINT_POSITION_SD', 10 * JOINT_POSITION_SD
+        'imu_calibration.calibration.window_observations.JOINT_POSITION_SD', 10 * JOINT_POSITION_SD
     )
-    large = error_budget(result)
+    large = result.error_budget()
     assert small.total**2 == pytest.approx(
         sum(part**2 for part in small.causes.values()), rel=1e-12
     )
@@ -146,13 +148,13 @@ def test_the_total_is_the_root_of_the_sum_of_squares_and_sizes_scale_it(result, 
 
 
 def test_gravity_sd_of_the_table_description_is_used(result):
-    stated = replace(result, table=replace(result.table, gravity_sd=1e-3))
-    assert '0.001' in error_budget(stated).texts['gravity']
+    stated = replace(result.data, table=replace(result.data.table, gravity_sd=1e-3))
+    assert '0.001' in error_budget(stated, result.solution).texts['gravity']
 
 
 def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording, result):
     """The sd of every scale factor contains 1e-4 of its value; the budget has the same share."""
-    place = replace(result.table, gravity=None)
+    place = replace(result.data.table, gravity=None)
     scales = [
         result.solution.param_names.index(f'accelerometer.matrix.{axis}')
         for axis in ('xx', 'yy', 'zz')
@@ -162,6 +164,5 @@ def test_normal_gravity_of_a_latitude_has_the_accuracy_of_its_formula(recording,
         for table in (place, replace(place, gravity_sd=0.0))
     )
     assert stated - exact == pytest.approx(1e-8 * result.solution.values[scales] ** 2, rel=1e-3)
-    assert error_budget(replace(result, table=place)).causes['gravity'][scales] == pytest.approx(
-        1e-4, rel=0.02
-    )
+    at_place = error_budget(replace(result.data, table=place), result.solution)
+    assert at_place.causes['gravity'][scales] == pytest.approx(1e-4, rel=0.02)

@@ -9,13 +9,13 @@ import pytest
 from refusal import refused
 
 from imu_calibration.calibration import collector
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.live import LiveCalibration, LiveSettings, SolvePacer
 from imu_calibration.calibration.table_calibration import (
-    Solved,
     calibrate_on_table,
-    conclude,
-    solve_gathered,
+    solved_windows,
 )
+from imu_calibration.calibration.window_observations import WindowObservations
 from imu_calibration.core.errors import DocumentError, InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.decision import HELPS
@@ -275,7 +275,7 @@ def test_a_state_comes_back_to_the_last_bit(quick):
     assert collector.to_bytes(again, live.model) == data
     found, expected = (
         conclude(
-            Solved(solve_gathered(each, live.model), each, live.model), table=TABLE
+            solved_windows(WindowObservations(TABLE, each, live.model), CalibrationOptions())
         ).calibration
         for each in (again, gathered)
     )

@@ -94,7 +94,7 @@ def test_a_gain_that_a_lag_has_spoiled_is_no_help_and_the_cause_is_named(late, t
 
 def test_a_fold_is_left_out_as_if_it_had_not_been_recorded(clean):
     result = clean.result
-    dealt = result.gathered.held_out.restricted(result.gathered_model, result.model)
+    dealt = result.gathered.held_out.restricted(result.data.model, result.model)
     without = dealt.values_without(result.solution)
     rest = Accumulator()
     for k, block in enumerate(dealt.blocks):

@@ -104,7 +104,7 @@ def test_a_warm_up_is_determined_and_a_weak_one_needs_no_attitude():
     assert (
         found.calibration.status_by_name['gyroscope.gyro_bias_drift.time_constant'] == 'determined'
     )
-    hand = found.result.hand
+    hand = found.result.applied
     index = hand.param_names.index('gyroscope.gyro_bias_drift.x')
     tight = replace(hand, tolerances=1e-3 * hand.tolerances)
     assert _without_motion(tight, index, _Excesses.of(tight)) == ALL_MOTIONS['warm_up']

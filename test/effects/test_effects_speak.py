@@ -372,10 +372,10 @@ def test_pickles_and_saved_sessions_carry_it():
         model_as_asked=True,
         **models('gyro_anisoelasticity'),
     ).result
-    data = to_bytes(found.gathered, found.gathered_model)
+    data = to_bytes(found.gathered, found.data.model)
     assert len(from_bytes(data)[0].accumulator.rows) == len(found.gathered.accumulator.rows)
     other = replace(
-        found.gathered_model,
+        found.data.model,
         catalogue=CATALOGUE.with_effects(
             term('gyro_anisoelasticity', **ADDED['gyro_anisoelasticity'] | {'unit': '1'})
         ),

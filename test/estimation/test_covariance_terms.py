@@ -150,7 +150,7 @@ def test_offsets_of_windows_are_a_term_apart_from_white_noise(by_table):
     }
     walking = {sensor: replace(noise, offset_sd=1e-2) for sensor, noise in white.items()}
     first, second = (
-        solve(accumulator, by_table.gathered_model, noise=each) for each in (white, walking)
+        solve(accumulator, by_table.data.model, noise=each) for each in (white, walking)
     )
     scale = np.diag(first.terms[SAMPLE_NOISE])
     assert np.all(np.abs(np.diag(first.terms[BIAS_PROCESS])) <= 1e-6 * scale)

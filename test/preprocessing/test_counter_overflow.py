@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.hand_workflow import read_by_hand
+from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.preprocessing.checks import Preflight

@@ -8,10 +8,8 @@ from refusal import refused
 
 from imu_calibration.allan.identify import figures_of, identify_noise
 from imu_calibration.calibration.collector import GatherStep
-from imu_calibration.calibration.hand_workflow import (
-    check_by_hand,
-    read_by_hand,
-)
+from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.hand_workflow import check_by_hand
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.outcome import exit_code, shortcomings

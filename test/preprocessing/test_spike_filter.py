@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from imu_calibration.calibration.hand_workflow import read_by_hand
+from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.kinematics.table import Table

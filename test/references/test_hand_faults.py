@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from imu_calibration.calibration.advice import missing_motion
-from imu_calibration.calibration.hand_workflow import HandRecording, evident_result, read_by_hand
+from imu_calibration.calibration.hand_recording import HandRecording, read_by_hand
+from imu_calibration.calibration.hand_workflow import calibrate_poses
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
@@ -137,7 +138,7 @@ def test_a_large_bias_does_not_spoil_the_gyroscope(session, bias):
 def test_a_scale_far_from_one_is_questioned_and_applied_where_the_data_support_it(session):
     halved = replace(session[0], force_s=0.52 * session[0].force_s, rate_s=2.2 * session[0].rate_s)
     options = CalibrationOptions(gravity=GRAVITY)
-    result = evident_result(read_by_hand([SampleBlock(halved)]), options)[0]
+    result = calibrate_poses(read_by_hand([SampleBlock(halved)]), options)
     assert set(scale_questions(result.calibration)) == {'accelerometer', 'gyroscope'}
     assert not refused_sensors(result.calibration)
     unit = [f for f in looked_at(halved) if f.check in ('gravity', 'full_scale')]
@@ -335,12 +336,12 @@ def test_what_was_left_out_does_not_come_back_in_the_proof():
     rate = imu.rate_s.copy()
     rate[ranges[3].stop + 20 : ranges[3].stop + 25, 1] += 4.0
     clean, found = (
-        evident_result(
+        calibrate_poses(
             HandRecording(samples, None, {}), CalibrationOptions(gravity=GRAVITY), stills=ranges
-        )[0]
+        )
         for samples in (imu, replace(imu, rate_s=rate))
     )
-    assert found.hand.statistics['left_out'] == {'contradicted by gravity': 1}
+    assert found.applied.statistics['left_out'] == {'contradicted by gravity': 1}
     assert (
         found.calibration.proof['gyroscope'].after < 2 * clean.calibration.proof['gyroscope'].after
     )
@@ -460,11 +461,11 @@ def test_a_gravity_of_no_place_on_the_earth_is_refused(gravity):
 def test_the_error_budget_lists_an_unknown_gravity_and_not_a_given_one():
     imu, ranges, _ = hold_and_turn(3, n_poses=14)
     unknown, given = (
-        evident_result(
+        calibrate_poses(
             HandRecording(imu, None, {}),
             CalibrationOptions(gravity=gravity, as_asked=True),
             stills=ranges,
-        )[0]
+        )
         for gravity in (None, STANDARD_GRAVITY)
     )
     scale = unknown.calibration.param_names.index('accelerometer.matrix.xx')

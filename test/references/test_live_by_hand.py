@@ -170,7 +170,7 @@ def test_after_a_solution_the_motion_that_helps_most_is_named(session):
     shown = live.coverage().next
     # The terminal, the status and the picture say one step.
     assert status.values['next'] == shown.text and shown.up is not None
-    assert shown.text in {item['needs'] for item in missing_motion(live.result.hand)}
+    assert shown.text in {item['needs'] for item in missing_motion(live.result.applied)}
     assert status.word == 'weak' and re.search(r'[+-][xyz] up', status.message.split('next: ')[1])
     assert groups['accelerometer', 'matrix'].status != 'determined' and re.search(
         r'[+-][xyz] up', groups['accelerometer', 'matrix'].needs
@@ -191,11 +191,11 @@ def test_residuals_of_poses_are_what_the_model_leaves(session, expected):
     assert live.residuals(poses) is None
     live.solve(pending=True)
     residuals = live.residuals(poses)
-    norms = expected.hand.norm_residuals()[: len(poses)]
+    norms = expected.applied.norm_residuals()[: len(poses)]
     along = np.linalg.norm(residuals.force_s, axis=1)
     np.testing.assert_allclose(along, np.abs(norms), rtol=0.1, atol=1e-6)
     assert set(residuals.stamp_ns) <= set(session.stamp_ns)
-    assert np.all(np.abs(residuals.rate_s) < 5 * np.max(expected.hand.poses.rate_sem))
+    assert np.all(np.abs(residuals.rate_s) < 5 * np.max(expected.applied.poses.rate_sem))
 
 
 def paused(first, second, seconds=100.0):

@@ -213,8 +213,8 @@ def test_errors_after_calibration_are_of_held_out_windows(on_table, by_hand):
             fitted = (
                 (_fitted(result, sensor) @ inverse.T)
                 if result is on_table
-                else result.hand.compensate(
-                    result.hand.poses.force, result.hand.poses.rate, result.hand.poses.time
+                else result.applied.compensate(
+                    result.applied.poses.force, result.applied.poses.rate, result.applied.poses.time
                 )[0]
                 - errors.true[sensor]
             )
@@ -226,9 +226,7 @@ def _fitted(result, sensor):
     means = np.array(
         [
             row.sensors[sensor].mean
-            for row in restrict(
-                result.gathered.accumulator, result.gathered_model, result.model
-            ).rows
+            for row in restrict(result.gathered.accumulator, result.data.model, result.model).rows
         ]
     )
     return means[:, -3:] - means[:, :-3] @ coefficients(

@@ -9,14 +9,13 @@ from argparse import ArgumentParser
 
 import numpy as np
 
-from imu_calibration.calibration.hand_workflow import solve_hand_by_evidence
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD_PRIORS, of_fit
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand
-from imu_calibration.references.gravity.hand_parameters import HandOptions
 
-from worlds.hand_sessions import GRAVITY, PARAM_NAMES
+from worlds.hand_sessions import PARAM_NAMES
 from worlds.physics_hand import hold_and_turn, warmed_up
+from worlds.searched_by_hand import searched
 
 WORLDS = {
     'clean': {},
@@ -67,7 +66,7 @@ def errors(world, seed, **options):
     The factor is the ratio to the sds that only noise and scatter give.
     """
     data, truth, moved = session(world, seed, **options)
-    hand, truth = solve_hand_by_evidence(data, HandOptions(GRAVITY)).hand, truth.copy()
+    hand, truth = searched(data).solution, truth.copy()
     for sensor, part in zip(SENSORS, (slice(0, 3), slice(9, 12)), strict=True):
         # A bias beside a drift is that of the start, else a mean.
         if not any(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.calibration.by_evidence import baseline_options, calibrate_by_evidence
+from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.diagnosis.diagnosis_result import (
     Candidate,
@@ -24,10 +25,11 @@ from imu_calibration.calibration.diagnosis.findings import (
 )
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.calibration.from_solution import ModelExtension
-from imu_calibration.calibration.hand_workflow import evident_result, read_by_hand
+from imu_calibration.calibration.hand_recording import read_by_hand
+from imu_calibration.calibration.hand_workflow import calibrate_poses
 from imu_calibration.calibration.plain_fit import CLEARLY_BETTER
-from imu_calibration.calibration.table_calibration import TableRecordings, conclude
-from imu_calibration.calibration.table_result import TableResult
+from imu_calibration.calibration.table_calibration import TableRecordings
+from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.core.units import error_text
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import HARM
@@ -360,8 +362,7 @@ def _with_proposals(
     )
     return conclude(
         replace(solved, solution=unsure.applied(solved.solution)),
-        table=table,
-        options=chosen,
+        chosen,
         provenance=provenance,
         under_test={effect.sensor for effect in effects},
     ).calibration
@@ -393,11 +394,11 @@ def diagnose_without_table(
 
     """
     recording = read_by_hand(source(), options.nominal, Preflight(options.gravity))
-    result, evident = evident_result(recording, replace(options, as_asked=False), provenance)
-    if evident.found is None:
-        raise too_few_poses(len(evident.hand.poses.start))
+    result = calibrate_poses(recording, replace(options, as_asked=False), provenance)
+    if result.found is None:
+        raise too_few_poses(len(result.solution.poses.start))
     return DiagnosisResult(
-        diagnosis_by_hand(evident.found, evident.hand),
+        diagnosis_by_hand(result.found, result.solution),
         result.calibration,
         result.tolerances,
         result.needed,

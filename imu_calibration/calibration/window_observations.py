@@ -1,5 +1,5 @@
 """
-The result of a calibration on a table, and its error budget after section V of Avrutov 2017.
+Windows of a calibration on a table, and its error budget after section V of Avrutov 2017.
 
 The paper sums errors of the reference and of the outputs as if they were independent, with sign.
 Noise gives the covariance of the solution; a wrong reference that changes the predicted output by
@@ -7,23 +7,40 @@ Noise gives the covariance of the solution; a wrong reference that changes the p
 not level and independent when an encoder is read in every pose.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from imu_calibration.calibration.proof import nominal_values
+from imu_calibration.calibration import latitude_check, mount_check
+from imu_calibration.calibration.from_solution import (
+    gauge_of,
+    motions_needed,
+    statistics,
+    weak_on_table,
+    with_gravity_uncertainty,
+)
+from imu_calibration.calibration.plain_fit import (
+    PlainFit,
+    better_plain_fits,
+    with_plain_fits,
+)
+from imu_calibration.calibration.proof import applied_folds, nominal_values, prove_solution
 from imu_calibration.calibration.result import (
     GRAVITY_SD,
     CalibrationResult,
     ErrorBudget,
+    Needs,
     WindowErrors,
 )
 from imu_calibration.core.units import ARCMIN
+from imu_calibration.document.proof_entry import Proof
+from imu_calibration.document.trust import Uncorrected, latest_settling, uncorrected_on_table
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import (
+    Centre,
     References,
     coefficient_jacobian,
     coefficients,
@@ -40,11 +57,13 @@ from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.kinematics.chain import tilt
 from imu_calibration.kinematics.joint_motion import JointMotion, rest_at
 from imu_calibration.kinematics.table import Table
+from imu_calibration.preprocessing.recording_evidence import CheckFinding, with_findings_of
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock
-from imu_calibration.selection.residual_analysis import ResidualAnalysis
+from imu_calibration.references.turntable.session_data import HeldOut, HeldOutBlock, SessionData
 from imu_calibration.selection.residual_blocks import residuals
 
+TableResult = CalibrationResult[Solution]
+"""A calibration on a table."""
 LEVELLING_SD = 2 * ARCMIN
 """
 Levelling of the table in each of two directions, rad; counts when table_tilt is not estimated.
@@ -57,7 +76,7 @@ MOVING_SAMPLES = 20_000
 """Most samples of moving windows that are used; they are subsampled evenly beyond it."""
 
 
-def error_budget(result: 'TableResult') -> ErrorBudget:
+def error_budget(data: 'WindowObservations', solution: Solution) -> ErrorBudget:
     """
     Return the ErrorBudget of a calibration on a table.
 
@@ -66,20 +85,21 @@ def error_budget(result: 'TableResult') -> ErrorBudget:
 
     Parameters
     ----------
-    result : TableResult
+    data : WindowObservations
+    solution : Solution
 
     """
-    table = result.table
+    table = data.table
     gravity_sd = table.gravity_sd_value
     if table.gravity is not None and table.gravity_sd is None:
         gravity_sd = GRAVITY_SD
-    errors = _errors_of_reference(result, gravity_sd)
+    errors = _errors_of_reference(data, solution, gravity_sd)
     changes: list[Callable] = []
     for error in errors:
         changes += error.changes
-    shifts = parameter_shifts(result, changes)
+    shifts = parameter_shifts(data, solution, changes)
 
-    causes = {'noise': result.solution.sd}
+    causes = {'noise': solution.sd}
     texts = {'noise': 'noise and wander of the sensors, as this recording shows them'}
     start = 0
     for error in errors:
@@ -90,7 +110,7 @@ def error_budget(result: 'TableResult') -> ErrorBudget:
             moved = moved.sum(axis=1, keepdims=True)
         causes[error.name] = np.sqrt((moved**2).sum(axis=(0, 1)))
         texts[error.name] = error.text
-    return ErrorBudget(tuple(result.solution.param_names), causes, texts)
+    return ErrorBudget(tuple(solution.param_names), causes, texts)
 
 
 @dataclass(frozen=True)
@@ -107,10 +127,12 @@ class _ReferenceError:
     """Whether it is independent in every window, or common to all."""
 
 
-def _errors_of_reference(result: 'TableResult', gravity_sd: float) -> list[_ReferenceError]:
+def _errors_of_reference(
+    data: 'WindowObservations', solution: Solution, gravity_sd: float
+) -> list[_ReferenceError]:
     """Return the errors of the reference that the solution does not estimate."""
     found = []
-    if result.solution.model.find('reference', Role.TILT) is None:
+    if solution.model.find('reference', Role.TILT) is None:
         tilts = LEVELLING_SD * np.eye(2)
         found.append(
             _ReferenceError(
@@ -120,7 +142,7 @@ def _errors_of_reference(result: 'TableResult', gravity_sd: float) -> list[_Refe
             )
         )
     arcsec = JOINT_POSITION_SD / ARCMIN * 60
-    turns = JOINT_POSITION_SD * np.eye(len(result.table.joints))
+    turns = JOINT_POSITION_SD * np.eye(len(data.table.joints))
     found.append(
         _ReferenceError(
             'joint position',
@@ -164,7 +186,9 @@ def _heavier(change: float, table: Table, motion: JointMotion) -> tuple[Table, J
     return replace(table, gravity=table.gravity_value + change), motion
 
 
-def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.ndarray:
+def parameter_shifts(
+    data: 'WindowObservations', solution: Solution, changes: Sequence[Callable]
+) -> np.ndarray:
     """
     Return how each window's share of each change moves the parameters.
 
@@ -173,9 +197,8 @@ def parameter_shifts(result: 'TableResult', changes: Sequence[Callable]) -> np.n
     Summed over windows: the shift of the estimate when all windows err together. A shift is
     estimate minus truth.
     """
-    solution = result.solution
-    sources = list(_sources(result))
-    outputs = [_outputs(result, source, changes) for source in sources]
+    sources = list(_sources(data.gathered))
+    outputs = [_outputs(data.table, solution, source, changes=changes) for source in sources]
     kinds = [source.kind for source in sources]
     counts = np.array([source.samples for source in sources])
     times = np.array([source.time for source in sources])
@@ -222,19 +245,19 @@ class _Source(NamedTuple):
     temperature_c: np.ndarray | None
 
 
-def _sources(result: 'TableResult') -> Iterator[_Source]:
+def _sources(gathered: SessionData) -> Iterator[_Source]:
     """Yield the windows at rest, and the moving ones that were kept."""
     rows = {
         (row.session, row.time): row.count
-        for row in result.gathered.accumulator.rows
+        for row in gathered.accumulator.rows
         if row.kind == 'static'
     }
     typical = float(np.median(list(rows.values()))) if rows else 1.0
-    for time, session, position in result.gathered.poses:
+    for time, session, position in gathered.poses:
         motion = replace(rest_at(np.asarray(position)[None]), time=np.array([time]))
         yield _Source('static', time, session, rows.get((session, time), typical), 1, motion, None)
-    stride = max(1, int(np.ceil(sum(len(w) for w in result.gathered.kept) / MOVING_SAMPLES)))
-    for window in result.gathered.kept:
+    stride = max(1, int(np.ceil(sum(len(w) for w in gathered.kept) / MOVING_SAMPLES)))
+    for window in gathered.kept:
         some = slice(None, None, stride)
         temperature = None if window.temperature_c is None else window.temperature_c[some]
         yield _Source(
@@ -258,21 +281,21 @@ class _Outputs(NamedTuple):
 
 
 def _outputs(
-    result: 'TableResult', source: _Source, changes: Sequence[Callable]
+    table: Table, solution: Solution, source: _Source, *, changes: Sequence[Callable]
 ) -> dict[str, _Outputs]:
     """Return sensor -> its columns and changes of the output at the samples of a window."""
-    model = result.solution.model
+    model = solution.model
     temperature = source.temperature_c
     if model.needs_temperature and temperature is None:  # the mean at rest is not kept
         temperature = np.full(len(source.motion), model.temperature_ref_c)
-    references = [References(model, result.table, source.motion, temperature_c=temperature)]
+    references = [References(model, table, source.motion, temperature_c=temperature)]
     for change in changes:
-        table, motion = change(result.table, source.motion)
-        references.append(References(model, table, motion, temperature_c=temperature))
+        changed, motion = change(table, source.motion)
+        references.append(References(model, changed, motion, temperature_c=temperature))
     found = {}
     for sensor in SENSORS:
         outputs = [
-            sensor_output(model, sensor, result.solution.values, ref=each.at(sensor))
+            sensor_output(model, sensor, solution.values, ref=each.at(sensor))
             for each in references
         ]
         moved = np.array(outputs[1:]).reshape(-1, *outputs[0].shape) - outputs[0]
@@ -280,89 +303,195 @@ def _outputs(
     return found
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TableResult(CalibrationResult):
-    """A calibration on a table with the data for a report."""
+@dataclass(frozen=True, eq=False)
+class WindowObservations:
+    """Windows of recordings on a table, reduced with the columns of a model."""
 
-    solution: Solution
-    """Parameters with noise and residuals."""
     table: Table
     """The reference."""
+    gathered: SessionData
+    """The windows, conditions and counts."""
     model: SensorModel
-    """The model that was solved."""
-    gathered_model: SensorModel
-    """The model of the gathered columns; it may have more effects."""
-    found: ResidualAnalysis | None = None
-    """Result of the search for the model; None without a search."""
+    """The model of the gathered columns; the solved one may have fewer effects."""
 
-    observations: ClassVar[str] = 'windows'
+    unit: ClassVar[str] = 'windows'
+    absent: ClassVar[tuple[str, ...]] = ()
+    tested: ClassVar[tuple[str, ...]] = ()
 
     @property
-    def singular_values(self) -> np.ndarray:
+    def reference(self) -> str:
+        """Short description of the table."""
+        table = self.table
+        return f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})'
+
+    @property
+    def gravity(self) -> float:
+        """Gravity at the table, m/s^2."""
+        return self.table.gravity_value
+
+    @property
+    def period(self) -> float:
+        """Sampling period, s."""
+        rows = self.gathered.accumulator.rows
+        return float(np.median([row.duration / max(row.count - 1, 1) for row in rows]))
+
+    def gauge(self, solution: Solution) -> dict[str, Any]:
+        """Return the conventions of origin and axes."""
+        return gauge_of(solution.model)
+
+    def findings(self, solution: Solution) -> tuple[CheckFinding, ...]:
         """
-        Singular values of the design in units of the tolerances.
+        Return the findings of the recordings, of the mount and of the latitude.
+
+        Raises
+        ------
+        InputError
+            When the latitude has the wrong sign.
+
+        """
+        mounted = with_findings_of(
+            mount_check.CHECK,
+            mount_check.mount_findings(solution, self.table),
+            self.gathered.findings,
+        )
+        windows = latitude_check.window_rates(self.gathered, self.model, self.table)
+        return with_findings_of(
+            latitude_check.CHECK,
+            latitude_check.latitude_findings(solution, self.table, windows),
+            mounted,
+        )
+
+    def with_reference_errors(self, solution: Solution) -> Solution:
+        """Return the solution with the uncertainty of gravity in its covariance."""
+        return with_gravity_uncertainty(solution, self.table)
+
+    def held_out(self, solution: Solution) -> 'HeldOutWindows':
+        """Return the windows in folds, with the parameters of a solution without each fold."""
+        held_out = self.gathered.held_out.restricted(self.model, solution.model)
+        centre = self.uncorrected(solution).centre
+        folds = applied_folds(held_out, solution, centre=centre)
+        return HeldOutWindows(solution, held_out, folds, centre)
+
+    def uncorrected(self, solution: Solution) -> Uncorrected:
+        """Return the errors that compensation leaves uncorrected."""
+        values = solution.values
+        return uncorrected_on_table(
+            solution.model.at(values),
+            values,
+            self.gathered.accumulator,
+            gathered=self.model,
+            latest=latest_settling(solution.model, values, solution.sd),
+        )
+
+    def statistics(self, solution: Solution) -> dict[str, Any]:
+        """Return the statistics of windows, noise and residuals, and the common turn."""
+        return statistics(solution, self.gathered) | mount_check.turn_entry(solution)
+
+    def needs(
+        self, solution: Solution, tolerances: np.ndarray, *, quality: dict[str, Any]
+    ) -> Needs:
+        """Return the needs of a solution, see `Observations.needs`."""
+        motions = motions_needed(solution, tolerances, self.table, quality=quality)
+        return Needs(motions, weak_on_table(solution, tolerances, motions))
+
+    def singular_values(self, result: TableResult) -> np.ndarray:
+        """
+        Return the singular values of the design in units of the tolerances.
 
         Directions that the gauge fixes by convention are left out.
         """
-        prior = make_prior(self.solution.model)
-        convention = prior.root[len(self.tolerances) :]
+        prior = make_prior(result.solution.model)
+        convention = prior.root[len(result.tolerances) :]
         values = tolerance_scaled_singular_values(
-            self.solution.information + convention.T @ convention, self.tolerances
+            result.solution.information + convention.T @ convention, result.tolerances
         )
         return values[len(prior.gauge) :]
 
-    def window_errors(self) -> WindowErrors:
+    def window_errors(self, result: TableResult) -> WindowErrors:
         """
         Return the errors of window means before and after, against the table.
 
         After: predicted without the fold of the window.
         """
-        held_out = (
-            self.gathered.held_out
-            if self.gathered.held_out.n_windows
-            else HeldOut([HeldOutBlock(self.gathered.accumulator)])
-        )
-        held_out, model = held_out.restricted(self.gathered_model, self.model), self.model
-        folds = (
-            held_out.values_without(self.solution)
-            if len(held_out.blocks) > 1
-            else [self.solution.values]
-        )
-        rows = [row for block in held_out.blocks for row in block.accumulator.rows]
-        fold = [
-            k % len(folds)
-            for k, block in enumerate(held_out.blocks)
-            for _ in block.accumulator.rows
-        ]
+        solution, model = result.solution, result.solution.model
+        held_out = self.gathered.held_out
+        if not held_out.n_windows:
+            held_out = HeldOut([HeldOutBlock(self.gathered.accumulator)])
+        held_out = held_out.restricted(self.model, model)
+        folds = [solution.values]
+        if len(held_out.blocks) > 1:
+            folds = held_out.values_without(solution)
+
+        # The rows of all blocks, and the fold of each row.
+        rows = []
+        fold = []
+        for number, block in enumerate(held_out.blocks):
+            for row in block.accumulator.rows:
+                rows.append(row)
+                fold.append(number % len(folds))
         count = np.array([row.count for row in rows], float)
-        parts = {name: {} for name in ('measured', 'true', 'before', 'after', 'floor')}
+
+        errors = WindowErrors(
+            np.array([row.time for row in rows]),
+            np.array([row.kind for row in rows]),
+            *({} for _ in range(5)),
+        )
         for sensor in SENSORS:
-            means, noise = (
-                np.array([row.sensors[sensor].mean for row in rows]),
-                self.solution.noise[sensor],
-            )
+            noise = solution.noise[sensor]
+            means = np.array([row.sensors[sensor].mean for row in rows])
+            columns_of_means, output = means[:, :-3], means[:, -3:]
+            nominal = coefficients(model, sensor, nominal_values(model))
             after = np.array([coefficients(model, sensor, values) for values in folds])[fold]
-            parts['measured'][sensor], parts['true'][sensor] = (
-                means[:, -3:],
-                means[:, model.columns_of(sensor, Role.LINEAR)],
-            )
-            parts['before'][sensor] = means[:, -3:] - means[:, :-3] @ coefficients(
-                model, sensor, nominal_values(model)
-            )
-            parts['after'][sensor] = (
-                means[:, -3:] - np.einsum('ni,nij->nj', means[:, :-3], after)
-            ) @ np.linalg.inv(self.calibration.of(sensor, Role.LINEAR)).T
-            parts['floor'][sensor] = np.sqrt(
+            missed = output - np.einsum('ni,nij->nj', columns_of_means, after)
+            matrix = result.calibration.of(sensor, Role.LINEAR)
+            errors.measured[sensor] = output
+            errors.true[sensor] = means[:, model.columns_of(sensor, Role.LINEAR)]
+            errors.before[sensor] = output - columns_of_means @ nominal
+            errors.after[sensor] = missed @ np.linalg.inv(matrix).T
+            errors.floor[sensor] = np.sqrt(
                 noise.low_variance / count[:, None] + noise.offset_sd**2 + noise.bias_variance
             )
-        return WindowErrors(
-            np.array([row.time for row in rows]), np.array([row.kind for row in rows]), **parts
+        return errors
+
+    def residuals_of(self, result: TableResult, window: Window) -> dict[str, np.ndarray]:
+        """Return measured values minus those predicted from the motion of the table."""
+        solution = result.solution
+        return residuals([window], self.table, solution.model, values=solution.values)
+
+    def error_budget(self, result: TableResult) -> ErrorBudget:
+        """Return the contributions of the noise and of the table."""
+        return error_budget(self, result.solution)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutWindows:
+    """Windows in folds, with the parameters of a solution without each fold."""
+
+    solution: Solution
+    """The solution of all windows."""
+    held_out: HeldOut
+    """The windows in folds, with the columns of its model."""
+    folds: list[np.ndarray]
+    """Parameters without each fold, as compensation applies them, each shape (n_params,)."""
+    centre: Centre
+    """Operating point at which effects that compensation cannot undo are applied."""
+
+    def better_plain_fits(
+        self, *, under_test: Collection[str], as_asked: bool
+    ) -> tuple[PlainFit, ...]:
+        """Return the plain fits to apply (`plain_fit.better_plain_fits`)."""
+        return better_plain_fits(
+            self.held_out,
+            self.solution,
+            self.folds,
+            under_test=under_test,
+            centre=self.centre,
+            as_asked=as_asked,
         )
 
-    def residuals_of(self, window: Window) -> dict[str, np.ndarray]:
-        """Return measured values minus those predicted from the motion of the table."""
-        return residuals([window], self.table, self.solution.model, values=self.solution.values)
-
-    def error_budget(self) -> ErrorBudget:
-        """Return the contributions of the noise and of the table."""
-        return error_budget(self)
+    def proof(self, fits: Sequence[PlainFit]) -> Proof:
+        """Return the errors before and after the solution with plain fits."""
+        folds = self.folds
+        for fit in fits:
+            folds = fit.merged(folds)
+        return prove_solution(self.held_out, with_plain_fits(self.solution, fits), folds)

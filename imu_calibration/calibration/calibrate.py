@@ -1,0 +1,101 @@
+"""From a solution to the calibration that is written, for any reference."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Any, Generic
+
+from imu_calibration.calibration.from_solution import ModelExtension, document
+from imu_calibration.calibration.plain_fit import changes_with, plain_entries, with_plain_fits
+from imu_calibration.calibration.result import CalibrationResult, Estimate, Observations
+from imu_calibration.estimation.solution import tolerances_of, with_weak_replaced
+from imu_calibration.references.options import CalibrationOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Solved(Generic[Estimate]):
+    """A solution with the data that it was solved from, and the search that chose its model."""
+
+    solution: Estimate
+    """Estimate of all parameters."""
+    data: Observations[Estimate]
+    """What the reference gathered."""
+    extension: ModelExtension = ModelExtension()
+    """Effects that the search added; nothing without a search."""
+    found: Any = None
+    """Result of the search; None without one, or with too few data."""
+
+
+def conclude(
+    solved: Solved[Estimate],
+    options: CalibrationOptions = CalibrationOptions(),
+    *,
+    provenance: dict[str, Any] | None = None,
+    under_test: Collection[str] = (),
+) -> CalibrationResult[Estimate]:
+    """
+    Judge a solution on held-out data, state what it does not determine, and document it.
+
+    Parameters
+    ----------
+    solved : Solved
+    options : CalibrationOptions
+        Of the model that was solved.
+    provenance : dict, optional
+        Names of recordings, hashes and options for the document.
+    under_test : collection of str
+        Sensors of which the effects have to predict better than plain least squares, besides those
+        with an unexplained residual.
+
+    Raises
+    ------
+    InputError
+        When the readings are clearly in another unit.
+
+    """
+    data, changes = solved.data, solved.extension.changes
+    tolerances = tolerances_of(solved.solution.model, options.tolerances)
+
+    # What the solution says of the recording, and the errors of the reference in its covariance.
+    gathered = replace(data.gathered, findings=data.findings(solved.solution))
+    solution = with_weak_replaced(data.with_reference_errors(solved.solution), tolerances)
+
+    # Effects that predict held-out data worse than bias and matrix alone are not applied.
+    held_out = data.held_out(solution)
+    fits = held_out.better_plain_fits(
+        under_test={*changes.unexplained, *under_test}, as_asked=options.as_asked
+    )
+    applied = with_plain_fits(solution, fits)
+    proof = held_out.proof(fits)
+
+    # What is not determined, and the motion or knowledge that would determine it.
+    statistics = data.statistics(applied)
+    needs = data.needs(applied, tolerances, quality={**statistics, **changes.to_mapping()})
+
+    calibration = document(
+        applied,
+        tolerances,
+        gathered,
+        gravity=data.gravity,
+        gauge=data.gauge(applied),
+        undetermined=needs.undetermined,
+        statistics=statistics | plain_entries(fits),
+        provenance=provenance,
+        proof=proof,
+        changes=changes_with(changes, fits),
+        uncorrected=data.uncorrected(applied),
+        tested=data.tested,
+        absent=data.absent,
+        readings=options.nominal,
+    )
+    return CalibrationResult(
+        calibration=calibration,
+        data=data,
+        gathered=gathered,
+        tolerances=tolerances,
+        needed=needs.motions,
+        options=options,
+        solution=solution,
+        applied=applied,
+        fits=fits,
+        found=solved.found,
+    )
