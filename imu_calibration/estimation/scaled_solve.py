@@ -219,3 +219,17 @@ def covariance_with_held(
     own = np.zeros((len(prior_sd),) * 2)
     own[np.ix_(free, free)] = inverse_gram(rows[:, free])
     return own, influence @ np.diag(prior_sd[held] ** 2) @ influence.T
+
+
+def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
+    """
+    Return an orthonormal basis of columns of unit length, maybe dependent.
+
+    Singular values above `least` of the largest count.
+    """
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns[:, size > 0] / size[size > 0]
+    if not columns.shape[1]:
+        return columns
+    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, singular > least * singular[0]]

@@ -23,10 +23,12 @@ from imu_calibration.kinematics.rotations import EARTH_RATE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.hand_calibration import gather_by_hand, solve_by_hand
 from imu_calibration.references.gravity.hand_parameters import HandOptions
-from imu_calibration.references.gravity.model_selection import HandProblem, investigate_by_hand
-from imu_calibration.references.gravity.pose_evidence import build_rows, regimes_by_hand
+from imu_calibration.references.gravity.model_selection import investigate_by_hand
+from imu_calibration.references.gravity.pose_residual import regimes_by_hand
+from imu_calibration.references.gravity.pose_rows import build_rows
 from imu_calibration.selection import regimes
 from imu_calibration.selection.gain import APPLIED, OF_MODEL
+from imu_calibration.selection.row_search import RowProblem
 from imu_calibration.simulation.profiles import make_profile
 from imu_calibration.simulation.session import random_values
 from imu_calibration.simulation.session import simulate_session as simulate_session
@@ -157,7 +159,7 @@ def test_what_held_parameters_may_be_is_no_finding(monkeypatch):
     model = SensorModel(joint_names=table.joint_names)
     imu = simulate_session(model, random_values(model), table, profile=profile)[0]
     # What is asked about is known before the search.
-    monkeypatch.setattr(HandProblem, 'named', lambda self: [])
+    monkeypatch.setattr(RowProblem, 'named', lambda self: [])
     found = investigate_by_hand(gather_by_hand(imu), HandOptions(GRAVITY))
     assert {'gyro_rate_product', 'gyro_quadratic'} <= {
         entry['effect'] for entry in found.not_testable

@@ -32,10 +32,7 @@ from imu_calibration.preprocessing.window import Window, all_samples, chunks
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.references.gravity.model_selection import (
     HandInvestigation,
-    HandProblem,
-    gain_of_poses,
 )
-from imu_calibration.references.gravity.pose_evidence import Block
 from imu_calibration.references.turntable.accumulator import Accumulator
 from imu_calibration.references.turntable.window_statistics import reduce_windows
 from imu_calibration.selection.gain import (
@@ -51,6 +48,8 @@ from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.proposals import Proposal
 from imu_calibration.selection.questions import Question
 from imu_calibration.selection.residual_blocks import residuals
+from imu_calibration.selection.row_evidence import RowBlock
+from imu_calibration.selection.row_search import RowProblem, gain_of_groups
 from imu_calibration.selection.saturation import measured
 
 
@@ -221,7 +220,7 @@ def _applied_parameters(found: Investigation, chosen: Sequence[Question]) -> _Si
 
 
 def _sd_of(
-    problem: LinearisedProblem | HandProblem, model: SensorModel, chosen: Sequence[Question]
+    problem: LinearisedProblem | RowProblem, model: SensorModel, chosen: Sequence[Question]
 ) -> np.ndarray:
     """
     Return the standard deviations of the parameters of some effects; of other ones zero.
@@ -257,32 +256,29 @@ def gain_by_hand(
     block, poses = found.problem.clearest(applied[0], applied[1], sensor), found.baseline.poses
     end = end_by_hand(poses)
     pair = [
-        np.zeros((len(block.pose), 1 if block.duration is not None else block.known.shape[1]))
+        np.zeros((len(block.group), 1 if block.duration is not None else block.known.shape[1]))
         for _ in applied
     ]
     start = 0.0
-    for out, named, smaller in found.held_out:
-        rows = np.isin(block.pose, out)
+    for part in found.held_out:
+        rows = np.isin(block.group, part.groups)
         for errors, chosen in zip(pair, applied):
-            names = {question.name for question in chosen}
-            model, values, earth = found.extended(
-                smaller, [question for question in named if question.name in names]
-            )
+            additional = part.named_in(chosen)
+            model, values, earth = found.extended(part.problem, additional)
             moved = model.model.at(values)
-            additional = [question for question in named if question.name in names]
-            latest = latest_settling(moved, values, _sd_of(smaller, moved, additional))
+            latest = latest_settling(moved, values, _sd_of(part.problem, moved, additional))
             start = max(start, judged_from_of(latest, end))
             uncorrected = uncorrected_in_time(moved, values, poses.time, end=end, latest=latest)
             values = applied_values(moved, values, uncorrected.centre)
             errors[rows] = _pose_errors(found, block, np.flatnonzero(rows), model, values, earth)
-    return gain_of_poses(
+    return gain_of_groups(
         block.select(late := block.time >= start), [errors[late] for errors in pair], APPLIED
     )
 
 
 def _pose_errors(
     found: HandInvestigation,
-    block: Block,
+    block: RowBlock,
     rows: np.ndarray,
     model: HandModel,
     values: np.ndarray,

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.estimation.scaled_solve import orthonormal_basis
 from imu_calibration.preprocessing.recording_evidence import WARNING, CheckFinding
 from imu_calibration.references.gravity.equations import Poses
 from imu_calibration.references.gravity.hand_parameters import HandModel
@@ -105,20 +106,6 @@ def _of_rates(time: np.ndarray, rates: np.ndarray) -> BiasMovement | None:
     if not _shown(square_before, square_after, 3 * powers.shape[1], spare):
         return None
     return BiasMovement(course, np.ones(12))
-
-
-def orthonormal_basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
-    """
-    Return an orthonormal basis of columns of unit length, maybe dependent.
-
-    Singular values above `least` of the largest count.
-    """
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 0] / size[size > 0]
-    if not columns.shape[1]:
-        return columns
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > least * singular[0]]
 
 
 def _shown(before: float, after: float, added: int, spare: int) -> bool:

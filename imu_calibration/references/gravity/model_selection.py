@@ -11,7 +11,6 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
-from imu_calibration.core.progress import reported
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.references.gravity.equations import Poses, TurnData
@@ -26,143 +25,23 @@ from imu_calibration.references.gravity.hand_parameters import (
     HandOptions,
     possible_by_hand,
 )
-from imu_calibration.references.gravity.pose_evidence import (
-    Block,
-    HandEvidence,
-    HandSpace,
-    build_rows,
-    gravity_turns,
-    unexplained_by_hand,
-)
-from imu_calibration.selection.evidence import agree
-from imu_calibration.selection.explained_share import Explained, pruned
-from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
+from imu_calibration.references.gravity.pose_residual import unexplained_by_hand
+from imu_calibration.references.gravity.pose_rows import build_rows, gravity_turns
 from imu_calibration.selection.questions import (
     TEMPERATURE_SPAN,
     Question,
     sort_effects,
     time_constants,
 )
-from imu_calibration.selection.search import Search, SelectedEffects
+from imu_calibration.selection.row_evidence import RowBlock, RowEvidence, RowSpace
+from imu_calibration.selection.row_search import ChoiceWithout, RowProblem, choose_effects
+from imu_calibration.selection.search import SelectedEffects
 from imu_calibration.selection.unexplained import Unexplained
 
-OUTER = 12
-"""Number of repetitions of the search without some of the poses, to measure the gain on them."""
 MIN_SPARE_POSES = 3
 """Least number of poses beyond the nine parameters of the accelerometer."""
 MIN_FOLD_POSES = 9 + MIN_SPARE_POSES
 """With fewer poses none can be held out."""
-
-
-class HandProblem:
-    """Rows of a recording, the evidence on a subset of its poses, and the search."""
-
-    def __init__(
-        self,
-        blocks: Sequence[Block],
-        space: HandSpace,
-        questions: Sequence[Question],
-        *,
-        baseline: Sequence[int],
-    ):
-        smooth = [
-            k
-            for q in questions
-            if q.effect.smooth and not q.effect.time_constant
-            for k in q.parameters
-        ]
-        self.blocks, self.space, self.questions = blocks, space, questions
-        self.evidence = HandEvidence(blocks, space, smooth, baseline=baseline)
-        self.search = Search(self.evidence, baseline, questions)
-        self.explained = Explained(
-            self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf
-        )
-
-    def without(self, poses: np.ndarray) -> 'HandProblem':
-        """Return the same inquiry without some poses."""
-        return HandProblem(
-            self._blocks_without(poses), self.space, self.questions, baseline=self.search.baseline
-        )
-
-    def _blocks_without(self, poses: np.ndarray) -> list[Block]:
-        blocks = [block.select(~np.isin(block.pose, poses)) for block in self.blocks]
-        return [block for block in blocks if block.known.size > 3]
-
-    def named(self) -> list[Question]:
-        """
-        Return the findings: chosen effects of which each explains most of the excess variance.
-
-        Sizes beyond the range of known instruments are tested only for the remaining excess.
-        """
-        named = list(pruned(self.search.run(), self.explained.share))
-        if self.explained.rest(named):
-            wide = self.search.asking_any_size()
-            known, self.search = self.search, wide
-            others = list(pruned(wide.run(), self.explained.share))
-            if self.explained.rest(others) < self.explained.rest(named):
-                return others
-            self.search = known
-        return named
-
-    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
-        """
-        Return whether the estimates of an effect from both halves of the poses agree.
-
-        The halves are the poses before and after the middle (`evidence.agree`).
-
-        Effects that are smooth in time differ by nature.
-        """
-        if question.effect.smooth:
-            return True
-        used = self.search.indices(chosen)
-        poses = np.unique(np.concatenate([block.pose for block in self.blocks]))
-        # the chosen effects are no noise here, so they are part of the baseline
-        first, second, whole = (
-            HandEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
-            for out in (*np.array_split(poses, 2), poses[:0])
-        )
-        return agree((first, second), whole, [used.index(k) for k in question.parameters])
-
-    def gain(
-        self,
-        held_out: Sequence,
-        before: Sequence[Question],
-        after: Sequence[Question],
-        *,
-        sensor: str,
-    ) -> Gain:
-        """
-        Return the Gain of one choice over another on held-out poses.
-
-        The poses are `HandInvestigation.held_out`, held out from both fit and choice.
-        """
-        block = self.clearest(before, after, sensor)
-        pair = [np.full(block.known.shape, np.nan) for _ in range(2)]
-        for out, named, smaller in held_out:
-            rows = np.isin(block.pose, out)
-            for residual, choice in zip(pair, (before, after)):
-                allowed = {question.name for question in choice}
-                values = smaller.search.values(
-                    [question for question in named if question.name in allowed]
-                )
-                residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
-        return gain_of_poses(block, pair)
-
-    def clearest(self, before: Sequence[Question], after: Sequence[Question], sensor: str) -> Block:
-        """
-        Return the rows of a sensor in which one choice improves most over another.
-
-        The improvement is by cross-validation of the fit.
-        """
-        squares = [
-            [
-                np.sum(rest**2)
-                for rest in self.evidence.heldout_residuals(self.search.indices(choice))
-            ]
-            for choice in (before, after)
-        ]
-        own = [k for k, block in enumerate(self.blocks) if block.sensor == sensor]
-        return self.blocks[min(own, key=lambda k: squares[1][k] / max(squares[0][k], 1e-300))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,14 +50,12 @@ class HandInvestigation(SelectedEffects):
 
     baseline: HandCalibration
     """The calibration under diagnosis."""
-    problem: HandProblem
+    problem: RowProblem
     """Rows, evidence and search."""
     named: Sequence[Question]
     """Questions that became findings, in the order found."""
-    held_out: Sequence
-    """
-    (poses, findings without them, the inquiry without them), ...: the complete search, repeated.
-    """
+    held_out: Sequence[ChoiceWithout]
+    """The complete search, repeated without each part of the poses."""
     not_testable: list[dict]
     """Effects that could not be tested."""
     constants: np.ndarray
@@ -208,7 +85,7 @@ class HandInvestigation(SelectedEffects):
             for sensor in SENSORS
         }
 
-    def point(self, problem: HandProblem, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
+    def point(self, problem: RowProblem, chosen: Sequence[Question]) -> dict[str, np.ndarray]:
         """
         Return effect -> initial values for its columns, of the warm-ups among the chosen effects.
 
@@ -224,7 +101,7 @@ class HandInvestigation(SelectedEffects):
         }
 
     def extended(
-        self, problem: HandProblem, chosen: Sequence[Question]
+        self, problem: RowProblem, chosen: Sequence[Question]
     ) -> tuple[HandModel, np.ndarray, float]:
         """
         Return the baseline extended by some effects.
@@ -291,24 +168,17 @@ def investigate_by_hand(data: HandData, options: HandOptions = HandOptions()) ->
     # Including fixed parameters and the Earth's rate: their uncertainty is no finding.
     base = tuple(range(baseline.hand_model.size + 1))
     questions = _questions(effects, blocks, space, base, not_testable)
-    problem = HandProblem(blocks, space, questions, baseline=base)
-    named = problem.named()
-    held_out = _held_out(problem) if named else []
-    named = _that_predict(problem, held_out, named)
-    unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
-    if unstable:
-        named = _that_predict(
-            problem, held_out, [question for question in named if question not in unstable]
-        )
+    problem = RowProblem(blocks, space, questions, baseline=base)
+    chosen = choose_effects(problem)
     return HandInvestigation(
         baseline,
         problem,
-        named,
-        held_out,
+        chosen.named,
+        chosen.held_out,
         not_testable,
         constants,
         gravity_turns(data.turns),
-        unstable,
+        chosen.unstable,
     )
 
 
@@ -319,25 +189,6 @@ def too_few_poses(count: int) -> NotObservableError:
         f' held out, {count} were found; hold the IMU still in more attitudes',
         code='too_few_poses',
     )
-
-
-def _that_predict(
-    problem: HandProblem,
-    held_out: Sequence[tuple[np.ndarray, list[Question], HandProblem]],
-    named: Sequence[Question],
-) -> list[Question]:
-    """Return the findings that improve the prediction of poses held out from their choice."""
-    named = list(named)
-    while named:
-        gains = [
-            problem.gain(held_out, named[:k], named[: k + 1], sensor=q.sensor)
-            for k, q in enumerate(named)
-        ]
-        poor = [q for q, gain in zip(named, gains) if not gain.ci95[0] > 0]
-        if not poor:
-            break
-        named.remove(poor[-1])
-    return named
 
 
 def _why_not(
@@ -379,8 +230,8 @@ def _why_not(
 
 def _questions(
     effects: Sequence[Effect],
-    blocks: Sequence[Block],
-    space: HandSpace,
+    blocks: Sequence[RowBlock],
+    space: RowSpace,
     base: Sequence[int],
     not_testable: list[dict[str, str]],
 ) -> list[Question]:
@@ -390,7 +241,7 @@ def _questions(
     An effect that is collinear with the baseline in these poses is moved to `not_testable`.
     """
     by_name, asked = {e.name: e for e in effects}, []
-    probe = HandEvidence(blocks, space, (), baseline=base)
+    probe = RowEvidence(blocks, space, (), baseline=base)
     for label, part in space.parts.items():
         name = label.split('@')[0]
         parameters = tuple(range(part.start, part.stop))
@@ -407,34 +258,3 @@ def _questions(
         for name in lacking
     ]
     return asked
-
-
-def _held_out(problem: HandProblem) -> list[tuple[np.ndarray, list[Question], HandProblem]]:
-    """
-    Return fold -> (poses, findings without them, evidence without them).
-
-    The complete search, repeated.
-    """
-    poses = np.unique(np.concatenate([block.pose for block in problem.blocks]))
-    found, times = [], min(OUTER, len(poses))
-    for number in reported('repeating the search', range(times), times):
-        out = poses[number::times]
-        smaller = problem.without(out)
-        found.append((out, smaller.named(), smaller))
-    return found
-
-
-def gain_of_poses(block: Block, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
-    """
-    Return the Gain from residuals of each row of a block before and after.
-
-    Shape (m, n), resampled by pose.
-    """
-    place = np.unique(block.pose, return_inverse=True)[1]
-    numbers = np.bincount(place) * block.known.shape[1]
-    return gain_of(
-        block.sensor,
-        block.name,
-        [(np.bincount(place, (residuals**2).sum(axis=1)), numbers) for residuals in pair],
-        of=of,
-    )

@@ -1,0 +1,225 @@
+"""Search of effects on few rows of any reference, repeated without each part of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from imu_calibration.core.progress import reported
+from imu_calibration.selection.evidence import agree
+from imu_calibration.selection.explained_share import Explained, pruned
+from imu_calibration.selection.gain import OF_MODEL, Gain, gain_of
+from imu_calibration.selection.questions import (
+    Question,
+)
+from imu_calibration.selection.row_evidence import RowBlock, RowEvidence, RowSpace
+from imu_calibration.selection.search import Search
+
+OUTER = 12
+"""Number of repetitions of the search without some of the groups, to measure the gain on them."""
+
+
+class RowProblem:
+    """Rows of a recording or of a part of it, their evidence, and the search."""
+
+    def __init__(
+        self,
+        blocks: Sequence[RowBlock],
+        space: RowSpace,
+        questions: Sequence[Question],
+        *,
+        baseline: Sequence[int],
+    ):
+        smooth = [
+            k
+            for q in questions
+            if q.effect.smooth and not q.effect.time_constant
+            for k in q.parameters
+        ]
+        self.blocks, self.space, self.questions = blocks, space, questions
+        self.evidence = RowEvidence(blocks, space, smooth, baseline=baseline)
+        self.search = Search(self.evidence, baseline, questions)
+        self.explained = Explained(
+            self.search, self.evidence.against_noise, self.evidence.numbers, least_part=-np.inf
+        )
+
+    @property
+    def groups(self) -> np.ndarray:
+        """Numbers of the groups of rows, shape (n_groups,)."""
+        return np.unique(np.concatenate([block.group for block in self.blocks]))
+
+    def without(self, groups: np.ndarray) -> 'RowProblem':
+        """Return the same problem without some groups of rows."""
+        return RowProblem(
+            self._blocks_without(groups), self.space, self.questions, baseline=self.search.baseline
+        )
+
+    def _blocks_without(self, groups: np.ndarray) -> list[RowBlock]:
+        blocks = [block.select(~np.isin(block.group, groups)) for block in self.blocks]
+        return [block for block in blocks if block.known.size > 3]
+
+    def named(self) -> list[Question]:
+        """
+        Return the findings: chosen effects of which each explains most of the excess variance.
+
+        Sizes beyond the range of known instruments are tested only for the remaining excess.
+        """
+        named = list(pruned(self.search.run(), self.explained.share))
+        if self.explained.rest(named):
+            wide = self.search.asking_any_size()
+            known, self.search = self.search, wide
+            others = list(pruned(wide.run(), self.explained.share))
+            if self.explained.rest(others) < self.explained.rest(named):
+                return others
+            self.search = known
+        return named
+
+    def agrees_in_halves(self, chosen: Sequence[Question], question: Question) -> bool:
+        """
+        Return whether the estimates of an effect from both halves of the groups agree.
+
+        The halves are the groups before and after the middle (`evidence.agree`).
+
+        Effects that are smooth in time differ by nature.
+        """
+        if question.effect.smooth:
+            return True
+        used = self.search.indices(chosen)
+        groups = self.groups
+        # the chosen effects are no noise here, so they are part of the baseline
+        first, second, whole = (
+            RowEvidence(self._blocks_without(out), self.space, (), baseline=used).fit(used)
+            for out in (*np.array_split(groups, 2), groups[:0])
+        )
+        return agree((first, second), whole, [used.index(k) for k in question.parameters])
+
+    def gain(
+        self,
+        held_out: Sequence['ChoiceWithout'],
+        before: Sequence[Question],
+        after: Sequence[Question],
+        *,
+        sensor: str,
+    ) -> Gain:
+        """
+        Return the Gain of one choice over another on rows held out from both fit and choice.
+        """
+        block = self.clearest(before, after, sensor)
+        pair = [np.full(block.known.shape, np.nan) for _ in range(2)]
+        for part in held_out:
+            rows = np.isin(block.group, part.groups)
+            for residual, choice in zip(pair, (before, after)):
+                values = part.problem.search.values(part.named_in(choice))
+                residual[rows] = block.rows[rows, :, -1] - block.rows[rows, :, :-1] @ values
+        return gain_of_groups(block, pair)
+
+    def clearest(
+        self, before: Sequence[Question], after: Sequence[Question], sensor: str
+    ) -> RowBlock:
+        """
+        Return the rows of a sensor in which one choice improves most over another.
+
+        The improvement is by cross-validation of the fit.
+        """
+        squares = [
+            [
+                np.sum(rest**2)
+                for rest in self.evidence.heldout_residuals(self.search.indices(choice))
+            ]
+            for choice in (before, after)
+        ]
+        own = [k for k, block in enumerate(self.blocks) if block.sensor == sensor]
+        return self.blocks[min(own, key=lambda k: squares[1][k] / max(squares[0][k], 1e-300))]
+
+
+@dataclass(frozen=True, eq=False)
+class ChoiceWithout:
+    """The complete search, repeated without some groups of rows."""
+
+    groups: np.ndarray
+    """Groups that are held out, shape (n,)."""
+    named: list[Question]
+    """Findings without them."""
+    problem: RowProblem
+    """The problem without them."""
+
+    def named_in(self, choice: Sequence[Question]) -> list[Question]:
+        """Return the findings that are effects of a choice, too."""
+        allowed = {question.name for question in choice}
+        return [question for question in self.named if question.name in allowed]
+
+
+@dataclass(frozen=True, eq=False)
+class RowChoice:
+    """Effects that rows support."""
+
+    named: list[Question]
+    """Questions that became findings, in the order found."""
+    held_out: list[ChoiceWithout]
+    """The search without each part of the groups."""
+    unstable: list[Question]
+    """Rejected, because the estimates of the two halves differ significantly."""
+
+
+def choose_effects(problem: RowProblem) -> RowChoice:
+    """
+    Return the effects that predict rows held out from their choice, and agree in both halves.
+
+    Parameters
+    ----------
+    problem : RowProblem
+
+    """
+    named = problem.named()
+    held_out = _held_out(problem) if named else []
+    named = _that_predict(problem, held_out, named)
+    unstable = [question for question in named if not problem.agrees_in_halves(named, question)]
+    if unstable:
+        stable = [question for question in named if question not in unstable]
+        named = _that_predict(problem, held_out, stable)
+    return RowChoice(named, held_out, unstable)
+
+
+def _held_out(problem: RowProblem) -> list[ChoiceWithout]:
+    """Return the complete search, repeated without each part of the groups in turn."""
+    groups = problem.groups
+    times = min(OUTER, len(groups))
+    found = []
+    for number in reported('repeating the search', range(times), times):
+        out = groups[number::times]
+        smaller = problem.without(out)
+        found.append(ChoiceWithout(out, smaller.named(), smaller))
+    return found
+
+
+def _that_predict(
+    problem: RowProblem, held_out: Sequence[ChoiceWithout], named: Sequence[Question]
+) -> list[Question]:
+    """Return the findings that improve the prediction of rows held out from their choice."""
+    kept = list(named)
+    while kept:
+        poor = []
+        for place, question in enumerate(kept):
+            gain = problem.gain(held_out, kept[:place], kept[: place + 1], sensor=question.sensor)
+            if not gain.ci95[0] > 0:
+                poor.append(question)
+        if not poor:
+            break
+        kept.remove(poor[-1])
+    return kept
+
+
+def gain_of_groups(block: RowBlock, pair: Sequence[np.ndarray], of: str = OF_MODEL) -> Gain:
+    """
+    Return the Gain from residuals of each row of a block before and after.
+
+    Shape (m, n), resampled by group.
+    """
+    place = np.unique(block.group, return_inverse=True)[1]
+    numbers = np.bincount(place) * block.known.shape[1]
+    return gain_of(
+        block.sensor,
+        block.name,
+        [(np.bincount(place, (residuals**2).sum(axis=1)), numbers) for residuals in pair],
+        of=of,
+    )
