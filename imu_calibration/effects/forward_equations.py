@@ -1,6 +1,6 @@
 """The columns of a model over a motion, predicted readings, and the model applied to samples."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -322,6 +322,47 @@ def effect_slopes(
         for group, block in coefficients(effect, {**of_sensor, effect.name: moved}, point).items():
             slopes[group][..., k] = np.imag(block) / 1e-30
     return found, slopes
+
+
+def output_of_effects(
+    effects: Sequence[Effect], model: SensorModel, values: np.ndarray, ref: Reference
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the contribution of some effects of one sensor to its output, and its derivative.
+
+    ``output = sum_g columns_g(ref) @ coefficients_g(values)`` over the groups of columns.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        Of one sensor, one or several.
+    model : SensorModel
+        With these effects.
+    values : array, shape (n_params,)
+    ref : Reference
+        True quantities at n samples.
+
+    Returns
+    -------
+    tuple
+        Output, shape (n, 3), and its derivative by the parameters of the effects in their order,
+        shape (n, 3, p).
+
+    """
+    point, own = model.full_point(), model.values_of(effects[0].sensor, values)
+    output = np.zeros((len(ref.time), 3))
+    derivatives = []
+    for effect in effects:
+        coefficients_of, slopes = effect_slopes(effect, own, point)
+        contribution = np.zeros((len(ref.time), 3))
+        derivative = np.zeros((len(ref.time), 3, effect.size))
+        for group in effect.groups:
+            basis = group.columns(ref, point)
+            contribution += basis @ coefficients_of[group.name]
+            derivative += np.einsum('mw,wip->mip', basis, slopes[group.name])
+        output += contribution
+        derivatives.append(derivative)
+    return output, np.concatenate(derivatives, axis=2)
 
 
 def predict(

@@ -185,7 +185,7 @@ def test_a_place_among_few_poses_is_paid_for(monkeypatch):
             poses=poses,
         )
         block = SimpleNamespace(
-            sensor='gyroscope', floor=np.ones((24, 3)), pose=np.arange(24), time=poses.time
+            sensor='gyroscope', floor=np.ones((24, 3)), group=np.arange(24), time=poses.time
         )
         told += regimes_by_hand(hand, block, rng.normal(size=(24, 3)))
     assert len(told) <= 2
@@ -199,9 +199,11 @@ def test_the_gain_is_the_error_of_corrected_readings_in_held_out_poses(respondin
     """
     found, gain = responding.search, responding.diagnosis.findings[0].gain
     poses, squares = found.baseline.poses, [0.0, 0.0]
-    for out, named, smaller in found.held_out:
-        for side, chosen in enumerate(([], [q for q in named if q.name == 'gyro_g_sensitivity'])):
-            model, values, earth = found.extended(smaller, chosen)
+    for part in found.held_out:
+        out = part.groups
+        of_gravity = [q for q in part.named if q.name == 'gyro_g_sensitivity']
+        for side, chosen in enumerate(([], of_gravity)):
+            model, values, earth = found.extended(part.problem, chosen)
             force, rate = model.compensate(values, poses.force[out], poses.rate[out])
             squares[side] += np.sum(
                 (rate - earth * force / np.linalg.norm(force, axis=1)[:, None]) ** 2

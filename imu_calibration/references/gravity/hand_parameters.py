@@ -13,7 +13,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.units import STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.effects.base import SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, Catalogue
-from imu_calibration.effects.forward_equations import effect_slopes
+from imu_calibration.effects.forward_equations import output_of_effects
 from imu_calibration.effects.sensor_model import SensorModel, linear_names, parse_effects
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.references.options import CalibrationOptions
@@ -195,9 +195,8 @@ class HandModel:
 
         """
         effects = [e for e in self.extras if e.sensor == sensor]
-        output, columns = np.zeros((len(force), 3)), [np.zeros((len(force), 3, 0))]
         if not effects:
-            return output, columns[0]
+            return np.zeros((len(force), 3)), np.zeros((len(force), 3, 0))
         time = np.zeros(len(force)) if time is None else np.asarray(time, float)
         rate = np.zeros_like(force) if rate is None else rate
         ref = Reference(
@@ -209,17 +208,7 @@ class HandModel:
             self.gravity,
             temperature_c,
         )
-        point, own = self.model.full_point(), self.model.values_of(sensor, values)
-        for effect in effects:
-            basis = {group.name: group.columns(ref, point) for group in effect.groups}
-            coefficients, slopes = effect_slopes(effect, own, point)
-            output = output + sum(basis[group] @ block for group, block in coefficients.items())
-            columns.append(
-                sum(
-                    np.einsum('mw,wip->mip', basis[group], block) for group, block in slopes.items()
-                )
-            )
-        return output, np.concatenate(columns, axis=2)
+        return output_of_effects(effects, self.model, values, ref)
 
     def compensate(
         self,

@@ -1,0 +1,298 @@
+"""
+A third reference: poses of motion capture.
+
+The rotation of the IMU over blocks of a second is that between the poses at their ends. All that an
+estimate, a search, a proof and a document need of it is here; the engine is the one of a table and
+of gravity.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from imu_calibration.calibration.calibrate import Solved, conclude
+from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
+from imu_calibration.calibration.hand_proof import entry_of
+from imu_calibration.calibration.result import Needs
+from imu_calibration.document.trust import Uncorrected
+from imu_calibration.effects.base import Role
+from imu_calibration.effects.forward_equations import output_of_effects
+from imu_calibration.effects.sensor_model import BASE, SensorModel
+from imu_calibration.estimation.noise_model import NoiseModel
+from imu_calibration.estimation.row_estimate import RowSet, estimate_rows
+from imu_calibration.estimation.solution import Solution
+from imu_calibration.kinematics.rotations import Reference
+from imu_calibration.kinematics.strapdown import integrate_turn, small_rotation
+from imu_calibration.references.options import CalibrationOptions
+from imu_calibration.references.turntable.session_data import SessionData
+from imu_calibration.selection.questions import Question
+from imu_calibration.selection.row_evidence import RowBlock, RowSpace
+from imu_calibration.selection.row_search import RowProblem, choose_effects
+
+BLOCK = 1.0
+"""Length of a block, s."""
+LARGEST_STEPS = (0.03, 0.05)
+"""Largest steps of the reference and of the IMU at a block, s."""
+MARGIN = 0.1
+"""Distance of blocks from the ends of the recording, s."""
+READING_SD = 1e-6
+"""Known noise of a rotation, rad; the scatter beyond it is estimated."""
+ATTITUDE_SD = np.radians(0.2)
+"""Usual noise of the attitude, rad."""
+FOLDS = 4
+"""Number of held-out parts."""
+ABSENT = ('accelerometer',)
+"""Poses determine the gyroscope here."""
+CANDIDATES = ('gyro_scale_asymmetry', 'gyro_quadratic', 'gyro_rate_product')
+"""Effects that rotations of blocks show."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseBlocks:
+    """What is gathered: readings, and rotations of blocks by the poses (`Observations`)."""
+
+    time: np.ndarray
+    """Seconds since the first sample, shape (n,)."""
+    rate: np.ndarray
+    """Readings, rad/s, shape (n, 3)."""
+    poses: Slerp
+    """Attitudes of the body in the room, interpolated."""
+
+    unit: ClassVar[str] = 'windows'
+    reference: ClassVar[str] = 'poses of motion capture'
+    table: ClassVar[None] = None
+    gravity: ClassVar[float] = 9.81
+    absent: ClassVar[tuple[str, ...]] = ABSENT
+    tested: ClassVar[tuple[str, ...]] = ()
+
+    @cached_property
+    def blocks(self):
+        """(samples, rotation by the poses) of each block without a gap."""
+        known, found = self.poses.times, []
+        start, end = max(self.time[0], known[0]) + MARGIN, min(self.time[-1], known[-1]) - MARGIN
+        edges = np.searchsorted(self.time, np.arange(start, end, BLOCK))
+        for block in map(slice, edges, edges[1:] + 1):
+            ends = self.time[[block.start, block.stop - 1]]
+            near = np.searchsorted(known, ends)
+            steps = (known[near] - known[near - 1]).max(), np.diff(self.time[block]).max()
+            if np.all(np.array(steps) <= LARGEST_STEPS):
+                first, last = self.poses(ends).as_matrix()
+                found.append((block, last.T @ first))
+        return found
+
+    @property
+    def period(self):
+        return float(np.median(np.diff(self.time)))
+
+    @property
+    def gathered(self):
+        end = int(1e9 * self.time[-1])
+        largest = float(np.linalg.norm(self.rate, axis=1).max())
+        return SessionData(first_stamp_ns=0, last_stamp_ns=end, largest_rate=largest)
+
+    def gauge(self, solution):
+        return {'origin': 'sensor', 'axes': 'body of the poses'}
+
+    def findings(self, solution):
+        return ()
+
+    def with_reference_errors(self, solution):
+        return solution
+
+    def uncorrected(self, solution):
+        return Uncorrected()
+
+    def statistics(self, solution):
+        noise_sd = [float(value) for value in solution.noise['gyroscope'].white_sd]
+        windows = {'blocks': len(self.blocks)}
+        return {'gyroscope': {'noise_sd': noise_sd}, 'windows': windows, 'dropped': {}}
+
+    def needs(self, solution, tolerances, *, quality):
+        return Needs({}, ())
+
+    def held_out(self, solution):
+        return HeldOutBlocks(self, solution)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseState:
+    """Parameters, and the nuisance of all blocks."""
+
+    values: np.ndarray
+    """Parameters of both sensors, shape (n,)."""
+    lag: float = 0.0
+    """Delay of the poses, s."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRows:
+    """Rows of the rotations: ``mat_ref = exp(-[psi]) mat(values)``, three of psi for each block."""
+
+    data: PoseBlocks
+    model: SensorModel
+    left_out: np.ndarray | None = None
+    """Mask of blocks without weight."""
+
+    @cached_property
+    def nominal(self):
+        return np.nan_to_num(self.model.prior()[0])
+
+    @cached_property
+    def priors(self):
+        """Those of the model, wide for bias and matrix: any sensor, in any units."""
+        sd = self.model.prior()[1].copy()
+        sd[self.model.part('gyroscope', Role.OFFSET)] = 0.2
+        sd[self.model.part('gyroscope', Role.LINEAR)] = 0.3
+        return sd
+
+    @cached_property
+    def fixed(self):
+        return np.char.startswith(self.model.param_names, ABSENT[0])
+
+    def moved(self, state, step):
+        return PoseState(state.values + step[1:], state.lag + step[0])
+
+    def linearise(self, state):
+        model, values = self.model, state.values
+        bias = values[model.part('gyroscope', Role.OFFSET)]
+        matrix = values[model.part('gyroscope', Role.LINEAR)].reshape(3, 3)
+        effects = [effect for effect in model.further if effect.sensor == 'gyroscope']
+        own = ~self.fixed
+        residual, late_columns, main = [], [], []
+        for block, mat_ref in self.data.blocks:
+            time, rate = self.data.time[block], self.data.rate[block]
+            true = np.linalg.solve(matrix, (rate - bias).T).T
+            further = None
+            if effects:
+                further = output_of_effects(effects, model, values, still(time, true))
+            turn = integrate_turn(time, rate, bias=bias, matrix=matrix, further=further)
+            first, last = true[0], true[-1]
+            late = (
+                small_rotation(state.lag * last) @ turn.mat_ji @ small_rotation(-state.lag * first)
+            )
+            residual.append(-Rotation.from_matrix(mat_ref @ late.T).as_rotvec())
+            late_columns.append((late @ first - last)[:, None])
+            rows = np.zeros((3, len(own)))
+            rows[:, own] = np.hstack([turn.by_bias, turn.by_matrix.reshape(3, 9), turn.by_further])
+            main.append(rows)
+        count = len(residual)
+        noise = np.full((count, 3), READING_SD**2)
+        if self.left_out is not None:
+            noise[self.left_out] = 1e6
+        number = np.repeat(np.arange(count), 3)
+        return RowSet(
+            np.concatenate(residual),
+            np.concatenate(late_columns),
+            np.concatenate(main),
+            noise.ravel(),
+            np.zeros(3 * count, int),
+            np.column_stack([number, number]),
+        )
+
+
+def still(time, rate):
+    """Return a motion with these rates for the columns of effects of the gyroscope."""
+    zero = np.zeros_like(rate)
+    return Reference(time, np.zeros((len(time), 3, 3)), zero, rate, zero, 9.81)
+
+
+def solve(data, model, left_out=None):
+    """Return the solution of a model, and where it was linearised."""
+    reference = PoseRows(data, model, left_out)
+    start = PoseState(reference.nominal)
+    found = estimate_rows(reference, start, fallback=np.array([ATTITUDE_SD**2]))
+    sd = np.sqrt(found.scatter.variance[0])
+    noise = NoiseModel(np.full(3, sd**2), np.ones(3))
+    solution = Solution(
+        model,
+        found.state.values,
+        found.terms,
+        found.held | reference.fixed,
+        {sensor: noise for sensor in ('accelerometer', 'gyroscope')},
+        {'gyroscope': {}, 'accelerometer': {}},
+        found.factor.T @ found.factor,
+        {},
+    )
+    return solution, found.state
+
+
+def errors_of(data, solution, state):
+    """Return the rotations that a solution misses, rad, shape (n_blocks, 3)."""
+    return PoseRows(data, solution.model).linearise(state).residual.reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutBlocks:
+    """Blocks in folds, each predicted without it."""
+
+    data: PoseBlocks
+    solution: Solution
+
+    def better_plain_fits(self, *, under_test, as_asked):
+        return ()
+
+    def proof(self, fits):
+        number = np.arange(len(self.data.blocks))
+        model = self.solution.model
+        nominal = PoseState(PoseRows(self.data, model).nominal)
+        before = errors_of(self.data, self.solution, nominal)
+        after = np.zeros_like(before)
+        for fold in range(FOLDS):
+            out = number % FOLDS == fold
+            solution, state = solve(self.data, model, out)
+            after[out] = errors_of(self.data, solution, state)[out]
+        return {'gyroscope': entry_of((before, after), 'rad', seconds=BLOCK * len(number))}
+
+
+def select(data, solution, state):
+    """Return the effects that the rotations support beyond bias and matrix."""
+    wide = solution.model
+    for name in CANDIDATES:
+        wide = wide.with_effect('gyroscope', name)
+    values = wide.start_from(solution.model, solution.values)
+    rows = PoseRows(data, wide).linearise(replace(state, values=values))
+    own = np.flatnonzero(~PoseRows(data, wide).fixed)
+    columns = np.column_stack([rows.main[:, own], rows.nuisance, rows.residual])
+    count = len(data.blocks)
+    known = np.full((count, 3), solution.noise['gyroscope'].white_variance)
+    block = RowBlock(
+        'blocks',
+        'gyroscope',
+        columns.reshape(count, 3, -1) / BLOCK,
+        known / BLOCK**2,
+        known / BLOCK**2,
+        np.arange(count),
+        np.array([data.time[part].mean() for part, _ in data.blocks]),
+    )
+    # Places of the parameters in the columns: bias, matrix, effects, and last the lag.
+    place = {int(index): column for column, index in enumerate(own)}
+    lag = len(own)
+    prior_sd = np.append(PoseRows(data, wide).priors[own], 1.0)
+    questions, parts = [], {}
+    for name in CANDIDATES:
+        part = wide.slices['gyroscope', name]
+        columns_of = tuple(place[index] for index in range(part.start, part.stop))
+        parts[name] = slice(columns_of[0], columns_of[-1] + 1)
+        effect = next(effect for effect in wide.effects if effect.name == name)
+        questions.append(Question(effect, columns_of, len(columns_of), name))
+    base = [column for column in range(lag) if not any(column in q.parameters for q in questions)]
+    prior_sd[base] *= 1e3
+    space = RowSpace(parts, prior_sd, lag + 1)
+    return choose_effects(RowProblem([block], space, questions, baseline=(*base, lag)))
+
+
+def calibrate(data, options=CalibrationOptions()):
+    """Return the result of a calibration against poses, with the effects that they support."""
+    asked = SensorModel(BASE, BASE)
+    solution, state = solve(data, asked)
+    chosen = select(data, solution, state)
+    model = asked
+    for question in chosen.named:
+        model = model.with_effect('gyroscope', question.name)
+    if chosen.named:
+        solution, state = solve(data, model)
+    changes = ModelChanges(added=tuple(question.name for question in chosen.named))
+    return conclude(Solved(solution, data, ModelExtension(changes=changes), chosen), options)
