@@ -325,7 +325,7 @@ def effect_slopes(
 
 
 def output_of_effects(
-    effects: Sequence[Effect], model: SensorModel, values: np.ndarray, ref: Reference
+    effects: Sequence[Effect], model: SensorModel, values: np.ndarray, *, ref: Reference
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     Return the contribution of some effects of one sensor to its output, and its derivative.

@@ -167,7 +167,7 @@ class PoseRows:
             true = np.linalg.solve(matrix, (rate - bias).T).T
             further = None
             if effects:
-                further = output_of_effects(effects, model, values, still(time, true))
+                further = output_of_effects(effects, model, values, ref=still(time, true))
             turn = integrate_turn(time, rate, bias=bias, matrix=matrix, further=further)
             first, last = true[0], true[-1]
             late = (

@@ -208,7 +208,7 @@ class HandModel:
             self.gravity,
             temperature_c,
         )
-        return output_of_effects(effects, self.model, values, ref)
+        return output_of_effects(effects, self.model, values, ref=ref)
 
     def compensate(
         self,
