@@ -53,6 +53,8 @@ def write_corrected_log(path: str | PathLike[str], log: CsvLog, corrected: ImuSa
     # The header states the unit of each column that was read.
     names = list(text.names)
     for columns in log.columns:
+        if columns.quantity == 'time' and len(columns.names) == 2:
+            continue  # seconds and nanoseconds
         for place in text.places.get(columns.quantity, ()):
             unit = columns.unit
             if columns.quantity in SENSOR_OF:

@@ -36,6 +36,7 @@ from imu_calibration.preprocessing.sensor_join import (
 )
 from imu_calibration.preprocessing.two_sources import TwoSourceSearch
 from imu_calibration.preprocessing.value_checks import force_error, samples_per_second
+from msg_adapters.csv_lines import plain_lines
 from msg_adapters.rosbag2 import Rosbag2
 from msg_adapters.storages import suffixes
 from msg_adapters.write import write_session
@@ -44,7 +45,7 @@ SUFFIXES = ('.csv', '.tsv', '.txt')
 HEAD_BYTES = 1 << 16
 """Bytes in which header, delimiter and first rows are found."""
 COLUMN_UNITS = {
-    'time': {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9},
+    'time': {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9, 'min': 60.0, 'h': 3600.0, 'd': 86_400.0},
     'force': UNIT_SIZES['accelerometer'],
     'rate': UNIT_SIZES['gyroscope'],
     'temperature': {'C': 1.0},
@@ -65,6 +66,9 @@ SPELLINGS = {
         'micros': 'us',
         'nsec': 'ns',
         'nanos': 'ns',
+        'minutes': 'min',
+        'hours': 'h',
+        'days': 'd',
     },
     'force': READING_SPELLINGS['accelerometer'],
     'rate': READING_SPELLINGS['gyroscope'],
@@ -72,6 +76,12 @@ SPELLINGS = {
     'joint': {'rads': 'rad', '°': 'deg', 'degrees': 'deg', 'radians': 'rad'},
 }
 """Quantity -> spelling in headers -> unit."""
+TICK = re.compile(r'(\d+(?:\.\d+)?)(?:/(\d+))?(s|ms|us|ns)')
+"""Tick of a counter as unit of time: 25us, 1/32768s."""
+USUAL_TICKS = ('10us', '21.7us', '25us', '25.6us', '1/32768s', '39.0625us', '100us', '10ms')
+"""Ticks of counters in IMUs, which are proposed."""
+NEAR_TICK = 0.1
+"""A measured tick is a usual one within this share: it is known as well as the scales."""
 SENSOR_OF = {'force': 'accelerometer', 'rate': 'gyroscope'}
 CORRECTED = 'corrected'
 """Word after the unit in the header of a log that holds corrected readings."""
@@ -80,23 +90,24 @@ RAW_UNIT = 'raw'
 COLUMN_PATTERNS = (
     (
         'time',
-        r'((logging|sensor|device|imu|sample) ?)?time|timestamp|t|epoch|seconds|sec|time ?stamp.*|'
-        r'(.* )?stamp|.*elapsed|time ?(since )?start.*|millis|micros|nanos|ms|us|ns|rtc ?time|'
-        r'time of day|sample ?time ?fine',
+        r'((logging|sensor|device|imu|sample|gps) ?)?time|timestamp|t|epoch|seconds|sec|'
+        r'time ?stamp.*|(.* )?stamp|.*elapsed|time ?(since )?start.*|millis|micros|nanos|ms|us|ns|'
+        r'rtc ?time|time of day|sample ?time ?fine|(gps )?(sow|i? ?tow)|seconds of week',
     ),
     (
         'force',
         r'(a|ac|acc|acc smooth|accel|accelerometer|acceleration|f|specific force|a rs'
-        r' s|(accelerometer|acc|raw|imu|total) ?accel\w*|(uncomp\w*|uncal\w*) ?acc\w*|'
-        r'(.* )?linear acceleration|d ?vel|(delta|d) ?v|delta ?vel(ocity)?|'
+        r' s|accl|(accelerometer|acc|raw|imu|total) ?accel\w*|(uncomp\w*|uncal\w*) ?acc\w*|'
+        r'g ?f(orce)?|(.* )?lin(ear)? ?acc(eleration)?|d ?vel|(delta|d) ?v|delta ?vel(ocity)?|'
         r'vel(ocity)? ?inc(rement)?s?)',
     ),
     (
         'rate',
         r'(g|w|gy|gyr|gyro|gyro adc|gyroscope|omega|rate|w rs s|'
-        r'(angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
+        r'(ang|angular|rotation|gyro|gyroscope|imu|raw) ?(rate|rotation|gyro\w*)|'
         r'(uncomp\w*|uncal\w*) ?gyr\w*|'
-        r'(.* )?angular velocity|(d|delta) ?(theta|ang|angle)|(ang|angle|theta) ?inc(rement)?s?)',
+        r'(.* )?ang(ular)? ?vel(ocity)?|(d|delta) ?(theta|ang|angle)|'
+        r'(ang|angle|theta) ?inc(rement)?s?)',
     ),
     (
         'temperature',
@@ -118,10 +129,12 @@ Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges d
 the usual rates.
 """
 CLOCK = re.compile(
-    r'\s*(?:\d{1,2}[./-]\d{1,2}[./-]\d{2,4},?[ T]\s*)?(\d{1,2}):(\d\d):(\d\d)(?:[.,](\d+))?\s*'
+    r'\s*(?:\d{1,2}[./-]\d{1,2}[./-]\d{2,4},?[ T]\s*)?(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?\s*'
+    r'(?:([AaPp])\.?[Mm]\.?)?\s*'
 )
 """
-Time of day: hours, minutes, seconds, decimals. A date with the day or the month first is not read,
+Time of day: hours, minutes, seconds, decimals, half of the day. A date with the day or the month
+first is not read,
 because the order is unknown; midnights are counted.
 """
 DAY_NS = 86_400 * 10**9
@@ -138,6 +151,10 @@ GRAVITY_BAND = 1.15
 """The median of the specific force may differ from gravity by this factor."""
 RATE_BAND = 1.6
 """The rate that turns gravity may differ from the measured one by this factor."""
+OWN_RATE_BAND = 1.25
+"""The same, where the units of time and rate are both found from the values."""
+TRIED_PERIODS = (0.01, 0.04, 0.0025, 6e-4)
+"""Periods with which the turns of gravity are searched, s."""
 REMEDY = (
     'convert it with the columns stated: time=NAME:UNIT force=X,Y,Z:UNIT rate=X,Y,Z:UNIT'
     ' [temperature=NAME:C] [joint.JOINT=NAME:UNIT]'
@@ -261,7 +278,7 @@ def read_csv(
         )
     table.load([name for each in found for name in each.names], where)
     time, stamp_ns, n_overflows = _times(table, by_quantity['time'])
-    readings = _sensors(table, by_quantity, stamp_ns)
+    readings = _sensors(table, by_quantity, stamp_ns, time)
     used, temperature, joints = [time, *readings.columns], None, []
     for each in found:
         if each.quantity == 'temperature':
@@ -336,9 +353,14 @@ def _lacking(table, by_quantity, *, stated):
 def _times(table, columns):
     """Return (Columns with the unit, stamps in ns, overflows of the counter, now undone)."""
     values = table.raw(columns.names[0])
+    if len(columns.names) == 2:
+        values = table.stamps(columns).view('datetime64[ns]')
     _require_distinct_times(values, table.path)
+    if _words(columns.names[0])[0] in SAMPLE_TIME_FINE:
+        columns = _with_unit(columns, lambda: _unit_of_sample_time_fine(values), table.path)
     columns = _with_unit(columns, lambda: _time_unit(values), table.path)
-    stamp_ns, n_overflows = without_overflows(table.stamps(columns))
+    tick_ns = 1e9 * _time_size(columns.unit)
+    stamp_ns, n_overflows = without_overflows(table.stamps(columns), tick_ns)
     return columns, stamp_ns, n_overflows
 
 
@@ -354,7 +376,7 @@ class _Readings:
     """Where the sensors have rows of their own."""
 
 
-def _sensors(table, by_quantity, stamp_ns):
+def _sensors(table, by_quantity, stamp_ns, time):
     """Return the `_Readings` of a table."""
     nothing = np.full((len(stamp_ns), 3), np.nan)
     if 'force' not in by_quantity:
@@ -379,7 +401,7 @@ def _sensors(table, by_quantity, stamp_ns):
     fewest = min(len(accelerometer.stamp_ns), len(gyroscope.stamp_ns))
     if np.count_nonzero(common) >= MIN_COMMON_ROWS * fewest:
         imu = ImuSamples(stamp_ns, force_s, raw_rate, 'imu_link')
-        return _with_rate_unit(force, by_quantity['rate'], imu, path=table.path)
+        return _with_rate_unit(force, by_quantity['rate'], imu, path=table.path, time=time)
 
     # Otherwise each sensor has rows of its own.
     return _joined(force, by_quantity['rate'], accelerometer, gyroscope, path=table.path)
@@ -391,10 +413,16 @@ def _joined(force, rate, accelerometer, gyroscope, *, path):
     return _with_rate_unit(force, rate, joined.imu, path=path, joined=joined)
 
 
-def _with_rate_unit(force, rate, imu, *, path, joined=None):
-    """Return the `_Readings` of samples with the rates as in the log."""
+def _with_rate_unit(force, rate, imu, *, path, time=None, joined=None):
+    """
+    Return the `_Readings` of samples with the rates as in the log.
+
+    `time`: its Columns, where both sensors have one.
+    """
     _require_one_imu(imu)
     rate = _with_unit(rate, lambda: _rate_unit(imu.stamp_ns, imu.force_s, imu.rate_s), path)
+    if time is not None:
+        _require_time_of_turns(time, rate, imu, path)
     return _Readings((force, rate), replace(imu, rate_s=imu.rate_s * _size_of(rate)), joined)
 
 
@@ -544,6 +572,10 @@ def _with_unit(columns, guess, path):
     return replace(columns, unit=unit, origin='values')
 
 
+N_NAMES = {'force': (3,), 'rate': (3,), 'time': (1, 2)}
+"""Quantity -> numbers of its columns; one for the other quantities."""
+
+
 def _parse(text):
     """Return the Columns of one assignment of `columns`."""
     label, _, rest = text.partition('=')
@@ -562,21 +594,38 @@ def _parse(text):
     if (
         not units
         or (quantity == 'joint') != bool(joint)
-        or len(names) != (3 if quantity in SENSOR_OF else 1)
+        or len(names) not in N_NAMES.get(quantity, (1,))
     ):
         raise InputError(
             'a column assignment must be quantity=NAME[:UNIT] with one name, three for force and'
-            f' rate, got {text!r}; {REMEDY}',
+            f' rate, two for a time in seconds and nanoseconds, got {text!r}; {REMEDY}',
             key='columns',
         )
     if unit is not None and scaled and quantity in SENSOR_OF:
         unit = unit_of(SENSOR_OF[quantity], unit).unit
-    elif unit is not None and unit not in units:
+    elif unit is not None and unit not in units and (quantity != 'time' or not _tick_size(unit)):
+        ticks = ''
+        if quantity == 'time':
+            ticks = ', or a tick such as 25us or 1/32768s'
         raise InputError(
-            f'the unit of {quantity} must be one of {", ".join(units)}, got {unit!r}; correct'
-            f' {text!r}'
+            f'the unit of {quantity} must be one of {", ".join(units)}{ticks}, got {unit!r};'
+            f' correct {text!r}',
+            key='columns',
         )
     return Columns(quantity, names, unit, joint, 'given')
+
+
+def _tick_size(unit):
+    """Return the size of a unit of time that is a tick, s; 0.0 for another text."""
+    tick = TICK.fullmatch(unit)
+    if tick is None or not float(tick[1]) or not int(tick[2] or 1):
+        return 0.0
+    return float(tick[1]) / int(tick[2] or 1) * COLUMN_UNITS['time'][tick[3]]
+
+
+def _time_size(unit):
+    """Return the size of a unit of time, s."""
+    return COLUMN_UNITS['time'].get(unit) or _tick_size(unit)
 
 
 def _size_of(columns):
@@ -636,7 +685,7 @@ class _Table:
         _refuse_compressed(path)
         with _opened(path) as file:
             head = file.read(HEAD_BYTES)
-        lines = head.splitlines()
+        lines = plain_lines(head.splitlines())
         if not lines or '\0' in head:
             raise InputError(
                 f'{path} must be a text log, got {"an empty file" if not lines else "binary data"};'
@@ -644,14 +693,7 @@ class _Table:
             )
         self.delimiter = _delimiter(lines)
         rows = [self._cells(line) for line in lines[: None if len(head) < HEAD_BYTES else -1]]
-        first = next(
-            (
-                k
-                for k, row in enumerate(rows)
-                if len(row) > 1 and sum(map(_numeric, row)) >= min(4, len(row))
-            ),
-            None,
-        )
+        first = _first_row(rows)
         if first is None:
             raise InputError(
                 f'{path} must have rows of numbers separated by comma, semicolon, tab or spaces,'
@@ -674,7 +716,7 @@ class _Table:
             for name in (header[0] if header else [str(k + 1) for k in range(width)])
         ]
         if len(header) == 2:  # a second row with units
-            units = [unit.strip(' ()[]') for unit in header[1]]
+            units = [_without_brackets(unit) for unit in header[1]]
             self.names = [
                 f'{name} ({unit})' if unit else name
                 for name, unit in zip(self.names, units, strict=True)
@@ -699,6 +741,8 @@ class _Table:
         self.n_dropped = 0
         self.lines = []
         self._values = {}
+        # Lines that some programs repeat between the rows.
+        self._header_lines = {line.strip() for line in lines[:first]}
 
     def _cells(self, line):
         return split_cells(line, self.delimiter, self.path)
@@ -725,7 +769,8 @@ class _Table:
         numbers = [k for k in wanted if k not in self.dates | self.clocks]
         options = {'delimiter': self.delimiter, 'encoding': 'utf-8-sig', 'comments': '#'}
         with _opened(self.path) as file:
-            lines = self._selected(file.read().splitlines()[self.first :], where)
+            lines = plain_lines(file.read().splitlines())[self.first :]
+        lines = self._selected(lines, where)
         lines = self.lines = self._complete(lines, wanted[-1] + 1)
         if self.decimal_comma and self.delimiter != ',':
             lines = [line.replace(',', '.') for line in lines]
@@ -754,6 +799,9 @@ class _Table:
         complete = []
         for line in lines:
             if not line.strip() or line.startswith('#'):
+                continue
+            if line.strip() in self._header_lines:
+                self.n_dropped += 1
                 continue
             if self.delimiter is not None and '"' not in line:
                 n_cells = line.count(self.delimiter) + 1
@@ -810,12 +858,21 @@ class _Table:
         return self._values[self.column(name)]
 
     def stamps(self, time):
-        """Return stamps in ns of the Columns of time, int64, shape (n,)."""
+        """
+        Return stamps in ns of the Columns of time, int64, shape (n,).
+
+        Two columns are seconds and nanoseconds.
+        """
         values = self.raw(time.names[0])
+        if len(time.names) == 2:
+            seconds_and_ns = self.values(time.names)
+            if np.isfinite(seconds_and_ns).all():
+                whole, fraction_ns = seconds_and_ns.astype(np.int64).T
+                return whole * 10**9 + fraction_ns
         if values.dtype.kind == 'M':
             bad = np.count_nonzero(np.isnat(values))
         else:
-            unit = COLUMN_UNITS['time'][time.unit]
+            unit = _time_size(time.unit)
             bad = np.count_nonzero(~(np.abs(values * unit) < MAX_TIME_SECONDS))
         if bad == len(values):
             cell = self.first_row[self.column(time.names[0])].strip()
@@ -862,8 +919,11 @@ def _times_of_day(cells):
     for k, cell in enumerate(cells):
         found = CLOCK.fullmatch(cell)
         if found:
-            hours, minutes, seconds, fraction = found.groups(default='')
-            whole = 3600 * int(hours) + 60 * int(minutes) + int(seconds)
+            hours, minutes, seconds, fraction, half = found.groups(default='')
+            hour = int(hours)
+            if half:  # 12 am is midnight, 12 pm is noon
+                hour = hour % 12 + 12 * (half in 'Pp')
+            whole = 3600 * hour + 60 * int(minutes) + int(seconds)
             time_ns[k] = whole * 10**9 + int(fraction[:9].ljust(9, '0'))
     good = time_ns != NO_TIME
     known = time_ns[good]
@@ -887,6 +947,39 @@ def _delimiter(lines):
     return max((';', '\t', ',', None), key=agreement)
 
 
+def _first_row(rows):
+    """
+    Return the index of the first row of numbers, or None.
+
+    A header may have numbers too, and has more words than most rows.
+    """
+    n_numbers = [sum(map(_numeric, row)) for row in rows]
+    n_words = [sum(map(_is_word, row)) for row in rows]
+    usual = Counter(number for number in n_numbers if number >= 2).most_common(1)
+    if not usual:
+        return None
+    most_words = Counter(n_words).most_common(1)[0][0]
+    for k, row in enumerate(rows):
+        enough = n_numbers[k] >= min(4, len(row), usual[0][0])
+        if len(row) > 1 and enough and n_words[k] <= most_words:
+            return k
+    return None
+
+
+def _is_word(cell):
+    """Return whether a cell is text that begins with a letter, no missing number."""
+    text = cell.strip().strip('"')
+    return text[:1].isalpha() and text.lower() not in ('nan', 'inf', 'null', 'na')
+
+
+def _without_brackets(text):
+    """Return text without the brackets around it: (m/(s^2)) is m/(s^2)."""
+    text = text.strip()
+    while len(text) >= 2 and text[0] + text[-1] in ('()', '[]'):
+        text = text[1:-1].strip()
+    return text
+
+
 def _numeric(cell):
     if len(cell) > LONGEST_NUMBER:
         return False
@@ -899,29 +992,20 @@ def _guess(table, stated=frozenset()):
     sensor_of_file = _words(table.path.stem)[0]
     for name in table.names:
         words, unit_text = _words(name)
-        if words in ('x', 'y', 'z'):  # a file of one sensor, which has the name of it
-            words = f'{sensor_of_file} {words}'
+        axis_name = re.fullmatch(r'([xyz])(?: axis)?', words)
+        if axis_name:  # a file of one sensor, which has the name of it, or sets by their units
+            words = f'{_sensor_of_unit(unit_text) or sensor_of_file} {axis_name[1]}'
         if words in ('t', 't imu') and _unit('temperature', unit_text):
             words = 'temperature'
         joint = re.fullmatch(r'joint[ ._](\w+?)(?: (?:position|angle))?', words)
-        # acc x raw, x acc
-        without_raw = re.sub(r'^([xyz]) (.*)$', r'\2 \1', words.removesuffix(' raw'))
-        # The number of one of several IMUs: imu1 ax, ax 1, or acc1 x.
-        device = re.fullmatch(r'((?:imu|sensor|mpu|device) ?\d+) (.*)', without_raw)
-        bare, of_imu = (device[2], device[1]) if device else (without_raw, '')
-        numbered = re.fullmatch(r'(\D+?) ?(\d+) ?([xyz]?)', bare)
-        if numbered:
-            bare = f'{numbered[1]} {numbered[3]}'.strip()
-            of_imu += numbered[2]
-        axis = re.fullmatch(r'(.*?) ?([xyz])', bare)
-        suffix = words[len(words.removesuffix(' raw')) :]
+        reading = _reading_of(words)
         for quantity, pattern in COLUMN_PATTERNS:
             if quantity in axes:
-                if axis and re.fullmatch(pattern, axis.group(1)):
-                    # Numbers distinguish sensors, and "raw" columns from converted ones.
-                    group = re.sub(r'[^a-z0-9]', '', of_imu + axis.group(1) + suffix)
+                if reading is not None and re.fullmatch(pattern, reading.sensor):
                     unit = _unit(quantity, unit_text)
-                    axes[quantity].setdefault(group, {})[axis.group(2)] = (name, unit)
+                    if unit is None and re.fullmatch(r'g ?f(orce)?', reading.sensor):
+                        unit = 'g'
+                    axes[quantity].setdefault(reading.group, {})[reading.axis] = (name, unit)
             elif (
                 re.fullmatch(pattern, words)
                 # T (°C) is no time, and temp (F) is not read as °C
@@ -931,31 +1015,118 @@ def _guess(table, stated=frozenset()):
                 found.append(Columns(quantity, (name,), _unit(quantity, unit_text)))
         if joint:
             found.append(Columns('joint', (name,), _unit('joint', unit_text), joint.group(1)))
+    if pair := _seconds_and_nanoseconds(table):
+        found = [pair, *(columns for columns in found if columns.quantity != 'time')]
     if not any(columns.quantity == 'time' for columns in found):
         found += _unnamed_time(table)
     for quantity, groups in axes.items():
-        complete = [group for group in groups.values() if set(group) == set('xyz')]
+        complete = {key: group for key, group in groups.items() if set(group) == set('xyz')}
         if quantity in stated:
             continue
+        if len(complete) > 1 and quantity == 'force':
+            complete = _with_gravity(complete)
         if len(complete) > 1:
+            sets = '; '.join(
+                ', '.join(group[axis][0] for axis in 'xyz') for group in complete.values()
+            )
             raise InputError(
                 f'{table.path} must have one column of {quantity} per axis, got {len(complete)}'
-                ' sets, as of several IMUs:'
-                f' {"; ".join(", ".join(group[axis][0] for axis in "xyz") for group in complete)};'
-                f' {REMEDY}',
+                f' sets, as of several IMUs: {sets}; {REMEDY}',
                 key='columns',
                 code='several_sets',
             )
-        if complete:
-            units = {group[axis][1] for group in complete for axis in 'xyz'}
-            found.append(
-                Columns(
-                    quantity,
-                    tuple(complete[0][axis][0] for axis in 'xyz'),
-                    units.pop() if len(units) == 1 else None,
-                )
-            )
+        for group in complete.values():
+            units = {group[axis][1] for axis in 'xyz'}
+            names = tuple(group[axis][0] for axis in 'xyz')
+            found.append(Columns(quantity, names, units.pop() if len(units) == 1 else None))
     return found
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """The parts of the name of a column with one axis of a sensor."""
+
+    sensor: str
+    """Name of the sensor or quantity, such as 'acc'."""
+    axis: str
+    """'x', 'y' or 'z'."""
+    group: str
+    """Equal for the axes of one set; numbers distinguish sensors, "raw" from converted ones."""
+
+
+DECORATION = r'(?:raw|cal|out|ln cal|wr cal|ln raw|wr raw|ln|wr)'
+"""Words after the axis that loggers add; LN and WR: low noise and wide range."""
+
+
+def _reading_of(words):
+    """Return the `_Reading` of a name in words, or None."""
+    # A logger adds words behind the axis: acc x raw, accel ln x cal.
+    suffix = re.search(rf'(?<= ){DECORATION}$', words)
+    bare = words
+    if suffix:
+        bare = words[: suffix.start()].strip()
+    inner = re.fullmatch(r'(?:shimmer \w+ )?(.*) (ln|wr) ([xyz])', bare)
+    range_name = ''
+    if inner:
+        bare, range_name = f'{inner[1]} {inner[3]}', inner[2]
+    bare = re.sub(r'^shimmer \w+ ', '', bare)
+    # The axis in front: x acc, xacc, x ang rate, behind the name of a message.
+    bare = re.sub(r'^(?:(?:.* )?(imu\d?|imu) )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\3 \2', bare)
+    bare = re.sub(r'^([xyz]) (.*)$', r'\2 \1', bare)
+
+    # The number of one of several IMUs: imu1 ax, ax 1, or acc1 x.
+    of_imu = ''
+    device = re.fullmatch(r'((?:imu|sensor|mpu|device) ?\d+) (.*)', bare)
+    if device:
+        of_imu, bare = device[1], device[2]
+    numbered = re.fullmatch(r'(\D+?) ?(\d+) ?([xyz]?)', bare)
+    if numbered:
+        bare = f'{numbered[1]} {numbered[3]}'.strip()
+        of_imu += numbered[2]
+    axis = re.fullmatch(r'(.*?) ?([xyz])', bare)
+    if axis is None:
+        return None
+    decoration = range_name
+    if suffix:
+        decoration += suffix[0]
+    group = re.sub(r'[^a-z0-9]', '', of_imu + axis[1] + decoration)
+    return _Reading(axis[1], axis[2], group)
+
+
+def _sensor_of_unit(unit_text):
+    """Return the sensor that has a unit, 'acc' or 'gyro'; '' for an unknown or missing unit."""
+    for quantity, sensor in (('force', 'acc'), ('rate', 'gyro')):
+        if unit_text and _unit(quantity, unit_text):
+            return sensor
+    return ''
+
+
+def _with_gravity(sets):
+    """Return the sets of force without the linear accelerations that a phone adds to them."""
+    with_gravity = {key: group for key, group in sets.items() if not key.startswith('lin')}
+    total = {key: group for key, group in with_gravity.items() if key.startswith('gf')}
+    return total or with_gravity or sets
+
+
+def _seconds_and_nanoseconds(table):
+    """Return the Columns of a stamp in two columns, seconds and nanoseconds; None without them."""
+    columns = {}
+    for name in table.names:
+        words = re.sub(r'[\s_./:-]+', ' ', name.lower()).strip()
+        part = re.fullmatch(r'(.*?) ?(secs?|seconds|nsecs?|nano ?secs?|nanoseconds)', words)
+        if part is not None and part[1] in (
+            '',
+            'header stamp',
+            'stamp',
+            'time',
+            'field header stamp',
+        ):
+            is_nano = part[2].startswith('n')
+            columns.setdefault(part[1], {})[is_nano] = name
+    for parts in columns.values():
+        if len(parts) == 2:
+            return Columns('time', (parts[False], parts[True]), 'ns')
+    return None
 
 
 def _unnamed_time(table):
@@ -1014,7 +1185,7 @@ def _without_unit(name):
     text = name[: bracket.start()] if bracket else name
     if not unit:
         suffix = re.search(
-            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|ms|us|ns|deg|rad|deg_?c|celsius|c|s)$',
+            r'_(m_s2|mps2|m_s_2|rad_s|rads|deg_s|dps|mdps|mg|(?<=\w\w_)g|[mun]?sec|ms|us|ns|deg|rad|deg_?c|celsius|c|s)$',
             text,
             re.IGNORECASE,
         ) or re.search(
@@ -1033,6 +1204,8 @@ def _unit(quantity, text):
     """Return the unit of a quantity by its spelling in a header, or None."""
     text = text.strip().removesuffix(CORRECTED).replace(' ', '')
     known = {unit.lower(): unit for unit in COLUMN_UNITS[quantity]} | SPELLINGS[quantity]
+    if quantity == 'time' and _tick_size(text):
+        return text
     return known.get(text)
 
 
@@ -1068,6 +1241,68 @@ def _time_unit(values):
     return next((unit for unit, low, high in PERIODS if low <= step <= high), None)
 
 
+SAMPLE_TIME_FINE = ('sample time fine', 'sampletimefine')
+SLOWEST_TICKS = 4000
+"""
+Median step of SampleTimeFine: from it on microseconds (Xsens DOT, at most 250 Hz), below ticks of
+100 us (MTi, at least 2.5 Hz).
+"""
+
+
+def _unit_of_sample_time_fine(values):
+    """Return the unit of a column SampleTimeFine of an Xsens log."""
+    steps = np.diff(values)
+    steps = steps[steps > 0]
+    if len(steps) and np.median(steps) >= SLOWEST_TICKS:
+        return 'us'
+    return '100us'
+
+
+def _require_time_of_turns(time, rate, imu, path):
+    """
+    Refuse stamps whose unit was found from the values, where gravity turns by another clock.
+
+    The turns of gravity per sample give the product of period and unit of the rates; with the unit
+    in the header, the period follows, and thereby the unit of time. A rate whose unit was found too
+    must agree well: the tick of a counter looks like another unit of the rate.
+
+    `imu`: force in SI, rates as in the log.
+    """
+    if time.origin != 'values' or imu.stamp_ns[0] == imu.stamp_ns[-1]:
+        return
+    period_s = float(np.median(np.diff(imu.stamp_ns))) * 1e-9
+    if period_s <= 0.0:
+        return
+    factor = _turning_factor(imu.stamp_ns, imu.force_s, imu.rate_s)
+    size = _size_of(rate)
+    band = RATE_BAND
+    if rate.origin == 'values':
+        band = OWN_RATE_BAND
+    if factor is not None and 1 / band < factor / size < band:
+        return
+
+    # Periods of usual IMUs, because a wrong one may hide the turns.
+    tick_s = None
+    for true_period_s in TRIED_PERIODS:
+        samples = np.arange(len(imu.stamp_ns))
+        stamp_ns = np.round(samples * (true_period_s * 1e9)).astype(np.int64)
+        tried = _turning_factor(stamp_ns, imu.force_s, imu.rate_s)
+        if tried is not None:
+            tick_s = tried / size * true_period_s / period_s * _time_size(time.unit)
+            break
+    if tick_s is None or abs(np.log(tick_s / _time_size(time.unit))) < np.log(band):
+        return
+    usual = [tick for tick in USUAL_TICKS if abs(tick_s / _tick_size(tick) - 1.0) < NEAR_TICK]
+    ticks = ' or '.join(usual) or f'{tick_s * 1e6:.3g}us'
+    raise InputError(
+        f'the unit of time in {path} must agree with the turns of gravity, {time.names[0]} was read'
+        f' in {time.unit}, a rate in {rate.unit} fits ticks of about {tick_s * 1e6:.3g} us; convert'
+        f' it with --columns time={time.names[0]}:{ticks}, or state the unit of the rate',
+        key='columns',
+        code='time_ticks',
+    )
+
+
 def _force_unit(force):
     """Return the unit in which the median length is that of gravity."""
     length = float(np.nanmedian(np.linalg.norm(force, axis=1)))
@@ -1089,22 +1324,26 @@ def _refuse_increments(force, stamp_ns):
         raise error
 
 
-def _rate_unit(stamp_ns, force_s, rate):
-    """Return the unit in which the rates turn gravity as the accelerometer measures it."""
+def _turning_factor(stamp_ns, force_s, rate):
+    """Return the factor from readings to the rates that turn gravity, rad/s; None if unknown."""
     series = ChunkSeries()
     good = np.isfinite(force_s).all(axis=1) & np.isfinite(rate).all(axis=1)
     series.push(stamp_ns[good], np.concatenate([force_s[good].T, rate[good].T]))
     turning = relate_turns(series.chunks())
     if turning is None:
         return None
-    return next(
-        (
-            unit
-            for unit, size in COLUMN_UNITS['rate'].items()
-            if 1 / RATE_BAND < turning.factor / size < RATE_BAND
-        ),
-        None,
-    )
+    return turning.factor
+
+
+def _rate_unit(stamp_ns, force_s, rate):
+    """Return the unit in which the rates turn gravity as the accelerometer measures it."""
+    factor = _turning_factor(stamp_ns, force_s, rate)
+    if factor is None:
+        return None
+    for unit, size in COLUMN_UNITS['rate'].items():
+        if 1 / RATE_BAND < factor / size < RATE_BAND:
+            return unit
+    return None
 
 
 def is_text_log(path: str | PathLike[str]) -> bool:

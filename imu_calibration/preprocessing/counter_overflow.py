@@ -1,5 +1,7 @@
 """Stamps from a counter that overflows: the steps back are undone."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 COUNTER_BITS = (16, 24, 31, 32)
@@ -8,14 +10,15 @@ TICKS_NS = (1, 1_000, 1_000_000)
 """Usual ticks: ns, us, ms."""
 LEAST_STEP_NS = 1_000_000_000
 """A smaller step back is a late sample."""
-SIZES_NS = tuple(
-    sorted(
-        2**bits * tick
-        for bits in COUNTER_BITS
-        for tick in TICKS_NS
-        if 2**bits * tick > LEAST_STEP_NS
-    )
-)
+
+
+def sizes_of_counters(ticks_ns: Sequence[float]) -> tuple[int, ...]:
+    """Return the sizes of the steps back at an overflow, ns, in order, for these ticks."""
+    sizes = {round(2**bits * tick) for bits in COUNTER_BITS for tick in ticks_ns}
+    return tuple(sorted(size for size in sizes if size > LEAST_STEP_NS))
+
+
+SIZES_NS = sizes_of_counters(TICKS_NS)
 """Sizes of the steps back at an overflow, ns: from 4.3 s to 50 days."""
 LOST_PERIODS = 5
 """An overflow may coincide with the loss of so many samples."""
@@ -25,13 +28,13 @@ LEAST_EQUAL_STEPS = 2
 """Steps back of one size from which on it is the size of a counter, whatever its width and tick."""
 
 
-def overflow_size(step_ns: int, period_ns: float) -> int:
+def overflow_size(step_ns: int, period_ns: float, sizes_ns: Sequence[int] = SIZES_NS) -> int:
     """
     Return the size of the counter whose overflow explains a step between stamps, ns; 0 for none.
 
     The step forward that remains without the overflow is at most `LOST_PERIODS` periods.
     """
-    for size in SIZES_NS:
+    for size in sizes_ns:
         if 0 < step_ns + size <= LOST_PERIODS * period_ns:
             return size
     return 0
@@ -40,7 +43,8 @@ def overflow_size(step_ns: int, period_ns: float) -> int:
 class OverflowSearch:
     """Undoes overflows in the stamps of one stream; the division into pieces has no influence."""
 
-    def __init__(self) -> None:
+    def __init__(self, tick_ns: float = 1.0) -> None:
+        self._sizes_ns = sizes_of_counters((*TICKS_NS, tick_ns))
         self.count = 0
         """Overflows until now."""
         self._shift_ns = 0
@@ -64,7 +68,7 @@ class OverflowSearch:
             # A step back within them is no overflow: the period is not known yet.
             if n_before + np.count_nonzero(is_forward[:place]) < PERIOD_STEPS:
                 continue
-            size = overflow_size(int(steps[place]), period_ns)
+            size = overflow_size(int(steps[place]), period_ns, self._sizes_ns)
             if size:
                 stamps[place:] += size
                 self._shift_ns += size
@@ -73,14 +77,22 @@ class OverflowSearch:
         return stamps
 
 
-def without_overflows(stamp_ns: np.ndarray) -> tuple[np.ndarray, int]:
+def without_overflows(stamp_ns: np.ndarray, tick_ns: float = 1.0) -> tuple[np.ndarray, int]:
     """
     Return all stamps of a recording without overflows, and the number of overflows.
 
     In addition to the known widths, any step back that recurs with one size, to a few periods, is
     the overflow of a counter.
+
+    Parameters
+    ----------
+    stamp_ns : ndarray, shape (n,)
+        Stamps, ns.
+    tick_ns : float
+        Tick of the counter, in addition to the usual ones.
+
     """
-    search = OverflowSearch()
+    search = OverflowSearch(tick_ns)
     stamps = search.undone(stamp_ns)
     steps = np.diff(stamps)
     forward = steps[steps > 0]

@@ -1,0 +1,100 @@
+"""Lines of text logs that programs have decorated, as lines with columns."""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+
+SERIAL_STAMP = re.compile(r'\s*(\d{1,2}:\d\d:\d\d[.,]\d+) -> (.*)')
+"""Line of a serial monitor that prints the time of its arrival."""
+LABELLED_CELL = re.compile(
+    r'\s*([A-Za-z_][\w /^\[\]()%]*?)\s*[:=]\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan)\s*'
+    r'(?:[,;\t]|\s|$)'
+)
+"""Name and number, as for a plotter: ``ax:0.12``."""
+MOST_LINES = 50
+"""Lines from which a decoration is recognised."""
+LEAST_CELLS = 4
+"""Labelled cells in a line, at least; three readings and a time."""
+LEAST_SHARE = 0.8
+"""Share of these lines with the decoration, at least."""
+CELLS_OF_ECHO = 40
+"""Numbers of a sensor_msgs/Imu, of which `ros2 topic echo --csv` prints no header."""
+ECHO_NAMES = (
+    *('header.stamp.sec', 'header.stamp.nanosec', 'header.frame_id'),
+    *(f'orientation.{axis}' for axis in 'xyzw'),
+    *(f'orientation_covariance.{k}' for k in range(9)),
+    *(f'angular_velocity.{axis}' for axis in 'xyz'),
+    *(f'angular_velocity_covariance.{k}' for k in range(9)),
+    *(f'linear_acceleration.{axis}' for axis in 'xyz'),
+    *(f'linear_acceleration_covariance.{k}' for k in range(9)),
+)
+
+
+def plain_lines(lines: Sequence[str]) -> list[str]:
+    """
+    Return lines without the decorations of serial monitors, plotters and `ros2 topic echo`.
+
+    The time that a serial monitor prints becomes a first column, labels and the fields of an Imu
+    message become a header. Other lines are unchanged.
+    """
+    lines = _with_serial_column(lines)
+    lines = _with_header_of_labels(lines)
+    return _with_header_of_echo(lines)
+
+
+def _with_serial_column(lines):
+    """Return lines whose time of arrival is a column, where a serial monitor printed it."""
+    stamped = [SERIAL_STAMP.fullmatch(line) for line in lines[:MOST_LINES]]
+    if not _are_most(stamped):
+        return list(lines)
+    texts = [match[2] for match in stamped if match]
+    delimiter = max('\t;, ', key=lambda mark: sum(text.count(mark) for text in texts))
+    plain = []
+    for line in lines:
+        match = SERIAL_STAMP.fullmatch(line)
+        time, text = 'time', line
+        if match:
+            time, text = match[1], match[2]
+        # The time of the header is its name.
+        if not any(character.isdigit() for character in text):
+            time = 'time'
+        plain.append(f'{time}{delimiter}{text}')
+    return plain
+
+
+def _with_header_of_labels(lines):
+    """Return numbers below a header, where each cell has a label."""
+    labels = [_labels(line) for line in lines[:MOST_LINES]]
+    if not _are_most(labels):
+        return lines
+    (header, _), *_ = Counter(filter(None, labels)).most_common(1)
+    plain = [','.join(header)]
+    for line in lines:
+        if _labels(line) == header:
+            plain.append(','.join(match[1] for match in LABELLED_CELL.findall(line)))
+    return plain
+
+
+def _labels(line):
+    """Return the labels of a line of labelled numbers; () for another line."""
+    found = LABELLED_CELL.findall(line)
+    if len(found) < LEAST_CELLS or LABELLED_CELL.sub('', line).strip():
+        return ()
+    return tuple(label for label, _ in found)
+
+
+def _with_header_of_echo(lines):
+    """Return messages below the names of their fields, where `ros2 topic echo` printed them."""
+    messages = []
+    for line in lines[:MOST_LINES]:
+        cells = line.split(',')
+        stamped = len(cells) == CELLS_OF_ECHO and cells[0].isdecimal() and cells[1].isdecimal()
+        messages.append(stamped)
+    if not _are_most(messages):
+        return lines
+    return [','.join(ECHO_NAMES), *lines]
+
+
+def _are_most(found):
+    """Return whether most lines have a decoration."""
+    return bool(found) and sum(map(bool, found)) >= LEAST_SHARE * len(found)
