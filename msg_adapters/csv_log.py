@@ -1270,6 +1270,8 @@ def _require_time_of_turns(time, rate, imu, path):
     """
     if time.origin != 'values' or imu.stamp_ns[0] == imu.stamp_ns[-1]:
         return
+    if rate.unit == RAW_UNIT:  # converted later, with the unit that the user states
+        return
     period_s = float(np.median(np.diff(imu.stamp_ns))) * 1e-9
     if period_s <= 0.0:
         return
