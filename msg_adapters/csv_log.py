@@ -360,7 +360,10 @@ def _times(table, columns):
         columns = _with_unit(columns, lambda: _unit_of_sample_time_fine(values), table.path)
     columns = _with_unit(columns, lambda: _time_unit(values), table.path)
     tick_ns = 1e9 * _time_size(columns.unit)
-    stamp_ns, n_overflows = without_overflows(table.stamps(columns), tick_ns)
+    counter_ns = None
+    if values.dtype.kind == 'f':
+        counter_ns = values * tick_ns
+    stamp_ns, n_overflows = without_overflows(table.stamps(columns), tick_ns, counter_ns)
     return columns, stamp_ns, n_overflows
 
 

@@ -24,6 +24,11 @@ LOST_PERIODS = 5
 """An overflow may coincide with the loss of so many samples."""
 PERIOD_STEPS = 20
 """The period is the median of the first steps forward; before, no overflow is undone."""
+LONGEST_GAP_NS, GAP_SHARE = 60_000_000_000, 0.02
+"""
+Longest gap that an overflow may coincide with where the counter is known, ns and as a share of its
+size: a restart in it would look alike.
+"""
 LEAST_EQUAL_STEPS = 2
 """Steps back of one size from which on it is the size of a counter, whatever its width and tick."""
 
@@ -77,7 +82,9 @@ class OverflowSearch:
         return stamps
 
 
-def without_overflows(stamp_ns: np.ndarray, tick_ns: float = 1.0) -> tuple[np.ndarray, int]:
+def without_overflows(
+    stamp_ns: np.ndarray, tick_ns: float = 1.0, counter_ns: np.ndarray | None = None
+) -> tuple[np.ndarray, int]:
     """
     Return all stamps of a recording without overflows, and the number of overflows.
 
@@ -90,10 +97,19 @@ def without_overflows(stamp_ns: np.ndarray, tick_ns: float = 1.0) -> tuple[np.nd
         Stamps, ns.
     tick_ns : float
         Tick of the counter, in addition to the usual ones.
+    counter_ns : ndarray, shape (n,), optional
+        Readings of the counter itself, ns, where they are known: an overflow in a gap leads from
+        its end to its beginning.
 
     """
     search = OverflowSearch(tick_ns)
     stamps = search.undone(stamp_ns)
+    if counter_ns is not None:
+        sizes_ns = sizes_of_counters((*TICKS_NS, tick_ns))
+        for place in np.flatnonzero(np.diff(stamps) < -LEAST_STEP_NS):
+            size = _size_in_gap(counter_ns[place], counter_ns[place + 1], sizes_ns)
+            stamps[place + 1 :] += size
+            search.count += bool(size)
     steps = np.diff(stamps)
     forward = steps[steps > 0]
     back = np.flatnonzero(steps < -LEAST_STEP_NS)
@@ -110,3 +126,12 @@ def without_overflows(stamp_ns: np.ndarray, tick_ns: float = 1.0) -> tuple[np.nd
     shift = np.zeros(len(stamps), np.int64)
     shift[back + 1] = np.round(sizes).astype(np.int64)
     return stamps + np.cumsum(shift), search.count + len(back)
+
+
+def _size_in_gap(before_ns, after_ns, sizes_ns):
+    """Return the size of the counter that overflows between two of its readings; 0 for none."""
+    for size in sizes_ns:
+        longest_gap = min(LONGEST_GAP_NS, GAP_SHARE * size)
+        if before_ns < size and size - before_ns + after_ns < longest_gap:
+            return size
+    return 0

@@ -105,3 +105,21 @@ def test_a_text_log_with_a_counter_that_overflows(tmp_path, clean):
     assert log.n_overflows == 1
     steps = np.diff(log.imu.stamp_ns)
     assert steps == pytest.approx(np.diff(clean.stamp_ns), abs=2_000)
+
+
+@pytest.mark.parametrize(
+    ('bits', 'tick_ns', 'gap'), [(32, 1e3, 7.0), (32, 1e6, 7.0), (16, 1e6, 0.9)]
+)
+def test_an_overflow_within_a_gap_is_undone_and_a_restart_is_not(bits, tick_ns, gap):
+    rate = 50.0
+    time = np.arange(2000) / rate
+    time = time[(time < 21.3) | (time > 21.3 + gap)]
+    size_ns = round(2**bits * tick_ns)
+    counter_ns = (np.round(time * 1e9).astype(np.int64) + size_ns - 21_500_000_000) % size_ns
+    found, count = without_overflows(10**18 + counter_ns, tick_ns, counter_ns.astype(float))
+    np.testing.assert_allclose((found - found[0]) * 1e-9, time, atol=1e-6)
+    assert count == 1
+    # The counter begins again long before its end.
+    restart_ns = np.where(time < 21.3, time + 3.0, time - 21.0) * 1e9
+    _, count = without_overflows(restart_ns.astype(np.int64), tick_ns, restart_ns)
+    assert count == 0
