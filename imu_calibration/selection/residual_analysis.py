@@ -4,7 +4,7 @@ The search of `calibrate` and `diagnose`.
 Supported effects, without findings that a formula or a regime replaces.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -24,10 +24,17 @@ from imu_calibration.selection.regimes import RestRegime, find_regimes
 from imu_calibration.selection.residual_blocks import BlockFits, RestBlocks, rest_blocks
 from imu_calibration.selection.spectrum import find_sway, find_tones
 from imu_calibration.selection.stamp_jitter import StampJitter
-from imu_calibration.selection.unexplained import Unexplained, beyond_noise, unexplained
+from imu_calibration.selection.unexplained import (
+    Unexplained,
+    beyond_noise,
+    scatter_in_motion,
+    unexplained,
+)
 
 MIN_FORMULA_SDS = 10.0
 """Standard deviations above noise at rest from which a formula is searched in moving blocks."""
+ALIKE = 3.0
+"""Scatter in motion of an axis over that of the middle axis, up to which all axes share it."""
 NOT_NEEDED = 0.05
 """
 Least share of a finding's reduction of the residual that must remain with a formula or a regime in
@@ -189,8 +196,13 @@ class ResidualAnalysis(Investigation):
         proposal = self.proposals[sensor]
         regimes = self.regimes(sensor, formula=self.columns(sensor, proposal))
         first = {regime.axis: regime for regime in reversed(regimes)}
-        if not rest.significant and proposal is None and _is_noise_of_motion(first.values()):
-            first = {}
+        if not rest.significant and proposal is None:
+            scatter = scatter_in_motion(self.problem, sensor)
+            first = {
+                axis: regime
+                for axis, regime in first.items()
+                if not _is_noise_of_motion(regime, scatter)
+            }
         if not rest.significant and proposal is None and not first:
             return beyond_noise(self.problem, sensor, rest)
         axes = rest.axes or (self.fits(sensor).axes() if proposal is not None else tuple(first))
@@ -275,19 +287,23 @@ def without_superseded(found: ResidualAnalysis) -> ResidualAnalysis:
     return found
 
 
-def _is_noise_of_motion(regimes: Collection[RestRegime]) -> bool:
+def _is_noise_of_motion(regime: RestRegime, scatter: np.ndarray) -> bool:
     """
-    Return whether regimes are noise that grows with the speed: scatter of all axes, no offset.
+    Return whether a regime is noise that grows with the motion, on the other axes too.
 
-    The speed of the sensor or of a joint. Vibration of the drives, no error of the model: a cause
-    in the sensor acts on one axis, a place of the table at an angle.
+    Vibration of the drives, no error of the model: a cause in the sensor acts on one axis, a place
+    of the table at an angle.
+
+    Parameters
+    ----------
+    regime : RestRegime
+    scatter : ndarray, shape (3,)
+        Excess variance of moving samples of each axis over the noise at rest.
+
     """
-    if {regime.axis for regime in regimes} != set(AXES):
+    if regime.offset or regime.variable.split(' ')[0] not in ('speed', 'rate'):
         return False
-    for regime in regimes:
-        if regime.offset or regime.variable.split(' ')[0] != 'speed':
-            return False
-    return True
+    return bool(scatter[AXES.index(regime.axis)] < ALIKE * np.median(scatter))
 
 
 def superseded(found: ResidualAnalysis) -> list[Question]:

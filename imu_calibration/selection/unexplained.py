@@ -132,18 +132,19 @@ def _scatter_of_one_axis(problem: LinearisedProblem, sensor: str) -> np.ndarray:
     Errors of the reference (encoder steps, jitter of the stamps) scatter all axes in motion, a
     cause in the sensor its own axis.
     """
+    excess = scatter_in_motion(problem, sensor)
+    least = np.maximum(np.median(excess), problem.noise[sensor].at_rest_only().low_variance)
+    return np.where(excess > MUCH_SCATTER * least, excess, 0.0)
+
+
+def scatter_in_motion(problem: LinearisedProblem, sensor: str) -> np.ndarray:
+    """Return the excess variance of moving samples over the noise at rest, shape (3,)."""
     noise, recording = problem.noise[sensor].at_rest_only(), problem.recording
     kinds, counts = recording.kind[recording.moving], recording.count[recording.moving]
     if not len(kinds):
         return np.zeros(3)
-    excess = np.maximum(
-        np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts)
-        - noise.low_variance,
-        0.0,
-    )
-    return np.where(
-        excess > MUCH_SCATTER * np.maximum(np.median(excess), noise.low_variance), excess, 0.0
-    )
+    in_motion = np.average([noise.row_variance(kind) for kind in kinds], axis=0, weights=counts)
+    return np.maximum(in_motion - noise.low_variance, 0.0)
 
 
 def biases_off(model: SensorModel, rests: Mapping[str, Unexplained]) -> list[dict[str, float]]:
