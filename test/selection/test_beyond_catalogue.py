@@ -5,6 +5,7 @@ Where the rest sits, the formula that it follows, and the way of that formula in
 """
 
 import json
+import re
 from dataclasses import replace
 from functools import lru_cache
 
@@ -256,6 +257,15 @@ def test_the_place_is_found(kind, size):
     assert len(known) == 24 and all(sd > 0 for _, sd in known.values())
 
 
+def hidden_rms(cause, found):
+    """Return the rms of the hidden signal over the samples of the locked windows and the axes."""
+    time = np.concatenate(
+        [window.time for window, locked in zip(found.used, found.problem.locked) if locked]
+    )
+    signal = [np.interp(time, cause.time, column) for column in cause.signal.T]
+    return float(np.sqrt(np.mean(np.square(signal))))
+
+
 def test_the_gain_of_a_formula_is_that_of_corrected_readings():
     """
     Beyond the noise at rest the error before is the hidden signal, all samples of locked windows.
@@ -265,11 +275,7 @@ def test_the_gain_of_a_formula_is_that_of_corrected_readings():
     (recording, cause), (found, _, _) = recorded('scale_under_load'), looked('scale_under_load')
     proposal = found.proposals['gyroscope']
     gain = gains_of_formulas(found, recording.table, [proposal])['gyroscope']
-    time = np.concatenate(
-        [window.time for window, locked in zip(found.used, found.problem.locked) if locked]
-    )
-    signal = [np.interp(time, cause.time, column) for column in cause.signal.T]
-    hidden = float(np.sqrt(np.mean(np.square(signal))))
+    hidden = hidden_rms(cause, found)
     before, after = gain.beyond_noise
     assert (gain.of, gain.measure) == (APPLIED, SAMPLES)
     assert before == pytest.approx(hidden, rel=0.1)
@@ -284,6 +290,9 @@ def test_the_formula_is_printed():
         part in lines
         for part in ('f_z * w', f'axis {min(cause.axes)}', found.proposals['gyroscope'].sentence)
     )
+    # The printed error beyond noise is that of the hidden signal in the held-out windows, exactly.
+    printed = re.search(r'beyond the noise at rest ([\d.e-]+) deg/s before', lines)
+    assert float(printed[1]) * np.pi / 180 == pytest.approx(hidden_rms(cause, found), rel=0.25)
 
 
 def test_a_mount_that_bends_is_named_in_both_sensors():
