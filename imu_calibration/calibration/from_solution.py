@@ -13,7 +13,7 @@ from imu_calibration.core.readings import RawReadings
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected
-from imu_calibration.document.verdict import incomplete_motions, judged
+from imu_calibration.document.verdict import incomplete_windows, judged
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.forward_equations import centred
 from imu_calibration.effects.sensor_model import SensorModel
@@ -147,7 +147,7 @@ def motions_needed(
     table : Table
     quality : mapping
         Statistics of the document, from which it follows whether the model is incomplete
-        (`verdict.incomplete_motions`).
+        (`verdict.incomplete_windows`).
 
     """
     prior_sd = make_prior(solution.model).sd
@@ -173,7 +173,7 @@ def motions_needed(
         # Both sensors determine table and clock.
         sensors = (section,) if section in SENSORS else SENSORS
         of_misfit: tuple[str, ...] = ()
-        if any(incomplete_motions(quality, sensor) for sensor in sensors):
+        if any(incomplete_windows(quality, sensor) for sensor in sensors):
             # Bias processes describe the error of the model.
             of_misfit = (BIAS_PROCESS,)
         if any(each.startswith(sensors) and is_shown[each] for each in solution.not_believed):
@@ -354,6 +354,12 @@ def statistics(solution: Solution, gathered: SessionData) -> dict:
             'chi2_per_dof': solution.chi2_per_dof[sensor],
             'slow_over_fast': solution.slow_over_fast.get(sensor, {}),
         }
+        if sensor in solution.attitude:
+            dependence = solution.attitude[sensor]
+            result[sensor]['attitude'] = {
+                'variance_ratio': dependence.ratio,
+                'p_value': dependence.p_value,
+            }
         if sensor in solution.session_biases:
             result[sensor] |= {
                 'between_recordings_sd': noise.session_sd,

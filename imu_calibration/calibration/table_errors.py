@@ -7,7 +7,7 @@ import numpy as np
 
 from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.calibration.window_observations import TableResult
-from imu_calibration.document.verdict import incomplete_motions
+from imu_calibration.document.verdict import incomplete_windows
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import Status
 from imu_calibration.kinematics.table import Table
@@ -73,7 +73,7 @@ def calibrate_with_table_errors(
 def _unlike_noise(result: TableResult) -> bool:
     """Return whether moving windows scatter clearly more than the noise at rest."""
     statistics = result.calibration.statistics
-    return any(incomplete_motions(statistics, sensor) for sensor in SENSORS)
+    return any(incomplete_windows(statistics, sensor) for sensor in SENSORS)
 
 
 def _table_error_findings(result: TableResult) -> list[CheckFinding]:

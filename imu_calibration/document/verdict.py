@@ -77,6 +77,8 @@ MIN_STRUCTURE = 1.25
 Ratio of the slow over the fast residual variance from which the residual of moving windows has
 structure in time (`BandMisfit.slow_over_fast`).
 """
+ATTITUDE_P_VALUE = 1e-3
+"""Chance of a dependence on the attitude of the means at rest of a complete model."""
 LOUDER_ONLY = 'without structure in time: noise or vibration that is larger in motion'
 """Description of residuals that are larger in motion, but not correlated."""
 MISFIT_FACTOR = 2.0
@@ -293,13 +295,15 @@ def misfit_ratios(statistics: Mapping, sensor: str) -> dict[str, float]:
     return ratios
 
 
-def incomplete_motions(statistics: Mapping, sensor: str) -> dict[str, float]:
+def incomplete_windows(statistics: Mapping, sensor: str) -> dict[str, float]:
     """
-    Return kind of window -> ratio of `misfit_ratios` where the model of the sensor is incomplete.
+    Return kind of window -> ratio of variances where the model of the sensor is incomplete.
 
-    The ratio exceeds `NOTED_MISFIT`, and the residual is correlated in time
-    (`BandMisfit.slow_over_fast`, if it is known). Without a rest the ratio compares the residual
-    with its slow part, so that every excess has structure. Arguments as for `misfit_ratios`.
+    The ratio exceeds `NOTED_MISFIT`. In motion it is that of `misfit_ratios`, with a residual that
+    is correlated in time (`BandMisfit.slow_over_fast`, if it is known). Without a rest it compares
+    the residual with its slow part, so that every excess has structure. At rest it is the variance
+    of the means over that of a significant fit with the attitude (`AttitudeDependence`). Arguments
+    as for `misfit_ratios`.
     """
     slow_over_fast = statistics.get(sensor, {}).get('slow_over_fast') or {}
     at_rest = rested(statistics)
@@ -308,6 +312,10 @@ def incomplete_motions(statistics: Mapping, sensor: str) -> dict[str, float]:
         has_structure = slow_over_fast.get(kind, np.inf) > MIN_STRUCTURE
         if ratio > NOTED_MISFIT and (has_structure or not at_rest):
             found[kind] = ratio
+    attitude = statistics.get(sensor, {}).get('attitude')
+    if attitude and attitude['p_value'] < ATTITUDE_P_VALUE:
+        if attitude['variance_ratio'] > NOTED_MISFIT:
+            found['static'] = attitude['variance_ratio']
     return found
 
 
@@ -326,7 +334,7 @@ def helps_everywhere(entry: ProofEntry | None) -> bool:
 
 def motion_misfits(calibration: Calibration) -> list[Reason]:
     """
-    Return the residuals in motion above the noise at rest.
+    Return the residuals in motion above the noise at rest, and means at rest that are not noise.
 
     Notes, or warnings where residuals with structure in time are far above; diagnoses use the same
     test. Residuals without structure are noise or vibration, which no effect of a model explains.
@@ -344,7 +352,7 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
             if at_rest and helps_everywhere(calibration.proof.get(sensor))
             else ''
         )
-        incomplete = incomplete_motions(calibration.statistics, sensor)
+        incomplete = incomplete_windows(calibration.statistics, sensor)
         for kind, ratio in misfit_ratios(calibration.statistics, sensor).items():
             if ratio <= NOTED_MISFIT:
                 continue
@@ -366,12 +374,28 @@ def motion_misfits(calibration: Calibration) -> list[Reason]:
                     sensors=(sensor,),
                 )
             )
+        if 'static' in incomplete:
+            size = (
+                f'the {sensor} means at rest scatter {np.sqrt(incomplete["static"]):.1f} times as'
+                ' much as around a dependence on the attitude'
+            )
+            reasons.append(
+                Reason(
+                    NOTE,
+                    f'{size}: the model is incomplete{more}',
+                    'find the cause',
+                    key='diagnose',
+                    sensors=(sensor,),
+                )
+            )
     return reasons
 
 
 def _misfit(calibration: Calibration, sensor: str) -> float:
     """Return the scatter of window means that the model may cause, in the unit of the sensor."""
     if any(sensor in reason.sensors for reason in _strange_causes(calibration)):
+        return np.inf
+    if incomplete_windows(calibration.statistics, sensor):
         return np.inf
     # Parameters that are weak because of an error of the model.
     if REMEDIES[MODEL_ERROR, DRIFT, REJECTED] in _needs_of(calibration, sensor):

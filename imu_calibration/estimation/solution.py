@@ -13,6 +13,7 @@ import numpy as np
 
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.attitude_dependence import AttitudeDependence
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
 
@@ -342,6 +343,9 @@ class Solution:
     Sensor -> kind of moving window -> `BandMisfit.slow_over_fast`: above 1 the residual has
     structure in time.
     """
+
+    attitude: dict[str, AttitudeDependence] = field(default_factory=dict)
+    """Sensor -> its means at rest with and without a dependence on the attitude."""
 
     replaced: tuple[str, ...] = ()
     """

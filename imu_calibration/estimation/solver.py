@@ -8,6 +8,10 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulated_rows import AccumulatedRows, not_separable
+from imu_calibration.estimation.attitude_dependence import (
+    AttitudeDependence,
+    attitude_dependence,
+)
 from imu_calibration.estimation.held_parameters import (
     Factors,
     implausible_parameters,
@@ -147,6 +151,7 @@ def solve(
         _session_biases(system, values, noises),
         not_believed,
         slow_over_fast=quality.slow_over_fast,
+        attitude=quality.attitude,
     )
 
 
@@ -293,6 +298,8 @@ class _FitQuality:
     """Sensor -> rms residual of the moving samples and of the means of windows, SI, shape (2,)."""
     slow_over_fast: dict[str, dict[str, float]]
     """Sensor -> kind -> `BandMisfit.slow_over_fast`."""
+    attitude: dict[str, AttitudeDependence]
+    """Sensor -> its means at rest with the attitude, with sufficiently many rests."""
 
 
 def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> _FitQuality:
@@ -300,8 +307,12 @@ def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> 
     chi2 = {}
     rms = {}
     slow_over_fast = {}
+    attitude = {}
     for sensor in SENSORS:
         noise = noises[sensor]
+        dependence = attitude_dependence(system, sensor, values, noise=noise)
+        if dependence is not None:
+            attitude[sensor] = dependence
         misfit = system.misfit(sensor, system.means[sensor], values)
         white = system.whitened(misfit[:, :, None], noise)
         freedom = max(white.size - _parameters_of_means(system, sensor), 1)
@@ -319,7 +330,7 @@ def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> 
             slow_over_fast[sensor][kind] = bands.slow_over_fast(noise.inflation)
         rms_moving = np.sqrt(moving_squares / moving_count) if moving_count else np.nan
         rms[sensor] = np.array([rms_moving, np.sqrt((misfit**2).mean())])
-    return _FitQuality(chi2, rms, slow_over_fast)
+    return _FitQuality(chi2, rms, slow_over_fast, attitude)
 
 
 def _session_biases(

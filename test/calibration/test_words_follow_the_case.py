@@ -10,7 +10,8 @@ from imu_calibration.calibration.from_solution import motions_needed
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.comparison import compare
-from imu_calibration.document.verdict import motion_misfits
+from imu_calibration.document.decision import NOTE
+from imu_calibration.document.verdict import incomplete_windows, motion_misfits
 from imu_calibration.estimation.solution import (
     BIAS_PROCESS,
     GRAVITY,
@@ -143,6 +144,33 @@ def test_a_missing_effect_on_a_table_needs_its_cause_and_no_motions():
     assert not any('window to window' in reason.what for reason in result.verdict.reasons)
 
 
+@pytest.mark.parametrize(
+    ('effects', 'keys'),
+    [
+        ({'gyro_quadratic': None, 'gyro_g_sensitivity': None}, {'diagnose'}),
+        ({'gyro_quadratic': None}, set()),
+    ],
+)
+def test_a_missing_effect_that_shows_at_rest_only_needs_its_cause(effects, keys):
+    """A g-sensitivity scatters the means at rest; a later or warmer recording scatters as much."""
+    session = make_session(9031, effects, profile='short', noise='realistic', grade='tactical')
+    found = calibrate_recordings(
+        SampleBlock(session.imu, session.joints),
+        Table.from_mapping(session.table),
+        gyroscope_model='bias+matrix+gyro_quadratic',
+        model_as_asked=True,
+    )
+    about = [
+        reason
+        for reason in found.result.verdict.reasons
+        if reason.sensors == ('gyroscope',) and reason.word is NOTE
+    ]
+    assert {reason.key for reason in about} == keys
+    assert set(incomplete_windows(found.calibration.statistics, 'gyroscope')) == (
+        {'static'} if keys else set()
+    )
+
+
 def test_an_effect_that_is_held_for_a_misfit_needs_its_cause_and_no_motions():
     """Arms are not in the model: a quadratic response takes their part, and is not believed."""
     session = make_session(8, profile='short', noise='realistic', grade='industrial', arms=True)
@@ -195,7 +223,11 @@ def test_needs_and_verdict_have_one_rule_for_an_incomplete_model():
     louder = misfit | {'slow_over_fast': {'spin': 0.9}}
     of_stamps = {'stamp_jitter': {'variance_ratio': {'gyroscope': {'spin': 15.0}}}}
     rests, none = {'windows': {'static': 9}}, {'windows': {'spin': 9}}
+    tilting = {'attitude': {'variance_ratio': 9.0, 'p_value': 1e-9}}
+    by_chance = {'attitude': {'variance_ratio': 9.0, 'p_value': 0.1}}
     for quality, is_incomplete in (
+        ({'gyroscope': tilting} | rests, True),
+        ({'gyroscope': by_chance} | rests, False),
         ({'gyroscope': misfit} | rests, True),
         ({'gyroscope': louder} | rests, False),
         ({'gyroscope': louder} | none, True),

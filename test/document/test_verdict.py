@@ -9,7 +9,7 @@ from imu_calibration.document.calibration import Calibration, parameter_rows
 from imu_calibration.document.decision import DECISION, HELPS, NOTE, PARAMETERS, UNPROVEN, WARNING
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
-from imu_calibration.document.verdict import incomplete_motions, judge, judged, motion_misfits
+from imu_calibration.document.verdict import incomplete_windows, judge, judged, motion_misfits
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import (
     DETERMINED,
@@ -156,7 +156,7 @@ def test_only_residuals_with_structure_show_an_incomplete_model(
     found = motion_misfits(calibration(statistics=statistics))
     assert [reason.word for reason in found] == kinds
     assert [reason.key for reason in found] == keys
-    assert bool(incomplete_motions(statistics, 'gyroscope')) == (keys == ['diagnose'])
+    assert bool(incomplete_windows(statistics, 'gyroscope')) == (keys == ['diagnose'])
 
 
 def test_a_regime_in_which_the_error_grows_is_a_warning_and_leaves_the_decision():
