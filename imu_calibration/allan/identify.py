@@ -9,6 +9,7 @@ from imu_calibration import __version__
 from imu_calibration.allan.curve import AllanCurve, Detrending, RestReader, averaging_factors
 from imu_calibration.allan.figures import AxisFigures, NoiseFigures
 from imu_calibration.allan.moment_fit import Moments, Whitener
+from imu_calibration.allan.moved_at_rest import tilt_at_rest
 from imu_calibration.allan.processes import RANDOM_WALK, WHITE, NoiseProcess, ScaleCovariance
 from imu_calibration.allan.still_parts import LEFT_OUT, StillPart, Survey, still_parts, survey
 from imu_calibration.allan.terms import (
@@ -340,6 +341,7 @@ def read_rest(
             ' you can',
             code='rest_too_short',
         )
+    _require_no_tilt(found, parts)
     clock = _Clock(found.epochs)
     search = TrendSearch(_blocks(found, parts, clock))
     skipped_sensors = {*found.absent, *found.unusable}
@@ -370,6 +372,23 @@ def read_rest(
         reader=reader,
         unusable=unusable,
     )
+
+
+def _require_no_tilt(found, parts):
+    """Refuse a rest in which gravity turns slowly and the rates explain it."""
+    if found.absent or found.unusable:
+        return
+    for chunks, of_epoch in zip(found.epochs, parts, strict=True):
+        for part in of_epoch:
+            tilt = tilt_at_rest(chunks.time[part.chunks], chunks.mean[part.chunks])
+            if tilt:
+                raise InputError(
+                    'the IMU must lie still, it was tilted slowly by'
+                    f' {np.degrees(tilt):.2g} deg (rms) during a rest of {part.seconds:.0f} s, as'
+                    ' both sensors measure; put it on something heavy, or omit that time',
+                    key='exclude',
+                    code='moved_at_rest',
+                )
 
 
 def _axes_of(sensors):

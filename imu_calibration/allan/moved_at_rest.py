@@ -1,0 +1,59 @@
+"""Slow tilts within a rest, which both sensors measure and no bias explains."""
+
+import numpy as np
+
+LEAST_CHUNKS = 80
+"""Chunks of a rest, at least."""
+DEGREE = 4
+"""
+Degree of the polynomial removed from both: warm-up, drift, and the bias in the sum of the rates.
+"""
+LEAST_TILT = 5e-4
+"""Rms tilt from which on it is motion, rad."""
+LEAST_EXPLAINED = 0.8
+"""Share of the changes of gravity's direction that the rates explain, at least."""
+MOST_FACTOR = 1.4
+"""Ratio of both tilts, at most: scales are off by less."""
+
+
+def tilt_at_rest(time: np.ndarray, mean: np.ndarray) -> float:
+    """
+    Return the rms tilt of a rest that both sensors measure, rad; 0.0 for none.
+
+    The direction u of the specific force turns by ``du/dt = u x (rate - bias)``. The bias of the
+    accelerometer changes u too, without the rates, and the bias of the gyroscope changes the sum of
+    the rates, without u; both are smooth.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Middle of short means, s.
+    mean : ndarray, shape (n, 6)
+        Mean force (m/s^2) and rate (rad/s).
+
+    """
+    length = np.linalg.norm(mean[:, :3], axis=1)
+    if len(time) < LEAST_CHUNKS or not np.isfinite(mean).all() or not length.min() > 0:
+        return 0.0
+    direction = mean[:, :3] / length[:, None]
+    step = np.diff(time, prepend=time[0])[:, None]
+    rate = mean[:, 3:] - mean[:, 3:].mean(axis=0)
+    predicted = np.cumsum(np.cross(direction, rate) * step, axis=0)
+
+    # Movement beyond a polynomial in time.
+    scaled_time = np.linspace(-1.0, 1.0, len(time))
+    basis, _ = np.linalg.qr(np.vander(scaled_time, DEGREE + 1))
+    predicted = predicted - basis @ (basis.T @ predicted)
+    measured = direction - basis @ (basis.T @ direction)
+
+    # measured = factor predicted
+    power = float(np.sum(predicted**2))
+    total = float(np.sum(measured**2))
+    tilt = np.sqrt(total / len(time))
+    if not power > 0.0 or tilt < LEAST_TILT:
+        return 0.0
+    factor = float(np.sum(predicted * measured)) / power
+    explained = factor**2 * power / total
+    if explained < LEAST_EXPLAINED or not 1 / MOST_FACTOR < factor < MOST_FACTOR:
+        return 0.0
+    return float(tilt)
