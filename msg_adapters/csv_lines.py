@@ -18,7 +18,7 @@ LEAST_CELLS = 4
 LEAST_SHARE = 0.8
 """Share of these lines with the decoration, at least."""
 CELLS_OF_ECHO = 40
-"""Numbers of a sensor_msgs/Imu, of which `ros2 topic echo --csv` prints no header."""
+"""Numbers of a sensor_msgs/Imu, of which `ros2 topic echo` prints no header."""
 ECHO_NAMES = (
     *('header.stamp.sec', 'header.stamp.nanosec', 'header.frame_id'),
     *(f'orientation.{axis}' for axis in 'xyzw'),

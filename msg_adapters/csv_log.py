@@ -1302,7 +1302,7 @@ def _require_time_of_turns(time, rate, imu, path):
     raise InputError(
         f'the unit of time in {path} must agree with the turns of gravity, {time.names[0]} was read'
         f' in {time.unit}, a rate in {rate.unit} fits ticks of about {tick_s * 1e6:.3g} us; convert'
-        f' it with --columns time={time.names[0]}:{ticks}, or state the unit of the rate',
+        f' it with the column stated: time={time.names[0]}:{ticks}, or state the unit of the rate',
         key='columns',
         code='time_ticks',
     )
