@@ -111,7 +111,7 @@ def outliers(values: np.ndarray) -> np.ndarray:
     middle = np.median(deviation, axis=0) / NORMAL_QUARTILE
     tail = np.quantile(deviation, TAIL_QUANTILE, axis=0) / TAIL_SD
     scatter = np.maximum(middle, tail)
-    # Most readings are equal: the scatter of those that change, such as by one step.
+    # Most readings are equal: the scatter of the remaining ones, such as by one step.
     for column in np.flatnonzero(middle == 0):
         changes = np.abs(np.diff(values[:, column]))
         changes = changes[changes > 0]

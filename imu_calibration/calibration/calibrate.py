@@ -55,7 +55,7 @@ def conclude(
     data, changes = solved.data, solved.extension.changes
     tolerances = tolerances_of(solved.solution.model, options.tolerances)
 
-    # What the solution says of the recording, and the errors of the reference in its covariance.
+    # Findings that follow from the solution; errors of the reference enter its covariance.
     gathered = replace(data.gathered, findings=data.findings(solved.solution))
     solution = with_weak_replaced(data.with_reference_errors(solved.solution), tolerances)
 
@@ -67,7 +67,7 @@ def conclude(
     applied = with_plain_fits(solution, fits)
     proof = held_out.proof(fits)
 
-    # What is not determined, and the motion or knowledge that would determine it.
+    # Parameters that are not determined, each with the motion or knowledge that determines it.
     statistics = data.statistics(applied)
     needs = data.needs(applied, tolerances, quality={**statistics, **changes.to_mapping()})
 

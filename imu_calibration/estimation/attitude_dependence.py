@@ -1,7 +1,5 @@
 """Means at rest that depend on the attitude, which the parameters of the model do not explain."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
@@ -9,6 +7,7 @@ from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.noise_model import NoiseModel, sessions_of
 from imu_calibration.estimation.scaled_solve import orthonormal_basis
+from imu_calibration.estimation.solution import AttitudeDependence
 from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.whitening import Whitening
 
@@ -16,16 +15,6 @@ MIN_SPARE = 6
 """Fewest degrees of freedom that must remain after the fit of the attitude."""
 PRODUCTS = np.triu_indices(3)
 """Axes of the six products of two components of gravity."""
-
-
-@dataclass(frozen=True)
-class AttitudeDependence:
-    """Scatter of the means at rest with and without a dependence on the attitude."""
-
-    ratio: float
-    """Variance of the residuals per degree of freedom, over that of a fit with the attitude."""
-    p_value: float
-    """Probability of so large a fall by chance."""
 
 
 def attitude_dependence(

@@ -13,7 +13,6 @@ import numpy as np
 
 from imu_calibration.core.text_enum import StrEnum
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.estimation.attitude_dependence import AttitudeDependence
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
 
@@ -294,6 +293,16 @@ def tolerances_of(model: SensorModel, overrides: dict | None = None) -> np.ndarr
             for e in model.effects
         ]
     )
+
+
+@dataclass(frozen=True)
+class AttitudeDependence:
+    """Scatter of the means at rest with and without a dependence on the attitude."""
+
+    ratio: float
+    """Variance of the residuals per degree of freedom, over that of a fit with the attitude."""
+    p_value: float
+    """Probability of so large a fall by chance."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,7 @@ from imu_calibration.core.errors import NotObservableError
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulated_rows import AccumulatedRows, not_separable
-from imu_calibration.estimation.attitude_dependence import (
-    AttitudeDependence,
-    attitude_dependence,
-)
+from imu_calibration.estimation.attitude_dependence import attitude_dependence
 from imu_calibration.estimation.held_parameters import (
     Factors,
     implausible_parameters,
@@ -26,7 +23,13 @@ from imu_calibration.estimation.session_noise import (
     moving_misfit,
     updated_noise,
 )
-from imu_calibration.estimation.solution import BIAS_PROCESS, HELD_PRIORS, SAMPLE_NOISE, Solution
+from imu_calibration.estimation.solution import (
+    BIAS_PROCESS,
+    HELD_PRIORS,
+    SAMPLE_NOISE,
+    AttitudeDependence,
+    Solution,
+)
 from imu_calibration.estimation.weighted_system import WeightedSystem
 from imu_calibration.estimation.whitening import predict_session_offsets
 from imu_calibration.estimation.window_outliers import outlier_windows
