@@ -45,6 +45,8 @@ class Variable:
     """Value at each row, in the unit of the edges, shape (n,)."""
     starts: np.ndarray
     """First row of each block, shape (b,)."""
+    is_rate: bool = False
+    """Whether it is a rate or speed of the motion."""
 
     @property
     def marks(self) -> np.ndarray:
@@ -146,18 +148,19 @@ def variables_of(blocks: RestBlocks, joint_names: Sequence[str]) -> list[Variabl
     """Return the variables of regimes in this recording; the first is reported among equals."""
     ref, starts, found = blocks.ref, blocks.starts, []
     each = partial(ranged, starts=starts)
+    rates = partial(ranged, unit='deg/s', starts=starts, is_rate=True)
     for k, name in enumerate(joint_names):
         if np.ptp(ref.joint_angle[:, k]) > 0.5:
             found.append(_cyclic(f'angle of {name}', ref.joint_angle[:, k] / DEG, starts))
-        found += each(f'rate of {name}', ref.joint_rate[:, k] / DEG, 'deg/s')
-        found += each(f'speed of {name}', np.abs(ref.joint_rate[:, k]) / DEG, 'deg/s')
+        joint_rate = ref.joint_rate[:, k] / DEG
+        found += rates(f'rate of {name}', joint_rate)
+        found += rates(f'speed of {name}', np.abs(joint_rate))
         found += _before_rest(name, ref.joint_rate[:, k], starts)
     speed = np.linalg.norm(ref.rate_s, axis=1)
-    found += each('speed', speed / DEG, 'deg/s') + each(
-        'specific force', np.linalg.norm(ref.force_s, axis=1), 'm/s^2', least=0.5
-    )
+    found += rates('speed', speed / DEG)
+    found += each('specific force', np.linalg.norm(ref.force_s, axis=1), 'm/s^2', least=0.5)
     for k, axis in enumerate(AXES):
-        found += each(f'rate about {axis}', ref.rate_s[:, k] / DEG, 'deg/s')
+        found += rates(f'rate about {axis}', ref.rate_s[:, k] / DEG)
         found += each(f'specific force along {axis}', ref.force_s[:, k], 'm/s^2', least=0.5)
     found += each('time', ref.time, 's')
     if blocks.warms and ref.temperature_c is not None:
@@ -203,7 +206,13 @@ def _cyclic(name: str, degrees: np.ndarray, starts: np.ndarray) -> Variable:
 
 
 def ranged(
-    name: str, values: np.ndarray, unit: str, *, starts: np.ndarray, least: float = 1e-3
+    name: str,
+    values: np.ndarray,
+    unit: str,
+    *,
+    starts: np.ndarray,
+    least: float = 1e-3,
+    is_rate: bool = False,
 ) -> list[Variable]:
     """
     Return the variable of a value at each row, in bins of equal numbers of blocks.
@@ -228,7 +237,7 @@ def ranged(
         return f'while the {name} is {span}'
 
     bins = np.clip(np.searchsorted(edges, values, side='right') - 1, 0, len(edges) - 2)
-    return [Variable(name, bins, edges, False, words, values, starts)]
+    return [Variable(name, bins, edges, False, words, values, starts, is_rate)]
 
 
 def _classes(

@@ -94,6 +94,8 @@ class RestRegime:
     """
     Where it begins and ends, SI or degrees for angles; an angle may begin beyond where it ends.
     """
+    is_rate: bool = False
+    """Whether the variable is a rate or speed of the motion."""
 
     def to_mapping(self) -> dict:
         """Return the regime as plain data."""
@@ -364,6 +366,7 @@ class RegimeSearch:
                         self.time,
                         True,
                         bounds,
+                        each.variable.is_rate,
                     )
                 )
         return _largest_share_first(found)
@@ -462,6 +465,7 @@ class RegimeSearch:
                         self.time,
                         False,
                         bounds,
+                        variable.is_rate,
                     )
                 )
         return _largest_share_first(found)

@@ -301,7 +301,7 @@ def _is_noise_of_motion(regime: RestRegime, scatter: np.ndarray) -> bool:
         Excess variance of moving samples of each axis over the noise at rest.
 
     """
-    if regime.offset or regime.variable.split(' ')[0] not in ('speed', 'rate'):
+    if regime.offset or not regime.is_rate:
         return False
     return bool(scatter[AXES.index(regime.axis)] < ALIKE * np.median(scatter))
 
