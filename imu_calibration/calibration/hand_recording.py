@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -33,7 +34,7 @@ class HandRecording:
     unusable: dict[str, str] = field(default_factory=dict)
     """Sensor with readings that cannot be used -> why; `imu` marks it as absent."""
 
-    @property
+    @cached_property
     def gathered(self) -> SessionData:
         """Data of the recording for the document, without parameters."""
         imu, warm = self.imu, self.temperature_c

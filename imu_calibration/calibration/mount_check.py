@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import fdtrc
 
+from imu_calibration.core.distributions import f_sf
 from imu_calibration.core.units import DEG
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.estimation.solution import Solution
@@ -64,7 +64,7 @@ class CommonTurn:
         """
         whole = np.sum((self.vector / self.sd) ** 2) / len(self.vector)
         about_axis = (axis @ self.vector) ** 2 / (axis**2 @ self.sd**2)
-        chance = min(fdtrc(3, self.freedom, whole), fdtrc(1, self.freedom, about_axis))
+        chance = min(f_sf(whole, 3, self.freedom), f_sf(about_axis, 1, self.freedom))
         return bool(chance < NOTED_CHANCE)
 
 

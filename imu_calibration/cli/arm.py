@@ -34,7 +34,7 @@ def add_arguments(parser: OneLineParser) -> None:
 def run(options: Options) -> VerbResult:
     """Estimate and print."""
     from imu_calibration.between_imus.arm import estimate_arm
-    from imu_calibration.calibration.hand_workflow import read_by_hand
+    from imu_calibration.calibration.hand_recording import read_by_hand
     from imu_calibration.cli.show import warn
     from imu_calibration.core.units import with_sd
     from imu_calibration.preprocessing.checks import Preflight, visible_findings

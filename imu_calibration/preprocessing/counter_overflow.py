@@ -49,7 +49,8 @@ class OverflowSearch:
     """Undoes overflows in the stamps of one stream; the division into pieces has no influence."""
 
     def __init__(self, tick_ns: float = 1.0) -> None:
-        self._sizes_ns = sizes_of_counters((*TICKS_NS, tick_ns))
+        self.sizes_ns = sizes_of_counters((*TICKS_NS, tick_ns))
+        """Sizes of the steps back at an overflow, ns."""
         self.count = 0
         """Overflows until now."""
         self._shift_ns = 0
@@ -73,7 +74,7 @@ class OverflowSearch:
             # A step back within them is no overflow: the period is not known yet.
             if n_before + np.count_nonzero(is_forward[:place]) < PERIOD_STEPS:
                 continue
-            size = overflow_size(int(steps[place]), period_ns, self._sizes_ns)
+            size = overflow_size(int(steps[place]), period_ns, self.sizes_ns)
             if size:
                 stamps[place:] += size
                 self._shift_ns += size
@@ -105,9 +106,8 @@ def without_overflows(
     search = OverflowSearch(tick_ns)
     stamps = search.undone(stamp_ns)
     if counter_ns is not None:
-        sizes_ns = sizes_of_counters((*TICKS_NS, tick_ns))
         for place in np.flatnonzero(np.diff(stamps) < -LEAST_STEP_NS):
-            size = _size_in_gap(counter_ns[place], counter_ns[place + 1], sizes_ns)
+            size = _size_in_gap(counter_ns[place], counter_ns[place + 1], search.sizes_ns)
             stamps[place + 1 :] += size
             search.count += bool(size)
     steps = np.diff(stamps)
