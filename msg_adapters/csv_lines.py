@@ -67,7 +67,7 @@ def _with_header_of_labels(lines):
     labels = [_labels(line) for line in lines[:MOST_LINES]]
     if not _are_most(labels):
         return lines
-    (header, _), *_ = Counter(filter(None, labels)).most_common(1)
+    header = Counter(filter(None, labels)).most_common(1)[0][0]
     plain = [','.join(header)]
     for line in lines:
         if _labels(line) == header:

@@ -1074,7 +1074,7 @@ def _reading_of(words):
         bare, range_name = f'{inner[1]} {inner[3]}', inner[2]
     bare = re.sub(r'^shimmer \w+ ', '', bare)
     # The axis in front: x acc, xacc, x ang rate, behind the name of a message.
-    bare = re.sub(r'^(?:(?:.* )?(imu\d?|imu) )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\3 \2', bare)
+    bare = re.sub(r'^(?:(?:.* )?imu\d? )?([xyz]) ?(acc\w*|gyr\w*|ang \w+)$', r'\2 \1', bare)
     bare = re.sub(r'^([xyz]) (.*)$', r'\2 \1', bare)
 
     # The number of one of several IMUs: imu1 ax, ax 1, or acc1 x.
@@ -1111,19 +1111,17 @@ def _with_gravity(sets):
     return total or with_gravity or sets
 
 
+STAMP_NAMES = ('', 'header stamp', 'stamp', 'time', 'field header stamp')
+"""Names of a stamp in two columns, before the word for seconds or nanoseconds."""
+
+
 def _seconds_and_nanoseconds(table):
     """Return the Columns of a stamp in two columns, seconds and nanoseconds; None without them."""
     columns = {}
     for name in table.names:
         words = re.sub(r'[\s_./:-]+', ' ', name.lower()).strip()
         part = re.fullmatch(r'(.*?) ?(secs?|seconds|nsecs?|nano ?secs?|nanoseconds)', words)
-        if part is not None and part[1] in (
-            '',
-            'header stamp',
-            'stamp',
-            'time',
-            'field header stamp',
-        ):
+        if part is not None and part[1] in STAMP_NAMES:
             is_nano = part[2].startswith('n')
             columns.setdefault(part[1], {})[is_nano] = name
     for parts in columns.values():

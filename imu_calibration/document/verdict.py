@@ -313,9 +313,9 @@ def incomplete_windows(statistics: Mapping, sensor: str) -> dict[str, float]:
         if ratio > NOTED_MISFIT and (has_structure or not at_rest):
             found[kind] = ratio
     attitude = statistics.get(sensor, {}).get('attitude')
-    if attitude and attitude['p_value'] < ATTITUDE_P_VALUE:
-        if attitude['variance_ratio'] > NOTED_MISFIT:
-            found['static'] = attitude['variance_ratio']
+    is_significant = bool(attitude) and attitude['p_value'] < ATTITUDE_P_VALUE
+    if is_significant and attitude['variance_ratio'] > NOTED_MISFIT:
+        found['static'] = attitude['variance_ratio']
     return found
 
 

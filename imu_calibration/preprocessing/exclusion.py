@@ -99,24 +99,24 @@ def exclusions_of_units(
         When a time names neither.
 
     """
-    names = set(recordings_of)
+    known = set(recordings_of)
     for recordings in recordings_of.values():
-        names.update(recordings)
+        known.update(recordings)
     for exclusion in exclusions:
-        if exclusion.recording and exclusion.recording not in names:
+        if exclusion.recording and exclusion.recording not in known:
             raise InputError(
                 'an excluded time must name a unit or a recording of one'
-                f" ({shortened(', '.join(sorted(names)), 200)}), got '{exclusion}'; write NAME=A:B,"
+                f" ({shortened(', '.join(sorted(known)), 200)}), got '{exclusion}'; write NAME=A:B,"
                 ' or A:B for all',
                 key='exclude',
                 code='exclude_recording',
             )
-    found = {}
+    found: dict[str, list[list[Exclusion]]] = {}
     for unit, recordings in recordings_of.items():
-        found[unit] = [
-            [each for each in exclusions if each.recording in ('', unit, recording)]
-            for recording in recordings
-        ]
+        found[unit] = []
+        for recording in recordings:
+            names = ('', unit, recording)
+            found[unit].append([each for each in exclusions if each.recording in names])
     return found
 
 

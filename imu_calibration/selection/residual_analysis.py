@@ -198,11 +198,9 @@ class ResidualAnalysis(Investigation):
         first = {regime.axis: regime for regime in reversed(regimes)}
         if not rest.significant and proposal is None:
             scatter = scatter_in_motion(self.problem, sensor)
-            first = {
-                axis: regime
-                for axis, regime in first.items()
-                if not _is_noise_of_motion(regime, scatter)
-            }
+            for axis, regime in list(first.items()):
+                if _is_noise_of_motion(regime, scatter):
+                    del first[axis]
         if not rest.significant and proposal is None and not first:
             return beyond_noise(self.problem, sensor, rest)
         axes = rest.axes or (self.fits(sensor).axes() if proposal is not None else tuple(first))

@@ -278,7 +278,10 @@ def select(data, solution, state):
         parts[name] = slice(columns_of[0], columns_of[-1] + 1)
         effect = next(effect for effect in wide.effects if effect.name == name)
         questions.append(Question(effect, columns_of, len(columns_of), name))
-    base = [column for column in range(lag) if not any(column in q.parameters for q in questions)]
+    of_effects = set()
+    for question in questions:
+        of_effects.update(question.parameters)
+    base = [column for column in range(lag) if column not in of_effects]
     prior_sd[base] *= 1e3
     space = RowSpace(parts, prior_sd, lag + 1)
     return choose_effects(RowProblem([block], space, questions, baseline=(*base, lag)))
