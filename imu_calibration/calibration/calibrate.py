@@ -5,8 +5,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic
 
 from imu_calibration.calibration.from_solution import ModelExtension, document
-from imu_calibration.calibration.plain_fit import changes_with, plain_entries, with_plain_fits
+from imu_calibration.calibration.plain_fit import (
+    PlainFit,
+    changes_with,
+    plain_entries,
+    with_plain_fits,
+)
 from imu_calibration.calibration.result import CalibrationResult, Estimate, Observations
+from imu_calibration.document.proof_entry import Proof
 from imu_calibration.estimation.solution import tolerances_of, with_weak_replaced
 from imu_calibration.references.options import CalibrationOptions
 
@@ -31,6 +37,7 @@ def conclude(
     *,
     provenance: dict[str, Any] | None = None,
     under_test: Collection[str] = (),
+    is_judged: bool = True,
 ) -> CalibrationResult[Estimate]:
     """
     Judge a solution on held-out data, state what it does not determine, and document it.
@@ -45,6 +52,9 @@ def conclude(
     under_test : collection of str
         Sensors of which the effects have to predict better than plain least squares, besides those
         with an unexplained residual.
+    is_judged : bool
+        False where only the status of the parameters is wanted: no data are held out, and the
+        document has no proof.
 
     Raises
     ------
@@ -60,12 +70,15 @@ def conclude(
     solution = with_weak_replaced(data.with_reference_errors(solved.solution), tolerances)
 
     # Effects that predict held-out data worse than bias and matrix alone are not applied.
-    held_out = data.held_out(solution)
-    fits = held_out.better_plain_fits(
-        under_test={*changes.unexplained, *under_test}, as_asked=options.as_asked
-    )
+    fits: tuple[PlainFit, ...] = ()
+    proof: Proof = {}
+    if is_judged:
+        held_out = data.held_out(solution)
+        fits = held_out.better_plain_fits(
+            under_test={*changes.unexplained, *under_test}, as_asked=options.as_asked
+        )
+        proof = held_out.proof(fits)
     applied = with_plain_fits(solution, fits)
-    proof = held_out.proof(fits)
 
     # Parameters that are not determined, each with the motion or knowledge that determines it.
     statistics = data.statistics(applied)

@@ -233,9 +233,9 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
 
     # The least residual, first among widely spaced delays, then near the best of them.
     coarse = np.arange(-MAX_DELAY, MAX_DELAY + DELAY_STEP / 2, DELAY_STEP)
-    near = coarse[int(np.argmin([cost.residuals(delay)[0] for delay in coarse]))]
+    near = coarse[int(np.argmin([cost.residual(delay) for delay in coarse]))]
     fine = near + np.arange(-DELAY_STEP, DELAY_STEP + FINE_DELAY_STEP / 2, FINE_DELAY_STEP)
-    residuals = np.array([cost.residuals(delay) for delay in fine])
+    residuals = np.array([cost.without_each_part(delay) for delay in fine])
     if residuals[:, 0].min() > (1.0 - MIN_EXPLAINED) * float(np.sum(change[used] ** 2)):
         return None
     delay = _least_place(fine, residuals[:, 0])
@@ -280,8 +280,22 @@ class _DelayCost:
         self._applied = [applied[part].T for part in self._parts]
         self._observed = np.array([np.sum(change[part] ** 2) for part in self._parts])
 
-    def residuals(self, delay: float) -> np.ndarray:
+    def residual(self, delay: float) -> float:
+        """Return the least sum of squares of all windows."""
+        normal, applied, observed = (of_parts.sum(axis=0) for of_parts in self._equations(delay))
+        return float(_least_squares_residual(normal, applied, observed))
+
+    def without_each_part(self, delay: float) -> np.ndarray:
         """Return the least sums of squares of all windows, then without each part in turn."""
+        normal, applied, observed = self._equations(delay)
+        return _least_squares_residual(
+            _all_and_without_each(normal),
+            _all_and_without_each(applied),
+            _all_and_without_each(observed),
+        )
+
+    def _equations(self, delay: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return (N, b, y'y) of the normal equations of each part, (k, 12, 12), (k, 12), (k,)."""
         turned = np.empty((len(self._start), 4))
         for axis in range(3):
             turned[:, axis] = np.interp(self._stop + delay, self._time, self._theta[:, axis])
@@ -294,12 +308,7 @@ class _DelayCost:
             blocks = (self._squared[number] @ products[part]).reshape(3, 3, 4, 4)
             normal[number] = blocks.transpose(0, 2, 1, 3).reshape(12, 12)
             applied[number] = (self._applied[number] @ turned[part]).reshape(12)
-
-        return _least_squares_residual(
-            _all_and_without_each(normal),
-            _all_and_without_each(applied),
-            _all_and_without_each(self._observed),
-        )
+        return normal, applied, self._observed
 
 
 def _all_and_without_each(of_parts):

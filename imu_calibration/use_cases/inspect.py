@@ -288,7 +288,8 @@ def _by_hand(source, options, preflight):
             return None
         asked = hand_options(options)
         poses = PoseObservations.of(recording, asked)
-        return conclude(Solved(solve_by_hand(poses.data, asked), poses), options)
+        solved = Solved(solve_by_hand(poses.data, asked), poses)
+        return conclude(solved, options, is_judged=False)
     except ImuCalibrationError as error:
         return error
 

@@ -1,5 +1,6 @@
 """The sample recording, replayed end to end through the verbs that a user types."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,18 @@ def test_truth_is_found_within_the_reported_standard_deviations(output):
         ('gyroscope', 'matrix', 1e-4),
     ):
         assert np.max(np.abs(found.value(sensor, effect) - truth.value(sensor, effect))) < bound
+
+
+def test_an_inspection_by_hand_gives_the_status_of_the_calibration(tmp_path, capsys):
+    """
+    The same parameters are determined, fixed and weak, though an inspection holds out no data.
+    """
+    assert main(['inspect', str(BAG), '--json']) == 0
+    (looked_at,) = json.loads(capsys.readouterr().out)['result']['imu']
+    main(['calibrate', str(BAG), '--output', str(tmp_path)])
+    found = load(tmp_path / 'calibration.yaml')
+    assert looked_at['status'] == {name: found.status_by_name[name] for name in found.param_names}
+    assert len(set(looked_at['status'].values())) == 3
 
 
 def test_compare_with_the_truth(output, capsys):
