@@ -24,7 +24,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np  # noqa: E402
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'test'))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / 'test')]  # simulated worlds of the tests
 
 from imu_calibration.core.samples import SampleBlock  # noqa: E402
 from imu_calibration.effects.base import SENSORS  # noqa: E402
