@@ -84,9 +84,17 @@ class Process:
         )
 
     def stop(self):
-        """End the process."""
+        """
+        End the process; kill it where a plain node has missed the signal.
+
+        An executor of rclpy that looks at its context between the signal and its effect waits on.
+        """
         self.process.terminate()
-        self.process.wait(timeout=10)
+        try:
+            self.process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 def run_once(raw, corrected, rate, seconds, environment, cpu_seconds=lambda: 0.0):
