@@ -1,7 +1,7 @@
 """noise.yaml and its summary for people."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,8 +20,18 @@ from imu_calibration.allan.processes import (
 from imu_calibration.allan.terms import GAUSS_MARKOV, TIME_KEY, Term
 from imu_calibration.allan.trends import AxisTrend
 from imu_calibration.core.documents import finite, from_text, to_text
-from imu_calibration.core.errors import DocumentError, shortened
+from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.exit_codes import dropped_text, exit_code_of
+from imu_calibration.core.schema import (
+    Document,
+    Requirement,
+    list_of,
+    mapping,
+    maybe,
+    number,
+    require,
+    text,
+)
 from imu_calibration.core.units import NOISE_QUANTITY, STANDARD_GRAVITY, for_people, significant
 from imu_calibration.effects.base import AXES, SENSORS, UNITS
 from imu_calibration.estimation.solution import DETERMINED, HELD, WEAK
@@ -57,6 +67,68 @@ LARGEST = 1e30
 """Figures of a document at most; their squares are finite."""
 STATUSES = (DETERMINED, WEAK, HELD)
 """Statuses of a figure."""
+_FIGURE = number(-LARGEST, LARGEST)
+_SIZE = number(0.0, LARGEST, code='status_or_interval')
+_FORM = list_of(text(*TERMS, code='not_a_text'))
+
+
+def _of_axes(each: Requirement) -> Requirement:
+    return list_of(each, len(AXES))
+
+
+_TERM = mapping(
+    {
+        'value': _of_axes(maybe(_FIGURE)),
+        'interval95': _of_axes(maybe(list_of(maybe(_SIZE), 2, code='status_or_interval'))),
+        'status': _of_axes(maybe(text(*STATUSES, code='status_or_interval'))),
+    },
+    {'reason': maybe(_of_axes(text(code='not_a_text')))},
+)
+_TREND = mapping(
+    dict.fromkeys(('value', 'sd'), _of_axes(maybe(_FIGURE))),
+    {'time_constant': _of_axes(maybe(_FIGURE))},
+)
+_SENSOR = mapping(
+    {
+        'slow_part': _of_axes(_FORM),
+        'also_possible': _of_axes(list_of(_FORM)),
+        **dict.fromkeys(('sample_sd', 'shortest_averaging_time', 'excess'), _of_axes(_FIGURE)),
+    },
+    {
+        **dict.fromkeys(TERMS, _TERM),
+        'alternatives': maybe(mapping(optional=dict.fromkeys(TERMS, _TERM), closed=True)),
+        'taken_out': maybe(
+            mapping(optional=dict.fromkeys(('temperature', 'turn_on', 'ramp'), _TREND), closed=True)
+        ),
+        'record_for': maybe(mapping(each=_of_axes(maybe(_FIGURE)))),
+        'scatter_between_rests': maybe(_of_axes(_FIGURE)),
+        'oscillation': maybe(_of_axes(maybe(list_of(_FIGURE, 2)))),
+    },
+)
+_CURVE = list_of(_FIGURE)
+NOISE = Document(
+    'noise document',
+    mapping(
+        {'sampling_rate': number(0.0, LARGEST, above=True, code='rate_not_positive')},
+        {
+            **dict.fromkeys(SENSORS, _SENSOR),
+            'frame_id': text(code='not_a_text'),
+            'recording': maybe(mapping(optional={'seconds_at_rest': maybe(_FIGURE)})),
+            'provenance': maybe(mapping()),
+            'allan_deviation': maybe(
+                mapping(
+                    optional={
+                        'tau': maybe(_CURVE),
+                        **dict.fromkeys(SENSORS, maybe(_of_axes(_CURVE))),
+                    }
+                )
+            ),
+        },
+    ),
+    'identify the noise again',
+    dict.fromkeys(('type', 'range'), 'figure_not_a_number')
+    | dict.fromkeys(('missing', 'unknown', 'length'), 'document_parts'),
+)
 
 
 def noise_to_text(figures: NoiseFigures, horizon: float = HORIZON) -> str:
@@ -175,7 +247,11 @@ def noise_from_text(text: str) -> NoiseFigures:
         When the text is no such document, newer, or a figure is missing or cannot be.
 
     """
-    document = from_text(text, 'noise document')
+    return noise_from_mapping(from_text(text, 'noise document'))
+
+
+def noise_from_mapping(document: Mapping[str, Any]) -> NoiseFigures:
+    """Return the figures in the mapping of noise.yaml; raises as `noise_from_text`."""
     found = str(document.get('format'))
     if found != NOISE_FORMAT:
         raise DocumentError(
@@ -183,80 +259,30 @@ def noise_from_text(text: str) -> NoiseFigures:
             " written by 'imu_calibration noise'",
             code='document_format',
         )
-    try:
-        return _parse(document)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise DocumentError(
-            f'a noise document must have the parts of {NOISE_FORMAT}, one is missing or has another'
-            f' shape ({type(error).__name__}: {error}); identify the noise again',
-            code='document_parts',
-        ) from error
-
-
-def _parse(document):
+    require(document, NOISE)
     curve = document.get('allan_deviation') or {}
-    sensors = {
-        sensor: tuple(
-            _axis(document[sensor], k, (curve.get(sensor) or [[]] * 3)[k]) for k in range(len(AXES))
-        )
-        for sensor in SENSORS
-        if sensor in document
-    }
-    if not sensors:
+    figures = {}
+    for sensor in SENSORS:
+        if sensor in document:
+            deviations = curve.get(sensor) or [[]] * len(AXES)
+            figures[sensor] = tuple(
+                _axis(document[sensor], k, deviations[k]) for k in range(len(AXES))
+            )
+    if not figures:
         raise DocumentError(
             'a noise document must have figures of a sensor, it has none; write the noise document'
             ' again',
             code='part_missing',
         )
-    rate = _number(document['sampling_rate'])
-    if not (math.isfinite(rate) and rate > 0):
-        raise DocumentError(
-            f'the sampling rate must be above zero, got {rate:g}; write the noise document again',
-            code='rate_not_positive',
-        )
     return NoiseFigures(
-        sensors.get('accelerometer', ()),
-        sensors.get('gyroscope', ()),
-        rate=rate,
-        frame_id=str(document.get('frame_id', '')),
-        recording=dict(document.get('recording') or {}),
-        tau=tuple(_number(t) for t in curve.get('tau') or ()),
-        provenance=dict(document.get('provenance') or {}),
+        figures.get('accelerometer', ()),
+        figures.get('gyroscope', ()),
+        rate=float(document['sampling_rate']),
+        frame_id=document.get('frame_id', ''),
+        recording=document.get('recording') or {},
+        tau=tuple(map(float, curve.get('tau') or ())),
+        provenance=document.get('provenance') or {},
     )
-
-
-def _number(value):
-    """
-    Return a number of the document.
-
-    Raises
-    ------
-    DocumentError
-        When it is text, a truth value, or not finite.
-
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < LARGEST:
-        raise DocumentError(
-            f'a figure of a noise document must be a number below {LARGEST:g}, got'
-            f' {shortened(repr(value), 60)}; write the noise document again',
-            code='figure_not_a_number',
-        )
-    return float(value)
-
-
-def _number_or_none(value):
-    return None if value is None else _number(value)
-
-
-def _texts(values):
-    """Return names of the document; raises DocumentError where one is no text."""
-    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-        raise DocumentError(
-            f'names in a noise document must be a list of texts, got {shortened(repr(values), 60)};'
-            ' write the noise document again',
-            code='not_a_text',
-        )
-    return tuple(values)
 
 
 def _axis(section, k, deviation):
@@ -265,7 +291,9 @@ def _axis(section, k, deviation):
         for name in TERMS
         if name in section and section[name]['interval95'][k] is not None
     }
-    for needed in (WHITE.name, RANDOM_WALK.name):
+    form = section['slow_part'][k]
+    time_constant = [TIME_KEY] if GAUSS_MARKOV in form else []
+    for needed in (WHITE.name, RANDOM_WALK.name, *form, *time_constant):
         if needed not in terms:
             raise DocumentError(
                 f"every axis must have '{needed}', it is missing; write the noise document again",
@@ -279,43 +307,40 @@ def _axis(section, k, deviation):
     trends = tuple(
         AxisTrend(
             name,
-            _number(entry['value'][k]),
-            _number(entry['sd'][k]),
-            _number(entry.get('time_constant', [0, 0, 0])[k]),
+            float(entry['value'][k]),
+            float(entry['sd'][k]),
+            float(entry.get('time_constant', [0, 0, 0])[k]),
         )
         for name, entry in (section.get('taken_out') or {}).items()
         if entry['value'][k] is not None
     )
     record_for = {
-        name: _number_or_none(values[k])
+        name: values[k]
         for name, values in (section.get('record_for') or {}).items()
-        if terms[name].status != DETERMINED
+        if name in terms and terms[name].status != DETERMINED
     }
-    others = tuple(_texts(form) for form in section['also_possible'][k])
+    oscillation = (section.get('oscillation') or [None] * 3)[k]
     return AxisFigures(
         terms,
-        _texts(section['slow_part'][k]),
-        others,
+        tuple(form),
+        tuple(tuple(form) for form in section['also_possible'][k]),
         alternatives,
-        _number(section['shortest_averaging_time'][k]),
-        _number(section['excess'][k]),
-        _pair((section.get('oscillation') or [None] * 3)[k]),
-        _number((section.get('scatter_between_rests') or [0.0] * 3)[k]),
+        float(section['shortest_averaging_time'][k]),
+        float(section['excess'][k]),
+        None if oscillation is None else (float(oscillation[0]), float(oscillation[1])),
+        float((section.get('scatter_between_rests') or [0.0] * 3)[k]),
         trends=trends,
         record_for=record_for,
-        sample_sd=_number(section['sample_sd'][k]),
-        deviation=tuple(_number(v) for v in deviation),
+        sample_sd=float(section['sample_sd'][k]),
+        deviation=tuple(map(float, deviation)),
     )
-
-
-def _pair(values):
-    return None if values is None else (_number(values[0]), _number(values[1]))
 
 
 def _term(name, entry, k):
     value, status = entry['value'][k], entry['status'][k]
-    interval = tuple(math.inf if end is None else _number(end) for end in entry['interval95'][k])
-    if status not in STATUSES or len(interval) != 2 or not 0 <= interval[0] <= interval[1]:
+    lower, upper = entry['interval95'][k]
+    interval = (math.inf if lower is None else lower, math.inf if upper is None else upper)
+    if status is None or interval[0] > interval[1]:
         raise DocumentError(
             f"'{name}' must have a status ({', '.join(STATUSES)}) and an interval of two numbers in"
             f' rising order, got {status!r} and {list(interval)}; write the noise document again',
@@ -329,10 +354,10 @@ def _term(name, entry, k):
         )
     return Term(
         name,
-        None if value is None else _number(value),
+        None if value is None else float(value),
         interval,
         status,
-        str((entry.get('reason') or [''] * 3)[k]),
+        (entry.get('reason') or [''] * 3)[k],
     )
 
 

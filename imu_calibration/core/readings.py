@@ -20,6 +20,15 @@ import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.core.samples import ImuSamples
+from imu_calibration.core.schema import (
+    Document,
+    mapping,
+    maybe,
+    number,
+    one_or_each,
+    require,
+    text,
+)
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 
 UNIT_SIZES = {
@@ -87,6 +96,24 @@ AXES_KEY = 'axes'
 STATED_KEYS = (*UNIT_KEYS.values(), INCREMENTS_KEY)
 """Names of the options that state units."""
 Number = float | tuple[float, float, float]
+_SCALE = maybe(one_or_each(number(0.0, LARGEST, above=True), 1, 3))
+_OFFSET = maybe(one_or_each(number(-LARGEST, LARGEST), 1, 3))
+_SENSOR = {'unit': maybe(text(code='unit_unknown')), 'scale': _SCALE, 'offset': _OFFSET}
+READINGS = Document(
+    'readings',
+    mapping(
+        optional={
+            **dict.fromkeys(SI_UNITS, maybe(mapping(optional=_SENSOR, closed=True))),
+            **{key: _SCALE if key.endswith('scale') else _OFFSET for key in FLAT_KEYS},
+            'axes': maybe(text(code='axes_unknown')),
+        },
+        closed=True,
+    ),
+    'correct it',
+    dict.fromkeys(('type', 'range', 'length'), 'reading_number'),
+    error=InputError,
+)
+"""The part `readings` of a document, or a file."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +235,7 @@ class RawReadings:
             When a key is unknown, a unit is unknown, or a number is not usable.
 
         """
-        known = (*SI_UNITS, 'axes', *FLAT_KEYS)
-        _require_known(mapping, known, place)
+        require(mapping, replace(READINGS, name=place))
         units = {}
         for sensor in SI_UNITS:
             entry = mapping.get(sensor)
@@ -225,11 +251,7 @@ class RawReadings:
                     code='unit_twice',
                 )
             units[sensor] = _sensor_unit(sensor, flat if entry is None else entry, place)
-        axes = mapping.get('axes')
-        if axes is None:
-            axes = ''
-        elif not isinstance(axes, str):
-            raise _axes_error(axes)
+        axes = mapping.get('axes') or ''
         return cls(units['accelerometer'], units['gyroscope'], parse_axes(axes) if axes else '')
 
     def mat_flu_source(self) -> np.ndarray | None:
@@ -411,24 +433,11 @@ def _of_scale(sensor, scale, offset):
 def _sensor_unit(sensor, entry, place):
     """Return the unit in a mapping of unit, scale and offset, each optional."""
     place = f'{place}.{sensor}'
-    if not isinstance(entry, Mapping):
-        raise InputError(
-            f"'{place}' must be a mapping of unit, scale and offset, got {shortened(repr(entry))};"
-            ' correct it',
-            code='not_a_mapping',
-        )
-    _require_known(entry, ('unit', 'scale', 'offset'), place)
-    scale = _checked(entry.get('scale'), f'{place}.scale', positive=True)
-    offset = _checked(entry.get('offset'), f'{place}.offset', positive=False)
+    scale = _number_or_none(entry.get('scale'))
+    offset = _number_or_none(entry.get('offset'))
     unit = entry.get('unit')
     if unit is None:
         return _of_scale(sensor, 1.0 if scale is None else scale, 0.0 if offset is None else offset)
-    if not isinstance(unit, str):
-        raise InputError(
-            f"'{place}.unit' must be a text, got {shortened(repr(unit))}; correct it",
-            key=UNIT_KEYS[sensor],
-            code='unit_unknown',
-        )
     increments = INCREMENTS_PATTERN.fullmatch(unit)
     if unit == COUNTS or (increments and increments[2] == COUNTS):
         if scale is None:
@@ -451,39 +460,15 @@ def _sensor_unit(sensor, entry, place):
     return known if offset is None else replace(known, offset=offset)
 
 
-def _require_known(mapping, known, place):
-    strange = sorted(str(name) for name in mapping if name not in known)
-    if strange:
-        raise InputError(
-            f'{place} may name {", ".join(known)}; it names {shortened(", ".join(strange))};'
-            ' correct it',
-            code='key_unknown',
-        )
-
-
-def _checked(value, place, *, positive):
-    """Return one number or three; None for None."""
-    if value is None:
-        return None
-    values = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
-    good = len(values) in (1, 3)
-    for number in values:
-        numeric = isinstance(number, (int, float)) and not isinstance(number, bool)
-        good = good and numeric and abs(number) < LARGEST and (number > 0 or not positive)
-    if not good:
-        sort = 'a number above zero' if positive else 'a number'
-        raise InputError(
-            f"'{place}' must be {sort} or three, got {shortened(repr(value))}; correct it",
-            code='reading_number',
-        )
-    return _number(value if len(values) == 3 else values[0])
+def _number_or_none(value):
+    return None if value is None else _number(value)
 
 
 def _number(value):
-    if np.ndim(value):
+    if np.size(value) > 1:
         x, y, z = (float(number) for number in value)
         return (x, y, z)
-    return float(value)
+    return float(np.squeeze(value))
 
 
 def _plain(value):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,10 +12,25 @@ import numpy as np
 from imu_calibration.core.documents import from_text, plain, to_text
 from imu_calibration.core.errors import DocumentError, InputError, shortened
 from imu_calibration.core.readings import RawReadings
+from imu_calibration.core.schema import (
+    Document,
+    Requirement,
+    anything,
+    array,
+    equal,
+    flag,
+    list_of,
+    mapping,
+    maybe,
+    number,
+    require,
+    text,
+    whole,
+)
 from imu_calibration.document.calibration import Calibration, with_nominal
 from imu_calibration.document.decision import HARMS, SensorDecision
 from imu_calibration.document.proof_entry import ProofEntry
-from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
+from imu_calibration.effects.base import AXES, SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.catalogue import CATALOGUE, JOINTS, Catalogue
 from imu_calibration.effects.sensor_model import BASE, SensorModel
 from imu_calibration.estimation.solution import Status
@@ -38,164 +53,124 @@ semidefinite.
 """
 
 
-def _is_number(value: Any, low: float = -MAX_VALUE, high: float = MAX_VALUE) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
-
-
-def _is_size(value: Any) -> bool:
-    return _is_number(value, 0.0)
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= 2**62
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _is_list_of(kind: Callable[[Any], bool], length: int | None = None) -> Callable[[Any], bool]:
-    return lambda value: (
-        isinstance(value, (list, tuple)) and length in (None, len(value)) and all(map(kind, value))
-    )
-
-
-def _is_range(value: Any, kind: Callable[[Any], bool] = _is_number) -> bool:
-    return _is_list_of(kind, 2)(value) and value[0] <= value[1]
-
-
-def _is_temperature_range(value: Any) -> bool:
-    return _is_range(value) and RANGE_C[0] <= value[0] and value[1] <= RANGE_C[1]
-
-
-def _or_none(kind: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: value is None or kind(value)
-
-
-def _is_direction(value: Any) -> bool:
-    weights = value.get('parameters') if isinstance(value, dict) else None
-    return (
-        isinstance(weights, dict)
-        and _is_text(value.get('needs'))
-        and all(_is_text(k) and _is_number(v) for k, v in weights.items())
-    )
-
-
-def _is_joint_errors(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        _is_list_of(_is_text)(value.get(name))
-        and len(set(value[name])) == len(value[name]) <= MAX_DOCUMENT_JOINTS
-        for name in ('turning', 'zeros', 'angles')
-    )
-
-
+_SIZE = number(0.0, MAX_VALUE)
 _NOISE = {
-    'noise_sd': _is_list_of(_is_size, 3),
-    'between_window_sd': _is_size,
-    'between_window_dof': _is_size,
-    'wander_sd': _is_size,
+    'noise_sd': list_of(_SIZE, len(AXES)),
+    'between_window_sd': _SIZE,
+    'between_window_dof': _SIZE,
+    'wander_sd': _SIZE,
 }
-_ERRORS: dict[str, Callable[[Any], bool]] = {
-    'before': _is_size,
-    'after': _is_size,
-    'ci95': lambda value: _is_range(value, _is_size),
-}
-"""Fields that errors in a regime of motion must have."""
-_PROOF = {**_ERRORS, 'unit': _is_text, 'windows': _is_count}
-"""Fields that the errors of a sensor must have."""
-_FURTHER: dict[str, Callable[[Any], bool]] = {
-    'unit': _is_text,
-    'windows': _is_count,
-    'seconds': _is_size,
-    'delay_s': _is_number,
-    'delay_explains': _is_number,
-}
-"""Fields that they may have."""
+_AFTER = {'after': _SIZE, 'ci95': list_of(_SIZE, 2, rising=True)}
+_ERRORS = {'before': _SIZE, **_AFTER}
+_FURTHER = {'unit': text(), 'windows': whole(), 'seconds': _SIZE}
+_PROOF = mapping(
+    {**_ERRORS, 'unit': text(), 'windows': whole()},
+    {
+        'seconds': _SIZE,
+        'delay_s': number(-MAX_VALUE, MAX_VALUE),
+        'delay_explains': number(-MAX_VALUE, MAX_VALUE),
+        'regimes': maybe(mapping(each=mapping(_ERRORS, _FURTHER))),
+        'one_attitude': flag(),
+        'few_directions': flag(),
+        'earlier': maybe(mapping(_AFTER)),
+    },
+)
+_JOINT_NAMES = list_of(text(), most=MAX_DOCUMENT_JOINTS, distinct=True)
+_JOINT_ERRORS = mapping(
+    {'turning': _JOINT_NAMES, 'zeros': _JOINT_NAMES, 'angles': _JOINT_NAMES},
+    {
+        'places': list_of(text(), most=2 * MAX_DOCUMENT_JOINTS, distinct=True),
+        'angle_sd': maybe(_SIZE),
+        'place_sd': maybe(_SIZE),
+    },
+    closed=True,
+)
+_DIRECTION = mapping({'parameters': mapping(each=number(-MAX_VALUE, MAX_VALUE)), 'needs': text()})
+_SECTION = mapping({'effects': list_of(text())})
+PARTS = mapping(
+    optional={
+        **dict.fromkeys(SECTIONS, _SECTION),
+        'frame_id': text(),
+        'absent': list_of(text(*SENSORS), 0, 1),
+        'reference_temperature_c': number(*RANGE_C),
+        'joint_names': _JOINT_NAMES,
+        'joint_errors': maybe(_JOINT_ERRORS),
+        **dict.fromkeys(('effects', 'gauge', 'provenance', 'readings'), maybe(mapping())),
+        'covariance': maybe(mapping({'names': list_of(text()), 'matrix': anything})),
+        'covariance_terms': maybe(mapping()),
+        'undetermined_directions': maybe(list_of(_DIRECTION)),
+        'statistics': maybe(mapping(optional=dict.fromkeys(SENSORS, mapping(optional=_NOISE)))),
+        'conditions': maybe(
+            mapping(
+                optional={
+                    'largest_rate': maybe(_SIZE),
+                    'temperature_range_c': maybe(list_of(number(*RANGE_C), 2, rising=True)),
+                    'date': text(),
+                }
+            )
+        ),
+        'decision': maybe(mapping(optional=dict.fromkeys(SENSORS, text(*SensorDecision)))),
+        'decision_reasons': maybe(mapping(optional=dict.fromkeys(SENSORS, text()))),
+        'notes': maybe(list_of(text())),
+        'proof': maybe(mapping(optional=dict.fromkeys(SENSORS, _PROOF))),
+    }
+)
+CALIBRATION = Document(
+    'calibration',
+    PARTS,
+    'correct the calibration file or calibrate again',
+    dict.fromkeys(('type', 'range', 'length'), 'part_value')
+    | dict.fromkeys(('missing', 'unknown'), 'document_parts'),
+)
 
 
-def _are_errors(value: Any, needed: Mapping[str, Callable[[Any], bool]]) -> bool:
-    """Return whether a mapping has the fields `needed`, and no other one of a wrong type."""
-    if not isinstance(value, dict) or not all(name in value for name in needed):
-        return False
-    known = {**_FURTHER, **needed}
-    return all(kind(value[name]) for name, kind in known.items() if name in value)
+def _entries_of(model: SensorModel, names: Collection[str]) -> Requirement:
+    """
+    Return the requirement of what depends on the effects of a document.
 
+    Parameters
+    ----------
+    model : SensorModel
+        Its effects.
+    names : collection of str
+        Names of its covariance, in their order; empty: each effect has standard deviations.
 
-def _is_proof(value: Any) -> bool:
-    if not _are_errors(value, _PROOF):
-        return False
-    earlier, regimes = value.get('earlier'), value.get('regimes') or {}
-    of_earlier = {name: kind for name, kind in _ERRORS.items() if name != 'before'}
-    if earlier is not None and not _are_errors(earlier, of_earlier):
-        return False
-    return isinstance(regimes, dict) and all(
-        _is_text(name) and _are_errors(part, _ERRORS) for name, part in regimes.items()
+    """
+    sections: dict[str, dict[str, Requirement]] = {section: {} for section in SECTIONS}
+    for effect in model.effects:
+        sections[effect.section][effect.name] = _entry_of(effect, with_sd=not names)
+    parts = {section: mapping(entries) for section, entries in sections.items() if entries}
+    each_variance = array((len(names),), number())
+    covariance = {
+        'names': list_of(text(), including=model.param_names),
+        'matrix': array((len(names), len(names)), number(code='not_finite')),
+    }
+    return mapping(
+        parts,
+        {
+            'covariance': mapping(covariance if names else {}),
+            'covariance_terms': maybe(mapping(each=each_variance)),
+        },
     )
 
 
-_SECTION = {'effects': _is_list_of(_is_text)}
-KEYS_OF_PARTS = {
-    **{section: _SECTION for section in SECTIONS},
-    'covariance': {},
-    'covariance_terms': {},
-    'frame_id': _is_text,
-    'absent': lambda value: _is_list_of(SENSORS.__contains__)(value) and len(value) < len(SENSORS),
-    'reference_temperature_c': lambda value: _is_number(value, *RANGE_C),
-    'joint_names': lambda value: (
-        _is_list_of(_is_text)(value) and len(set(value)) == len(value) <= MAX_DOCUMENT_JOINTS
-    ),
-    'effects': {},
-    'joint_errors': _or_none(_is_joint_errors),
-    'gauge': {},
-    'provenance': {},
-    'readings': {},
-    'undetermined_directions': _or_none(_is_list_of(_is_direction)),
-    'statistics': {sensor: _NOISE for sensor in SENSORS},
-    'conditions': {
-        'largest_rate': _or_none(_is_size),
-        'temperature_range_c': _or_none(_is_temperature_range),
-        'date': _is_text,
-    },
-    'decision': dict.fromkeys(SENSORS, tuple(SensorDecision).__contains__),
-    'decision_reasons': {sensor: _is_text for sensor in SENSORS},
-    'notes': _is_list_of(_is_text),
-    'proof': {sensor: _is_proof for sensor in SENSORS},
-}
-"""
-Part of a document -> requirement if present: a function, or a mapping with requirements of its
-entries.
-"""
-
-
-def check_parts(document: Mapping, known: Mapping = KEYS_OF_PARTS, place: str = '') -> None:
-    """
-    Refuse a document in which a part of `known` has another type or range.
-
-    Other parts are not checked.
-
-    Raises
-    ------
-    DocumentError
-
-    """
-    for name, wanted in known.items():
-        if name not in document:
-            continue
-        value = document[name]
-        if isinstance(wanted, dict):
-            if not isinstance(value, dict) and (value is not None or place):
-                raise DocumentError(
-                    f"'{place}{name}' must be a mapping, got {shortened(repr(value))}; "
-                    'correct the calibration file or calibrate again',
-                    code='not_a_mapping',
-                )
-            check_parts(value or {}, wanted, f'{place}{name}.')
-        elif not wanted(value):
-            raise DocumentError(
-                f"'{place}{name}' must have the type and range of the format, got"
-                f' {shortened(repr(value))}; correct the calibration file or calibrate again',
-                code='part_value',
-            )
+def _entry_of(effect: Effect, with_sd: bool) -> Requirement:
+    """Return the requirement of the entry of an effect."""
+    # Saturation levels may be infinite; `check_numbers` checks the values.
+    values = array(effect.shape, number(finite=False, code='document_parts'))
+    centre = {group.name: array((group.width,), number(code='centre')) for group in effect.groups}
+    unit = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
+    needed = {
+        'value': values,
+        'status': array(effect.shape, text(*Status, code='status_unknown')),
+    }
+    sd = {'sd': array(effect.shape, number(0.0, code='negative_sd'))}
+    further = {
+        'unit': maybe(equal(unit, code='unit')),
+        'centre': maybe(mapping(optional=centre, closed=True, code='centre')),
+        'held_reason': array(effect.shape, maybe(text())),
+    }
+    return mapping(needed | sd, further) if with_sd else mapping(needed, further | sd)
 
 
 def check_numbers(calibration: Calibration) -> Calibration:
@@ -293,79 +268,72 @@ def _check_covariance(covariance: np.ndarray) -> None:
         )
 
 
-def parts_of(document: Mapping) -> dict[str, Any]:
+def parts_of(document: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return {field of a Calibration: value} from the mapping of its document, after `check_parts`.
+    Return {field of a Calibration: value} from the mapping of its document.
 
     Raises
     ------
-    DocumentError, KeyError, TypeError, ValueError, AttributeError, OverflowError
+    InputError
         When a part is missing or has the wrong form.
 
     """
-    model, entries = _model(document)
-    values = np.concatenate([_shaped(entries[e.key]['value'], e) for e in model.effects])
-    status = [word for e in model.effects for word in _statuses(entries[e.key]['status'], e)]
-    for effect in model.effects:
-        entry = entries[effect.key]
-        _check_unit(entry.get('unit'), effect)
-        if not np.all(_shaped(entry.get('sd', np.zeros(effect.shape)), effect) >= 0):
-            raise DocumentError(
-                f"the standard deviations of '{effect.name}' must not be negative, some are or are"
-                ' no numbers; calibrate again',
-                code='negative_sd',
-            )
-    terms = document.get('covariance_terms') or {}
-    order = (
-        [document['covariance']['names'].index(name) for name in model.param_names] if terms else []
-    )
-    return {
-        'model': replace(model.at(values), centre=_centre(model, entries)),
+    require(document, CALIBRATION)
+    model = _model(document)
+    covariance = document.get('covariance') or {}
+    names = covariance.get('names') or []
+    require(document, CALIBRATION, _entries_of(model, names))
+
+    entries = [document[effect.section][effect.name] for effect in model.effects]
+    values = _joined(entry['value'] for entry in entries)
+    status = _joined((entry['status'] for entry in entries), str)
+    order = [names.index(name) for name in model.param_names] if names else []
+    if names:
+        matrix = np.asarray(covariance['matrix'], float)[np.ix_(order, order)]
+    else:
+        matrix = np.diag(_joined(entry['sd'] for entry in entries) ** 2)
+
+    held_reason, centre = {}, {}
+    for effect, entry in zip(model.effects, entries):
+        reasons = np.ravel(np.array(entry.get('held_reason', ''), dtype=object)).tolist()
+        for name, reason in zip(effect.param_names(), reasons):
+            if reason:
+                held_reason[name] = reason
+        for group, value in (entry.get('centre') or {}).items():
+            centre[group] = np.asarray(value, float)
+    terms = {}
+    for name, variance in (document.get('covariance_terms') or {}).items():
+        terms[str(name)] = np.asarray(variance, float)[order]
+    proof = {}
+    for sensor, entry in (document.get('proof') or {}).items():
+        if sensor in SENSORS:
+            proof[sensor] = ProofEntry.from_mapping(entry)
+    found: dict[str, Any] = {
+        'model': replace(model.at(values), centre=centre),
         'values': values,
-        'covariance': _covariance(document.get('covariance'), model, entries),
-        'status': tuple(status),
+        'covariance': matrix,
+        'status': tuple(map(Status, status)),
         'frame_id': document.get('frame_id', ''),
-        'covariance_terms': {
-            str(name): np.asarray(variance, float)[order] for name, variance in terms.items()
-        },
-        'held_reason': {
-            name: str(reason)
-            for e in model.effects
-            if 'held_reason' in entries[e.key]
-            for name, reason in zip(
-                e.param_names(),
-                np.array(entries[e.key]['held_reason'], dtype=object).reshape(e.size),
-                strict=True,
-            )
-            if reason
-        },
+        'covariance_terms': terms,
+        'held_reason': held_reason,
         'undetermined': tuple(document.get('undetermined_directions') or ()),
         'absent': tuple(document.get('absent') or ()),
         'notes': tuple(document.get('notes') or ()),
         'readings': RawReadings.from_mapping(document.get('readings') or {}),
-        **{
-            name: dict(document.get(name) or {})
-            for name in (
-                'gauge',
-                'statistics',
-                'conditions',
-                'decision',
-                'decision_reasons',
-                'provenance',
-            )
-        },
-        'proof': {
-            sensor: ProofEntry.from_mapping(entry)
-            for sensor, entry in (document.get('proof') or {}).items()
-            if sensor in SENSORS and entry
-        },
+        'proof': proof,
     }
+    for name in _COPIED:
+        found[name] = dict(document.get(name) or {})
+    return found
 
 
-def _model(
-    document: Mapping[str, Any],
-) -> tuple[SensorModel, dict[tuple[str, str], dict[str, Any]]]:
-    """Return (SensorModel, {(sensor, effect): entry of the document})."""
+def _joined(values: Iterable[Any], kind: type = float) -> np.ndarray:
+    """Return the items of nested lists, one after the other."""
+    return np.concatenate([np.ravel(np.asarray(value, kind)) for value in values])
+
+
+def _model(document: Mapping[str, Any]) -> SensorModel:
+    """Return the SensorModel of the effects that a document lists."""
     joint_names = JointNames.of(document.get('joint_names', JOINTS), document.get('joint_errors'))
     catalogue = CATALOGUE.with_definitions(document.get('effects') or {})
     owners = {
@@ -373,111 +341,47 @@ def _model(
         for effect in catalogue.effects(joint_names).values()
         if effect.in_reference
     }
-    members, entries = {section: [] for section in SECTIONS}, {}
+    members: dict[str, list[str]] = {section: [] for section in SECTIONS}
     for section in SECTIONS:
-        part = document.get(section) or {'effects': []}
-        for name in part['effects']:
+        names = (document.get(section) or {'effects': []})['effects']
+        listed_entries = mapping(dict.fromkeys(names, mapping()))
+        require(document, CALIBRATION, mapping(optional={section: listed_entries}))
+        for name in names:
             sensor = owners.get(name, section)
-            if (sensor, name) in entries:
+            if name in members[sensor]:
                 raise DocumentError(
                     f"an effect must be listed once, '{name}' is listed twice; remove one",
                     code='effect_repeated',
                 )
             members[sensor].append(name)
-            entries[sensor, name] = part[name]
-    return (
-        SensorModel(
-            tuple(members['accelerometer']),
-            tuple(members['gyroscope']),
-            tuple(members['reference']),
-            joint_names=joint_names,
-            temperature_ref_c=float(document.get('reference_temperature_c', 25.0)),
-            catalogue=catalogue,
-        ),
-        entries,
+    return SensorModel(
+        tuple(members['accelerometer']),
+        tuple(members['gyroscope']),
+        tuple(members['reference']),
+        joint_names=joint_names,
+        temperature_ref_c=float(document.get('reference_temperature_c', 25.0)),
+        catalogue=catalogue,
     )
 
 
-def _shaped(value: Any, effect: Effect) -> np.ndarray:
-    array = np.asarray(value, float)
-    if array.shape != effect.shape or np.asarray(value).dtype == bool:
-        raise DocumentError(
-            f"'{effect.name}' must be numbers of shape {effect.shape}, got {array.shape}; correct"
-            ' the file',
-            code='shape',
-        )
-    return array.ravel()
-
-
-def _statuses(value: Any, effect: Effect) -> Iterator[Status]:
-    words = np.array(value, dtype=object).reshape(effect.size).tolist()
-    if any(word not in tuple(Status) for word in words):
-        raise DocumentError(
-            f"the status of '{effect.name}' must be {', '.join(Status)}; correct the file",
-            code='status_unknown',
-        )
-    return map(Status, words)
-
-
-def _check_unit(found: Any, effect: Effect) -> None:
-    wanted = effect.unit if isinstance(effect.unit, str) else list(effect.unit)
-    if found is not None and found != wanted:
-        raise DocumentError(
-            f"the unit of '{effect.name}' must be {wanted}, got {shortened(repr(found))}; correct"
-            ' the file',
-            code='unit',
-        )
-
-
-def _centre(
-    model: SensorModel, entries: Mapping[tuple[str, str], Mapping[str, Any]]
-) -> dict[str, np.ndarray]:
-    """Return column group -> the value from which its columns are measured."""
-    known = {group.name: group for e in model.effects for group in e.groups}
-    found = {
-        name: np.asarray(value, float)
-        for e in model.effects
-        for name, value in (entries[e.key].get('centre') or {}).items()
-    }
-    for name, value in found.items():
-        if (
-            name not in known
-            or value.shape != (known[name].width,)
-            or not np.all(np.isfinite(value))
-        ):
-            raise DocumentError(
-                f'the centre {shortened(repr(name))} must have one finite number for each column of'
-                ' its effect; correct the calibration file',
-                code='centre',
-            )
-    return found
-
-
-def _covariance(
-    given: Mapping[str, Any] | None,
-    model: SensorModel,
-    entries: Mapping[tuple[str, str], Mapping[str, Any]],
-) -> np.ndarray:
-    """
-    Return the covariance in the model's order.
-
-    Without one, the diagonal of the standard deviations.
-    """
-    if not given:
-        return np.diag(
-            np.concatenate([_shaped(entries[e.key]['sd'], e) for e in model.effects]) ** 2
-        )
-    order = [given['names'].index(name) for name in model.param_names]
-    return np.asarray(given['matrix'], float)[np.ix_(order, order)]
-
-
+_COPIED = ('gauge', 'statistics', 'conditions', 'decision', 'decision_reasons', 'provenance')
+"""Parts that a Calibration has as the document has them."""
 CALIBRATION_FORMAT = 'imu_calibration/1'
 _WHERE_KNOWN = ('decision', 'decision_reasons', 'notes', 'proof')
 """Parts of a document that are omitted while unknown."""
 
 
+TOLERANCES = Document(
+    'tolerance file',
+    mapping(),
+    'correct it',
+    dict.fromkeys(('mapping', 'unknown'), 'tolerance_section'),
+    error=InputError,
+)
+
+
 def checked_tolerances(
-    mapping: Any, catalogue: Catalogue = CATALOGUE
+    mapping_of_file: Any, catalogue: Catalogue = CATALOGUE
 ) -> dict[str, dict[str, float]]:
     """
     Return the content of a tolerance file when it is one: {section: {effect: number above zero}}.
@@ -488,34 +392,13 @@ def checked_tolerances(
         When a section or an effect does not exist, or a tolerance is no number above zero.
 
     """
-    known = {
-        section: [name for owner, name in catalogue.effects() if owner == section]
-        for section in SECTIONS
-    }
-    for section, entries in mapping.items():
-        if section not in known or not isinstance(entries, dict):
-            raise InputError(
-                f'a tolerance file must have the mappings {", ".join(SECTIONS)}, it has'
-                f' {shortened(repr(section))}: {shortened(repr(entries))}; correct it',
-                code='tolerance_section',
-            )
-        for name, value in entries.items():
-            if name not in known[section]:
-                raise InputError(
-                    f'a tolerance must be of an effect of the {section}, {shortened(repr(name))} is'
-                    f' not one; its effects are {", ".join(known[section])}',
-                    code='tolerance_name',
-                )
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, (int, float))
-                or not 0 < value < np.inf
-            ):
-                raise InputError(
-                    f"the tolerance of '{name}' must be a number above zero, got"
-                    f' {shortened(repr(value))}; correct it'
-                )
-    return mapping
+    sections = {}
+    for section in SECTIONS:
+        names = [name for owner, name in catalogue.effects() if owner == section]
+        tolerances = dict.fromkeys(names, number(0.0, above=True, code='tolerance_value'))
+        sections[section] = mapping(optional=tolerances, closed=True, code='tolerance_name')
+    require(mapping_of_file, TOLERANCES, mapping(optional=sections, closed=True))
+    return mapping_of_file
 
 
 def calibration_mapping(calibration: Calibration) -> dict:
@@ -593,30 +476,15 @@ def from_mapping(document: Any) -> Calibration:
         When the format is unknown or newer, a value is missing, not finite or implausible.
 
     """
-    if not isinstance(document, dict):
-        raise DocumentError(
-            f'a calibration document must be a mapping, got {type(document).__name__}; '
-            "give a file written by 'imu_calibration calibrate'",
-            code='not_a_mapping',
-        )
+    require(document, CALIBRATION, mapping())
     _check_format(document.get('format'))
-    check_parts(document)
     try:
         calibration = Calibration(**parts_of(document))
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        IndexError,
-        AttributeError,
-        OverflowError,
-        InputError,
-    ) as error:
-        text = str(error) if isinstance(error, InputError) else f'{type(error).__name__}: {error}'
+    except InputError as error:
+        if isinstance(error, DocumentError):
+            raise
         raise DocumentError(
-            f'a calibration document must have the parts of {CALIBRATION_FORMAT}, one is missing or'
-            f' has another shape ({shortened(text, 200)}); calibrate again',
-            code=getattr(error, 'code', '') or 'document_parts',
+            f'{CALIBRATION.name}: {error}', code=error.code or 'document_parts'
         ) from error
     return check_numbers(calibration)
 

@@ -1,13 +1,21 @@
 """The catalogue of effects, and effects of users: one column of text per parameter."""
 
 import copyreg
-import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
 
 from imu_calibration.core.errors import InputError, did_you_mean, shortened
+from imu_calibration.core.schema import (
+    Document,
+    mapping,
+    maybe,
+    number,
+    one_or_each,
+    require,
+    text,
+)
 from imu_calibration.effects.base import (
     AXES,
     SECTIONS,
@@ -49,6 +57,33 @@ DRAWN_AGAINST = {
 """Quantity -> abscissa of the residual plot of a column that uses it; the first applies."""
 PRIOR_TOLERANCES = 100.0
 """Tolerances in the default standard deviation of the prior."""
+
+
+_ABOVE_ZERO = number(0.0, above=True, code='tolerance_value')
+_TEXT = text(code='not_a_text')
+_NEEDED = {
+    'sensor': text(*SENSORS, code='sensor_unknown'),
+    'column': one_or_each(text(code='column_count'), 1, len(AXES), code='column_count'),
+    'unit': _TEXT,
+    'tolerance': _ABOVE_ZERO,
+    'text': _TEXT,
+}
+_FURTHER = {
+    'tolerance_reason': _TEXT,
+    'prior_sd': maybe(_ABOVE_ZERO),
+    'largest': maybe(_ABOVE_ZERO),
+    'time_constant': _ABOVE_ZERO,
+}
+DEFINITION = Document(
+    'effect',
+    mapping(_NEEDED, _FURTHER, closed=True),
+    'correct it',
+    dict.fromkeys(('missing', 'unknown', 'mapping'), 'definition_keys'),
+    InputError,
+)
+EFFECTS = Document(
+    'effects', mapping(), 'correct them', {'mapping': 'effects_count'}, error=InputError
+)
 
 
 def term(
@@ -99,41 +134,16 @@ def term(
         When a column is no arithmetic, or the sensor is unknown.
 
     """
-    if sensor not in SENSORS:
-        raise InputError(
-            f"effect '{name}' must belong to {' or '.join(SENSORS)}, got '{sensor}'; correct it",
-            code='sensor_unknown',
-        )
     numbers: dict[str, Any] = {
         'tolerance': tolerance,
         'prior_sd': prior_sd,
         'largest': largest,
         'time_constant': time_constant,
     }
-    for key, value in numbers.items():
-        if value is not None and (
-            isinstance(value, bool)
-            or not isinstance(value, (int, float))
-            or not 0 < value < math.inf
-        ):
-            raise InputError(
-                f"the {key} of effect '{name}' must be a number above zero, got {value!r:.60};"
-                ' correct it',
-                code='tolerance_value',
-            )
-    for key, value in {'unit': unit, 'text': text, 'tolerance_reason': tolerance_reason}.items():
-        if not isinstance(value, str):
-            raise InputError(
-                f"the {key} of effect '{name}' must be a text, got {value!r:.60}; correct it",
-                code='not_a_text',
-            )
+    texts = {'unit': unit, 'text': text, 'tolerance_reason': tolerance_reason}
+    declared = replace(DEFINITION, name=f"effect '{shortened(str(name))}'")
+    require({'sensor': sensor, 'column': column, **numbers, **texts}, declared)
     columns = (column,) if isinstance(column, str) else tuple(column)
-    if len(columns) not in (1, 3):
-        raise InputError(
-            f"effect '{name}' must have one column, or one for each axis, got {len(columns)};"
-            ' correct it',
-            code='column_count',
-        )
     group = ColumnGroup(name, columns, name)
     try:
         settles, thermal, turns = (
@@ -218,14 +228,9 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
         When something is missing, or a key is unknown.
 
     """
-    try:
-        return term(name, **definition)
-    except TypeError as error:
-        raise InputError(
-            f"effect '{name}' must have sensor, column, unit, tolerance and text, got"
-            f' {definition!r:.200} ({error}); correct it',
-            code='definition_keys',
-        ) from error
+    declared = replace(DEFINITION, name=f"effect '{shortened(str(name))}'")
+    require(definition, declared, mapping(_NEEDED, _FURTHER, closed=True))
+    return term(name, **definition)
 
 
 def _reduced(effect):
@@ -367,13 +372,10 @@ class Catalogue:
             As `with_effects` and `term`; also when there are too many.
 
         """
-        if not isinstance(definitions, dict) or len(definitions) > MOST_ADDED:
-            is_mapping = isinstance(definitions, dict)
-            received = len(definitions) if is_mapping else shortened(str(definitions))
+        require(definitions, EFFECTS, mapping())
+        if len(definitions) > MOST_ADDED:
             raise InputError(
-                f'effects must be given as at most {MOST_ADDED} of NAME: {{sensor, column, unit,'
-                f' tolerance, text}}, got {received};'
-                ' correct it',
+                f'effects must be at most {MOST_ADDED}, got {len(definitions)}; remove some',
                 code='effects_count',
             )
         return self.with_effects(

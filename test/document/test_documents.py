@@ -217,7 +217,7 @@ def test_the_document_has_the_published_layout():
         (
             lambda d: d['accelerometer']['bias'].update(value=['a', 'b', 'c']),
             'document_parts',
-            ['ValueError'],
+            ['accelerometer.bias.value[0]', "'a'"],
         ),
         (lambda d: d['accelerometer']['bias'].update(sd=[0.1, -0.1, 0.1]), 'negative_sd', ['bias']),
         (lambda d: d['accelerometer']['bias'].update(unit='mg'), 'unit', ['m/s^2', 'mg']),
