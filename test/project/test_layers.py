@@ -82,6 +82,7 @@ def parsed(path):
     return ast.parse(path.read_text())
 
 
+@lru_cache(maxsize=None)
 def imports(path, top_level_only=False):
     """Absolute names of what `path` imports, at any depth or at import time only."""
     tree = parsed(path)
@@ -137,28 +138,28 @@ def test_the_core_imports_with_numpy_and_scipy_alone_and_without_a_screen():
     assert (done.returncode, done.stdout) == (0, ''), done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
-    'path', [path for path in core_modules() if path != FRONT_DOOR], ids=module_name
-)
-def test_the_core_knows_nothing_of_ros_or_of_the_layers_above(path):
-    assert not ros_packages(imports(path))
-    assert not inside(imports(path), 'msg_adapters', *(f'imu_calibration.{name}' for name in EDGE))
+def test_the_core_knows_nothing_of_ros_or_of_the_layers_above():
+    above = ('msg_adapters', *(f'imu_calibration.{name}' for name in EDGE))
+    for path in core_modules():
+        if path != FRONT_DOOR:
+            assert not ros_packages(imports(path)), path
+            assert not inside(imports(path), *above), path
 
 
-@pytest.mark.parametrize('path', core_modules(), ids=module_name)
-def test_heavy_libraries_are_imported_where_they_are_used(path):
-    names = imports(path, top_level_only=True)
-    assert not heads(names) & LATE and not inside(names, *LATE_OF_SCIPY)
-    assert (
-        not inside(imports(path), 'scipy.signal', 'scipy.stats')
-        or module_name(path).split('.')[1] in NOT_IN_CALIBRATE
-    )
+def test_heavy_libraries_are_imported_where_they_are_used():
+    for path in core_modules():
+        names = imports(path, top_level_only=True)
+        assert not heads(names) & LATE and not inside(names, *LATE_OF_SCIPY), path
+        assert (
+            not inside(imports(path), 'scipy.signal', 'scipy.stats')
+            or module_name(path).split('.')[1] in NOT_IN_CALIBRATE
+        ), path
 
 
-@pytest.mark.parametrize('path', modules('msg_adapters'), ids=module_name)
-def test_adapters_know_no_node_and_no_command_line(path):
-    assert 'rclpy' not in heads(imports(path, top_level_only=True))
-    assert not inside(imports(path), 'imu_calibration.cli', 'imu_calibration.nodes')
+def test_adapters_know_no_node_and_no_command_line():
+    for path in modules('msg_adapters'):
+        assert 'rclpy' not in heads(imports(path, top_level_only=True)), path
+        assert not inside(imports(path), 'imu_calibration.cli', 'imu_calibration.nodes'), path
 
 
 ORDER = (
@@ -188,23 +189,24 @@ ENTRIES = (FRONT_DOOR, FRONT_DOOR.with_name('__main__.py'))
 """Modules of no package; both import late or the command line only."""
 
 
-@pytest.mark.parametrize(
-    'path', [path for path in modules('imu_calibration') if path not in ENTRIES], ids=module_name
-)
-def test_each_package_imports_only_what_stands_below_it(path):
+def test_each_package_imports_only_what_stands_below_it():
     height = {name: row for row, names in enumerate(ORDER) for name in names}
-    own = path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0]
-    others = {
-        name.split('.')[1] for name in inside(imports(path), 'imu_calibration') if '.' in name
-    } & set(height) - {own}
-    above = {name for name in others if height[name] >= height[own]}
-    assert above == {UPWARD[key] for key in [module_name(path)] if key in UPWARD}, (own, above)
+    for path in modules('imu_calibration'):
+        if path in ENTRIES:
+            continue
+        own = path.relative_to(ROOT / 'imu_calibration').with_suffix('').parts[0]
+        imported = {
+            name.split('.')[1] for name in inside(imports(path), 'imu_calibration') if '.' in name
+        }
+        above = {name for name in imported & set(height) - {own} if height[name] >= height[own]}
+        allowed = {UPWARD[key] for key in [module_name(path)] if key in UPWARD}
+        assert above == allowed, path
 
 
-@pytest.mark.parametrize('path', modules('imu_calibration/estimation'), ids=module_name)
-def test_estimation_knows_no_window_no_pose_and_no_table(path):
+def test_estimation_knows_no_window_no_pose_and_no_table():
     of_data = ('preprocessing', 'references', 'kinematics.table', 'kinematics.joint')
-    assert not inside(imports(path), *(f'imu_calibration.{name}' for name in of_data))
+    for path in modules('imu_calibration/estimation'):
+        assert not inside(imports(path), *(f'imu_calibration.{name}' for name in of_data)), path
 
 
 def test_every_package_has_its_place_in_the_order():
@@ -238,7 +240,7 @@ def test_a_public_name_means_one_thing():
     entries = {'main', 'run', 'add_arguments'}  # of each node and verb
     homes = {}
     for path in [*modules('imu_calibration'), *modules('msg_adapters')]:
-        for node in ast.parse(path.read_text()).body:
+        for node in parsed(path).body:
             named = isinstance(node, (ast.ClassDef, ast.FunctionDef))
             if named and not node.name.startswith('_') and node.name not in entries:
                 homes.setdefault(node.name, []).append(module_name(path))
@@ -274,7 +276,7 @@ def test_the_start_of_a_program_is_the_last_statement_of_its_module():
     starts = {
         path: [
             isinstance(node, ast.If) and '__main__' in ast.unparse(node.test)
-            for node in ast.parse(path.read_text()).body
+            for node in parsed(path).body
         ]
         for path in modules('imu_calibration')
     }
@@ -293,20 +295,18 @@ def test_modules_of_all_layers_were_found():
     } <= names
 
 
-@pytest.mark.parametrize(
-    'path', modules('imu_calibration') + modules('msg_adapters'), ids=module_name
-)
-def test_a_module_binds_each_constant_once(path):
+def test_a_module_binds_each_constant_once():
     """
     Two constants of one name.
 
     As after a join of two files, leave the first one's users with the second one's value.
     """
-    bound = [
-        target.id
-        for node in parsed(path).body
-        if isinstance(node, (ast.Assign, ast.AnnAssign))
-        for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
-        if isinstance(target, ast.Name)
-    ]
-    assert sorted(set(bound)) == sorted(bound)
+    for path in modules('imu_calibration') + modules('msg_adapters'):
+        bound = [
+            target.id
+            for node in parsed(path).body
+            if isinstance(node, (ast.Assign, ast.AnnAssign))
+            for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
+            if isinstance(target, ast.Name)
+        ]
+        assert sorted(set(bound)) == sorted(bound), path

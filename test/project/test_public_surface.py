@@ -5,8 +5,6 @@ Everything public says its types, and what comes after the third argument is nam
 import ast
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[2]
 XYZ = {'x', 'y', 'z', 'wx', 'wy', 'wz', 'fx', 'fy', 'fz'}
 """Components of one vector, as what is called for every sample takes them."""
@@ -50,25 +48,29 @@ def public_functions(path):
                 yield entry, [*entry.args.posonlyargs, *entry.args.args][bound:]
 
 
-@pytest.mark.parametrize('path', modules(), ids=lambda path: path.stem)
-def test_it_says_its_types(path):
-    found = [
-        f'{entry.name} (line {entry.lineno})'
+def found_where(is_wrong):
+    """Return 'file: function (line)' of the public functions whose arguments are wrong."""
+    return [
+        f'{path.relative_to(ROOT)}: {entry.name} (line {entry.lineno})'
+        for path in modules()
         for entry, arguments in public_functions(path)
-        if any(argument.annotation is None for argument in arguments + entry.args.kwonlyargs)
-        or entry.returns is None
-        and (entry.name != '__init__' or not arguments + entry.args.kwonlyargs)
+        if is_wrong(path, entry, arguments)
     ]
-    assert not found, f'annotate {", ".join(found)}'
 
 
-@pytest.mark.parametrize(
-    'path', [path for path in modules() if path.name not in POSITIONAL], ids=lambda path: path.stem
-)
-def test_what_comes_after_the_third_argument_is_named(path):
-    found = [
-        f'{entry.name} (line {entry.lineno})'
-        for entry, arguments in public_functions(path)
-        if len([argument for argument in arguments if argument.arg not in XYZ]) > 3
-    ]
-    assert not found, f'put a * behind the third argument of {", ".join(found)}'
+def test_every_public_function_says_its_types():
+    def is_untyped(path, entry, arguments):
+        every = arguments + entry.args.kwonlyargs
+        if any(argument.annotation is None for argument in every):
+            return True
+        return entry.returns is None and (entry.name != '__init__' or not every)
+
+    assert found_where(is_untyped) == []
+
+
+def test_what_comes_after_the_third_argument_is_named():
+    def takes_more_than_three(path, entry, arguments):
+        counted = [argument for argument in arguments if argument.arg not in XYZ]
+        return path.name not in POSITIONAL and len(counted) > 3
+
+    assert found_where(takes_more_than_three) == []
