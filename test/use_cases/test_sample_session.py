@@ -62,7 +62,7 @@ def test_truth_is_found_within_the_reported_standard_deviations(output):
 
 def test_an_inspection_by_hand_gives_the_status_of_the_calibration(tmp_path, capsys):
     """
-    The same parameters are determined, fixed and weak, though an inspection holds out no data.
+    The same parameters are determined and fixed, though an inspection holds out no data.
     """
     assert main(['inspect', str(BAG), '--json']) == 0
     (looked_at,) = json.loads(capsys.readouterr().out)['result']['imu']
