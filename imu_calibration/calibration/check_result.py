@@ -16,6 +16,9 @@ from imu_calibration.document.decision import (
 )
 from imu_calibration.document.proof_entry import Proof, ProofEntry
 
+TOO_FEW_WINDOWS = 'fewer than three windows of rest or motion were found; record for longer'
+"""Why there is no proof on a table."""
+
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
@@ -25,7 +28,7 @@ class CheckResult:
     """Sensor -> error before and after by regime (see `proof.prove`); {}: not determined."""
     findings: tuple = ()
     """Findings of the checks of the recording."""
-    why: str = 'fewer than three windows of rest or motion were found; record for longer'
+    why: str = TOO_FEW_WINDOWS
     """Why there is no proof, where there is none."""
     notes: tuple[str, ...] = ()
     """Notes on the result."""

@@ -11,34 +11,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from imu_calibration.calibration.calibrate import Solved, conclude
-from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
-from imu_calibration.calibration.hand_proof import (
-    TURN_ANGLE_UNIT,
-    TURNS_LEAST,
-    entry_of,
-    turn_error,
-)
 from imu_calibration.calibration.hand_recording import HandRecording, read_by_hand
 from imu_calibration.calibration.pose_observations import HandResult, PoseObservations
-from imu_calibration.compensation.stream import compensate_samples
-from imu_calibration.core.errors import InputError, NotObservableError
-from imu_calibration.core.exit_codes import dropped_text
-from imu_calibration.core.samples import ImuSamples, TemperatureSamples
-from imu_calibration.core.units import STANDARD_GRAVITY
-from imu_calibration.document.calibration import Calibration, one_significant
-from imu_calibration.document.proof_entry import Proof, ProofEntry
-from imu_calibration.effects.base import SENSORS, UNITS
+from imu_calibration.core.errors import InputError
+from imu_calibration.document.calibration import one_significant
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE
 from imu_calibration.estimation.solution import REJECTED, with_term
-from imu_calibration.kinematics.rotations import unit_rows
-from imu_calibration.preprocessing.checks import Preflight, unusable
-from imu_calibration.preprocessing.joint_checks import check_force
+from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.references.gravity.hand_calibration import (
     HandCalibration,
     HandData,
     default_gyroscope,
-    gather_by_hand,
     solve_by_hand,
 )
 from imu_calibration.references.gravity.hand_parameters import (
@@ -221,129 +206,3 @@ def calibrate_poses(
     observations = PoseObservations.of(recording, asked, stills)
     solved = solve_hand_by_evidence(observations, asked, as_asked=options.as_asked)
     return conclude(solved, options, provenance=provenance)
-
-
-def check_by_hand(
-    source: Callable, calibration: Calibration, options: CalibrationOptions = CalibrationOptions()
-) -> CheckResult:
-    """
-    Prove a calibration on a recording of its IMU held still in some attitudes.
-
-    With turns between them.
-
-    The error of the accelerometer is the length of its mean reading in a pose less gravity; that of
-    the gyroscope the angle between gravity rotated by its rates and gravity in the pose at the end
-    of a turn, and its mean reading at rest. Before: readings unchanged; after: as corrected by
-    compensation. Directions of gravity are those of the corrected accelerometer for both.
-
-    Parameters
-    ----------
-    source : callable
-        Returns an iterator of SampleBlock.
-    calibration : Calibration
-        From a table or by hand.
-    options : CalibrationOptions
-        The local gravity, if it differs from that of the calibration, and the conversion of volts
-        or counts.
-
-    Raises
-    ------
-    InputError
-        When the recording cannot be used.
-
-    """
-    preflight = Preflight(options.gravity, one_sensor=True)
-    recording = read_by_hand(source(), options.nominal, preflight)
-    try:
-        data = gather_by_hand(recording.imu, temperature_c=recording.temperature_c)
-    except NotObservableError as error:
-        return CheckResult({}, recording.findings, str(error))
-    lost = {**recording.counts, 'unusable': unusable(recording.findings)}
-    check_force(float(np.median(np.linalg.norm(data.poses.force, axis=1))))
-    warm = (
-        None
-        if recording.temperature_c is None
-        else TemperatureSamples(recording.imu.stamp_ns, recording.temperature_c)
-    )
-    corrected = compensate_samples(calibration, recording.imu, warm)
-    # Of an absent sensor either the readings or the parameters have no meaning.
-    absent = {*calibration.absent, *recording.imu.absent}
-    if absent == set(SENSORS):
-        raise InputError(
-            'a calibration must be of a sensor that the recording has, it is of the'
-            f' {calibration.sensors[0]} only and the recording has no readings of it; give another'
-            ' recording',
-            code='absent',
-        )
-    gravity = gravity_of(calibration, options)
-    return CheckResult(
-        prove_hand_readings(data, recording.imu, corrected, gravity=gravity, absent=absent),
-        recording.findings,
-        dropped=dropped_text(lost, len(recording.imu)),
-    )
-
-
-def gravity_of(calibration: Calibration, options: CalibrationOptions) -> float:
-    """
-    Return the reference gravity for readings at rest, m/s^2.
-
-    The given one, or that of the calibration.
-    """
-    return options.gravity or calibration.conditions.get('gravity') or STANDARD_GRAVITY
-
-
-def prove_hand_readings(
-    data: HandData,
-    before: ImuSamples,
-    after: ImuSamples,
-    *,
-    gravity: float,
-    absent: Collection[str] = (),
-) -> Proof:
-    """
-    Return the proof of corrected samples `after` against the raw ones.
-
-    None of the sensors `absent`.
-    """
-    poses, turns = data.poses, [turn for turn in data.turns if turn.rotation is None]
-    ranges = [slice(start, stop) for start, stop in zip(poses.start, poses.stop, strict=True)]
-    (raw_force, raw_rate), (force, rate) = (_means(imu, ranges) for imu in (before, after))
-    rested = float(np.sum(poses.stop - poses.start) * poses.period)
-    lengths = (np.linalg.norm(mean, axis=1, keepdims=True) - gravity for mean in (raw_force, force))
-    proof: dict[str, ProofEntry] = {}
-    for sensor, errors in zip(SENSORS, (lengths, (raw_rate, rate)), strict=True):
-        if sensor not in absent:
-            rest = entry_of(errors, UNITS[sensor], seconds=rested)
-            proof[sensor] = replace(rest, regimes={'rest': rest})
-    # The directions at both ends of a turn are those of the corrected accelerometer.
-    if not absent and len(turns) >= TURNS_LEAST:
-        up = unit_rows(force)
-        # the first corrected readings are NaN where they need an angular acceleration
-        errors = (
-            np.array(
-                [
-                    [
-                        turn_error(
-                            poses,
-                            turn,
-                            imu.rate_s[poses.stop[turn.first] - 1 : poses.start[turn.last] + 1],
-                            up=up,
-                        )
-                    ]
-                    for turn in turns
-                ]
-            )
-            for imu in (before, after)
-        )
-        turning = float(sum(turn.time[-1] - turn.time[0] for turn in turns))
-        angles = entry_of(errors, TURN_ANGLE_UNIT, seconds=turning)
-        regimes = {**proof['gyroscope'].regimes, 'turns': angles}
-        proof['gyroscope'] = replace(angles, regimes=regimes)
-    return proof
-
-
-def _means(imu: ImuSamples, ranges: Sequence[slice]) -> tuple[np.ndarray, ...]:
-    return tuple(
-        np.array([np.nanmean(values[part], axis=0) for part in ranges])
-        for values in (imu.force_s, imu.rate_s)
-    )

@@ -1,28 +1,17 @@
-"""Calibration on a table, and the check of a calibration on another recording."""
+"""Calibration on a table."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from imu_calibration.calibration.calibrate import Solved, conclude
-from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.collector import GatherStep, from_bytes
-from imu_calibration.calibration.proof import (
-    prove_readings,
-    reference_model,
-    reference_values,
-)
 from imu_calibration.calibration.window_observations import TableResult, WindowObservations
-from imu_calibration.compensation.compensate import invertible
-from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.errors import DocumentError, InputError
-from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.progress import report
-from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.samples import SampleBlock, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.trust import (
     end_of,
@@ -34,14 +23,10 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution, shrunk
 from imu_calibration.estimation.solver import solve
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import Preflight, unusable
 from imu_calibration.preprocessing.joint_checks import check_units
-from imu_calibration.preprocessing.window import Window
-from imu_calibration.preprocessing.window_cutter import dropped
 from imu_calibration.references.options import CalibrationOptions, choose_model, settle_model
 from imu_calibration.references.turntable.accumulator import restrict
-from imu_calibration.references.turntable.session_data import HeldOut, SessionData, join, naming
-from imu_calibration.references.turntable.window_statistics import reduce_window
+from imu_calibration.references.turntable.session_data import SessionData, join
 from imu_calibration.selection.questions import MAX_TABLE_PASSES, at_time_constants, linearise_again
 
 
@@ -312,100 +297,3 @@ def _size_effect_unseen(solution: Solution) -> bool:
     )
     # An arm that is seen would bias the bias if left out.
     return len(arms) > 0 and bool(arms.all() and arm.all())
-
-
-def check_on_table(
-    sources: Sequence[Callable],
-    table: Table,
-    calibration: Calibration,
-    *,
-    options: CalibrationOptions = CalibrationOptions(),
-    names: Sequence[str] = (),
-) -> CheckResult:
-    """
-    Return the errors of a calibration on recordings of its IMU on a table.
-
-    They are the errors of the readings that compensation writes.
-
-    Parameters
-    ----------
-    sources : sequence of callables
-        Each returns an iterator of SampleBlock.
-    table : Table
-        The reference; it need not be the one on which the calibration was made.
-    calibration : Calibration
-    options : CalibrationOptions
-        How windows are found, and the conversion of volts or counts.
-    names : sequence of str
-        Names of the recordings for messages.
-
-    Raises
-    ------
-    InputError
-        When a recording cannot be used, or is of another IMU than the one on the table.
-
-    """
-    names = tuple(names or (f'recording {number}' for number in range(1, len(sources) + 1)))
-    model, before, after, parts = reference_model(calibration, table), HeldOut(), HeldOut(), []
-    step = GatherStep(table, model, options.windows, options.nominal, names)
-    for session, source in enumerate(sources):
-        windows: list[Window] = []
-        parts.append(
-            naming(names, session)(
-                step.read,
-                partial(_with_corrected, source, calibration, options),
-                session,
-                Preflight(table.gravity_value),
-                windows=windows,
-            )
-        )
-        for raw, corrected in map(_both, (window for window in windows if window.kind != 'unused')):
-            for held_out, window in ((before, raw), (after, corrected)):
-                if len(window) > 1:
-                    held_out.add(reduce_window(window, model, table, session=session))
-    gathered = join(parts, names, lambda part: check_units(part, model, table))
-    lost = dropped(gathered.counts)
-    kept = sum(count for reason, count in gathered.counts.items() if reason not in lost)
-    return CheckResult(
-        prove_readings(before, after, model, reference=reference_values(model, calibration)),
-        gathered.findings,
-        dropped=dropped_text({**lost, 'unusable': unusable(gathered.findings)}, kept),
-    )
-
-
-def _with_corrected(
-    source: Callable, calibration: Calibration, options: CalibrationOptions
-) -> Iterator[SampleBlock]:
-    """
-    Yield the blocks of a recording with corrected readings in addition to the raw ones.
-
-    As compensation writes them into a bag.
-    """
-    temperature = None
-    if invertible(calibration.model).needs_temperature:
-        known = [block.temperature for block in source() if block.temperature is not None]
-        temperature = TemperatureSamples.concatenate(known) if known else None
-    stream = CompensationStream(calibration, temperature=temperature)
-    for block in source():
-        if block.imu is not None and len(block.imu):
-            # The cleaner converts the raw readings of the block afterwards.
-            readings = options.nominal or RawReadings()
-            found = stream.correct(readings.apply(block.imu))
-            block = replace(
-                block, imu=replace(block.imu, corrected=np.hstack([found.force, found.rate]))
-            )
-        yield block
-
-
-def _both(window: Window) -> tuple[Window, Window]:
-    """
-    Return a window with raw readings and the same with corrected ones.
-
-    Both are without samples that cannot be corrected.
-    """
-    corrected = window.corrected
-    assert corrected is not None, 'the window is of corrected readings'
-    known = np.isfinite(corrected).all(axis=1)
-    if not known.all():
-        window, corrected = window.select(known), corrected[known]
-    return window, replace(window, force_s=corrected[:, :3], rate_s=corrected[:, 3:])

@@ -13,23 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
+from imu_calibration.calibration.check import check
 from imu_calibration.calibration.check_result import CheckResult
-from imu_calibration.calibration.hand_workflow import (
-    calibrate_without_table,
-    check_by_hand,
-    gravity_of,
-)
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
+from imu_calibration.calibration.pose_readings import errors_by_hand
 from imu_calibration.calibration.result import CalibrationResult, summary
-from imu_calibration.calibration.table_calibration import check_on_table
+from imu_calibration.calibration.window_readings import errors_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import counter, report
 from imu_calibration.core.readings import STATED_KEYS
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.core.settings import CHANGE
 from imu_calibration.document import files
-from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
+from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.change import changes_since, checked_limit, with_kinds_by_hand
+from imu_calibration.document.change import checked_limit
 from imu_calibration.document.decision import Verdict
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.document.proof_entry import EarlierErrors
@@ -188,9 +186,8 @@ def calibrate_recordings(
         else:
             result = _side_by_side(sources, table, options, recordings, jobs)
             if earlier is not None and result.calibration.proof:
-                result = _beside(
-                    result, check_on_table(sources, table, earlier, options=options).proof
-                )
+                errors = errors_on_table(sources, table, earlier, options=options)
+                result = _beside(result, errors.proof)
         calibration = result.calibration
         return Calibrated(
             replace(
@@ -276,49 +273,12 @@ def check_recording(
         described.pop(name, None)
     options, table, sources = inputs_of([recording], table, described)
     if table is None:
-        result, notes = (
-            check_by_hand(sources[0], calibration, options),
-            _gravity(options, calibration),
-        )
+        errors = errors_by_hand(sources[0], calibration, options)
     else:
-        result, notes = (
-            check_on_table(
-                sources, table, calibration, options=options, names=[name_of(recording)]
-            ),
-            (),
-        )
-    refused = {}
-    for sensor in calibration.sensors:
-        if why := never_applied(calibration, sensor):
-            refused[sensor] = why
-    questions = scale_questions(calibration).values()
-    stored = calibration.proof
-    if table is None:
-        # A table compares components, rests by hand the length: only these errors are alike.
-        stored = with_kinds_by_hand(stored)
-    changes = changes_since(stored, result.proof)
-    if result.proof and not changes:
-        notes = (*notes, 'the file has no held-out error of the same kinds of motion to compare')
-    return replace(
-        result,
-        notes=(*notes, *questions, *_notes(recording, calibration)),
-        refused=refused,
-        changes=changes,
-        change_limit=limit,
-    )
-
-
-def _gravity(options, calibration):
-    """Return a note on the gravity used, when none was given."""
-    if options.gravity:
-        return ()
-    taken = gravity_of(calibration, options)
-    return (
-        (
-            f'gravity is that of the calibration, {taken:.6g} m/s^2; give the local value if it'
-            ' differs'
-        ),
-    )
+        names = [name_of(recording)]
+        errors = errors_on_table(sources, table, calibration, options=options, names=names)
+    result = check(errors, calibration, change_limit=limit)
+    return replace(result, notes=(*result.notes, *_notes(recording, calibration)))
 
 
 def _notes(recording, calibration):

@@ -12,7 +12,7 @@ import pytest
 
 import imu_calibration as imu
 from imu_calibration.calibration.hand_recording import read_by_hand
-from imu_calibration.calibration.hand_workflow import prove_hand_readings
+from imu_calibration.calibration.pose_readings import prove_hand_readings
 from imu_calibration.calibration.proof import nominal_values
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.core.units import DEG

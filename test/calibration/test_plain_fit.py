@@ -19,10 +19,8 @@ from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
     helpful_formulas,
 )
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
-from imu_calibration.calibration.table_calibration import (
-    TableRecordings,
-    check_on_table,
-)
+from imu_calibration.calibration.table_calibration import TableRecordings
+from imu_calibration.calibration.window_readings import errors_on_table
 from imu_calibration.document.proof_entry import ProofEntry, RegimeErrors
 from imu_calibration.effects.base import SENSORS, Role
 from imu_calibration.effects.catalogue import term
@@ -157,7 +155,7 @@ def plain_values(session, table):
 
 def errors_on_second(kind, seed, calibration):
     pair, table, *_ = world(kind, seed)
-    proof = check_on_table([source(pair.second)], table, calibration).proof
+    proof = errors_on_table([source(pair.second)], table, calibration).proof
     return np.array([proof[sensor].after for sensor in SENSORS])
 
 

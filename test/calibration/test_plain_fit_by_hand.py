@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from imu_calibration.calibration.hand_workflow import calibrate_without_table, check_by_hand
+from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.plain_fit import PlainFit, misses
+from imu_calibration.calibration.pose_readings import errors_by_hand
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
@@ -88,7 +89,7 @@ def test_turns_of_a_second_session_are_no_worse_than_with_least_squares():
     plain = with_plain_values(result.calibration, first)
     errors = []
     for calibration in (result.calibration, plain):
-        proof = check_by_hand(source(second), calibration, OPTIONS).proof
+        proof = errors_by_hand(source(second), calibration, OPTIONS).proof
         regimes = proof['gyroscope'].regimes
         errors.append([proof['accelerometer'].after, regimes['rest'].after, regimes['turns'].after])
     assert np.all(np.divide(*errors) < 1.05)

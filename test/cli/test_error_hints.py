@@ -105,7 +105,6 @@ UNREACHABLE = {
         'calibration': 'no recording is replayed',
         'jobs': 'one process reads',
         'scheduler': 'one process reads',
-        'target_frame': 'no calibration is applied',
     },
     'planner_node': {
         'increments': 'no readings are compared',
@@ -121,7 +120,6 @@ UNREACHABLE = {
         'inspect': 'no calibration is estimated',
         'temperature_topic': 'no recording is replayed',
         'up': 'of transforms in a bag',
-        'target_frame': 'no calibration is applied',
     },
     'simulator_node': {
         'up': 'of transforms in a bag',

@@ -7,9 +7,10 @@ import pytest
 from refusal import refused
 
 from imu_calibration.allan.identify import figures_of, identify_noise
+from imu_calibration.calibration.check import check
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.hand_recording import read_by_hand
-from imu_calibration.calibration.hand_workflow import check_by_hand
+from imu_calibration.calibration.pose_readings import errors_by_hand
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.document.outcome import exit_code, shortcomings
@@ -83,8 +84,13 @@ def test_a_recording_without_any_reading_is_refused(clean):
 
 def test_check_and_compensate_note_the_part(clean, usual):
     bad = without_output(clean, 20.0, 36.0)
-    checked = check_by_hand(lambda: iter([SampleBlock(bad)]), usual.calibration, OPTIONS)
-    good = check_by_hand(lambda: iter([SampleBlock(clean)]), usual.calibration, OPTIONS)
+    checked, good = (
+        check(
+            errors_by_hand(lambda: iter([SampleBlock(samples)]), usual.calibration, OPTIONS),
+            usual.calibration,
+        )
+        for samples in (bad, clean)
+    )
     assert (checked.exit_code, good.exit_code) == (3, 0)
     assert checked.proof['accelerometer'].after < 2 * good.proof['accelerometer'].after
     corrected = compensate_recording(bad, usual.calibration)

@@ -1,0 +1,76 @@
+"""Does a calibration help on another recording, and has its error changed? For any reference."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from imu_calibration.calibration.check_result import TOO_FEW_WINDOWS, CheckResult
+from imu_calibration.core.exit_codes import dropped_text
+from imu_calibration.core.settings import CHANGE
+from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
+from imu_calibration.document.change import changes_since
+from imu_calibration.document.proof_entry import Proof
+from imu_calibration.preprocessing.checks import unusable
+from imu_calibration.preprocessing.recording_evidence import CheckFinding
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReadingErrors:
+    """
+    Errors of the readings of a recording against a reference, raw and as compensation writes them.
+
+    This is what a reference contributes to a check (`window_readings`, `pose_readings`).
+    """
+
+    proof: Proof
+    """Sensor -> error before and after by regime; {} with too few data."""
+    stored: Proof
+    """Held-out errors in the file of the calibration, with the same names of motions."""
+    findings: tuple[CheckFinding, ...]
+    """Findings of the checks of the recording."""
+    lost: Mapping[str, int]
+    """Reason -> samples that are not used because of a fault."""
+    n_used: int
+    """Samples without a fault."""
+    why: str = TOO_FEW_WINDOWS
+    """Why there is no proof, where there is none."""
+    notes: tuple[str, ...] = ()
+    """Notes on the reference."""
+
+
+def check(
+    errors: ReadingErrors, calibration: Calibration, *, change_limit: float = CHANGE
+) -> CheckResult:
+    """
+    Return the result of the check of a calibration.
+
+    Parameters
+    ----------
+    errors : ReadingErrors
+        Of a recording of its IMU.
+    calibration : Calibration
+    change_limit : float
+        Factor of the error from which a significant change counts, at least 1.
+
+    """
+    refused = {}
+    for sensor in calibration.sensors:
+        if why := never_applied(calibration, sensor):
+            refused[sensor] = why
+
+    # Errors of the same kind of motion now and on the day of the calibration.
+    changes = changes_since(errors.stored, errors.proof)
+    notes = [*errors.notes]
+    if errors.proof and not changes:
+        notes.append('the file has no held-out error of the same kinds of motion to compare')
+    notes += scale_questions(calibration).values()
+
+    return CheckResult(
+        errors.proof,
+        errors.findings,
+        why=errors.why,
+        notes=tuple(notes),
+        refused=refused,
+        changes=changes,
+        change_limit=change_limit,
+        dropped=dropped_text({**errors.lost, 'unusable': unusable(errors.findings)}, errors.n_used),
+    )
