@@ -37,7 +37,7 @@ class ReadingErrors:
     """Notes on the reference."""
 
 
-def check(
+def check_errors(
     errors: ReadingErrors, calibration: Calibration, *, change_limit: float = CHANGE
 ) -> CheckResult:
     """

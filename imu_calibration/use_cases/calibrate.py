@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from imu_calibration.calibration.by_evidence import calibrate_by_evidence
-from imu_calibration.calibration.check import check
+from imu_calibration.calibration.check import check_errors
 from imu_calibration.calibration.check_result import CheckResult
 from imu_calibration.calibration.hand_workflow import calibrate_without_table
 from imu_calibration.calibration.pose_readings import errors_by_hand
@@ -277,7 +277,7 @@ def check_recording(
     else:
         names = [name_of(recording)]
         errors = errors_on_table(sources, table, calibration, options=options, names=names)
-    result = check(errors, calibration, change_limit=limit)
+    result = check_errors(errors, calibration, change_limit=limit)
     return replace(result, notes=(*result.notes, *_notes(recording, calibration)))
 
 

@@ -7,7 +7,7 @@ import pytest
 from refusal import refused
 
 from imu_calibration.allan.identify import figures_of, identify_noise
-from imu_calibration.calibration.check import check
+from imu_calibration.calibration.check import check_errors
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.calibration.pose_readings import errors_by_hand
@@ -85,7 +85,7 @@ def test_a_recording_without_any_reading_is_refused(clean):
 def test_check_and_compensate_note_the_part(clean, usual):
     bad = without_output(clean, 20.0, 36.0)
     checked, good = (
-        check(
+        check_errors(
             errors_by_hand(lambda: iter([SampleBlock(samples)]), usual.calibration, OPTIONS),
             usual.calibration,
         )
