@@ -15,7 +15,7 @@ MOST_LINES = 50
 """Lines from which a decoration is recognised."""
 LEAST_CELLS = 4
 """Labelled cells in a line, at least; three readings and a time."""
-LEAST_SHARE = 0.8
+LEAST_DECORATED_SHARE = 0.8
 """Share of these lines with the decoration, at least."""
 CELLS_OF_ECHO = 40
 """Numbers of a sensor_msgs/Imu, of which `ros2 topic echo` prints no header."""
@@ -97,4 +97,4 @@ def _with_header_of_echo(lines):
 
 def _are_most(found):
     """Return whether most lines have a decoration."""
-    return bool(found) and sum(map(bool, found)) >= LEAST_SHARE * len(found)
+    return bool(found) and sum(map(bool, found)) >= LEAST_DECORATED_SHARE * len(found)

@@ -21,8 +21,7 @@ import numpy as np
 from imu_calibration.core.documents import open_regular
 from imu_calibration.core.errors import InputError, shortened
 from imu_calibration.core.progress import remark
-from imu_calibration.core.readings import SPELLINGS as READING_SPELLINGS
-from imu_calibration.core.readings import UNIT_SIZES, unit_of
+from imu_calibration.core.readings import READING_SPELLINGS, UNIT_SIZES, unit_of
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
 from imu_calibration.preprocessing.counter_overflow import without_overflows
@@ -121,14 +120,14 @@ and rate.
 """
 LONGEST_NUMBER = 100
 """Characters of a cell that is tested for a number; a double has 24."""
-LONGEST_NAME = 200
+LONGEST_COLUMN_NAME = 200
 """Characters of the name of a column; names are matched with expressions that may backtrack."""
 PERIODS = (('s', 1.25e-4, 0.11), ('ms', 0.12, 110.0), ('us', 120.0, 1.1e5), ('ns', 1.2e5, 1.1e8))
 """
 Unit of time -> range of the median step for rates of 9 to 8000 Hz; the ranges do not overlap within
 the usual rates.
 """
-CLOCK = re.compile(
+TIME_OF_DAY = re.compile(
     r'\s*(?:\d{1,2}[./-]\d{1,2}[./-]\d{2,4},?[ T]\s*)?(\d{1,2}):(\d\d):(\d\d)(?:[.,:](\d+))?\s*'
     r'(?:([AaPp])\.?[Mm]\.?)?\s*'
 )
@@ -640,7 +639,7 @@ def _size_of(columns):
 
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 """First bytes of text in UTF-16, as spreadsheets export it."""
-COMPRESSED = {b'\x1f\x8b': 'gzip', b'PK': 'zip', b'\x28\xb5': 'zstd', b'BZ': 'bzip2'}
+COMPRESSORS = {b'\x1f\x8b': 'gzip', b'PK': 'zip', b'\x28\xb5': 'zstd', b'BZ': 'bzip2'}
 """First two bytes -> program that has compressed a file."""
 
 
@@ -653,7 +652,7 @@ def _opened(path):
 
 def _refuse_compressed(path):
     with open_regular(path) as file:
-        program = COMPRESSED.get(file.read(2))
+        program = COMPRESSORS.get(file.read(2))
         binary = b'\0' in file.read(HEAD_BYTES)
     if program is not None and binary:
         raise InputError(
@@ -725,9 +724,9 @@ class _Table:
                 for name, unit in zip(self.names, units, strict=True)
             ]
         longest = max(map(len, self.names))
-        if longest > LONGEST_NAME:
+        if longest > LONGEST_COLUMN_NAME:
             raise InputError(
-                f'a column name of {path} must have at most {LONGEST_NAME} characters, got'
+                f'a column name of {path} must have at most {LONGEST_COLUMN_NAME} characters, got'
                 f' {longest}; shorten the header',
                 code='csv_header',
             )
@@ -740,7 +739,7 @@ class _Table:
             for k, cell in enumerate(rows[first])
             if re.match(r'\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d', cell)
         }
-        self.clocks = {k for k, cell in enumerate(rows[first]) if CLOCK.fullmatch(cell)}
+        self.clocks = {k for k, cell in enumerate(rows[first]) if TIME_OF_DAY.fullmatch(cell)}
         self.n_dropped = 0
         self.lines = []
         self._values = {}
@@ -920,7 +919,7 @@ def _times_of_day(cells):
     """
     time_ns = np.full(len(cells), NO_TIME, np.int64)
     for k, cell in enumerate(cells):
-        found = CLOCK.fullmatch(cell)
+        found = TIME_OF_DAY.fullmatch(cell)
         if found:
             hours, minutes, seconds, fraction, half = found.groups(default='')
             hour = int(hours)

@@ -24,7 +24,7 @@ DEFAULT_TOPICS = {
     TEMPERATURE_TYPE: '/imu/temperature',
 }
 
-FIELDS = {
+FIELDS_OF_TYPE = {
     IMU_TYPE: """\
 std_msgs/Header header
 geometry_msgs/Quaternion orientation
@@ -97,18 +97,18 @@ class TypeDefinition(NamedTuple):
 @cache
 def standard_definition(message_type: str) -> TypeDefinition:
     """Return the TypeDefinition of a type that this package supports, as in ROS 2 Jazzy."""
-    text = FIELDS[message_type]
+    text = FIELDS_OF_TYPE[message_type]
     for nested in _nested_types(message_type):
-        text += f'{SEPARATOR}\nMSG: {nested.replace("/msg/", "/")}\n{FIELDS[nested]}'
+        text += f'{SEPARATOR}\nMSG: {nested.replace("/msg/", "/")}\n{FIELDS_OF_TYPE[nested]}'
     return TypeDefinition(message_type, 'ros2msg', text, DIGESTS[message_type])
 
 
 def _nested_types(message_type):
     """Return the types of the fields and of their fields, each once, in the order of the fields."""
     nested = {}
-    for kind, _ in _fields(FIELDS[message_type], message_type)[message_type]:
+    for kind, _ in _fields(FIELDS_OF_TYPE[message_type], message_type)[message_type]:
         name = kind.partition('[')[0]
-        if name in FIELDS:
+        if name in FIELDS_OF_TYPE:
             nested[name] = None
             nested.update(dict.fromkeys(_nested_types(name)))
     return list(nested)

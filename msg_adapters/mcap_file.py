@@ -254,10 +254,10 @@ def _strings(content, position, count):
 
 FIRST_BYTES = 1 << 16
 """
-Bytes read at first of messages outside of chunks; doubled up to `STRETCH_BYTES` while no other
-record is between them, otherwise reduced, so that few bytes are read twice.
+Bytes read at first of messages outside of chunks; doubled up to `CHUNK_STRETCH_BYTES` while no
+other record is between them, otherwise reduced, so that few bytes are read twice.
 """
-STRETCH_BYTES = 4 << 20
+CHUNK_STRETCH_BYTES = 4 << 20
 """Chunks are joined to about this size before they are decoded."""
 FOOTER_SIZE = PREFIX.size + 20
 
@@ -354,7 +354,7 @@ class McapFile(StorageFile):
         for piece in self._pieces(wanted):
             waiting.append(piece)
             n_waiting += len(piece[1].buffer)
-            if n_waiting >= STRETCH_BYTES:
+            if n_waiting >= CHUNK_STRETCH_BYTES:
                 yield _join(waiting)
                 waiting, n_waiting = [], 0
         if waiting:
@@ -429,7 +429,7 @@ class McapFile(StorageFile):
                 )
                 messages, others, end = walk(buffer)
                 if 2 * end > len(buffer):
-                    ahead = min(2 * ahead, STRETCH_BYTES)
+                    ahead = min(2 * ahead, CHUNK_STRETCH_BYTES)
                 else:
                     ahead = max(2 * end, MESSAGE_PREFIX)
                 if end:

@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """
-Print back-quoted names in docstrings and comments that the code does not have.
+Print back-quoted names that the code does not have, and public names with two meanings.
 
 Fail if there is one.
 
 Usage: `quoted_names.py [ROOT]`. A name in single back quotes is a module, class, function,
 argument, attribute or key of imu_calibration or msg_adapters; with dots, each part is a name in the
-module or package before it. Names of files and of other packages are in double back quotes.
+module or package before it. Names of files and of other packages are in double back quotes. A
+public function, class or constant is defined in one module.
 """
 
 import argparse
@@ -16,6 +17,16 @@ import re
 import sys
 
 PACKAGES = ('imu_calibration', 'msg_adapters')
+SAME_ROLE = {
+    'main': 'entry of a program',
+    'EXAMPLES': 'command lines in the help of a verb',
+    'add_arguments': 'options of a verb',
+    'run': 'action of a verb, or of a motion',
+    'TARGETS': 'exports that a module adds to the registry',
+    'diagnose': 'a use case, and the same in a notebook',
+    'simulate': 'a use case, and the same in a notebook',
+}
+"""Public names that several modules define -> their one meaning."""
 QUOTED = re.compile(r'(?<!`)`([A-Za-z_][\w.]*)`(?!`)')
 
 
@@ -67,12 +78,40 @@ def absent_names(root: pathlib.Path) -> list[str]:
     return lines
 
 
+def defined_in(tree: ast.Module) -> set[str]:
+    """Return the public functions, classes and constants that a module defines."""
+    found = set()
+    for node in tree.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            found.add(node.name)
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found.update(target.id for target in targets if isinstance(target, ast.Name))
+    return {name for name in found if not name.startswith('_')}
+
+
+def ambiguous_names(root: pathlib.Path) -> list[str]:
+    """Return a line for each public name that two modules define, unless its role is the same."""
+    homes: dict[str, list[str]] = {}
+    for package in PACKAGES:
+        for path in sorted((root / package).rglob('*.py')):
+            for name in defined_in(ast.parse(path.read_text(encoding='utf8'))) - set(SAME_ROLE):
+                homes.setdefault(name, []).append(str(path.relative_to(root)))
+    lines = []
+    for name, paths in sorted(homes.items()):
+        if len(paths) > 1:
+            lines.append(f'{paths[1]}: must not define {name}, which {paths[0]} defines')
+    return lines
+
+
 def main():
     """Print the names."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('root', nargs='?', default='.')
-    lines = absent_names(pathlib.Path(parser.parse_args().root))
-    print('\n'.join(lines) if lines else 'each back-quoted name exists')
+    root = pathlib.Path(parser.parse_args().root)
+    lines = [*absent_names(root), *ambiguous_names(root)]
+    fine = 'each back-quoted name exists, and each public name is defined once'
+    print('\n'.join(lines) if lines else fine)
     return int(bool(lines))
 
 

@@ -63,12 +63,12 @@ NOISE_UNITS = {
 }
 """Unit of every figure."""
 TERMS = (QUANTISATION.name, WHITE.name, FLICKER.name, GAUSS_MARKOV, TIME_KEY, RANDOM_WALK.name)
-LARGEST = 1e30
+LARGEST_FIGURE = 1e30
 """Figures of a document at most; their squares are finite."""
 STATUSES = (DETERMINED, WEAK, HELD)
 """Statuses of a figure."""
-_FIGURE = number(-LARGEST, LARGEST)
-_SIZE = number(0.0, LARGEST, code='status_or_interval')
+_FIGURE = number(-LARGEST_FIGURE, LARGEST_FIGURE)
+_SIZE = number(0.0, LARGEST_FIGURE, code='status_or_interval')
 _FORM = list_of(text(*TERMS, code='not_a_text'))
 
 
@@ -109,7 +109,7 @@ _CURVE = list_of(_FIGURE)
 NOISE = Document(
     'noise document',
     mapping(
-        {'sampling_rate': number(0.0, LARGEST, above=True, code='rate_not_positive')},
+        {'sampling_rate': number(0.0, LARGEST_FIGURE, above=True, code='rate_not_positive')},
         {
             **dict.fromkeys(SENSORS, _SENSOR),
             'frame_id': text(code='not_a_text'),

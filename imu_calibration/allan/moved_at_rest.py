@@ -2,15 +2,15 @@
 
 import numpy as np
 
-LEAST_CHUNKS = 80
+LEAST_REST_CHUNKS = 80
 """Chunks of a rest, at least."""
-DEGREE = 4
+DRIFT_DEGREE = 4
 """
 Degree of the polynomial removed from both: warm-up, drift, and the bias in the sum of the rates.
 """
 LEAST_TILT = 5e-4
 """Rms tilt from which on it is motion, rad."""
-LEAST_EXPLAINED = 0.8
+LEAST_EXPLAINED_TILT = 0.8
 """Share of the changes of gravity's direction that the rates explain, at least."""
 MOST_FACTOR = 1.4
 """Ratio of both tilts, at most: scales are off by less."""
@@ -33,7 +33,7 @@ def tilt_at_rest(time: np.ndarray, mean: np.ndarray) -> float:
 
     """
     length = np.linalg.norm(mean[:, :3], axis=1)
-    if len(time) < LEAST_CHUNKS or not np.isfinite(mean).all() or not length.min() > 0:
+    if len(time) < LEAST_REST_CHUNKS or not np.isfinite(mean).all() or not length.min() > 0:
         return 0.0
     direction = mean[:, :3] / length[:, None]
     step = np.diff(time, prepend=time[0])[:, None]
@@ -42,7 +42,7 @@ def tilt_at_rest(time: np.ndarray, mean: np.ndarray) -> float:
 
     # Movement beyond a polynomial in time.
     scaled_time = np.linspace(-1.0, 1.0, len(time))
-    basis, _ = np.linalg.qr(np.vander(scaled_time, DEGREE + 1))
+    basis, _ = np.linalg.qr(np.vander(scaled_time, DRIFT_DEGREE + 1))
     predicted = predicted - basis @ (basis.T @ predicted)
     measured = direction - basis @ (basis.T @ direction)
 
@@ -54,6 +54,6 @@ def tilt_at_rest(time: np.ndarray, mean: np.ndarray) -> float:
         return 0.0
     factor = float(np.sum(predicted * measured)) / power
     explained = factor**2 * power / total
-    if explained < LEAST_EXPLAINED or not 1 / MOST_FACTOR < factor < MOST_FACTOR:
+    if explained < LEAST_EXPLAINED_TILT or not 1 / MOST_FACTOR < factor < MOST_FACTOR:
         return 0.0
     return float(tilt)

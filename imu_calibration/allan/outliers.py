@@ -12,12 +12,12 @@ PIECE = 1024
 """Samples that are decided together, with one estimate of their scatter."""
 MEDIAN_SAMPLES = 7
 """Samples of the running median: three outliers among them do not shift it to one of them."""
-CONTEXT = 8
+CONTEXT_SAMPLES = 8
 """Samples on either side of a piece that its running median and its counts use."""
 FAR = 5.5
 """Standard deviations beyond which a reading is an outlier: white noise exceeds it in 4e-8."""
 MOST_AROUND = 6
-"""Outliers of an axis among the 2 CONTEXT + 1 readings around one, at most; more are motion."""
+"""Outliers of an axis among the 2 CONTEXT_SAMPLES + 1 readings around one, at most; more: moved."""
 TAIL_QUANTILE, TAIL_SD = 0.9, 1.645
 """Quantile of absolute values, and its value for a standard normal distribution."""
 NORMAL_QUARTILE = 0.6745
@@ -41,11 +41,11 @@ class RestOutliers:
         self._n_before = 0
 
     def push(self, samples: ImuSamples) -> list[ImuSamples]:
-        """Return the samples with a decision; at most `PIECE` + `CONTEXT` are buffered."""
+        """Return the samples with a decision; at most `PIECE` + `CONTEXT_SAMPLES` are buffered."""
         held = samples if self._held is None else type(samples).concatenate([self._held, samples])
         self._held = held
         passed = []
-        while len(self._held) >= self._n_before + PIECE + CONTEXT:
+        while len(self._held) >= self._n_before + PIECE + CONTEXT_SAMPLES:
             passed.append(self._decide(self._n_before + PIECE))
         return passed
 
@@ -60,7 +60,7 @@ class RestOutliers:
     def _decide(self, stop):
         """Return the samples up to row `stop` without outliers; their last rows become context."""
         assert self._held is not None
-        context = self._held.select(slice(0, min(stop + CONTEXT, len(self._held))))
+        context = self._held.select(slice(0, min(stop + CONTEXT_SAMPLES, len(self._held))))
         values = np.hstack([context.force_s, context.rate_s])
         decided = slice(self._n_before, stop)
         outlying = outliers(values)[decided]
@@ -68,7 +68,7 @@ class RestOutliers:
         self.dropped += int(np.count_nonzero(outlying))
         if outlying.any():
             kept = kept.select(~outlying)
-        first = max(stop - CONTEXT, 0)
+        first = max(stop - CONTEXT_SAMPLES, 0)
         self._n_before = stop - first
         self._held = self._held.select(slice(first, None))
         return kept
@@ -104,7 +104,7 @@ def outliers(values: np.ndarray) -> np.ndarray:
     """
     from scipy.ndimage import median_filter, uniform_filter1d  # here, because its import is slow
 
-    if len(values) < 4 * CONTEXT:
+    if len(values) < 4 * CONTEXT_SAMPLES:
         return np.zeros(len(values), bool)
     deviation = np.abs(values - median_filter(values, (MEDIAN_SAMPLES, 1), mode='nearest'))
     # The quantile is for readings that repeat, of which many deviate by zero.
@@ -120,6 +120,6 @@ def outliers(values: np.ndarray) -> np.ndarray:
             typical_change = np.median(changes)
         scatter[column] = max(scatter[column], typical_change)
     far = deviation > FAR * scatter
-    around = uniform_filter1d(far.astype(float), 2 * CONTEXT + 1, axis=0, mode='constant')
-    single = far & (around * (2 * CONTEXT + 1) < MOST_AROUND + 0.5)
+    around = uniform_filter1d(far.astype(float), 2 * CONTEXT_SAMPLES + 1, axis=0, mode='constant')
+    single = far & (around * (2 * CONTEXT_SAMPLES + 1) < MOST_AROUND + 0.5)
     return single.any(axis=1)

@@ -9,7 +9,7 @@ from imu_calibration.allan.torn_reads import HIGH_BYTE, Excess, excess_of_torn_r
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.preprocessing.scan import SENSOR_COLUMNS
 
-LEAST_STEPS = 4.0
+LEAST_STEPS_IN_SCATTER = 4.0
 """Steps of the converter within the scatter, at least: below, its quantiles are those of steps."""
 WIDENING_SDS = 1.0
 """sds of an excess from which on it widens the interval of the white noise."""
@@ -24,18 +24,18 @@ core, and larger ones are outliers, which are excluded before.
 """
 MEAN_DEVIATION = 0.8
 """Mean of the absolute value of a standard normal variable."""
-BLOCK = 32
+READINGS_PER_MEAN = 32
 """
 Neighbouring readings whose mean is subtracted: motion and drift are slower, and an outlier moves
 the mean by 3 % of its size.
 """
-REPEATED = 0.05
+NAMED_REPEATED_SHARE = 0.05
 """Share of repeated readings above which they are named."""
 TOGETHER = 0.9
 """Where an axis repeats its reading, the other axes do in at least this share: no chance."""
-LEAST_READINGS = 1024
+LEAST_CORE_READINGS = 1024
 """Readings of the core, at least."""
-MOST_READINGS = 200_000
+MOST_KEPT_READINGS = 200_000
 """Readings that are kept."""
 
 
@@ -149,13 +149,13 @@ class FaultSearch:
 
     def _add_blocks(self, sensor, readings):
         """Add the complete blocks of a sensor; the last one is continued."""
-        if self._n_kept[sensor] >= MOST_READINGS:
+        if self._n_kept[sensor] >= MOST_KEPT_READINGS:
             return
         readings = np.vstack([self._next_block[sensor], readings])
-        n_complete = len(readings) // BLOCK
-        self._next_block[sensor] = readings[n_complete * BLOCK :].copy()
-        self._readings[sensor].append(readings[: n_complete * BLOCK].copy())
-        self._n_kept[sensor] += n_complete * BLOCK
+        n_complete = len(readings) // READINGS_PER_MEAN
+        self._next_block[sensor] = readings[n_complete * READINGS_PER_MEAN :].copy()
+        self._readings[sensor].append(readings[: n_complete * READINGS_PER_MEAN].copy())
+        self._n_kept[sensor] += n_complete * READINGS_PER_MEAN
 
     def _add_runs(self, k, changes, n_pairs):
         """Add the lengths of the runs that end at `changes`; the last one is continued."""
@@ -181,7 +181,7 @@ class FaultSearch:
             return NO_FAULTS
         share = self._n_same_sensor / self._n_pairs
         largest_axis_share = self._n_same_axis.reshape(2, 3).max(axis=1) / self._n_pairs
-        repeats = (share > REPEATED) & (share > TOGETHER * largest_axis_share)
+        repeats = (share > NAMED_REPEATED_SHARE) & (share > TOGETHER * largest_axis_share)
         # Root of the mean square over the mean of the lengths; 1 before the first complete run.
         n_runs = np.maximum(self._n_runs, 1.0)
         mean_square = np.maximum(self._run_squares, 1.0) / n_runs
@@ -206,7 +206,7 @@ class FaultSearch:
         """Return the list of `Excess` of each axis, by tails and by torn reads."""
         of_axes: list[list[Excess]] = []
         for sensor, columns in SENSOR_COLUMNS.items():
-            if self._n_kept[sensor] < LEAST_READINGS:
+            if self._n_kept[sensor] < LEAST_CORE_READINGS:
                 of_axes += [[], [], []]
                 continue
             of_sensor = np.concatenate(self._readings[sensor]).T
@@ -221,14 +221,14 @@ class FaultSearch:
 
 def _excesses_of_tails(readings, smallest_step):
     """Return the `Excess` that the tails of an axis give, one for each core with known scale."""
-    blocks = readings.reshape(-1, BLOCK)
+    blocks = readings.reshape(-1, READINGS_PER_MEAN)
     deviation = (blocks - blocks.mean(axis=1, keepdims=True)).ravel()
     sd = float(np.sqrt(np.mean(deviation**2)))
     excesses = []
     for core in CORES:
         core_sd = core.sd(deviation)
         # The quantiles of few steps are those of the steps.
-        if core_sd < LEAST_STEPS * smallest_step:
+        if core_sd < LEAST_STEPS_IN_SCATTER * smallest_step:
             continue
         excess = sd / core_sd - 1.0
         if excess <= 0.0:

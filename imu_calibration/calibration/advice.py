@@ -175,7 +175,7 @@ GOAL_SHARE = 0.85
 Share of the tolerance as goal: the scatter of some twenty poses and turns, a part of every standard
 deviation, is known to a sixth.
 """
-MOST_STEPS = 60
+MOST_PLANNED_STEPS = 60
 MIN_POSE_GAIN = 1e-3
 """
 Poses with a smaller relative gain are not planned; other information is required, such as the
@@ -315,7 +315,7 @@ def foretold(knowledge: HandKnowledge) -> list[HandStep]:
 def _rollout(knowledge: HandKnowledge, weight: float) -> tuple[list[HandStep], float]:
     """Return (the steps by greedy choice, the remaining excess)."""
     steps: list[HandStep] = []
-    while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_STEPS:
+    while float(knowledge.missing(knowledge.information)) > 0 and len(steps) < MOST_PLANNED_STEPS:
         step, worth, _ = knowledge.best(weight=weight)
         if worth.max() < MIN_POSE_GAIN:
             break

@@ -14,7 +14,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding, Severity
 from imu_calibration.references.turntable.session_data import SessionData
 
-CHECK = 'latitude'
+LATITUDE_CHECK = 'latitude'
 CONTRADICTING_SDS = 5.0
 """Standard deviations beyond which the estimate contradicts the latitude."""
 NAMED_SDS = 3.0
@@ -22,7 +22,7 @@ NAMED_SDS = 3.0
 The same where a g-sensitivity is in the model, which may stand for another latitude; without one, a
 note from here on.
 """
-LEAST_SHARE = 0.1
+LEAST_EARTH_SHARE = 0.1
 """The same as a share of the Earth's rate: below, small errors of the model explain it."""
 AGREEING_SDS = 4.0
 """Standard deviations within which an estimate agrees with a cause."""
@@ -215,7 +215,7 @@ def _vertical_rate(table: Table) -> float:
 
 
 def _contradicts(difference: float, sd: float, sds: float = CONTRADICTING_SDS) -> bool:
-    return abs(difference) > max(sds * sd, LEAST_SHARE * EARTH_RATE)
+    return abs(difference) > max(sds * sd, LEAST_EARTH_SHARE * EARTH_RATE)
 
 
 def _severity(difference: float, sd: float, sds: float = CONTRADICTING_SDS) -> Severity | None:
@@ -245,7 +245,7 @@ def _finding(
     name: str, measured: float, sd: float, *, expected: float, severity: Severity
 ) -> CheckFinding:
     return CheckFinding(
-        CHECK,
+        LATITUDE_CHECK,
         severity,
         f"the latitude must give the {name} of the Earth's rate: {_hourly(expected)} deg/h, the"
         f' gyroscopes measured {_hourly(measured)} ± {_hourly(sd)} deg/h; correct the latitude in'
@@ -256,7 +256,7 @@ def _finding(
 
 def _excess(measured: float, sd: float) -> CheckFinding:
     return CheckFinding(
-        CHECK,
+        LATITUDE_CHECK,
         WARNING,
         f"the Earth's rate must be {_hourly(EARTH_RATE)} deg/h at most, the gyroscopes measured"
         f' {_hourly(measured)} ± {_hourly(sd)} deg/h that no bias explains; state latitude and'

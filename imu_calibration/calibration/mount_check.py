@@ -13,15 +13,15 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_geometry import mount_rpy_deg
 from imu_calibration.preprocessing.recording_evidence import NOTE, WARNING, CheckFinding
 
-CHECK = 'mount'
-LEAST_TURN = 1.5 * DEG
+MOUNT_CHECK = 'mount'
+LEAST_COMMON_TURN = 1.5 * DEG
 """Smallest common turn that is a warning, rad; the axes of a sensor are off by less."""
 LARGEST_DIFFERENCE = 0.5
 """
 Largest difference between the turns of two sensors, as a share of their mean, for a warning. Axes
 that are off at random have a common turn too, which is as large as this allows in 3 of 100 units.
 """
-LEAST_SPREAD = 0.07 * DEG
+LEAST_TURN_SD = 0.07 * DEG
 """
 Smallest sd of the turn of a triad about one axis, rad. The axes of the best sensors are off by a
 tenth of a degree, and a turn is the mean of two of these angles.
@@ -106,7 +106,7 @@ def common_turn(solution: Solution) -> CommonTurn | None:
         half_sums = (axes + axes.T)[np.triu_indices(3, 1)] / 2
         squares += float(half_sums @ half_sums)
     freedom = 3 * (len(triads) - 1) + 3 * len(triads)
-    spread = max(squares / freedom, LEAST_SPREAD**2)
+    spread = max(squares / freedom, LEAST_TURN_SD**2)
 
     # Variance of the mean of the turns: of the axes, and of their estimates.
     estimates = np.zeros(3)
@@ -143,7 +143,7 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
         return ()
     # The axis of the last joint is the same in both links that it connects.
     last_axis = table.mat_sl @ np.array(table.joints[-1].axis)
-    severe = turn.agreed and turn.angle >= LEAST_TURN
+    severe = turn.agreed and turn.angle >= LEAST_COMMON_TURN
     if not severe and not turn.noted(last_axis):
         return ()
     zero = ''
@@ -158,10 +158,10 @@ def mount_findings(solution: Solution, table: Table) -> tuple[CheckFinding, ...]
             f' of {size} against it: mount.rpy_deg [{fits}] would remove it; if the axes of the'
             f' sensors are wanted, state it{zero}'
         )
-        return (CheckFinding(CHECK, NOTE, text, key='table'),)
+        return (CheckFinding(MOUNT_CHECK, NOTE, text, key='table'),)
     text = (
         'the IMU must be mounted as in the table description, its readings are turned by'
         f' {size} against it: mount.rpy_deg [{fits}] would fit; correct it{zero}, or'
         ' the matrices contain this turn'
     )
-    return (CheckFinding(CHECK, WARNING, text, key='table'),)
+    return (CheckFinding(MOUNT_CHECK, WARNING, text, key='table'),)

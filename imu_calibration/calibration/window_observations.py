@@ -350,13 +350,13 @@ class WindowObservations:
 
         """
         mounted = with_findings_of(
-            mount_check.CHECK,
+            mount_check.MOUNT_CHECK,
             mount_check.mount_findings(solution, self.table),
             self.gathered.findings,
         )
         windows = latitude_check.window_rates(self.gathered, self.model, self.table)
         return with_findings_of(
-            latitude_check.CHECK,
+            latitude_check.LATITUDE_CHECK,
             latitude_check.latitude_findings(solution, self.table, windows),
             mounted,
         )

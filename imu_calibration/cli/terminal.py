@@ -16,12 +16,19 @@ from typing import TextIO
 
 UNLIMITED = 10_000
 """Width of a line in a file."""
-CODES = {'bold': '1', 'dim': '2', 'green': '32', 'yellow': '33', 'cyan': '36', 'bold red': '1;31'}
+STYLE_CODES = {
+    'bold': '1',
+    'dim': '2',
+    'green': '32',
+    'yellow': '33',
+    'cyan': '36',
+    'bold red': '1;31',
+}
 """Style -> code of its escape sequence (ECMA-48, select graphic rendition)."""
 STYLES = {'refuse': 'bold red', 'warning': 'yellow', 'note': 'cyan', 'good': 'green'}
 """Severity of a finding or level of a status -> style."""
 Cell = str | tuple[str, str]
-"""Text, or (text, style of `CODES` or '')."""
+"""Text, or (text, style of `STYLE_CODES` or '')."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +59,10 @@ class Terminal:
         )
 
     def styled(self, text: str, style: str) -> str:
-        """Return the text in a style of `CODES`; '' is plain."""
-        return f'\x1b[{CODES[style]}m{text}\x1b[0m' if self.coloured and style and text else text
+        """Return the text in a style of `STYLE_CODES`; '' is plain."""
+        return (
+            f'\x1b[{STYLE_CODES[style]}m{text}\x1b[0m' if self.coloured and style and text else text
+        )
 
     def print(self, text: str = '', style: str = '', indent: str | None = None) -> None:
         """Print the lines of a text; `indent` as for `wrapped`."""

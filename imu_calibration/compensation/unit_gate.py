@@ -16,7 +16,7 @@ from imu_calibration.preprocessing.value_checks import (
 
 WINDOW_S = 1.0
 """s; readings are collected over it before they are judged."""
-LEAST_READINGS = 10
+LEAST_WINDOW_READINGS = 10
 """Number of readings in a window, at least."""
 MOST_READINGS = 10_000
 """Number of readings in a window, at most: the stamps of a driver may stand still."""
@@ -81,7 +81,7 @@ class UnitGate:
         self._stamps.append(stamp_ns)
         self._lengths.append(length)
         is_long = stamp_ns - self._stamps[0] >= WINDOW_S * 1e9
-        is_complete = is_long and len(self._lengths) >= LEAST_READINGS
+        is_complete = is_long and len(self._lengths) >= LEAST_WINDOW_READINGS
         if not is_complete and len(self._lengths) < MOST_READINGS:
             return False
         self._judge()

@@ -47,7 +47,7 @@ UNIT_SIZES = {
 }
 """Sensor -> unit -> size of the unit in SI."""
 SI_UNITS = {'accelerometer': 'm/s^2', 'gyroscope': 'rad/s'}
-SPELLINGS = {
+READING_SPELLINGS = {
     'accelerometer': {
         'm/s2': 'm/s^2',
         'm/s²': 'm/s^2',
@@ -84,9 +84,9 @@ MOST_PER_SECOND = 1e5
 """Samples per second; no inertial sensor gives more."""
 UNIT_AGREEMENT = 1e-4
 """Relative difference up to which the scale of a file may differ from that of its unit."""
-LARGEST = 1e12
+LARGEST_SCALE = 1e12
 """Scales and offsets above it occur with no converter."""
-AXES = {'flu': ((0, 1), (1, 1), (2, 1)), 'frd': ((0, 1), (1, -1), (2, -1))}
+AXES_OF_CONVENTION = {'flu': ((0, 1), (1, 1), (2, 1)), 'frd': ((0, 1), (1, -1), (2, -1))}
 """Name -> (axis of the source, sign) of forward, left and up."""
 FLAT_KEYS = ('accelerometer_offset', 'accelerometer_scale', 'gyroscope_offset', 'gyroscope_scale')
 UNIT_KEYS = {'accelerometer': 'accelerometer_unit', 'gyroscope': 'gyroscope_unit'}
@@ -96,10 +96,10 @@ AXES_KEY = 'axes'
 STATED_KEYS = (*UNIT_KEYS.values(), INCREMENTS_KEY)
 """Names of the options that state units."""
 Number = float | tuple[float, float, float]
-_SCALE = maybe(one_or_each(number(0.0, LARGEST, above=True), 1, 3))
-_OFFSET = maybe(one_or_each(number(-LARGEST, LARGEST), 1, 3))
+_SCALE = maybe(one_or_each(number(0.0, LARGEST_SCALE, above=True), 1, 3))
+_OFFSET = maybe(one_or_each(number(-LARGEST_SCALE, LARGEST_SCALE), 1, 3))
 _SENSOR = {'unit': maybe(text(code='unit_unknown')), 'scale': _SCALE, 'offset': _OFFSET}
-READINGS = Document(
+READINGS_DOCUMENT = Document(
     'readings',
     mapping(
         optional={
@@ -235,7 +235,7 @@ class RawReadings:
             When a key is unknown, a unit is unknown, or a number is not usable.
 
         """
-        require(mapping, replace(READINGS, name=place))
+        require(mapping, replace(READINGS_DOCUMENT, name=place))
         units = {}
         for sensor in SI_UNITS:
             entry = mapping.get(sensor)
@@ -292,7 +292,7 @@ def unit_of(sensor: str, text: str) -> SensorUnit:
     if counts is not None:
         per = _spelled(sensor, counts[2])
         number = _positive(counts[1])
-        if per in sizes and 0.0 < number < LARGEST:
+        if per in sizes and 0.0 < number < LARGEST_SCALE:
             label = per if per.isalpha() or sensor == 'accelerometer' else f'({per})'
             return SensorUnit(f'counts:{counts[1]}/{label}', number / sizes[per])
     raise InputError(
@@ -344,7 +344,7 @@ def parse_axes(text: str) -> str:
 
     """
     name = text.strip().lower()
-    if name not in AXES:
+    if name not in AXES_OF_CONVENTION:
         name = ','.join(part.strip().removeprefix('+') for part in name.split(','))
     if np.linalg.det(_axes_matrix(name)) < 0:
         raise InputError(
@@ -387,8 +387,8 @@ def combined(
 def _axes_matrix(axes):
     """Return the matrix from axes of the source to forward-left-up, shape (3, 3)."""
     matrix = np.zeros((3, 3))
-    if axes in AXES:
-        for row, (column, sign) in enumerate(AXES[axes]):
+    if axes in AXES_OF_CONVENTION:
+        for row, (column, sign) in enumerate(AXES_OF_CONVENTION[axes]):
             matrix[row, column] = sign
         return matrix
     parts = axes.split(',')
@@ -412,7 +412,7 @@ def _axes_error(axes):
 
 def _spelled(sensor, text):
     text = text.strip()
-    return SPELLINGS[sensor].get(text.lower(), text)
+    return READING_SPELLINGS[sensor].get(text.lower(), text)
 
 
 def _positive(text):

@@ -457,7 +457,7 @@ LOAD = {
 Columns of a mount that bends with load: force and rate are measured in a frame that rotates with
 the force.
 """
-CHANGE = {
+CHANGE_COLUMNS = {
     'accelerometer': ColumnGroup(
         'force_change', ('f_y * w_z - f_z * w_y', 'f_z * w_x - f_x * w_z', 'f_x * w_y - f_y * w_x')
     ),

@@ -52,7 +52,7 @@ def _pair(sensor):
     full = STANDARD_GRAVITY if accel else 100 * DEG
     own = {
         group: getattr(base, group)[sensor]
-        for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE', 'WARM_UP')
+        for group in ('TRUE_INPUT', 'SQUARES', 'SIGNED', 'THERMAL', 'CHANGE_COLUMNS', 'WARM_UP')
     }
     curved = ('static_dense', 'centrifuge') if accel else ('three_speeds',)
 
@@ -264,7 +264,7 @@ def _pair(sensor):
             motion=('oscillate_fast', 'two_axis'),
             needs=('rotation',),
             moot=_one_axis,
-            groups=(own['CHANGE'],),
+            groups=(own['CHANGE_COLUMNS'],),
             input_order=1,
             input_places=base.OTHER_AXES,
             coefficients=cross_axis_coefficients,

@@ -13,7 +13,7 @@ from imu_calibration.estimation.whitening import Whitening
 
 MIN_SPARE = 6
 """Fewest degrees of freedom that must remain after the fit of the attitude."""
-PRODUCTS = np.triu_indices(3)
+PRODUCT_AXES = np.triu_indices(3)
 """Axes of the six products of two components of gravity."""
 
 
@@ -55,7 +55,7 @@ def attitude_dependence(
     misfit = system.misfit(sensor, means, values)
     of_force = model.columns_of('accelerometer', Role.LINEAR)
     force = system.means['accelerometer'][still][:, of_force]
-    first, second = PRODUCTS
+    first, second = PRODUCT_AXES
     shapes = np.concatenate([force, force[:, first] * force[:, second]], axis=1)
     candidates = np.einsum('ks,ab->kabs', shapes, np.eye(3)).reshape(len(still), 3, -1)
     rows = np.concatenate([design, candidates, misfit[:, :, None]], axis=2)

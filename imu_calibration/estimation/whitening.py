@@ -114,7 +114,7 @@ class Whitening:
         return white
 
 
-ALIKE = 1e11
+LARGEST_SAFE_RATIO = 1e11
 """
 Largest ratio of variances whose differences are not lost in rounding; windows without weight and
 rests that all read zero are farther apart.
@@ -143,7 +143,7 @@ class _Filter:
         times = np.array([process.time for process in processes])
         decay = np.exp(-steps[:, None] / times)
         fresh = -np.expm1(-2 * steps[:, None] / times) * power
-        alike = variance.max() < ALIKE * (variance + fresh[:, 0]).min()
+        alike = variance.max() < LARGEST_SAFE_RATIO * (variance + fresh[:, 0]).min()
         if len(power) == 1 and alike:
             self.total, gain = _gains_of_one(variance, decay[:, 0], fresh[:, 0])
         else:

@@ -16,7 +16,7 @@ from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.solution import HELD, tolerances_of
 from imu_calibration.kinematics.motion_limits import MotionLimits
 from imu_calibration.kinematics.table import Table
-from imu_calibration.planning.coordinates import Cause, Coordinates, ToldApart
+from imu_calibration.planning.coordinates import CollinearEffect, Coordinates, ToldApart
 from imu_calibration.planning.motion_library import MotionLibrary
 from imu_calibration.planning.planner import Decision, Planner
 from imu_calibration.planning.planning_problem import PlanningProblem
@@ -108,7 +108,7 @@ def suspected(
     table: Table,
     *,
     sizes: Mapping[str, float],
-) -> list[Cause]:
+) -> list[CollinearEffect]:
     """
     Return the causes with their sizes.
 
@@ -127,7 +127,7 @@ def suspected(
             else [sizes.get(names[k], np.nan) for k in places]
         )
         found.append(
-            Cause(
+            CollinearEffect(
                 key, _places(coordinates, key), np.asarray(known, float) / coordinates.units[places]
             )
         )

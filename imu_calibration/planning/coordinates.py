@@ -182,7 +182,7 @@ class WithinTolerances:
 
 
 @dataclass(frozen=True, eq=False)
-class Cause:
+class CollinearEffect:
     """One effect of a class that is collinear in a recording."""
 
     key: tuple[str, str]
@@ -207,13 +207,13 @@ class ToldApart:
     ----------
     coordinates : Coordinates
         Of the baseline with all causes.
-    causes : sequence of Cause
+    causes : sequence of CollinearEffect
     questions : int
         Candidate effects of the search.
 
     """
 
-    def __init__(self, coordinates: Coordinates, causes: Sequence[Cause], questions: int):
+    def __init__(self, coordinates: Coordinates, causes: Sequence[CollinearEffect], questions: int):
         self.coordinates, self.causes = coordinates, tuple(causes)
         self.pairs = [(a, b) for a in self.causes for b in self.causes if a is not b]
         self.words = ' and '.join(cause.key[1] for cause in causes)

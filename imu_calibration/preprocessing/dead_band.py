@@ -5,7 +5,7 @@ import numpy as np
 BINS_PER_OCTAVE = 16
 SMALLEST, LARGEST = 2.0**-30, 2.0**10
 """Rates whose magnitudes are counted, rad/s."""
-N_BINS = int(BINS_PER_OCTAVE * np.log2(LARGEST / SMALLEST))
+N_OCTAVE_BINS = int(BINS_PER_OCTAVE * np.log2(LARGEST / SMALLEST))
 LEAST_ZERO_SHARE = 0.05
 """Share of zeros of an axis with a dead band: it rests in some part of a recording."""
 MOST_STRAYS = 4
@@ -15,7 +15,7 @@ LEAST_ABOVE = 15
 Readings in the octave above the band. As many are expected in the band if readings are spread
 evenly down to zero, so that `MOST_STRAYS` are improbable.
 """
-LEAST_STEPS = 8.0
+LEAST_BAND_STEPS = 8.0
 """The band is wider than this many steps of the converter; a coarse output also reads zero."""
 
 
@@ -25,7 +25,7 @@ class DeadBandSearch:
     def __init__(self) -> None:
         self._n_samples = 0
         self._n_zero = np.zeros(3, np.int64)
-        self._counts = np.zeros((3, N_BINS), np.int64)
+        self._counts = np.zeros((3, N_OCTAVE_BINS), np.int64)
 
     def push(self, rate: np.ndarray) -> None:
         """Process rates, shape (3, n), rad/s."""
@@ -37,7 +37,7 @@ class DeadBandSearch:
             magnitude = np.abs(values[values != 0.0])
             octaves = np.log2(np.clip(magnitude, SMALLEST, 0.99 * LARGEST) / SMALLEST)
             bins = (BINS_PER_OCTAVE * octaves).astype(np.int64)
-            self._counts[axis] += np.bincount(bins, minlength=N_BINS)
+            self._counts[axis] += np.bincount(bins, minlength=N_OCTAVE_BINS)
 
     def bands(self, resolution: np.ndarray) -> np.ndarray:
         """
@@ -53,7 +53,7 @@ class DeadBandSearch:
             threshold = SMALLEST * 2.0 ** (first / BINS_PER_OCTAVE)
             n_above = counts[first : first + BINS_PER_OCTAVE].sum()
             often_zero = self._n_zero[axis] >= LEAST_ZERO_SHARE * max(self._n_samples, 1)
-            is_wide = threshold >= LEAST_STEPS * resolution[axis]
+            is_wide = threshold >= LEAST_BAND_STEPS * resolution[axis]
             if often_zero and is_wide and n_above >= LEAST_ABOVE:
                 found[axis] = threshold
         return found

@@ -16,7 +16,7 @@ MAX_SAMPLES = 2_000
 """Samples that are compared."""
 LARGEST_UNEXPLAINED = 0.01
 """Largest unexplained share of the squared rates with a description that counts as correct."""
-LEAST_FACTOR = 10.0
+LEAST_IMPROVEMENT = 10.0
 """A correction of the description divides the unexplained share at least by this factor."""
 LEAST_SPAN = 0.1
 """Rates span three directions from this ratio of their smallest to their largest rms on."""
@@ -26,7 +26,7 @@ FIRST_ANGLE = 1e-3
 """Start of a fit, rad: joints about coordinate axes have no derivative, they are simplified."""
 MAX_EVALUATIONS = 20
 """Linearisations of one fit of zeros or axes."""
-TIE = 2.0
+TIED_FACTOR = 2.0
 """
 Corrections within this factor of the smallest unexplained share of the rates are separated by the
 specific force: rates do not show which way is up, nor how the IMU is mounted.
@@ -140,7 +140,7 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
     if not _spans_three(readings.rate):  # many descriptions have the same rates about one axis
         return None
     as_described = readings.correction('', table, readings.motion)
-    sufficient = min(LARGEST_UNEXPLAINED, as_described.rate_share / LEAST_FACTOR)
+    sufficient = min(LARGEST_UNEXPLAINED, as_described.rate_share / LEAST_IMPROVEMENT)
     corrections = list(_corrections(readings, table))
     smallest = min(correction.rate_share for correction in corrections)
     if smallest > sufficient:
@@ -149,7 +149,11 @@ def description_error(windows: Sequence[Window], table: Table) -> CheckFinding |
     if smallest > sufficient:
         return None
     best = min(
-        (correction for correction in corrections if correction.rate_share <= TIE * smallest),
+        (
+            correction
+            for correction in corrections
+            if correction.rate_share <= TIED_FACTOR * smallest
+        ),
         key=lambda correction: correction.force_share,
     )
     return CheckFinding(
@@ -286,7 +290,7 @@ def turned_rates(
     unexplained = _share(measured - reference @ turn.T - bias, measured)
     difference = measured - reference
     as_described = _share(difference - difference.mean(axis=0), measured)
-    if unexplained > min(LARGEST_UNEXPLAINED, as_described / LEAST_FACTOR):
+    if unexplained > min(LARGEST_UNEXPLAINED, as_described / LEAST_IMPROVEMENT):
         return None
     return [rates @ turn.T + bias for rates in expected]
 

@@ -256,7 +256,7 @@ OLD = 0.5
 ABSENT_MARK = -1.0
 """First element of a covariance: the message does not have that quantity (sensor_msgs/Imu)."""
 MESSAGE_QUANTITIES = ('specific force', 'angular rate', 'orientation')
-SYMMETRY = 1e-6
+LARGEST_ASYMMETRY = 1e-6
 """Share of the largest variance; rounding errors are much smaller."""
 
 
@@ -348,7 +348,9 @@ def covariance(evidence: MessageEvidence) -> Iterator[CheckFinding]:
                     f'the covariance of the {name} is unknown (zeros): estimators need it; '
                     'compensator_node fills it',
                 )
-        elif not np.allclose(matrix, matrix.T, rtol=0, atol=SYMMETRY * np.abs(matrix).max()):
+        elif not np.allclose(
+            matrix, matrix.T, rtol=0, atol=LARGEST_ASYMMETRY * np.abs(matrix).max()
+        ):
             yield CheckFinding(
                 'covariance',
                 WARNING,

@@ -173,7 +173,7 @@ LEAST_POSES = 9
 LEAST_FACES = 6
 FARTHEST = 0.8
 """Bias in units of gravity from which on readings are no sphere but counts with an offset."""
-LEAST_SPREAD = 0.05
+LEAST_EIGENVALUE = 0.05
 """
 Smallest eigenvalue of the scatter of directions (1/3 when they are even) above which poses separate
 bias from length.
@@ -221,7 +221,7 @@ class Rest:
             return None
         found = fit_sphere(self.force)
         far = np.linalg.norm(found.centre) > FARTHEST * np.median(self.norm)
-        return None if far or found.spread < LEAST_SPREAD else found
+        return None if far or found.spread < LEAST_EIGENVALUE else found
 
     @property
     def length(self) -> float:

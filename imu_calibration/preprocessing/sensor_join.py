@@ -24,7 +24,7 @@ DELAY_WINDOW = 0.1
 """s; rotation of gravity and integral of the rates are compared over this time."""
 DELAY_PARTS = 8
 """Parts of the recording that are left out in turn, for the standard deviation of the delay."""
-MOST_WINDOWS = 4000
+MOST_COMPARED_WINDOWS = 4000
 """Windows that are compared, at most."""
 MIN_DELAY_ROTATION = 0.5
 """Sum of the rotation of gravity that a delay needs, rad."""
@@ -220,7 +220,7 @@ def gyroscope_delay(accelerometer: SensorStream, gyroscope: SensorStream) -> Gyr
         return None
     # Windows in which gravity rotates most determine the delay.
     rotation = np.where(inside, np.linalg.norm(change, axis=1), 0.0)
-    most = np.sort(np.argsort(rotation)[-MOST_WINDOWS:])
+    most = np.sort(np.argsort(rotation)[-MOST_COMPARED_WINDOWS:])
     used = most[rotation[most] > 0.0]
     cost = _DelayCost(
         gyroscope,

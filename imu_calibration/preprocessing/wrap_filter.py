@@ -6,11 +6,11 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples
 
-LEAST_STEP = np.array([20.0] * 3 + [3.0] * 3)
+LEAST_WRAP = np.array([20.0] * 3 + [3.0] * 3)
 """Smallest step, m/s^2 and rad/s: ranges of +-2 g and +-125 deg/s wrap by 39 and 4.4."""
 LEAST_SLOPE = np.array([1000.0] * 3 + [150.0] * 3)
 """Smallest slope of the step, m/s^3 and rad/s^2: no motion with smooth neighbours is as steep."""
-SYMMETRY = 0.3
+LARGEST_SUM_SHARE = 0.3
 """Largest sum of the readings on both sides, as a share of the step: both are at an end."""
 NEIGHBOUR_SHARE = 0.1
 """Largest step between neighbours, as a share of the step: two steps on each side."""
@@ -18,13 +18,13 @@ END_SHARE = 1.05
 """Largest earlier reading of the sensor, as a share of the end of the range, for scaled axes."""
 BACKWARD_SHARE = 0.02
 """Largest movement away from the end of the range before the step, as a share of it, for noise."""
-LONGEST_NS = 3 * 10**9
+LONGEST_WRAP_NS = 3 * 10**9
 """A reading that wraps returns within this time."""
 MARGIN_NS = 150 * 10**6
 """Left out after the return, so that the hole is a gap: no motion is interpolated across it."""
 WRAP_REACH = 3
 """Last readings that wait: the steps between them lack one of the two later neighbours."""
-CONTEXT = 4
+KEPT_NEIGHBOURS = 4
 """Decided samples that are kept as neighbours of the next ones."""
 
 
@@ -106,7 +106,7 @@ class WrapFilter:
             self._until_ns = max(self._until_ns, until_ns)
             self._returned_ns[span.column] = span.return_ns
         self.dropped += int(np.count_nonzero(wrapped))
-        first = max(stop - CONTEXT, 0)
+        first = max(stop - KEPT_NEIGHBOURS, 0)
         if first:
             forgotten = self._held.select(slice(0, first))
             self._largest = largest_so_far(forgotten, self._largest)[-1]
@@ -130,7 +130,7 @@ class WrapFilter:
             for first_ns, return_ns in returns_ns:
                 spans.append(WrappedSpan(int(number), int(first_ns), int(return_ns)))
             # A step at the end may still return.
-            if open_ns is not None and samples.stamp_ns[-1] - open_ns < LONGEST_NS:
+            if open_ns is not None and samples.stamp_ns[-1] - open_ns < LONGEST_WRAP_NS:
                 open_steps.append(int(open_ns))
         return spans, min(open_steps, default=None)
 
@@ -141,7 +141,7 @@ def _returns(stamp_ns, up):
     k = 0
     while k + 1 < len(stamp_ns):
         opposite = up[k + 1] != up[k]
-        if opposite and stamp_ns[k + 1] - stamp_ns[k] < LONGEST_NS:
+        if opposite and stamp_ns[k + 1] - stamp_ns[k] < LONGEST_WRAP_NS:
             pairs.append((stamp_ns[k], stamp_ns[k + 1]))
             k += 2
         else:
@@ -197,7 +197,7 @@ def wrap_steps(
     if len(values) < 6:
         return none, none, none.astype(bool)
     step = np.diff(values, axis=0)
-    row, column = np.nonzero(np.abs(step) > LEAST_STEP)
+    row, column = np.nonzero(np.abs(step) > LEAST_WRAP)
     inside = (row >= 2) & (row + 2 < len(step))
     row, column = row[inside], column[inside]
     if not len(row):
@@ -208,7 +208,7 @@ def wrap_steps(
     sizes = np.abs(size)
     seconds = np.diff(samples.stamp_ns)[row] * 1e-9
     # Both readings are at the ends of the range.
-    wraps = np.abs(before + after) < SYMMETRY * sizes
+    wraps = np.abs(before + after) < LARGEST_SUM_SHARE * sizes
     # A step that is too steep for motion, with smooth neighbours.
     wraps &= sizes > LEAST_SLOPE[column] * seconds
     neighbours = np.maximum(np.abs(earlier), np.abs(later))

@@ -4,7 +4,7 @@ import numpy as np
 
 from imu_calibration.core.samples import ImuSamples, runs_of
 
-LONGEST_NS = 1_000_000_000
+LONGEST_HELD_RUN_NS = 1_000_000_000
 """ns; longer runs pass and are found as a frozen sensor, with their time."""
 MOST_HELD = 10_000
 """Samples of a run that are held, at most: stamps may stand still."""
@@ -45,7 +45,7 @@ class ZeroFilter:
         for start, stop in runs_of(zero):
             is_open = stop == len(samples)
             length_ns = samples.stamp_ns[stop - 1] - samples.stamp_ns[start]
-            is_long = length_ns >= LONGEST_NS or stop - start >= MOST_HELD
+            is_long = length_ns >= LONGEST_HELD_RUN_NS or stop - start >= MOST_HELD
             if is_long or (start == 0 and continues):
                 self._in_long_run = is_open
                 continue

@@ -83,7 +83,7 @@ MAX_DRIFT_RATIO = 100.0
 Largest drift over the usual bias variation: the ratio by which the effects' priors, for consumer
 instruments, exceed their bias variation.
 """
-LEAST_FACTOR = 0.9
+LEAST_NOISE_SHARE = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
 
 
@@ -211,7 +211,7 @@ def _with_moving_factors(
             else:
                 variances[axis] = reduced @ space.within_sum(sensor, axis, rows) @ reduced / dof
         share = float(np.clip(np.mean(along / variances), 1.0, None)) if look_along else 1.0
-        factor = np.maximum(variances / noise.white_variance, LEAST_FACTOR)
+        factor = np.maximum(variances / noise.white_variance, LEAST_NOISE_SHARE)
         factor = factor * share / noise.inflation
         found[str(kind)] = MovingFactors(factor, factor, np.maximum(factor, 1.0), share)
     return replace(noise, moving=found)

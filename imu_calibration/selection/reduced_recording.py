@@ -151,7 +151,7 @@ def _entry(
     )
 
 
-PARTS = ('within', 'slow')
+FACTOR_PARTS = ('within', 'slow')
 """Triangular factors of a window: of all centred rows, and of the means of short pieces."""
 REDUCING = 'reducing the recording'
 """Phase of the progress."""
@@ -179,8 +179,8 @@ class ReducedRecording:
     """Reduced as for a calibration, kept one by one, without their triangular factors."""
     factors: dict[tuple[str, str], list[np.ndarray]]
     """
-    (sensor, one of `PARTS`) -> triangular factor of the centred rows ``[columns | output]`` of each
-    window.
+    (sensor, one of `FACTOR_PARTS`) -> triangular factor of the centred rows
+    ``[columns | output]`` of each window.
     """
     describe: dict[str, np.ndarray]
     """
@@ -256,7 +256,7 @@ class ReducedRecording:
         ----------
         sensor : str
         part : str
-            One of `PARTS`.
+            One of `FACTOR_PARTS`.
         rows : array, shape (k,)
             Mask of the windows; those at rest have no factor.
 
@@ -347,7 +347,7 @@ class ReducedRecording:
                 known,
                 **{
                     part: unpacked([self.factors[sensor, part][k]], self._width(sensor))[0]
-                    for part in PARTS
+                    for part in FACTOR_PARTS
                 },
             )
             for sensor, known in self.windows[k].sensors.items()
@@ -380,7 +380,7 @@ def reduce_recording(
     """
     reduced = []
     factors: dict[tuple[str, str], list[np.ndarray]] = {
-        (sensor, part): [] for sensor in SENSORS for part in PARTS
+        (sensor, part): [] for sensor in SENSORS for part in FACTOR_PARTS
     }
     for some in chunks(windows):
         for window in reduce_windows(

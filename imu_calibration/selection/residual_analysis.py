@@ -33,7 +33,7 @@ from imu_calibration.selection.unexplained import (
 
 MIN_FORMULA_SDS = 10.0
 """Standard deviations above noise at rest from which a formula is searched in moving blocks."""
-ALIKE = 3.0
+SHARED_SCATTER_RATIO = 3.0
 """Scatter in motion of an axis over that of the middle axis, up to which all axes share it."""
 NOT_NEEDED = 0.05
 """
@@ -301,7 +301,7 @@ def _is_noise_of_motion(regime: RestRegime, scatter: np.ndarray) -> bool:
     """
     if regime.offset or not regime.is_rate:
         return False
-    return bool(scatter[AXES.index(regime.axis)] < ALIKE * np.median(scatter))
+    return bool(scatter[AXES.index(regime.axis)] < SHARED_SCATTER_RATIO * np.median(scatter))
 
 
 def superseded(found: ResidualAnalysis) -> list[Question]:

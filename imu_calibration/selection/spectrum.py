@@ -38,7 +38,7 @@ MIN_ORDER_SHARE = 0.75
 """Share of the windows that must be, more than."""
 SHORTEST_CYCLE = 2.2
 """Samples per cycle, at least."""
-REPEATED = 1e-12
+ROUNDING_SHARE = 1e-12
 """
 Least variance over the squared mean, and least determinant over the squared trace: less is
 rounding.
@@ -107,8 +107,8 @@ def orders_of(windows: Sequence[Window], rests: Sequence[np.ndarray], joint: int
     scatter = about / (count - 1)[:, None, None, None]
     spread = np.trace(scatter, axis1=-2, axis2=-1)
     # Repeated data have no scatter.
-    known = (spread > REPEATED * (mean**2).sum(axis=-1)) & (
-        np.linalg.det(scatter) > REPEATED * spread**2
+    known = (spread > ROUNDING_SHARE * (mean**2).sum(axis=-1)) & (
+        np.linalg.det(scatter) > ROUNDING_SHARE * spread**2
     )
     scatter[~known], mean[~known] = np.eye(2), 0.0
     t_squared = count[:, None] * np.einsum(

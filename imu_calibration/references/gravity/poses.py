@@ -219,7 +219,7 @@ MAX_TURN_GAP = 0.1
 """A turn with a longer hole in it is not used, s; never below five periods."""
 KNOWN_TURN_SD = 0.017
 """Accuracy of the angle and of the axis of full turns made by hand, rad."""
-BLOCK = 16384
+SAMPLES_AT_ONCE = 16384
 """Samples that are processed together: copies of a long recording are large."""
 SUMMIT = 3
 """Neighbours in one coarse step at the top of a smooth turn."""
@@ -335,9 +335,11 @@ def _at_end(signed: Callable, axes: np.ndarray, fresh: np.ndarray) -> np.ndarray
 def _largest(signed: Callable, axis: np.ndarray, fresh: np.ndarray) -> np.ndarray:
     """Return the largest values of ``signed(axis[fresh])``, block by block."""
     largest, least = np.zeros(0), -np.inf
-    for start in range(0, len(axis), BLOCK):
-        values = signed(axis[start : start + BLOCK])
-        largest = np.append(largest, values[(values > least) & fresh[start : start + BLOCK]])
+    for start in range(0, len(axis), SAMPLES_AT_ONCE):
+        values = signed(axis[start : start + SAMPLES_AT_ONCE])
+        largest = np.append(
+            largest, values[(values > least) & fresh[start : start + SAMPLES_AT_ONCE]]
+        )
         if len(largest) > MAX_RANGE_READINGS:
             largest = np.partition(largest, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:]
             least = largest[0]
@@ -436,8 +438,11 @@ def _roughness(time: np.ndarray, rate: np.ndarray) -> float:
     The interpolation is between the two neighbours of each reading.
     """
     total = 0.0
-    for start in range(0, len(time) - 2, BLOCK):
-        some, own = time[start : start + BLOCK + 2], rate[start : start + BLOCK + 2].T
+    for start in range(0, len(time) - 2, SAMPLES_AT_ONCE):
+        some, own = (
+            time[start : start + SAMPLES_AT_ONCE + 2],
+            rate[start : start + SAMPLES_AT_ONCE + 2].T,
+        )
         share = (some[1:-1] - some[:-2]) / (some[2:] - some[:-2])
         total += float(np.sum((own[:, 1:-1] - (1 - share) * own[:, :-2] - share * own[:, 2:]) ** 2))
     return total

@@ -16,7 +16,7 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.preprocessing.stream_cleaning import ContinuedStamps
 
 SAMPLES_FORMAT = 'imu_calibration/hand_samples/1'
-RESET_PAUSE_NS = 3600 * 10**9
+INSERTED_PAUSE_NS = 3600 * 10**9
 """Pause that is inserted at a clock reset: no turn is used across it."""
 REST_KEPT = 30.0
 """Of a rest that is discarded, this much is kept at its start and at its end, s."""
@@ -40,7 +40,7 @@ class HandStore:
     def __init__(self, most: int):
         self.most = most
         self._parts: list[ImuSamples] = []
-        self._stamps, self.forgotten = ContinuedStamps(RESET_PAUSE_NS), 0
+        self._stamps, self.forgotten = ContinuedStamps(INSERTED_PAUSE_NS), 0
 
     def __len__(self) -> int:
         return sum(len(part) for part in self._parts)

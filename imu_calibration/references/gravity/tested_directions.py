@@ -41,7 +41,7 @@ to 5 deg, 45 % do, up to 3.1 sd wrong.
 """
 PLACEMENT_STEPS = 8
 """Gauss-Newton steps of a fit of the placements."""
-LEAST_STEP = 0.1
+LEAST_STEP_SHARE = 0.1
 """Smallest share of a step that is tried where a larger share does not lower the errors."""
 TURNS_CONTRADICT = 3.84
 """Increase of ``n log(mean square)`` of turns by which they contradict the cross terms."""
@@ -172,7 +172,7 @@ def fit_placements(
     for _ in range(PLACEMENT_STEPS):
         step = np.linalg.lstsq(columns[:, index], errors, rcond=1e-9)[0]
         share = 1.0
-        while share > LEAST_STEP:
+        while share > LEAST_STEP_SHARE:
             trial = values.copy()
             trial[index] += share * step
             trial_errors, trial_columns = model.norm_rows(trial, force, **conditions)
