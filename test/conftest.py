@@ -85,14 +85,23 @@ def pytest_configure(config):
 
 def pytest_collection_modifyitems(items):
     """
-    Let the files with the most long tests begin first.
+    Let the files with the most long tests begin first, live ones and others in turn.
 
-    One that begins last keeps the other processes waiting for it.
+    One that begins last keeps the other processes waiting for it. Live tests mostly wait: where
+    all processes have some, the processors are idle.
     """
-    long = Counter(
-        item.path for item in items if any(map(item.get_closest_marker, ('slow', 'long', 'live')))
-    )
-    items.sort(key=lambda item: -long[item.path])
+    long, live = Counter(), Counter()
+    for item in items:
+        long[item.path] += any(map(item.get_closest_marker, ('slow', 'long', 'live')))
+        live[item.path] += item.get_closest_marker('live') is not None
+
+    # Place of each file among those of its kind; of two equal places the live one is first.
+    place = {}
+    for is_live in (True, False):
+        files = [file for file in long if (live[file] > 0) == is_live]
+        files.sort(key=lambda file: -long[file])
+        place |= {file: (number, not is_live) for number, file in enumerate(files)}
+    items.sort(key=lambda item: place[item.path])
 
 
 def pytest_terminal_summary(terminalreporter):
