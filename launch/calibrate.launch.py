@@ -80,12 +80,12 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'gravity',
                 default_value='',
-                description='local gravity without a table, m/s^2; empty: by latitude or params',
+                description='gravity by hand or on an arm, m/s^2; empty: by latitude or params',
             ),
             DeclareLaunchArgument(
                 'latitude',
                 default_value='',
-                description='latitude without a table, deg, for the gravity there',
+                description='latitude by hand or on an arm, deg, for the gravity there',
             ),
             DeclareLaunchArgument(
                 'noise_file',

@@ -33,6 +33,7 @@ OPTIONAL_PARAMETERS = {
     'target_frame': ('target_frame', str),
     'anyway': ('anyway', bool),
     'gravity': ('gravity', float),
+    'latitude': ('latitude', float),
     'noise_file': ('noise_file', str),
 }
 """Launch argument, empty by default -> parameter that it sets, and the type of its value."""
@@ -72,6 +73,11 @@ def generate_launch_description():
                 'gravity',
                 default_value='',
                 description='gravity at the site of the robot, m/s^2, for the test at stops',
+            ),
+            DeclareLaunchArgument(
+                'latitude',
+                default_value='',
+                description='latitude of the robot, deg, from which gravity follows',
             ),
             DeclareLaunchArgument(
                 'noise_file',

@@ -10,9 +10,11 @@ There is no motion before ~/start.
     joint_trajectory:=/joint_trajectory_controller/joint_trajectory
 
     ros2 service call /planner_node/start std_srvs/srv/Trigger
+
+An empty argument has no effect on the parameter files in config/.
 """
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -21,22 +23,17 @@ from launch_ros.substitutions import FindPackageShare
 from launch import LaunchDescription
 
 CONFIG = PathJoinSubstitution([FindPackageShare('imu_calibration'), 'config'])
+OPTIONAL_PARAMETERS = {
+    'save_file': ('save_file', str),
+    'gravity': ('gravity', float),
+    'latitude': ('latitude', float),
+    'noise_file': ('noise_file', str),
+}
+"""Argument, empty by default -> parameter of calibration_node that it sets, and its type."""
 
 
 def generate_launch_description():
     """Describe calibration_node and planner_node, for the same table."""
-    table = {
-        'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
-        'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
-        'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
-        'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
-    }
-    save = {'save_file': ParameterValue(LaunchConfiguration('save_file'), value_type=str)}
-    topics = [
-        ('imu/data_raw', LaunchConfiguration('imu')),
-        ('joint_states', LaunchConfiguration('joint_states')),
-        ('joint_trajectory', LaunchConfiguration('joint_trajectory')),
-    ]
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -68,6 +65,26 @@ def generate_launch_description():
                 ),
             ),
             DeclareLaunchArgument(
+                'gravity',
+                default_value='',
+                description='local gravity of an arm whose site states none, m/s^2',
+            ),
+            DeclareLaunchArgument(
+                'latitude',
+                default_value='',
+                description='latitude of such an arm, deg, for the gravity there',
+            ),
+            DeclareLaunchArgument(
+                'noise_file',
+                default_value='',
+                description='noise.yaml of this IMU, from the verb noise',
+            ),
+            DeclareLaunchArgument(
+                'respawn',
+                default_value='false',
+                description='start a node again when it ends; motion only after ~/start',
+            ),
+            DeclareLaunchArgument(
                 'imu', default_value='imu/data_raw', description='topic of sensor_msgs/Imu'
             ),
             DeclareLaunchArgument(
@@ -83,17 +100,37 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 'use_sim_time', default_value='false', description='use the time of /clock'
             ),
-            _node('calibration_node', topics, table, save),
-            _node('planner_node', topics, table),
+            OpaqueFunction(function=_nodes),
         ]
     )
 
 
-def _node(name, topics, *parameters):
+def _nodes(context):
+    """Return both nodes; a parameter without an argument keeps its value."""
+    table = {
+        'table_file': ParameterValue(LaunchConfiguration('table'), value_type=str),
+        'urdf_file': ParameterValue(LaunchConfiguration('urdf'), value_type=str),
+        'imu_link': ParameterValue(LaunchConfiguration('imu_link'), value_type=str),
+        'use_sim_time': ParameterValue(LaunchConfiguration('use_sim_time'), value_type=bool),
+    }
+    parameters = {}
+    for argument, (name, kind) in OPTIONAL_PARAMETERS.items():
+        if LaunchConfiguration(argument).perform(context):
+            parameters[name] = ParameterValue(LaunchConfiguration(argument), value_type=kind)
+    noise = {name: value for name, value in parameters.items() if name == 'noise_file'}
+    return [_node('calibration_node', table, parameters), _node('planner_node', table, noise)]
+
+
+def _node(name, *parameters):
     return Node(
         package='imu_calibration',
         executable=name,
         output='screen',
-        remappings=topics,
+        respawn=LaunchConfiguration('respawn'),
+        remappings=[
+            ('imu/data_raw', LaunchConfiguration('imu')),
+            ('joint_states', LaunchConfiguration('joint_states')),
+            ('joint_trajectory', LaunchConfiguration('joint_trajectory')),
+        ],
         parameters=[PathJoinSubstitution([CONFIG, f'{name}.yaml']), *parameters],
     )

@@ -38,7 +38,7 @@ from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
 from imu_calibration.core.settings import setting
 from imu_calibration.effects.sensor_model import SensorModel
-from imu_calibration.kinematics.rotations import local_gravity
+from imu_calibration.kinematics.rotations import gravity_of_settings
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.joint_checks import check_units
 from imu_calibration.preprocessing.stamping import StampLine
@@ -160,12 +160,13 @@ class LiveSettings:
 
 @dataclass(frozen=True)
 class LiveByHandSettings:
-    """Reference and memory of a calibration by hand."""
+    """Local gravity, by hand and on an arm, and memory of a calibration by hand."""
 
     gravity: float = setting(
         0.0,
         'm/s^2',
-        'local gravity, used without a table; 0: the standard gravity, which may be off by 0.02',
+        'local gravity, used without a table, and on an arm whose site states none; 0: the standard'
+        ' gravity, which may be off by 0.02',
         (0.0, 30.0),
         'all three accelerometer scales are wrong together',
         live=True,
@@ -174,7 +175,7 @@ class LiveByHandSettings:
     latitude: float = setting(
         100.0,
         'deg',
-        'latitude, used without a table if gravity is 0 (WGS 84 normal gravity); above 90: unknown',
+        'latitude, used as gravity is, if that is 0 (WGS 84 normal gravity); above 90: unknown',
         (-90.0, 100.0),
         'as with a wrong gravity',
         live=True,
@@ -199,10 +200,15 @@ class LiveByHandSettings:
         live=True,
     )
 
+    @property
+    def place(self) -> tuple[float | None, float]:
+        """The local gravity (None: unknown) and its standard deviation, m/s^2."""
+        gravity, spread = gravity_of_settings(self.gravity, self.latitude, self.height)
+        return gravity or None, spread
+
     def at_place(self, options: CalibrationOptions) -> CalibrationOptions:
         """Return the options with the gravity of these settings and its standard deviation."""
-        place = () if self.gravity or self.latitude > 90 else (self.latitude, self.height)
-        gravity, spread = local_gravity(self.gravity or None, *place)
+        gravity, spread = self.place
         return replace(options, gravity=gravity, gravity_sd=spread)
 
 

@@ -165,7 +165,7 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
         for name, paths in found
     ]
     if not options.force:
-        _require_same_units(Path(options.output), units)
+        _require_same_units(Path(options.output), units, report=not options.no_report)
     with files.output_folder(options.output) as folder:
         advance = counter('units', len(units))
         mapper = (
@@ -194,16 +194,16 @@ def run_fleet(options: Options, settings: CalibrationOptions) -> VerbResult:
     )
 
 
-def _require_same_units(folder, units):
+def _require_same_units(folder, units, *, report):
     """Refuse a folder with a result of other recordings for one of the units."""
     for unit in units:
-        if not (folder / unit.name / 'calibration.yaml').exists():
-            continue
-        try:
-            found = unit.provenance()
-        except (ImuCalibrationError, OSError):
-            continue  # A unit that cannot be read gives no file.
-        require_same_inputs(folder / unit.name, found)
+        found = {}
+        if (folder / unit.name / 'calibration.yaml').exists():
+            try:
+                found = unit.provenance()
+            except (ImuCalibrationError, OSError):
+                continue  # A unit that cannot be read gives no file.
+        require_same_inputs(folder / unit.name, partial(dict, found), report=report)
 
 
 def _table(options, bags):

@@ -19,6 +19,7 @@ def add_arguments(parser: OneLineParser) -> None:
     parser.add_recording(
         'with it, axes and units are compared with the joints and the motions are listed'
     )
+    parser.add_gravity()
     parser.add_gyroscope_topic()
     parser.add_exclusion()
     parser.add_rows()
@@ -45,14 +46,17 @@ def run(options: Options) -> VerbResult:
         options.hints(),
     )
     topics = imu_topics_of(bag, topics_of(choices))
-    table = (
-        None
-        if stand is None
-        else table_of(stand, [options.bag], Topics(topics[0].imu, frame=topics[0].frame))
-    )
-    looks = inspect_recording(
-        bag, topics, table, options=calibration_options(choices), exclude=options.exclude
-    )
+    wanted = calibration_options(choices)
+    table = None
+    if stand is not None:
+        table = table_of(
+            stand,
+            [options.bag],
+            Topics(topics[0].imu, frame=topics[0].frame),
+            gravity=wanted.gravity,
+            gravity_sd=wanted.gravity_sd,
+        )
+    looks = inspect_recording(bag, topics, table, options=wanted, exclude=options.exclude)
     out = Terminal.of()
     _show_topics(out, looks)
     _show_unread(out, looks[0].recording, hints)

@@ -1,7 +1,6 @@
 """``imu_calibration noise``: the noise of an IMU from a recording at rest."""
 
 from itertools import groupby
-from pathlib import Path
 
 from imu_calibration.cli.parser import OneLineParser, Options, VerbResult, print_line
 
@@ -55,9 +54,13 @@ def run(options: Options) -> VerbResult:
         for name, value in options.arguments_for(identify_recording).items()
         if value is not None
     }
-    if not options.force and (Path(options.output) / 'noise.yaml').exists():
-        found = noise_provenance(existing(options.bag))
-        require_same_inputs(options.output, found, 'noise.yaml')
+    if not options.force:
+        require_same_inputs(
+            options.output,
+            lambda: noise_provenance(existing(options.bag)),
+            'noise.yaml',
+            report=not options.no_report,
+        )
     with files.output_folder(options.output) as folder:
         found = identify_recording(options.bag, **choices)
         warn(finding.to_mapping() for finding in found.findings)

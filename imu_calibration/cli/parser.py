@@ -372,11 +372,13 @@ class Options(argparse.Namespace):
 
         The folder is refused if it holds the result of another verb or of other inputs.
         """
-        if not self.force and (Path(self.output) / 'calibration.yaml').exists():
+        if not self.force:
             from imu_calibration.use_cases.choices import provenance_with, require_same_inputs
 
             require_same_inputs(
-                self.output, provenance_with(self.verb, bags, self.choices(), stand=self.stand())
+                self.output,
+                lambda: provenance_with(self.verb, bags, self.choices(), stand=self.stand()),
+                report=not vars(self).get('no_report'),
             )
 
     def arguments_for(self, function: Callable) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def run(options: Options) -> VerbResult:
     from imu_calibration.use_cases.plan import by_hand, plan, require_no_plan
 
     stand = None if options.by_hand and options.motion == 'any' else _stand(options)
-    require_no_plan(options.output, force=options.force)
+    require_no_plan(options.output, report=not options.no_report, force=options.force)
     with files.output_folder(options.output) as folder:
         if stand is None:
             made = by_hand(grade=options.grade, imu_rate=options.imu_rate, **options.choices())

@@ -308,6 +308,25 @@ def local_gravity(
     return value, NORMAL_GRAVITY_ACCURACY * value
 
 
+def gravity_of_settings(gravity: float, latitude_deg: float, height: float) -> tuple[float, float]:
+    """
+    Return (gravity, its standard deviation), m/s^2, of parameters of a node; (0.0, 0.0) without.
+
+    Parameters
+    ----------
+    gravity : float
+        m/s^2; 0: unknown.
+    latitude_deg : float
+        Used if the gravity is unknown; above 90: unknown.
+    height : float
+        Above the ellipsoid, m, used with the latitude.
+
+    """
+    place = () if gravity or latitude_deg > 90 else (latitude_deg, height)
+    value, spread = local_gravity(gravity or None, *place)
+    return value or 0.0, spread
+
+
 def earth_rate_n(latitude_deg: float, azimuth_deg: float) -> np.ndarray:
     """
     Return the Earth's rate in the level frame n, rad/s, shape (3,).

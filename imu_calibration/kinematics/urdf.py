@@ -168,7 +168,14 @@ simulators' tags are ignored.
 """
 
 
-def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None = None) -> Table:
+def table_from_urdf(
+    text: str | bytes,
+    link: str,
+    site: Mapping[str, Any] | None = None,
+    *,
+    gravity: float | None = None,
+    gravity_sd: float = 0.0,
+) -> Table:
     """
     Return the chain of joints from the root of a robot to one of its links.
 
@@ -183,8 +190,10 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
         Link whose frame is the sensor's: the frame_id of its messages.
     site : mapping, optional
         Entries of a table description except the joints (up, gravity, latitude, mount, ...); its
-        joints may give limits, by name. Without gravity and latitude the standard gravity is used,
-        with the standard deviation of an unknown site.
+        joints may give limits, by name.
+    gravity, gravity_sd : float, optional
+        Local gravity and its standard deviation, m/s^2, where the site states no gravity. Without
+        any gravity and latitude: the standard gravity, with the sd of an unknown site.
 
     Raises
     ------
@@ -195,10 +204,12 @@ def table_from_urdf(text: str | bytes, link: str, site: Mapping[str, Any] | None
     """
     robot = _read(text)
     values = site_from_mapping(site or {})
-    if values.get('gravity') is None and values.get('latitude') is None:
+    if gravity is None and values.get('latitude') is None:
+        gravity, gravity_sd = STANDARD_GRAVITY, STANDARD_GRAVITY_SD
+    if gravity is not None and values.get('gravity') is None:
         values |= {
-            'gravity': STANDARD_GRAVITY,
-            'gravity_sd': values.get('gravity_sd') or STANDARD_GRAVITY_SD,
+            'gravity': gravity,
+            'gravity_sd': values.get('gravity_sd') or gravity_sd or None,
         }
     joints, rest = _chain(robot, link)
     xyz, rpy_deg = (

@@ -18,6 +18,7 @@ from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.document.comparison import moved_beyond_sd
 from imu_calibration.document.decision import HARMS, decisions_text
 from imu_calibration.document.trust import with_measured_noise
+from imu_calibration.kinematics.rotations import gravity_of_settings
 from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.nodes.robot_stand import TF_STATIC, StaticFrames
 
@@ -147,9 +148,25 @@ class CompensatorSettings:
         0.0,
         'm/s^2',
         'gravity at the site of the robot, for the test of the calibration at stops; 0: that of the'
-        ' calibration, within the half per cent of variation between sites',
+        ' latitude, or of the calibration, within the half per cent of variation between sites',
         (0.0, 20.0),
         'an error of a scale below half a per cent is not detected',
+        live=True,
+    )
+    latitude: float = setting(
+        100.0,
+        'deg',
+        'latitude of the robot, used if gravity is 0 (WGS 84 normal gravity); above 90: unknown',
+        (-90.0, 100.0),
+        'as with a wrong gravity',
+        live=True,
+    )
+    height: float = setting(
+        0.0,
+        'm',
+        'height above the ellipsoid, used with latitude',
+        (-500.0, 9000.0),
+        '3e-6 m/s^2 of gravity per metre',
         live=True,
     )
     update_gyro_bias: bool = setting(
@@ -372,7 +389,8 @@ def _watch(
     before: Adopted | None,
 ) -> StopWatch:
     """Return the StopWatch: the present one where its inputs are unchanged."""
-    options = HealthOptions(settings.gravity, settings.update_gyro_bias, settings.gyro_bias_time)
+    gravity, _ = gravity_of_settings(settings.gravity, settings.latitude, settings.height)
+    options = HealthOptions(gravity, settings.update_gyro_bias, settings.gyro_bias_time)
     watch = (
         None
         if before is None or before.used.calibration is not calibration

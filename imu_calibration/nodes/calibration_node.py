@@ -26,7 +26,7 @@ from visualization_msgs.msg import MarkerArray
 
 from imu_calibration.calibration.live import LiveByHandSettings, LiveCalibration, LiveSettings
 from imu_calibration.calibration.live_poses import LiveByHand
-from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.core.settings import setting
 from imu_calibration.document import files
 from imu_calibration.nodes.calibration_status import CalibrationGuide, markers_of, statuses_of
@@ -154,8 +154,9 @@ class CalibrationNodeSettings:
         '',
         '',
         'file of ~/save for the calibration; the accumulator is NAME.accumulator.npz in the same'
-        ' folder, written also when the node ends with unsaved motion; empty: calibration.yaml in'
-        ' the working directory, by ~/save only',
+        ' folder, written also when the node ends with unsaved motion; files of an earlier session'
+        ' are renamed (NAME.1), except with resume; empty: calibration.yaml in the working'
+        ' directory, by ~/save only',
         symptom='the node reports at its start that the folder is not writable',
         session=True,
         path=True,
@@ -218,8 +219,14 @@ class CalibrationNode(Node):
             ['imu/data_raw', *joints, 'imu/temperature'],
             ['imu/calibration', 'imu/residual', 'imu/coverage'],
         )
+        gravity, gravity_sd = self._session[LiveByHandSettings].place
         self._table = chain_of(
-            self, robot, self.settings.table_file, frame_id=self.settings.frame_id
+            self,
+            robot,
+            self.settings.table_file,
+            frame_id=self.settings.frame_id,
+            gravity=gravity,
+            gravity_sd=gravity_sd,
         )
         place = SessionFiles(self.settings.save_file)
         live = self._resumed(place) if self.settings.resume else self._make_live()
@@ -328,6 +335,7 @@ class CalibrationNode(Node):
                 f'earlier motion is in {kept}',
             )
             return self._make_live()
+        place.continue_earlier()
         self.get_logger().info(
             f'continued with {live.n_windows} {live.observations} from {place.accumulator}'
             if live.n_windows
@@ -357,6 +365,15 @@ class CalibrationNode(Node):
         self.worker.autosave_period, self.settings = group.autosave_period, group
 
     def _change_session(self, group: LiveSettings | WindowSettings | LiveByHandSettings) -> None:
+        before = self._session[type(group)]
+        if self._table is not None and isinstance(group, LiveByHandSettings):
+            if group.place != before.place:
+                raise InputError(
+                    'gravity is part of the reference of a session on a table or an arm, it cannot'
+                    ' change while the node runs; start the node with it',
+                    key='gravity',
+                    code='gravity_fixed',
+                )
         self._session[type(group)] = group
         self.worker.ask(lambda: self.worker.change(group))
 

@@ -57,6 +57,7 @@ class SessionFiles:
         self.given = bool(save_file)
         self.calibration = files.user_path(save_file or DEFAULT_FILE)
         self.saved_at, self.n_saved = time.monotonic(), 0
+        self._own: set[Path] = set()
         for path in (self.calibration, self.accumulator):
             files.remove_leftovers(path)
 
@@ -104,6 +105,28 @@ class SessionFiles:
         """
         return files.put_aside(self.accumulator)
 
+    def continue_earlier(self) -> None:
+        """Let the files of the earlier session be those of this one."""
+        self._own = {self.calibration, self.accumulator}
+
+    def _write(self, path: Path, content: bytes, *, to_disk: bool = True) -> str:
+        """
+        Write a file of this session; a file of an earlier session is renamed, not replaced.
+
+        Return a text about the renamed file, '' without one; raises as `files.write_whole`.
+        """
+        aside = None
+        if path not in self._own and os.path.isfile(path):
+            aside = files.put_aside(path)
+        try:
+            files.write_whole(path, content, to_disk)
+        except BaseException:
+            if aside is not None:
+                os.rename(aside, path)
+            raise
+        self._own.add(path)
+        return '' if aside is None else f' (that of an earlier session is now {aside.name})'
+
     def unsaved(self, live: LiveSession) -> int:
         """Return how many windows or poses of a session are in no file yet."""
         return max(live.n_windows - self.n_saved, 0)
@@ -130,8 +153,7 @@ class SessionFiles:
         for path, make in [*wanted, (self.accumulator, lambda: live.saved(pending=True))]:
             existed = os.path.exists(path)  # False where the path cannot even be
             try:
-                files.write_whole(path, make())
-                done.append(str(path))
+                done.append(f'{path}{self._write(path, make())}')
             except ImuCalibrationError as error:
                 failed.append(
                     f'{error};'
@@ -157,7 +179,7 @@ class SessionFiles:
             time.monotonic(),
             live.n_windows,
         )
-        files.write_whole(self.accumulator, live.saved(pending=False), to_disk=False)
+        self._write(self.accumulator, live.saved(pending=False), to_disk=False)
         self.note_saved(n_windows)
         return True
 
@@ -176,7 +198,7 @@ class SessionFiles:
                 f"{ends} and are lost: call ~/save, or give parameter 'save_file' and they are kept"
             )
         try:
-            files.write_whole(self.accumulator, live.saved(pending=True))
+            self._write(self.accumulator, live.saved(pending=True))
         except Exception as error:  # the process ends in any case
             return f'{ends} and are lost: {shortened(str(error), 300)}'
         return f'{ends}: they are kept in {self.accumulator}; resume:=true continues with them'

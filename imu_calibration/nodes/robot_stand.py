@@ -145,7 +145,13 @@ class RobotSettings:
 
 
 def chain_of(
-    node: Node, robot: RobotSettings, table_file: str, *, frame_id: str = ''
+    node: Node,
+    robot: RobotSettings,
+    table_file: str,
+    *,
+    frame_id: str = '',
+    gravity: float | None = None,
+    gravity_sd: float = 0.0,
 ) -> Table | None:
     """
     Return the chain of joints that a node's parameters describe, None for neither table nor arm.
@@ -160,6 +166,8 @@ def chain_of(
     table_file : str
     frame_id : str
         Frame of the IMU's messages; '': that of the first one received.
+    gravity, gravity_sd : float, optional
+        Local gravity and its standard deviation where the site of an arm gives none, m/s^2.
 
     Raises
     ------
@@ -183,7 +191,7 @@ def chain_of(
     )
     if robot.world_frame:
         site['up'] = _up(node, robot.world_frame, root_of(text))
-    return table_from_urdf(text, link, site)
+    return table_from_urdf(text, link, site, gravity=gravity, gravity_sd=gravity_sd)
 
 
 def words_of(robot: RobotSettings, table_file: str) -> str:

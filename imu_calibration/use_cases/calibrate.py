@@ -114,7 +114,7 @@ class Calibrated:
         The result of other inputs there is replaced only with `force`.
         """
         if not force:
-            require_same_inputs(folder, self.calibration.provenance)
+            require_same_inputs(folder, lambda: self.calibration.provenance, report=report)
         files.write_texts(
             folder,
             ({'report.html': self.report} if report else {})

@@ -4,7 +4,7 @@ Choices of the user by name, the inputs that they select, and the effects.
 The module also holds the list of effects and the provenance of a result.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from hashlib import sha256
 from os import PathLike
 from pathlib import Path
@@ -167,7 +167,11 @@ def inputs_of(
             code='choice_unknown',
         )
     options, topics = calibration_options(choices), topics_of(choices)
-    table = None if stand is None else table_of(stand, recordings, topics, gravity=options.gravity)
+    table = None
+    if stand is not None:
+        table = table_of(
+            stand, recordings, topics, gravity=options.gravity, gravity_sd=options.gravity_sd
+        )
     for path in recordings:
         if not isinstance(path, SampleBlock):
             open_bag(path, topics, want_joints=table is not None).close()
@@ -441,8 +445,16 @@ def made_from(found: Mapping[str, Any]) -> set[str]:
     }
 
 
+REPORT = 'report.html'
+"""Page next to the document of a result; one name for all verbs."""
+
+
 def require_same_inputs(
-    folder: str | PathLike, found: Mapping[str, Any], name: str = 'calibration.yaml'
+    folder: str | PathLike,
+    provenance: Callable[[], Mapping[str, Any]],
+    name: str = 'calibration.yaml',
+    *,
+    report: bool = True,
 ) -> None:
     """
     Refuse to overwrite the result of another verb or of other inputs.
@@ -451,21 +463,25 @@ def require_same_inputs(
     ----------
     folder : path-like
         Output folder.
-    found : mapping
-        Provenance of the new result.
+    provenance : callable
+        Returns the provenance of the new result; called if there is an earlier one.
     name : str
         File of the result.
+    report : bool
+        Whether the new result has a report.
 
     Raises
     ------
     InputError
         If the file in the folder differs in verb, recordings, table or robot description, or is no
-        such document.
+        such document. Also if there is only a report, which is then that of another verb.
 
     """
     path = Path(folder) / name
     if not path.exists():
+        files.require_new(Path(folder) / REPORT, force=not report)
         return
+    found = provenance()
     try:
         before = files.read_mapping(path, 'document').get('provenance')
     except ImuCalibrationError:

@@ -113,7 +113,7 @@ class Diagnosed:
         inputs there is replaced only with `force`.
         """
         if not force:
-            require_same_inputs(folder, self.calibration.provenance)
+            require_same_inputs(folder, lambda: self.calibration.provenance)
         files.write_texts(
             folder,
             {

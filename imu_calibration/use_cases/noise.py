@@ -75,7 +75,9 @@ class IdentifiedNoise:
         The noise of other inputs there is replaced only with `force`.
         """
         if not force:
-            require_same_inputs(folder, self.figures.provenance, 'noise.yaml')
+            require_same_inputs(
+                folder, lambda: self.figures.provenance, 'noise.yaml', report=report
+            )
         files.write_texts(
             folder,
             ({'report.html': self.report} if report else {})

@@ -41,7 +41,7 @@ from imu_calibration.planning.planner import (
 from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import calibration_options
+from imu_calibration.use_cases.choices import REPORT, calibration_options
 from imu_calibration.use_cases.recordings import Stand, table_of
 
 ACCUMULATOR = '.npz'
@@ -127,7 +127,7 @@ class Planned:
         """
         from msg_adapters.write import write_trajectories
 
-        require_no_plan(folder, force=force)
+        require_no_plan(folder, report=report, force=force)
         place = files.make_folder(folder)
         moves_joints = self.table is not None and bool(self.plan.motions)
         text = documents.to_text(plan_to_mapping(self.plan, self.provenance))
@@ -140,7 +140,7 @@ class Planned:
         if moves_joints:
             write_trajectories(place / 'trajectory', self._messages(), storage=storage)
         if report:
-            files.write_text(place / 'report.html', page)
+            files.write_text(place / REPORT, page)
         if moves_joints:
             files.write_text(
                 place / 'trajectory.yaml',
@@ -165,9 +165,9 @@ class Planned:
         return '\n'.join(plan_summary(self.plan) + self.notes)
 
 
-def require_no_plan(folder: str | PathLike, *, force: bool) -> None:
+def require_no_plan(folder: str | PathLike, *, report: bool, force: bool) -> None:
     """Refuse to replace an existing plan without consent; raises as `files.require_new`."""
-    for name in ('plan.yaml', *TRAJECTORIES):
+    for name in ('plan.yaml', *TRAJECTORIES, *[REPORT] * report):
         files.require_new(Path(folder) / name, force=force)
 
 
@@ -225,7 +225,8 @@ def plan(
 
     """
     report('planning')
-    table, options = table_of(stand, gravity=choices.get('gravity')), calibration_options(choices)
+    options = calibration_options(choices)
+    table = table_of(stand, gravity=options.gravity, gravity_sd=options.gravity_sd)
     noise = expected_noise(options.noise, grade, imu_rate)
     limits, start = limits_of(table), None
     if around or reach is not None:

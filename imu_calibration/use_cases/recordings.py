@@ -526,6 +526,7 @@ def table_of(
     topics: Topics = Topics(),
     *,
     gravity: float | None = None,
+    gravity_sd: float = 0.0,
 ) -> Table:
     """
     Return the chain of joints of a table or an arm.
@@ -538,8 +539,8 @@ def table_of(
         where no file is named.
     topics : Topics
         Topics of the recordings.
-    gravity : float, optional
-        Local gravity for a robot whose site does not give it, m/s^2.
+    gravity, gravity_sd : float, optional
+        Local gravity and its standard deviation for a robot whose site does not give it, m/s^2.
 
     Raises
     ------
@@ -571,9 +572,13 @@ def table_of(
         site['up'] = list(stand.up)
     elif bag is not None and site.get('up') is None:
         site['up'] = list(up_of(root_of(text), static_transforms(*bag)))
-    if gravity is not None and site.get('gravity') is None:
-        site['gravity'] = gravity
-    return table_from_urdf(text, stand.imu_link or topics.frame or _frame(recordings, bag), site)
+    return table_from_urdf(
+        text,
+        stand.imu_link or topics.frame or _frame(recordings, bag),
+        site,
+        gravity=gravity,
+        gravity_sd=gravity_sd,
+    )
 
 
 def _description(arm, bag):

@@ -114,6 +114,14 @@ def test_the_frame_of_the_messages_names_the_link(home):
         )
 
 
+def test_a_stated_gravity_and_its_sd_hold_where_the_site_states_none(home):
+    arm = home / 'arm.urdf'
+    unknown, stated = table_of(arm), table_of(arm, gravity=9.8, gravity_sd=1e-3)
+    assert (unknown.gravity_sd_value, stated.gravity_sd_value) == (0.02, 1e-3)
+    known = table_of(Arm(arm, site={'gravity': 9.81}), gravity=9.8, gravity_sd=1e-3)
+    assert (stated.gravity_value, known.gravity_value, known.gravity_sd_value) == (9.8, 9.81, 0.0)
+
+
 QUARTER = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
 
 

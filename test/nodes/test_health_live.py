@@ -65,6 +65,17 @@ def test_a_drift_is_told_at_the_stops(bench, tmp_path):
     assert bench.figure(STATUS, 'outcome') == 'moved' and bench.figure(STATUS, 'stops') == '9'
 
 
+def test_gravity_follows_from_the_latitude_of_the_robot(bench, tmp_path):
+    node = start(bench, tmp_path, latitude=0.0)
+    converted(node)
+    bench.until(lambda: bench.figure(STATUS, 'gravity expected [m/s^2]') == '9.7803', 'gravity')
+    answer = node.set_parameters_atomically([Parameter('latitude', value=90.0)])
+    options = node.compensation.watch.health.options
+    assert answer.successful and options.gravity == pytest.approx(
+        9.8321849378
+    )  # WGS 84 at the pole
+
+
 def test_a_driver_that_publishes_g_is_told_the_unit_and_nothing_is_published(bench, tmp_path):
     node = start(bench, tmp_path)
     in_g = replace(WORLD.imu, force_s=WORLD.imu.force_s / 9.80665)

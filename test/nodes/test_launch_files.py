@@ -110,22 +110,25 @@ def test_arguments_are_declared_and_parameters_exist(path, launch):
         assert given <= known | {'use_sim_time'}, name
 
 
-@pytest.mark.parametrize('verb', ['calibrate', 'compensate'])
+@pytest.mark.parametrize('verb', ['calibrate', 'compensate', 'drive'])
 def test_an_argument_that_is_not_given_keeps_the_parameter_of_the_file(verb, launch):
     given = {'gravity': '9.81', 'noise_file': 'noise.yaml', 'latitude': '48', 'anyway': 'true'}
-    expected = {'gravity', 'noise_file', {'calibrate': 'latitude', 'compensate': 'anyway'}[verb]}
+    expected = {'gravity', 'latitude', 'noise_file'} | (
+        {'anyway'} if verb == 'compensate' else set()
+    )
     parameters = []
     for context in ({}, given):
         Recorded.made = []
         described(ROOT / f'launch/{verb}.launch.py', context)
-        (node,) = [
+        nodes = [
             r
             for r in Recorded.made
             if type(r).__name__ == 'Node' and r.kwargs['package'] == 'imu_calibration'
         ]
-        (group,) = [each for each in node.kwargs['parameters'] if isinstance(each, dict)]
-        parameters.append(set(group))
-    assert parameters[0] <= {'table_file', 'use_sim_time'}
+        assert all(type(r.kwargs['respawn']).__name__ == 'LaunchConfiguration' for r in nodes)
+        groups = [each for each in nodes[0].kwargs['parameters'] if isinstance(each, dict)]
+        parameters.append(set().union(*groups))
+    assert parameters[0] <= {'table_file', 'use_sim_time', 'urdf_file', 'imu_link'}
     assert parameters[1] - parameters[0] == expected
 
 

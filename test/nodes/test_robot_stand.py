@@ -12,12 +12,14 @@ import pytest
 import yaml
 
 from imu_calibration.core.errors import ImuCalibrationError
+from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document import files
 from imu_calibration.kinematics.urdf import StaticTransforms, table_from_urdf
 from imu_calibration.planning.planning_problem import noise_of_grade
 from imu_calibration.simulation.sensor_noise import GRADES
 
 pytest.importorskip('rclpy')
+from rclpy.parameter import Parameter  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from refusal import refused
 from sensor_msgs.msg import Imu  # noqa: E402
@@ -151,6 +153,25 @@ def test_an_arm_from_a_file_stands_as_static_transforms_say_and_the_noise_is_tha
     )
     found = node._make_campaign().planner.problem.noise  # with the joints' own
     assert all(found[sensor].white_variance is noise[sensor].white_variance for sensor in noise)
+
+
+@pytest.mark.parametrize(
+    'given, gravity, sd',
+    [({}, STANDARD_GRAVITY, 0.02), ({'gravity': 9.79}, 9.79, 0.0), ({'latitude': 0.0}, 9.78, 1e-3)],
+)
+def test_the_stated_gravity_holds_for_an_arm_whose_site_states_none(
+    bench, tmp_path, given, gravity, sd
+):
+    (tmp_path / 'arm.urdf').write_text(SIX_AXES)
+    robot = {'urdf_file': str(tmp_path / 'arm.urdf'), 'imu_link': 'tool'}
+    node = bench.start(CalibrationNode, {**robot, 'table_file': 'none', **given})
+    table = node.worker.live.table
+    assert table.gravity_value == pytest.approx(gravity, abs=5e-4)  # 9.78033 on the equator
+    assert table.gravity_sd_value == pytest.approx(sd, rel=0.03)
+    # the reference of the gathered motion cannot change
+    answer = node.set_parameters_atomically([Parameter('gravity', value=9.83)])
+    assert not answer.successful and 'gravity' in answer.reason
+    assert node.set_parameters_atomically([Parameter('hand_samples', value=5000)]).successful
 
 
 def test_what_cannot_be_used_is_refused_by_name(bench, tmp_path):

@@ -147,6 +147,22 @@ def test_autosave_is_due_once_a_period_and_not_again_at_once_when_it_fails(tmp_p
     assert not place.autosave(live(9), 30.0)
 
 
+def test_files_of_an_earlier_session_are_kept_unless_it_is_continued(tmp_path):
+    path = tmp_path / 'calibration.yaml'
+    for number, text in enumerate(('first', 'second', 'third')):
+        place = SessionFiles(str(path))
+        if text == 'third':
+            place.continue_earlier()
+        for again in (text, f'{text} again'):
+            whole, answer = place.save(live(saved=again.encode()), again)
+            assert whole
+        assert f'{path.name}.{number}' not in answer  # a second save replaces the first one
+    assert path.read_text() == 'third again' and place.accumulator.read_text() == 'third again'
+    names = [path, place.accumulator]
+    assert [each.with_name(f'{each.name}.1').read_text() for each in names] == ['first again'] * 2
+    assert len(list(tmp_path.iterdir())) == 4
+
+
 def test_what_is_put_aside_is_never_written_over(tmp_path):
     for number in (1, 2):
         (tmp_path / 'a').write_text(str(number))

@@ -98,6 +98,22 @@ def test_results_of_other_inputs_are_replaced_only_by_force(tmp_path):
     other.save(tmp_path, report=False, force=True)
 
 
+@pytest.mark.parametrize('verb', ('calibrate', 'diagnose', 'noise', 'plan', 'fleet'))
+def test_the_report_of_another_verb_is_not_replaced(verb, tmp_path, capsys):
+    """All reports have one name: a report without the document of this verb is not its own."""
+    write_session(tmp_path / 'units' / 'still', SampleBlock.from_arrays(**at_rest()).imu)
+    folder = tmp_path / 'out' / ('still' if verb == 'fleet' else '')
+    folder.mkdir(parents=True)
+    (folder / 'report.html').write_text('of another verb')
+    inputs = {
+        'fleet': [tmp_path / 'units', '--table', config_file('table_simulated.yaml')],
+        'plan': ['--by-hand'],
+    }.get(verb, [tmp_path / 'units' / 'still'])
+    code = refused_code(capsys, verb, *inputs, '--output', tmp_path / 'out')
+    assert code == 'file_exists'
+    assert (folder / 'report.html').read_text() == 'of another verb'
+
+
 def test_the_noise_of_another_recording_is_not_replaced_on_the_command_line(tmp_path, capsys):
     for seed in (0, 1):
         held = SampleBlock.from_arrays(**at_rest(seed)).imu
