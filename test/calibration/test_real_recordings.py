@@ -63,7 +63,7 @@ def test_the_lag_is_the_one_finding(recordings, name='shaft_yaw_medium'):
             start = None
             for block in recording.blocks(table.joint_names):
                 start = block.imu.stamp_ns[0] if start is None else start
-                if block.imu.stamp_ns[0] > start + 240 * 10**9:
+                if block.imu.stamp_ns[0] > start + 150 * 10**9:
                     return
                 yield block
 

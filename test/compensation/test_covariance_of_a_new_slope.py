@@ -82,7 +82,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize('arm', (0.0, 0.2, 0.6, 1.0))
+@pytest.mark.parametrize('arm', (0.0, 0.6))
 def test_the_error_has_its_stated_size_at_the_start_and_after_gaps(arm):
     """Without the missing term the error was 5 to 90 stated sds at the start, 3 to 8 after gaps."""
     first = []

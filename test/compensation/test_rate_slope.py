@@ -247,7 +247,7 @@ def world(kind, seed=0, lively=1.0, arm=ARM, period_ns=PERIOD_NS):
 
 
 @pytest.mark.parametrize('kind', (*DRIVERS, 'runaway', 'irregular', 'exponential 5.0 ms'))
-@pytest.mark.parametrize('lively', (0.0, 0.3, 1.0))
+@pytest.mark.parametrize('lively', (0.0, 1.0))
 def test_the_covariance_that_is_published_is_that_of_the_error(kind, lively):
     """
     True error against stated sd, rms over the stream.
@@ -277,10 +277,8 @@ def test_the_covariance_that_is_published_is_that_of_the_error(kind, lively):
     (
         ('normal 2.0 ms', 5),
         ('normal 3.0 ms', 5),
-        ('normal 0.5 ms', 1),
         ('normal 8.0 ms', 5),
         ('normal 3.0 ms', 1),
-        ('exponential 2.0 ms', 5),
         ('exponential 10.0 ms', 5),
         ('exponential 3.0 ms', 1),
         ('irregular', 5),

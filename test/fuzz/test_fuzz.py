@@ -1,11 +1,11 @@
-"""Forty mutated inputs for each reader of untrusted input, and the limits of `make fuzz`."""
+"""Twenty mutated inputs for each reader of untrusted input, and the limits of `make fuzz`."""
 
 import pytest
 from fuzz import readers, run
 
 from imu_calibration.core.errors import InputError
 
-N_INPUTS = 40
+N_INPUTS = 20
 
 
 @pytest.mark.parametrize('name', readers.READERS)

@@ -57,7 +57,7 @@ def test_the_bound_would_be_wrong_if_the_floor_were_larger():
     assert np.linalg.eigvalsh(tight - exact).min() < -1e-6 * np.linalg.eigvalsh(exact).max()
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_no_random_plan_that_meets_the_tolerances_is_shorter_than_the_bound(seed):
     made, rng = problem(), np.random.default_rng(seed)
     bound = made.lower_bound()

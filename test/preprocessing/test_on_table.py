@@ -350,7 +350,7 @@ def frozen(block, *, joint, start, stop):
     return replace(block, joints=replace(block.joints, position=position, velocity=velocity))
 
 
-@pytest.mark.parametrize('joint', [0, 1, 2])
+@pytest.mark.parametrize('joint', [0, 2])
 def test_one_joint_that_stands_still_is_named_with_the_time(gimbals, joint):
     block, table = gimbals
     count = len(block.joints.position)

@@ -85,7 +85,7 @@ def looked_at(imu):
 # a gyroscope at the wrong full-scale setting
 
 
-@pytest.mark.parametrize('factor', [2.0, 0.5, 8.0, 3.0])
+@pytest.mark.parametrize('factor', [0.5, 8.0])
 def test_the_solver_reaches_a_wrong_full_scale(session, factor):
     """Half a turn that is read as a whole one is far outside what steps from the identity reach."""
     imu, _, truth = session
@@ -114,7 +114,7 @@ def test_preflight_names_the_full_scale_factor(session, factor):
 # scales and biases far from the nominal ones
 
 
-@pytest.mark.parametrize('factor', [0.43, 0.55, 1.8, 2.4])
+@pytest.mark.parametrize('factor', [0.43, 2.4])
 def test_force_at_another_scale_does_not_end_on_the_mirrored_branch(session, factor):
     """Steps from the identity passed zero for half of the scale: the matrix was -0.5."""
     imu, _, _ = session

@@ -115,7 +115,8 @@ def test_solving_on_the_way_changes_nothing(session, expected):
 @pytest.mark.long
 @pytest.mark.real_data
 def test_a_real_recording_live(recordings):
-    imu = load(recordings, 'mpu9150_0')
+    whole = load(recordings, 'mpu9150_0')
+    imu = whole.select(slice(0, len(whole) // 2))
     live = make_live(gravity=0.0)
     run(live, imu)
     assert_same(live.solve(pending=True), offline(imu, None))
@@ -241,9 +242,9 @@ def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
     Memory stays bounded; of the long rest the inside goes, and the answer is that of what is left.
     """
     rng = np.random.default_rng(6)
-    live = make_live(hand_samples=len(session) + 6000)
+    live = make_live(hand_samples=len(session) + 4000)
     run(live, session)
-    n, largest = 16_000, 0
+    n, largest = 9_000, 0
     mean = session.force_s[-50:].mean(0), session.rate_s[-50:].mean(0)
     noise = rng.normal(0, [[[0.02]], [[0.002]]], (2, n, 3))
     still = ImuSamples(
@@ -254,7 +255,7 @@ def test_a_night_on_the_desk_does_not_push_the_poses_out(session, expected):
     for block in blocks(still, mean=100):
         live.push(block)
         largest = max(largest, len(live._store))
-    assert largest < len(session) + 7000 and live.status().values['samples forgotten'] > 8_000
+    assert largest < len(session) + 5000 and live.status().values['samples forgotten'] > 4_000
     result = live.solve(pending=True)
     assert live.found.attitudes == 12 and live.found.turns == 11
     assert_same(result, offline(all_kept(live)), 1e-4)

@@ -198,6 +198,8 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
     assert [found[sensor].significant for sensor in ('accelerometer', 'gyroscope')] == [
         size > 0
     ] * 2
+    tones = found['accelerometer'].tones + found['gyroscope'].tones
+    assert bool(tones) == (size > 0)
     if size:
         assert [(rest.axes, rest.correlates_with) for rest in found.values()] == [
             (('z',), None),
@@ -250,14 +252,11 @@ class Sway(Cause):
 
 
 @pytest.mark.usefixtures('few_candidates')
-@pytest.mark.parametrize('size', [1.0, 0.0])
-def test_a_sway_of_the_floor_is_named_with_its_period_and_size(size):
-    recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(size))
+def test_a_sway_of_the_floor_is_named_with_its_period_and_size():
+    recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(1.0))
     found = investigate(recording.windows, recording.table, recording.model)
     tones = ResidualAnalysis.of(found, recording.table).unexplained['accelerometer'].tones
-    sways = [tone for tone in tones if tone.tilts]
-    assert len(sways) == size
-    if sways:
-        assert 1 / sways[0].frequency == pytest.approx(Sway.PERIOD, rel=0.03)
-        assert sways[0].amplitude / 9.8 == pytest.approx(Sway.ANGLE, rel=0.2)
-        assert sways[0].p_value < 1e-6
+    (sway,) = [tone for tone in tones if tone.tilts]
+    assert 1 / sway.frequency == pytest.approx(Sway.PERIOD, rel=0.03)
+    assert sway.amplitude / 9.8 == pytest.approx(Sway.ANGLE, rel=0.2)
+    assert sway.p_value < 1e-6
