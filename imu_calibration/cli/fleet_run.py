@@ -12,7 +12,7 @@ from imu_calibration.calibration.fleet import FleetStep, Spread, Unit, UnitResul
 from imu_calibration.cli.parser import Options, VerbResult
 from imu_calibration.cli.show import show_table, warn
 from imu_calibration.cli.terminal import Terminal
-from imu_calibration.core.errors import ImuCalibrationError, InputError, with_hint
+from imu_calibration.core.errors import ImuCalibrationError, InputError, printable, with_hint
 from imu_calibration.core.progress import counter
 from imu_calibration.core.units import for_people, significant, with_sd
 from imu_calibration.document import files
@@ -307,9 +307,9 @@ def csv_text(rows: Sequence[dict[str, Any]]) -> str:
 
 def _cell(value):
     if isinstance(value, str):
-        # Spreadsheets skip blanks in front of a formula.
-        calculated = value.strip()[:1] in tuple('=+-@') or value[:1] in tuple('\t\r')
-        return f"'{value}" if calculated else value
+        # Spreadsheets skip blanks in front of a formula, and a bare \r begins another row.
+        value = printable(value)
+        return f"'{value}" if value.strip()[:1] in tuple('=+-@') else value
     return '' if isinstance(value, float) and math.isnan(value) else value
 
 

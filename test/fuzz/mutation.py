@@ -1,9 +1,13 @@
 """Random changes of bytes, of text and of the members of a zip archive."""
 
 import io
+import math
 import re
 import struct
 import zipfile
+from datetime import date
+
+import yaml
 
 NUMBERS = [
     0,
@@ -97,6 +101,39 @@ def mutated(data, others, rng, text=False):
             else _changed_bytes(data, others, rng)
         )
     return data
+
+
+WRONG = (
+    *(None, True, '', 'text', '1e-3', -1, 0, 7, 10**40, 1e308, -1e308, math.inf, math.nan),
+    *([], [1.0], [None] * 3, [math.nan] * 3, [[1.0] * 3] * 3, ['a'] * 3, {}, {'a': 1}, {1: {}}),
+    *(' =1+1', date(2026, 1, 1), b'bytes', 'x' * 4000),
+)
+"""What a node of a document is replaced by."""
+
+
+def mutated_document(data, others, rng, text=True):
+    """
+    Return a YAML document with one to three nodes replaced by values of other kinds.
+
+    One of three times as any text.
+    """
+    if rng.random() < 0.3:
+        return mutated(data, others, rng, text)
+    document = yaml.safe_load(data)
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        part, key = None, None
+        inner = document
+        while isinstance(inner, (dict, list)) and inner and (part is None or rng.random() < 0.8):
+            part = inner
+            key = rng.choice(list(part)) if isinstance(part, dict) else rng.randrange(len(part))
+            inner = part[key]
+        if part is None:
+            break
+        if rng.random() < 0.1:
+            del part[key]
+        else:
+            part[key] = rng.choice(WRONG)
+    return yaml.safe_dump(document, default_flow_style=None, width=10**6).encode()
 
 
 def mutated_archive(data, others, rng):

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -9,26 +10,33 @@ from typing import Any
 
 import numpy as np
 import yaml
-from fuzz.mutation import mutated, mutated_archive
+from fuzz import attacks
+from fuzz.mutation import mutated, mutated_archive, mutated_document
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from imu_calibration.allan.document import noise_from_text, noise_to_text
+from imu_calibration.allan.document import counts, noise_from_text, noise_to_text, rows
 from imu_calibration.allan.identify import figures_of, identify_noise
 from imu_calibration.calibration.collector import from_bytes, to_bytes
 from imu_calibration.calibration.live import LiveCalibration
 from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.documents import from_text
 from imu_calibration.core.errors import InputError
+from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
-from imu_calibration.document import files
+from imu_calibration.document import files, trust
 from imu_calibration.document.calibration_text import calibration_from_text, calibration_to_text
+from imu_calibration.document.comparison import compare
 from imu_calibration.document.exports.export import all_targets, export
 from imu_calibration.document.exports.loss import import_file
+from imu_calibration.document.outcome import parameter_count
 from imu_calibration.kinematics.table import Table
 from imu_calibration.kinematics.urdf import root_of, table_from_urdf
+from imu_calibration.nodes.message_compensation import LiveCompensation
 from imu_calibration.references.gravity.sample_store import HandStore
+from imu_calibration.use_cases.inspect import imu_topics_of
+from imu_calibration.use_cases.recordings import Topics
 from msg_adapters.bag import STRING_TYPE, TF_TYPE, description_in, open_recording, static_transforms
 from msg_adapters.csv_log import read_csv
 from msg_adapters.decode import Decoder, JointDecoder
@@ -42,6 +50,7 @@ from worlds.arms import SIX_AXES
 from worlds.compensation_cases import random_calibration
 from worlds.live_sessions import make_session
 
+WRITERS = [target for _, target in sorted(all_targets().items()) if target.write]
 ROOT = Path(__file__).resolve().parents[2]
 STEP_NS = 5_000_000
 IMU = random_calibration(0, ())
@@ -61,6 +70,8 @@ class Reader:
     text: bool = False
     """Whether tokens and lines are changed as well as bytes."""
     mutate: Callable = mutated
+    attack: bool = False
+    """Whether all inputs may be refused."""
 
 
 def small_session(n=60):
@@ -326,9 +337,35 @@ def calibration_seeds(_folder):
 
 
 def read_calibration(data, _folder):
-    """Read a calibration as compensator_node does, and correct readings with it."""
+    """Read a calibration, and do with it what `compensator_node`, `compare` and `export` do."""
     calibration = calibration_from_text(data.decode(errors='replace'))
     CompensationStream(calibration)
+    calibration_to_text(calibration)
+    trust.caveats(calibration)
+    parameter_count(calibration)
+    for other in (calibration, IMU):
+        with suppress(InputError):
+            compare(calibration, other)
+    with suppress(InputError):
+        export(calibration, WRITERS[len(data) % len(WRITERS)], rate=200.0)
+    if not list(trust.refused_sensors(calibration, live=True)):
+        live = LiveCompensation(calibration, check_frame=False, correct_stamps=True)
+        live.set_temperature(26.0)
+        for message in _imu_messages():
+            live(message)
+
+
+@cache
+def _imu_messages():
+    return [row.tobytes() for row in encode_imu(small_session(5)[0])]
+
+
+def read_noise(data, _folder):
+    """Read noise.yaml, and compute what exports and nodes use of it."""
+    figures = noise_from_text(data.decode(errors='replace'))
+    counts(figures)
+    rows(figures)
+    noise_to_text(figures)
 
 
 def _text_of(function):
@@ -347,6 +384,25 @@ def _import_reader(target):
     )
 
 
+def _document_reader(seeds, read):
+    return Reader(seeds, read, text=True, mutate=mutated_document)
+
+
+def _attack(draw, read):
+    return Reader(attacks.seeds_of(draw), read, mutate=attacks.mutation_of(draw), attack=True)
+
+
+def list_imus(path):
+    """List the Imu topics and frames of a recording as `inspect` does, and read it."""
+    imu_topics_of(path, Topics())
+    read_bag(path)
+
+
+READINGS = (
+    b'accelerometer: {unit: counts, scale: 415, offset: [1.0, 2.0, 3.0]}\n'
+    b"gyroscope: {unit: 'counts:4770/(rad/s)', offset: 32000}\naxes: frd\n"
+)
+FLAT_READINGS = b'accelerometer_scale: 400.0\ngyroscope_offset: [1.0, 2.0, 3.0]\n'
 EFFECTS = (
     b"effects:\n  mine: {sensor: accelerometer, column: 'f_x * abs(f_x)', unit: 's^2/m', tolerance:"
     b" 0.001, text: 'mine'}\n"
@@ -357,7 +413,7 @@ READERS = {
         lambda folder: [_bags(folder, 'bag', '.db3')], _file_reader('x.db3', read_bag)
     ),
     'ROS 1 bag': Reader(ros1_seeds, _file_reader('x.bag', read_bag)),
-    'metadata': Reader(metadata_seeds, read_metadata, text=True),
+    'metadata': _document_reader(metadata_seeds, read_metadata),
     'CDR': Reader(cdr_seeds, read_cdr),
     'definition': Reader(definition_seeds, read_definition, text=True),
     'CSV': Reader(csv_seeds, _file_reader('x.csv', read_csv), text=True),
@@ -370,27 +426,39 @@ READERS = {
         _text_of(lambda text: (root_of(text), table_from_urdf(text, 'imu_link'))),
         text=True,
     ),
-    'YAML of a table': Reader(
+    'YAML of a table': _document_reader(
         lambda _folder: [
             re.sub(rb'(?m)^gravity:.*', b'gravity: 9.81', path.read_bytes())
             for path in sorted((ROOT / 'config').glob('table_*.yaml'))
         ],
         _text_of(lambda text: Table.from_mapping(from_text(text))),
-        text=True,
     ),
-    'YAML of a calibration': Reader(calibration_seeds, read_calibration, text=True),
-    'YAML of noise': Reader(noise_seeds, _text_of(noise_from_text), text=True),
-    'YAML of effects': Reader(
-        lambda _folder: [EFFECTS], _file_reader('x.yaml', files.read_effects), text=True
+    'YAML of a calibration': _document_reader(calibration_seeds, read_calibration),
+    'YAML of noise': _document_reader(noise_seeds, read_noise),
+    'YAML of effects': _document_reader(
+        lambda _folder: [EFFECTS], _file_reader('x.yaml', files.read_effects)
     ),
-    'YAML of tolerances': Reader(
+    'YAML of readings': _document_reader(
+        lambda _folder: [READINGS, FLAT_READINGS],
+        _text_of(lambda text: RawReadings.from_mapping(from_text(text))),
+    ),
+    'YAML of tolerances': _document_reader(
         lambda _folder: [(ROOT / 'config' / 'tolerances.yaml').read_bytes()],
         _file_reader('x.yaml', files.read_tolerances),
-        text=True,
     ),
     **{
         f'import from {target.name}': _import_reader(target)
         for target in all_targets().values()
         if target.read and target.write
     },
+    'rows that share pages': _attack(attacks.draw_shared_pages, _file_reader('x.db3', read_bag)),
+    'repeated index entries': _attack(attacks.draw_index_entries, _file_reader('x.bag', read_bag)),
+    'overlapping chunks': _attack(
+        attacks.draw_overlapping_chunks, _file_reader('x.mcap', read_bag)
+    ),
+    'thousands of Imu topics': _attack(attacks.draw_many_imus, _file_reader('x.mcap', list_imus)),
+    'empty arrays in a session': _attack(attacks.draw_empty_arrays, read_accumulator),
+    'long cells': _attack(attacks.draw_long_cells, _file_reader('x.csv', read_csv)),
+    'own effects': _attack(attacks.draw_own_effects, read_calibration),
+    'formulas in units.csv': _attack(attacks.draw_formula, attacks.read_name),
 }

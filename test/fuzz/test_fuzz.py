@@ -18,7 +18,7 @@ def test_mutated_inputs_are_read_or_refused(tmp_path, name):
         tmp_path,
         goes_on=lambda record: record.n_read + record.n_refused < N_INPUTS,
     )
-    assert record.n_read > 0
+    assert record.n_read > 0 or reader.attack
     assert not record.findings, next(iter(record.findings.values()))[0]
 
 
