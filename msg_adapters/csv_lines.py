@@ -7,10 +7,15 @@ from collections.abc import Sequence
 SERIAL_STAMP = re.compile(r'\s*(\d{1,2}:\d\d:\d\d[.,]\d+) -> (.*)')
 """Line of a serial monitor that prints the time of its arrival."""
 LABELLED_CELL = re.compile(
-    r'\s*([A-Za-z_][\w /^\[\]()%]*?)\s*[:=]\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan)\s*'
-    r'(?:[,;\t]|\s|$)'
+    r'([A-Za-z_][\w /^\[\]()%]{0,60}?)\s*[:=]\s*'
+    r'([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?|nan)\s*(?:[,;\t]|\s|$)'
 )
-"""Name and number, as for a plotter: ``ax:0.12``."""
+"""
+Name and number, as for a plotter: ``ax:0.12``.
+
+The name has a limit, and digits can be divided in one way only: the time of a search is otherwise
+quadratic in the length of a line.
+"""
 MOST_LINES = 50
 """Lines from which a decoration is recognised."""
 LEAST_CELLS = 4

@@ -5,9 +5,9 @@ One line and exit code 1, or a warning and what is usable.
 """
 
 import os
-import re
 import sqlite3
 import struct
+from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,6 +15,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import yaml
+from fuzz.attacks import overlapping_chunks, ros1_with_entries, rows_that_share_pages
 from test_adapters_mcap import chunk, message, prefixed_string, record, write_file
 
 from imu_calibration.core.documents import parsed
@@ -22,7 +23,7 @@ from imu_calibration.core.errors import InputError
 from msg_adapters.bag import Ros1File, list_topics
 from msg_adapters.compression import LARGEST_CHUNK, decompress_message, zstd
 from msg_adapters.decode import Decoder, JointDecoder
-from msg_adapters.definitions import deserializer, is_standard, standard_definition
+from msg_adapters.definitions import deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE
 from msg_adapters.layout import Packed
 from msg_adapters.rosbag2 import spelled_out
@@ -237,13 +238,7 @@ def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_pat
 
     All the rest was read for each.
     """
-    one = struct.pack('<BQ', 0x06, 2**40) + bytes(51)
-    starts = b''.join(
-        record(0x08, struct.pack('<QQQ', 0, 0, 8 + 60 * k) + bytes(40)) for k in range(60_000)
-    )
-    data = b'\x89MCAP0\r\n' + one * 60_000
-    footer = record(0x02, struct.pack('<QQI', len(data), 0, 0))
-    (tmp_path / 'x.mcap').write_bytes(data + starts + footer + b'\x89MCAP0\r\n')
+    (tmp_path / 'x.mcap').write_bytes(overlapping_chunks(60_000, 60, 2**40))
     refused('inspect', tmp_path / 'x.mcap')
     write_file(tmp_path / 'y.mcap', (message(1, 0, b'') + chunk(b'')) * 20_000)
     refused('inspect', tmp_path / 'y.mcap')
@@ -252,13 +247,28 @@ def test_overlapping_chunks_and_messages_between_chunks_take_linear_time(tmp_pat
 # Definitions
 
 
-@pytest.mark.parametrize('text', ['9' * 60_000 + 'x', 'a' + '(' * 25_000])
+@pytest.mark.parametrize(
+    'text',
+    [
+        '9' * 60_000 + 'x',
+        'a' + '(' * 25_000,
+        'E' * 60_000,
+        'ax:' + '9' * 60_000 + 'x',
+        '\t' * 60_000,
+        'a ' * 30_000,
+        'a:' * 30_000,
+    ],
+)
 def test_long_cells_and_headers_of_a_log_take_linear_time(tmp_path, text):
-    """Regular expressions that backtrack needed 195 s for a cell of 60,000 digits."""
-    (tmp_path / 'x.csv').write_text(
-        f'time,ax,ay,az,gx,gy,{text}\n' + ''.join(f'{k},1,2,9,0,0,1\n' for k in range(9))
-    )
-    refused('inspect', tmp_path / 'x.csv')
+    """
+    Regular expressions that backtrack needed 195 s for a cell of 60,000 digits.
+
+    Later ones, of labelled cells, needed minutes for 60,000 letters.
+    """
+    rows = [f'{k},1,2,9,0,0,{text}\n' for k in range(9)]
+    for name, lines in (('x.csv', [f'time,ax,ay,az,gx,gy,{text}\n', *rows]), ('y.csv', rows)):
+        (tmp_path / name).write_text(''.join(lines))
+        refused('inspect', tmp_path / name)
 
 
 def doubling(n_levels, last):
@@ -439,106 +449,13 @@ def test_index_entries_of_one_message_read_it_once(tmp_path):
     survived('inspect', path)
 
 
-def ros1_with_entries(n_entries, n_bytes):
-    """Return a ROS 1 bag with one Imu message of so many bytes, listed again and again."""
-
-    def header(**fields):
-        parts = [name.encode() + b'=' + value for name, value in fields.items()]
-        packed = b''.join(struct.pack('<I', len(part)) + part for part in parts)
-        return struct.pack('<I', len(packed)) + packed
-
-    def entry(data, **fields):
-        return header(**fields) + struct.pack('<I', len(data)) + data
-
-    def number(value, kind='<I'):
-        return struct.pack(kind, value)
-
-    definition = standard_definition(IMU_TYPE).text.encode()
-    names = header(
-        topic=b'/imu/data_raw',
-        type=b'sensor_msgs/Imu',
-        md5sum=b'6a62c6daae103f4ff57a132d6f95cec2',
-        message_definition=definition,
-    )[4:]
-    connection = entry(names, op=b'\x07', conn=number(0), topic=b'/imu/data_raw')
-    time = struct.pack('<II', 1, 0)
-    content = connection + entry(bytes(n_bytes), op=b'\x02', conn=number(0), time=time)
-    chunk_record = entry(content, op=b'\x05', compression=b'none', size=number(len(content)))
-    index = entry(
-        (time + number(len(connection))) * n_entries,
-        op=b'\x04',
-        ver=number(1),
-        conn=number(0),
-        count=number(n_entries),
-    )
-    magic, size = b'#ROSBAG V2.0\n', 4096
-    start = len(magic) + size
-    place = start + len(chunk_record) + len(index)
-    fields = {'op': b'\x03', 'conn_count': number(1), 'chunk_count': number(1)}
-    plain = header(**fields, index_pos=number(place, '<Q'))
-    fill = size - len(plain) - 4
-    info = entry(
-        number(0) + number(n_entries),
-        op=b'\x06',
-        ver=number(1),
-        chunk_pos=number(start, '<Q'),
-        start_time=time,
-        end_time=time,
-        count=number(1),
-    )
-    bag_header = plain + number(fill) + b' ' * fill
-    return magic + bag_header + chunk_record + index + connection + info
-
-
-def _varint(value):
-    """An SQLite varint of at most three bytes."""
-    assert value < 1 << 21
-    return bytes([0x80 | value >> 14, 0x80 | value >> 7 & 0x7F, value & 0x7F])
-
-
-def test_rows_that_share_overflow_pages_take_little_memory(bag):
+def test_rows_that_share_overflow_pages_take_little_memory(tmp_path):
     """8.5 MB with 1000 rows on one chain of overflow pages took 7.1 GB."""
-    n_rows, n_small, page_size = 400, 20_000, 4096
-    path = next(bag.glob('*.db3'))
-    change_database(bag, 'DELETE FROM messages')
-    connection = sqlite3.connect(path)
-    connection.execute(f'PRAGMA page_size = {page_size}')
-    connection.execute('VACUUM')
-    # Multiples of the content of an overflow page leave the part inside the leaf unchanged.
-    n_long = n_small + 240 * (page_size - 4)
-    insert = 'INSERT INTO messages (id, topic_id, timestamp, data) VALUES (?, 1, 1000000, ?)'
-    connection.execute(insert, (1000, b'L' * n_long))
-    connection.executemany(insert, ((1001 + k, b'S' * n_small) for k in range(n_rows)))
-    connection.commit()
-    connection.close()
-    data = path.read_bytes()
-    # A cell: sizes of payload and blob as varints, and after the part inside the number of the
-    # first overflow page. Both sizes of the small rows become those of the long one.
-    minimum = (page_size - 12) * 32 // 255 - 23
-    payload = n_small + 10
-    part = minimum + (payload - minimum) % (page_size - 4)
-    if part > page_size - 35:
-        part = minimum
-    starts = [match.start() for match in re.finditer(re.escape(_varint(2 * n_long + 12)), data)]
-    (start,) = starts
-    header = data[start - 4 : start + 3]
-    chain_at = data.index(b'L', start) - (payload - n_small) + part
-    first_page = data[chain_at : chain_at + 4]
-    changed = bytearray(data)
-    n_changed = 0
-    for match in re.finditer(re.escape(_varint(2 * n_small + 12)), data):
-        at = match.start()
-        begin = data.index(b'S', at) - (payload - n_small)
-        changed[at : at + 3] = _varint(2 * n_long + 12)
-        size_at = data.rindex(_varint(payload), 0, at)
-        changed[size_at : size_at + 3] = _varint(n_long + payload - n_small)
-        changed[begin + part : begin + part + 4] = first_page
-        n_changed += 1
-    assert n_changed == n_rows and len(header) == 7
-    path.write_bytes(changed)
-    connection = sqlite3.connect(path)
-    assert connection.execute(
-        'SELECT count(*) FROM messages WHERE length(data) = ?', (n_long,)
-    ).fetchone() == (n_rows + 1,)
-    connection.close()
-    assert survived('inspect', bag).megabytes < 150
+    path = tmp_path / 'x.db3'
+    path.write_bytes(rows_that_share_pages(400, 240))
+    with closing(sqlite3.connect(path)) as connection:
+        (n_rows,) = connection.execute(
+            'SELECT count(*) FROM messages WHERE length(data) = ?', (20_000 + 240 * 4092,)
+        ).fetchone()
+    assert n_rows == 401
+    assert survived('inspect', path).megabytes < 150
