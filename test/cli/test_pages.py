@@ -8,6 +8,8 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +40,8 @@ def commands(page):
 
 WITH_ROS = 'test/nodes/test_readme_commands.py runs it where the ros2 command is available'
 NOT_RUN = {
-    'python3 -m venv venv && . venv/bin/activate': 'test_package installs into an environment',
-    'pip install .': 'test_package installs into an empty environment, by the same command',
+    'python3 -m venv venv && . venv/bin/activate': 'the set-up of the tests makes an environment',
+    'pip install .': 'make readme-check installs the wheel into an empty environment',
     "pip install '.[arm]'": 'the set-up of the tests installs the extra with its pins',
     'make demo': 'a stage of .ci/run, before the tests',
     'make test': 'this test is a part of it',
@@ -97,6 +99,21 @@ def test_the_package_is_the_one_to_be_checked():
     """`make readme-check` checks an installed wheel, other targets the checkout."""
     place = Path(os.environ.get('IMPORTED_FROM', ROOT))
     assert Path(imu_calibration.__file__).is_relative_to(place)
+
+
+@pytest.mark.live
+def test_the_installed_command_finds_the_installed_data(tmp_path):
+    """The command beside the interpreter simulates by the installed table."""
+    tool = Path(sys.executable).with_name('imu_calibration')
+    shown = ''
+    for arguments in (
+        ['simulate', '--profile', 'six_faces', '--output', 'session'],
+        ['inspect', 'session'],
+    ):
+        done = subprocess.run([tool, *arguments], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        shown = done.stdout
+    assert '/imu/data_raw' in shown
 
 
 @pytest.fixture(scope='module')

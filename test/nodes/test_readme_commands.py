@@ -150,13 +150,15 @@ def terminals(home):
     for terminal in opened:
         if terminal.process.poll() is None:
             terminal.interrupt()
-    subprocess.run(
-        sourced(home[0] / 'ws', 'ros2 daemon stop'),
-        cwd=home[0],
-        env=home[1] | {'ROS_DOMAIN_ID': str(domain_id)},
-        capture_output=True,
-        timeout=60,
-    )
+    # Questions start the daemon, other commands do not.
+    if not all(starts(terminal.command) for terminal in opened):
+        subprocess.run(
+            sourced(home[0] / 'ws', 'ros2 daemon stop'),
+            cwd=home[0],
+            env=home[1] | {'ROS_DOMAIN_ID': str(domain_id)},
+            capture_output=True,
+            timeout=60,
+        )
     lock.close()
 
 

@@ -99,7 +99,6 @@ def test_every_verb_of_the_plain_command_is_offered(place):
     'line',
     [
         f'inspect {ROOT}/bags/sample_session --table {TABLE}',
-        'export --list',
         f'export {TRUTH} --to json --output WHERE.json --force',
         f'compare {TRUTH} nowhere.yaml',
         'calibrate --output WHERE',
