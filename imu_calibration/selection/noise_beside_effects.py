@@ -3,11 +3,11 @@ Noise estimated in addition to candidate effects, and the band of frequencies in
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
+from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
 from imu_calibration.estimation.noise_model import (
     BiasProcess,
@@ -24,6 +24,7 @@ from imu_calibration.estimation.session_noise import (
     shaken_means,
     white_noise,
 )
+from imu_calibration.selection.bias_courses import step_places, temperature_courses
 from imu_calibration.selection.parameter_space import ParameterSpace, normal_matrix, within_matrix
 
 
@@ -83,6 +84,8 @@ MAX_DRIFT_RATIO = 100.0
 Largest drift over the usual bias variation: the ratio by which the effects' priors, for consumer
 instruments, exceed their bias variation.
 """
+MOST_MOMENTS = 40
+"""Moments at which a step of the biases is compared with a bias process at a time."""
 LEAST_NOISE_SHARE = 0.9
 """Moving windows scatter no less than this share of the noise at rest."""
 
@@ -226,7 +229,9 @@ def _with_bias_process(
     """
     Return the noise of a sensor with window offsets and bias process.
 
-    It is estimated with all effects but the superfluous smooth ones.
+    It is estimated with all effects but the superfluous smooth ones. A wander would follow a step
+    of the biases, or a temperature that acts late: one of these that beats the process is a part
+    of the model too.
     """
     recording, superfluous = (
         space.recording,
@@ -243,30 +248,116 @@ def _with_bias_process(
     white = noise[sensor].mean_variance(
         recording.kind, recording.count, recording.duration, keys=recording.keys
     )
-    likelihood = NoiseLikelihood(
-        rows,
-        white,
-        recording.time,
-        sessions=recording.sessions,
-        information=_known_otherwise(space, sensor, noise, own),
-        known=noise[sensor].known,
-        durations=recording.duration,
-        common=len(structural),
-    )
     natural = float(
         np.sqrt(
             sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))
         )
     )
-    search = BiasProcessSearch(likelihood, 0.0 if noise[sensor].known else natural, STABLE[sensor])
-    options = [[place[k] - len(structural) for k in parameters] for parameters in smooth]
-    prior_sd = drift_prior(
-        rows[:, :, len(structural) : -1], space.prior_sd[superfluous], max(natural, STABLE[sensor])
+    usual = max(natural, STABLE[sensor])
+    effects = _SmoothColumns(
+        [[place[k] - len(structural) for k in parameters] for parameters in smooth],
+        drift_prior(rows[:, :, len(structural) : -1], space.prior_sd[superfluous], usual),
     )
-    used = _needed_smooth(search, options, prior_sd=prior_sd)
-    shape = search.best(used)[0]
-    middle = search.of_middle_axis(shape, used) if shape[1] > PLAUSIBLE * search.usual else 0.0
-    return replace(noise[sensor], middle_wander=middle, **search.polished(shape, used))
+    information = _known_otherwise(space, sensor, noise, own)
+
+    def choice(courses: Sequence[np.ndarray], n_moments: int) -> _Choice:
+        """Return the best of the effects and courses; the last `n_moments` courses are steps."""
+        added = _columns_of_biases(courses, len(rows))
+        sd = drift_prior(added, np.full(added.shape[2], np.inf), usual)
+        likelihood = NoiseLikelihood(
+            np.concatenate([rows[:, :, :-1], added, rows[:, :, -1:]], axis=2),
+            white,
+            recording.time,
+            sessions=recording.sessions,
+            information=_with_priors(information, sd),
+            known=noise[sensor].known,
+            durations=recording.duration,
+            common=len(structural),
+        )
+        search = BiasProcessSearch(
+            likelihood, 0.0 if noise[sensor].known else natural, STABLE[sensor]
+        )
+        options = [list(option) for option in effects.options]
+        for first in range(len(effects.prior_sd), len(effects.prior_sd) + len(sd), len(AXES)):
+            options.append([first, first + 1, first + 2])
+        # Each of the moments is as likely as the other ones.
+        prices = np.zeros(len(options))
+        prices[len(options) - n_moments :] = 2 * np.log(max(n_moments, 1))
+        used = _needed_smooth(
+            search, options, prior_sd=np.append(effects.prior_sd, sd), prices=prices
+        )
+        moment = -1
+        if used:
+            moment = options.index(list(used)) - (len(options) - n_moments)
+        return _Choice(search, used, moment)
+
+    # Only within one recording: between two of them each bias may change.
+    courses = []
+    places = np.zeros(0, int)
+    if len(recording.sessions) == 1:
+        temperature = recording.describe['temperature']
+        courses = [course.values for course in temperature_courses(recording.time, temperature)]
+        places = step_places(np.arange(len(rows)), MOST_MOMENTS)
+    found = choice([*courses, *_steps(places, len(rows))], len(places))
+    if found.moment >= 0 and len(places) == MOST_MOMENTS:
+        # the windows between the neighbours of the best moment
+        first = places[max(found.moment - 1, 0)]
+        last = places[min(found.moment + 1, len(places) - 1)]
+        places = step_places(np.arange(first, last + 1), MOST_MOMENTS, least=0)
+        found = choice([*courses, *_steps(places, len(rows))], len(places))
+
+    shape = found.search.best(found.used)[0]
+    middle = 0.0
+    if shape[1] > PLAUSIBLE * found.search.usual:
+        middle = found.search.of_middle_axis(shape, found.used)
+    return replace(noise[sensor], middle_wander=middle, **found.search.polished(shape, found.used))
+
+
+@dataclass(frozen=True, eq=False)
+class _SmoothColumns:
+    """Parameters of effects that are smooth in time."""
+
+    options: Sequence[Sequence[int]]
+    """Their numbers for each effect."""
+    prior_sd: np.ndarray
+    """Of each parameter, shape (q,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Choice:
+    """The model beside which a bias process is estimated."""
+
+    search: BiasProcessSearch
+    """Noise with these columns."""
+    used: Sequence[int]
+    """Parameters of the smooth effect or course of the biases that is needed."""
+    moment: int
+    """Number of the step among the steps; negative: it is none."""
+
+
+def _steps(places: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return 1 after each of the windows `places`, 0 up to it, each shape (count,)."""
+    return [(np.arange(count) > last).astype(float) for last in places]
+
+
+def _columns_of_biases(courses: Sequence[np.ndarray], count: int) -> np.ndarray:
+    """Return the columns of courses in time on each axis, shape (count, 3, 3 * n_courses)."""
+    columns = np.zeros((count, len(AXES), len(AXES) * len(courses)))
+    for number, course in enumerate(courses):
+        for axis in range(len(AXES)):
+            columns[:, axis, len(AXES) * number + axis] = course
+    return columns
+
+
+def _with_priors(information: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Return the information with further parameters before the column of the residual."""
+    count = len(information) - 1 + len(sd)
+    extended = np.zeros((count + 1, count + 1))
+    kept = np.append(np.arange(len(information) - 1), count)
+    extended[np.ix_(kept, kept)] = information
+    added = np.arange(len(information) - 1, count)
+    extended[added, added] = 1 / sd**2
+    return extended
 
 
 def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.ndarray:
@@ -290,20 +381,24 @@ def drift_prior(columns: np.ndarray, prior_sd: np.ndarray, usual: float) -> np.n
 
 
 def _needed_smooth(
-    search: BiasProcessSearch, options: Sequence[Sequence[int]], *, prior_sd: np.ndarray
+    search: BiasProcessSearch,
+    options: Sequence[Sequence[int]],
+    *,
+    prior_sd: np.ndarray,
+    prices: np.ndarray | float = 0.0,
 ) -> Sequence[int]:
     """
     Return the parameters of the smooth effect that beats the bias process.
 
-    Each one is judged with the noise estimated jointly.
+    Each one is judged with the noise estimated jointly, and has a further price.
 
     By restricted likelihood, all parameters integrated out under their priors: at its maximum over
     as many as there are windows the wander is underestimated, and noise of 15 s resembles a drift.
     """
     losses = [search.best([])[1]]
-    losses += [
-        search.best(option)[1] + 2 * np.log(prior_sd[option]).sum() + STRONG for option in options
-    ]
+    for option, price in zip(options, np.broadcast_to(prices, len(options)), strict=True):
+        occam = 2 * np.log(prior_sd[option]).sum()
+        losses.append(search.best(option)[1] + occam + STRONG + price)
     return [[], *options][int(np.argmin(losses))]
 
 

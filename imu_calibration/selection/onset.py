@@ -72,6 +72,11 @@ class Onset:
     Axes of which the biases or rows of the matrices change, the largest change first; empty for an
     effect of the reference.
     """
+    temperature_c: float | None = None
+    """
+    Temperature of which all windows before the moment are on one side and all later ones on the
+    other, so that a step where it is passed is not separable; None without one.
+    """
 
     def to_mapping(self) -> dict:
         """Return the onset as plain data."""
@@ -81,6 +86,7 @@ class Onset:
             'what': self.what,
             'share': self.share,
             'axes': list(self.axes),
+            'temperature_c': self.temperature_c,
             'parameters': {
                 name: {
                     'before': value,
@@ -171,6 +177,8 @@ class _Candidate:
     """Share of the excess that the second state removes."""
     fit: ChangeFit
     """The first state and the change."""
+    temperature_c: float | None
+    """Temperature that is passed at the moment only; None without one."""
 
 
 def _groups(model: SensorModel) -> list[_Group]:
@@ -215,8 +223,12 @@ def _candidate(
     losses = _losses_of_moments(rows, own, changing, allowed)
     last = min(losses, key=losses.__getitem__)
     least = losses[last]
-    if group.role is Role.OFFSET and _follows_temperature(rows, own, changing, least):
-        return None
+    warmth = rows.space.recording.describe['temperature']
+    passed = None
+    if group.role is Role.OFFSET:
+        passed = _passed_once(warmth, last)
+        if passed is None and _follows_temperature(rows, own, changing, least):
+            return None
 
     # The change lies within one of the windows about the moment, which hold both states: all
     # models are compared without them.
@@ -240,6 +252,7 @@ def _candidate(
         noise=after.limit,
         share=1 - after.squares / before.squares,
         fit=step,
+        temperature_c=passed,
     )
 
 
@@ -285,6 +298,15 @@ def _follows_temperature(
         if _loss_of_step(rows, own, changing, warm) <= loss:
             return True
     return False
+
+
+def _passed_once(warmth: np.ndarray, last: int) -> float | None:
+    """Return a temperature on different sides of which the windows up to and after `last` are."""
+    first, second = warmth[: last + 1], warmth[last + 1 :]
+    for lower, upper in ((first, second), (second, first)):
+        if lower.max() < upper.min():
+            return float(0.5 * (lower.max() + upper.min()))
+    return None
 
 
 def _after(rows: WindowRows, last: int) -> np.ndarray:
@@ -338,6 +360,7 @@ def _onset_of(
         {label: units[label] for label in names},
         candidate.share,
         axes,
+        candidate.temperature_c,
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from imu_calibration.core.distributions import f_sf
 from imu_calibration.effects.base import AXES, SENSORS, Role
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.selection.bias_courses import LEAST_WARMING, temperature_courses
 from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
@@ -29,8 +30,6 @@ ALPHA = 1e-4
 """Significance that a correlation must have."""
 IN_MOTION = 'motion (moving windows against windows at rest)'
 """Name of the variable that separates moving windows from windows at rest."""
-TEMPERATURE_LAGS = (15, 30, 45, 60, 90, 120, 180, 300)
-"""Times by which the output may follow the temperature late, s."""
 MUCH_SCATTER = 10.0
 """
 Least excess variance in motion, over the noise at rest and over the excess of the middle axis, of
@@ -274,20 +273,9 @@ def slow_explanations(
     levels = np.quantile(share, (0.2, 0.35, 0.5, 0.65, 0.8))
     steps = np.stack([share > level for level in levels], axis=1)
     yield 'time', steps.astype(float), every
-    if not np.all(np.isfinite(temperature)) or np.ptp(temperature) <= 0.5:
+    if not np.all(np.isfinite(temperature)) or np.ptp(temperature) <= LEAST_WARMING:
         return
     warm = (temperature - temperature.mean()) / np.ptp(temperature)
     yield 'temperature', np.stack([warm, warm**2], axis=1), every
-
-    # The rate over twice the shortest lag, so that noise of the thermometer averages.
-    shortest = TEMPERATURE_LAGS[0]
-    later = np.interp(time + shortest, time, warm)
-    rate = (later - np.interp(time - shortest, time, warm)) / (2 * shortest)
-    within = (time - time[0] >= shortest) & (time[-1] - time >= shortest)
-    yield 'temperature rate', rate[:, None], within
-    for lag in TEMPERATURE_LAGS:
-        known = time - time[0] >= lag
-        if 2 * np.count_nonzero(known) < len(time):
-            return
-        earlier = np.interp(time - lag, time, warm)
-        yield f'the temperature {lag} s earlier', earlier[:, None], known
+    for course in temperature_courses(time, temperature):
+        yield course.name, course.values[:, None], course.known

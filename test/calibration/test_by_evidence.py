@@ -31,6 +31,7 @@ from imu_calibration.selection.unexplained import Unexplained, biases_off
 
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair
+from worlds.moments import Wander
 from worlds.physics import TABLES, make_session
 from worlds.physics_beyond import Beyond
 
@@ -377,21 +378,34 @@ def test_what_a_rest_may_move_biases_by():
 
 
 @pytest.mark.long
-def test_a_bias_that_steps_on_every_axis_passes_for_noise_and_is_told():
+def test_a_bias_that_steps_on_every_axis_is_found_with_its_size():
+    """A wander of all axes alike would follow the step, which passed for noise."""
     session = make_session(7, {'knock_step': 0.05}, 'realistic', **COARSE)
+    result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))
+    onset = result.diagnosis.onset
+    assert onset.what == 'bias of accelerometer' and not result.diagnosis.findings
+    assert abs(onset.time - session.truth['knock']) < 0.04  # two samples
+    for place, (name, before) in enumerate(onset.before.items()):
+        step = 0.05 * session.truth['direction'][place]
+        assert abs(onset.after[name] - before - step) < 4 * onset.sd[name]
+
+
+@pytest.mark.long
+def test_a_wander_of_every_axis_passes_for_noise_and_is_told():
+    session = make_session(7, None, 'realistic', cause=Wander(sd=(0.02, 0.0)), **COARSE)
     result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))
     assert (
         not result.diagnosis.findings
+        and result.diagnosis.onset is None
         and not result.diagnosis.unexplained['accelerometer'].significant
     )
-    motion, bias = result.notes  # residuals of windows in motion, scatter of the means
-    for note in (motion, bias):
-        assert (
-            'accelerometer' in note
-            and f'note: {note}' in result.lines
-            and note[1:] in diagnosis_report(result)
-        )
-    assert result.document['notes'] == [motion, bias]
+    (note,) = result.notes  # scatter of the means
+    assert (
+        'accelerometer' in note
+        and f'note: {note}' in result.lines
+        and note[1:] in diagnosis_report(result)
+    )
+    assert result.document['notes'] == [note]
     plain = make_session(7, None, 'realistic', **COARSE)
     assert not diagnose_recording(
         lambda: iter([plain.block]), Table.from_mapping(plain.table)

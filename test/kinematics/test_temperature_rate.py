@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from few_candidates import restricted
 
+from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.table_calibration import calibrate_on_table
 from imu_calibration.core.errors import InputError
 from imu_calibration.document.trust import MEAN
@@ -47,7 +49,8 @@ def test_a_steady_change_has_its_slope_and_parts_give_the_same():
     np.testing.assert_array_equal(np.concatenate(joined), slope)
 
 
-def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
+def session_that_warms():
+    """Return (samples, table) of a gyroscope whose biases are SIZE times the slope."""
     session = make_session(
         8250,
         None,
@@ -64,12 +67,16 @@ def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
     imu = replace(session.imu, rate_s=session.imu.rate_s + bias)
     temperature = replace(session.temperature, temperature_c=warming(at_readings)[0])
     block = replace(session.block, imu=imu, temperature=temperature)
+    return block, Table.from_mapping(session.table)
+
+
+def test_a_bias_in_proportion_to_the_slope_of_the_temperature_is_estimated():
+    block, table = session_that_warms()
     options = CalibrationOptions(
         accelerometer_model='bias+matrix',
         gyroscope_model='bias+matrix+bias_while_warming',
         catalogue=CATALOGUE.with_effects(FOLLOWS),
     )
-    table = Table.from_mapping(session.table)
     result = calibrate_on_table([lambda: iter([block])], table, options)
     value = result.calibration.value('gyroscope', 'bias_while_warming')
     np.testing.assert_allclose(value, SIZE, rtol=0.2)
@@ -99,3 +106,14 @@ def test_formulas_with_a_temperature_contain_its_slope():
     assert ('temperature_rate',) not in [f.columns for f in grammar(1, False, 100.0)]
     (slope,) = [f for f in grammar(1, True, 100.0) if f.columns == ('temperature_rate',)]
     assert slope.unit('rad/s') == 'rad/s/(K/s)' and slope.smooth
+
+
+@restricted(('gyro_thermal_bias', 'gyro_bias_drift', 'gyro_bias_trend'))
+def test_the_diagnosis_names_the_slope_of_the_temperature():
+    # A wander of all axes alike followed it, and nothing was found.
+    block, table = session_that_warms()
+    diagnosis = diagnose_recording(lambda: iter([block]), table).diagnosis
+    assert not diagnosis.findings
+    rest = diagnosis.unexplained['gyroscope']
+    assert rest.significant and rest.correlates_with == 'temperature rate' and rest.share > 0.5
+    assert not diagnosis.unexplained['accelerometer'].significant

@@ -251,7 +251,11 @@ def test_shares_are_of_the_locked_windows():
     [('cable_in_an_arc', 1.0), pytest.param('sticks_when_warm', 2.0, marks=pytest.mark.long)],
 )
 def test_the_place_is_found(kind, size):
-    """A gyroscope step of half this size is within the wander of its bias."""
+    """
+    A gyroscope step of half this size is within the wander of its bias.
+
+    The temperature is passed once: it is named with the moment.
+    """
     row, known = row_of(6, kind, 'white', Beyond(kind, 6, size))
     assert row['flagged'] and row['f1'] > 0.7 and row['axis'] and not row['found'], row
     assert len(known) == 24 and all(sd > 0 for _, sd in known.values())
@@ -409,7 +413,7 @@ def test_a_finding_that_a_formula_does_without_is_withdrawn_and_one_that_is_ther
     row, _ = row_of(141, 'gyro_scale_settling', 'realistic', Beyond('gyro_scale_settling', 141))
     assert row['found'] == [] and row['family'], row
     row, _ = row_of(81013, 'sticks_when_warm', 'realistic', Beyond('sticks_when_warm', 81013))
-    assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.95, (
+    assert row['found'] == [] and row['flagged'] and row['axis'] and row['f1'] > 0.999, (
         'a step when it is warm looks like a curve of the temperature'
     )
     recording = record(

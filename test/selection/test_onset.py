@@ -92,6 +92,12 @@ def test_a_change_at_one_moment_is_found_with_both_states(kind, what, axes):
     [
         (((0.03, 0.0, 0.0), (0.0, 2e-3, 0.0)), 'accelerometer and gyroscope', 'xy'),
         (((0.0, 0.0, 0.0), (0.0, 2e-3, 0.0)), 'gyroscope', 'y'),
+        # A wander of all axes alike followed such a step, and nothing was found.
+        (
+            ((0.02, -0.03, 0.025), (1.4e-3, 0.9e-3, -1.7e-3)),
+            'accelerometer and gyroscope',
+            'xyz',
+        ),
     ],
 )
 def test_a_step_of_the_biases_is_found_with_both_states(shock, what, axes):
@@ -105,6 +111,8 @@ def test_a_step_of_the_biases_is_found_with_both_states(shock, what, axes):
         change = onset.after[name] - before
         assert abs(change - truth[sensor][axis]) < 4 * onset.sd[name], name
     assert not found.named
+    printed = ' '.join(diagnosis_lines(build_diagnosis(recording.table, found)))
+    assert all(f'{name} ' in printed for name in onset.before)
 
 
 def test_a_wandering_bias_is_no_onset():

@@ -34,6 +34,7 @@ from imu_calibration.selection.noise_beside_effects import (
     natural_processes,
     plausible_processes,
 )
+from imu_calibration.selection.onset import _passed_once
 from imu_calibration.selection.parameter_space import (
     ParameterSpace,
     parameter_space,
@@ -985,6 +986,29 @@ def test_a_bias_that_follows_the_temperature_late_is_named(lag):
     beside = residual - np.outer(measured - 25, [1.0, -0.5, 0.2])
     name, share = rests.correlate(rests.slow_explanations(time, measured), beside)
     assert {0: None, 45: 'temperature rate'}.get(lag, name) == name
+
+
+def test_a_temperature_behind_a_thermal_mass_is_named_with_its_lag():
+    rng = np.random.default_rng(9211)
+    time = np.sort(rng.uniform(0, 900, 200))
+    fine = np.arange(0.0, 900.0, 0.1)
+    warm = 25 + 4 * (1 - np.exp(-fine / 90)) + 2 * np.sin(2 * np.pi * fine / 110)
+    mass = warm.copy()
+    for k in range(1, len(fine)):
+        mass[k] = mass[k - 1] + 0.1 / 45.0 * (warm[k - 1] - mass[k - 1])
+    residual = np.outer(np.interp(time, fine, mass) - 25, [1.0, -0.5, 0.2])
+    residual += rng.normal(0, 0.1, residual.shape)
+    measured = np.interp(time, fine, warm) + rng.normal(0, 0.02, len(time))
+    name, share = rests.correlate(rests.slow_explanations(time, measured), residual)
+    assert name == 'the temperature with a lag of 45 s' and share > 0.9
+
+
+@pytest.mark.parametrize(('first', 'passed'), [((20.0, 24.0), 25.0), ((20.0, 27.0), None)])
+def test_a_temperature_that_is_passed_once_is_that_of_the_moment(first, passed):
+    warmth = np.array([*first, 26.0, 29.0])
+    for sign in (1.0, -1.0):
+        found = _passed_once(sign * warmth, 1)
+        assert found == (None if passed is None else sign * passed)
 
 
 @pytest.mark.parametrize(('constant', 'expected'), [(-0.09, 30.0), (0.0, 30.0), (250.0, 250.0)])

@@ -90,8 +90,14 @@ def _known(found, recording):
 def _judged(found, cause):
     kind, rest = cause.kind, found.unexplained[cause.kind.sensor]
     proposal, told = rest.proposal, set(rest.axes)
+    # A change at one moment is the place in time after it, and in temperature where one is passed.
+    onset = found.onset
+    if onset is not None and kind.sensor in onset.what:
+        told = set(onset.axes)
+    else:
+        onset = None
     row = {
-        'flagged': bool(rest.significant),
+        'flagged': bool(rest.significant) or onset is not None,
         'axis': told == cause.axes if len(cause.axes) == 1 else bool(told) and told <= cause.axes,
         'told_axes': sorted(told),
         'axes': sorted(cause.axes),
@@ -105,20 +111,23 @@ def _judged(found, cause):
         regimes = [
             regime for regime in rest.regimes if regime.variable.startswith(kind.place)
         ] or list(rest.regimes)
+        places = [_f1(regime.time, regime.inside, cause, regime.offset) for regime in regimes[:1]]
+        if onset is not None and (kind.place == 'time' or onset.temperature_c is not None):
+            places = [_f1(cause.time, cause.time > onset.time, cause, True)]
         row |= {
-            'f1': max((_f1(regime, cause) for regime in regimes[:1]), default=0.0),
+            'f1': max(places, default=0.0),
             'where': [regime.text for regime in rest.regimes],
         }
     return row
 
 
-def _f1(regime, cause):
+def _f1(time, inside, cause, offset):
     strength = np.abs(cause.signal).max(axis=1)
-    true = np.interp(regime.time, cause.time, strength) > 0.2 * strength.max()
+    true = np.interp(time, cause.time, strength) > 0.2 * strength.max()
     # An offset here is an offset of the other sign everywhere else: the bias is free.
     return max(
         float(2 * (true & told).sum() / max(true.sum() + told.sum(), 1))
-        for told in [regime.inside, ~regime.inside][: 1 + regime.offset]
+        for told in [inside, ~inside][: 1 + offset]
     )
 
 

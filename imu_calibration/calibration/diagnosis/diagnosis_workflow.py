@@ -469,9 +469,11 @@ def timing_lines(diagnosis: Diagnosis) -> list[str]:
 def _onset_lines(onset: Onset | None) -> list[str]:
     if onset is None:
         return []
-    largest = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))[
-        :MOST_SHOWN
-    ]
+    by_size = sorted(onset.before, key=lambda name: -abs(onset.after[name] - onset.before[name]))
+    # the largest of each sensor: their units differ
+    largest = []
+    for owner in sorted({name.partition('.')[0] for name in by_size}):
+        largest += [name for name in by_size if name.partition('.')[0] == owner][:MOST_SHOWN]
     states = [
         [
             in_words(state[name], onset.what, onset.units[name]).removesuffix(' 1')
@@ -483,12 +485,19 @@ def _onset_lines(onset: Onset | None) -> list[str]:
         f'{name} {before} before, {after} after' for name, (before, after) in zip(largest, states)
     )
     axes = f' (axis {", ".join(onset.axes)})' if onset.axes else ''
+    separable = []
+    if onset.temperature_c is not None:
+        separable.append(
+            f'   the temperature passed {onset.temperature_c:.1f} degC at this moment only: a step'
+            ' above or below it is not separable in this recording'
+        )
     return [
         f'change at {onset.time:.1f} +- {onset.time_sd:.1g} s of {onset.what}{axes}: {values}',
         (
             f'   it explains {100 * onset.share:.0f} % of the residual; other results: of the'
             ' longer part; record again without the change'
         ),
+        *separable,
     ]
 
 
