@@ -196,7 +196,7 @@ def _judge(out, look, hints):
             f'{kind}: {count} windows, {result.calibration.statistics["samples_used"][kind]}'
             ' samples'
         )
-    _show_parameters(out, result.calibration)
+    _show_parameters(out, result.calibration, hints)
     return ''
 
 
@@ -212,11 +212,19 @@ def _show_by_hand(out, found, hints):
         f'by hand, without a table, it determines, from {windows["static"]} poses and'
         f' {windows["turns"]} turns between them:'
     )
-    _show_parameters(out, found.calibration)
+    _show_parameters(out, found.calibration, hints)
 
 
-def _show_parameters(out, calibration):
-    """Print the parameters by status, and the motions that would determine more."""
+def _show_parameters(out, calibration, hints):
+    """Print the parameters by status, and the motions or options that would determine more."""
+    from imu_calibration.estimation.solution import (
+        COMMON_SCALE,
+        GRAVITY,
+        REMEDIES,
+        REMEDY_KEYS,
+        WEAK,
+    )
+
     groups = {}
     for name, status in calibration.status_by_name.items():
         groups.setdefault(status, []).append(name)
@@ -225,5 +233,9 @@ def _show_parameters(out, calibration):
     needs = {}
     for direction in calibration.undetermined:
         needs.setdefault(direction['needs'], {}).update(direction['parameters'])
+    if COMMON_SCALE in groups.get(WEAK, []):
+        needs[REMEDIES[GRAVITY,]] = {COMMON_SCALE: 1.0}
     for motion, names in needs.items():
-        out.print(f'needs: {motion}  ({", ".join(names)})')
+        out.print(
+            f'needs: {with_hint(motion, REMEDY_KEYS.get(motion), hints)}  ({", ".join(names)})'
+        )

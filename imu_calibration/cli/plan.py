@@ -71,7 +71,7 @@ def add_arguments(parser: OneLineParser) -> None:
         '--tolerances', metavar='FILE', help='largest sd of a determined parameter, by effect'
     )
     parser.expert('--imu-rate', type=float, default=100.0, metavar='HZ', help='default 100')
-    parser.expert('--gravity', type=float, help='local gravity for a robot description, m/s^2')
+    parser.add_gravity()
     parser.expert('--accelerometer-model', metavar='MODEL', help='default size_effect')
     parser.expert('--gyroscope-model', metavar='MODEL', help='default bias+matrix')
     parser.expert('--reference-model', metavar='MODEL', help='default table_tilt')
@@ -139,10 +139,12 @@ def _pose(text):
 
 
 def _stand(options):
+    from imu_calibration.kinematics.rotations import local_gravity
     from imu_calibration.planning.motion_library import yaw_table
 
     if options.motion == 'yaw-only':
-        return yaw_table(options.gravity)
+        gravity, _ = local_gravity(options.gravity, options.latitude, options.height)
+        return yaw_table(gravity)
     stand = options.stand()
     if stand is None:
         raise InputError(

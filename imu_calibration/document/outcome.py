@@ -31,9 +31,9 @@ class ParameterCount:
         return self.requested - len(self.lacking)
 
     @property
-    def text(self) -> str:
-        """The count as it is printed everywhere."""
-        return f'{self.determined} of {self.requested} parameters determined'
+    def figures(self) -> dict[str, int]:
+        """The count as the nodes publish it on /diagnostics."""
+        return {'parameters': self.requested, 'not determined': len(self.lacking)}
 
 
 def parameter_count(calibration: Calibration) -> ParameterCount:

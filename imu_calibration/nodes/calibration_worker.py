@@ -29,7 +29,7 @@ from imu_calibration.calibration.result import CalibrationResult, summary
 from imu_calibration.core.errors import ImuCalibrationError, NotObservableError, shortened
 from imu_calibration.document import files
 from imu_calibration.document.calibration_text import calibration_to_text
-from imu_calibration.document.outcome import missing
+from imu_calibration.document.outcome import missing, parameter_count
 from imu_calibration.nodes.calibration_status import WorkerState
 from imu_calibration.nodes.diagnosis_thread import DiagnosisThread, Listeners, return_freed_memory
 from imu_calibration.preprocessing.stream_watch import StreamWatch
@@ -524,6 +524,8 @@ class CalibrationWorker(threading.Thread):
             'process': os.getpid(),
             **counts,
         }
+        if result is not None:
+            values |= parameter_count(result.calibration).figures
         if self.live.needs_linearising:
             lines = [
                 *lines,

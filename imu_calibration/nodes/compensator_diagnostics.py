@@ -286,13 +286,11 @@ class CompensatorDiagnostics:
         if adopted is None:
             return values
         calibration, compensation = adopted.calibration, adopted.compensation
-        count = parameter_count(calibration)
         values |= {
             'decision': decisions_text(calibration.decisions),
             'not corrected': ', '.join(adopted.used.refused) or 'none',
             'date': calibration.conditions.get('date', ''),
-            'parameters': count.requested,
-            'not determined': len(count.lacking),
+            **parameter_count(calibration).figures,
             'messages': compensation.received,
             'corrected': compensation.corrected,
             **compensation.counts,

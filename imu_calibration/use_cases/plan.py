@@ -16,12 +16,12 @@ from imu_calibration.core import documents
 from imu_calibration.core.errors import DocumentError, InputError
 from imu_calibration.core.exit_codes import exit_code_of
 from imu_calibration.core.progress import report
-from imu_calibration.core.units import DEG, STANDARD_GRAVITY
+from imu_calibration.core.units import DEG, STANDARD_GRAVITY, STANDARD_GRAVITY_SD
 from imu_calibration.document import files
 from imu_calibration.document.calibration import Calibration, listed
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import BASE, SensorModel, parse_effects
-from imu_calibration.estimation.solution import tolerances_of
+from imu_calibration.estimation.solution import GRAVITY, REMEDIES, tolerances_of
 from imu_calibration.kinematics.motion_limits import (
     NOT_CHECKED,
     limit_words,
@@ -88,12 +88,18 @@ class Planned:
 
     @property
     def notes(self) -> list[str]:
-        """Checks and doubts about the limits, a line each."""
-        return (
-            []
-            if self.table is None
-            else [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
-        )
+        """Checks and doubts about the limits, and an unknown gravity, a line each."""
+        if self.table is None:
+            return []
+        lines = [NOT_CHECKED, *(f'warning: {line}' for line in range_warnings(self.table))]
+        # No motion determines the scales better than gravity is known.
+        if self.table.gravity_sd_value >= STANDARD_GRAVITY_SD:
+            share = self.table.gravity_sd_value / self.table.gravity_value
+            lines.append(
+                f'warning: the scales of the accelerometer are known to {100 * share:.2g} %, as'
+                f' gravity is; {REMEDIES[GRAVITY,]}'
+            )
+        return lines
 
     @cached_property
     def report(self) -> str:
