@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import factorial
@@ -147,6 +147,10 @@ class ScaleCovariance:
         self._correlations: dict[NoiseProcess, np.ndarray] = {}
         self._products: dict[tuple[NoiseProcess, NoiseProcess], np.ndarray] = {}
 
+    @cached_property
+    def _distances(self) -> '_Distances':
+        return _Distances(np.stack([np.abs(shifted) for shifted in self._shifted(self._lag)]))
+
     def expectation(self, process: NoiseProcess) -> np.ndarray:
         """Return the Allan variances of unit coefficient, shape (n_scales,)."""
         if process not in self._expectations:
@@ -233,18 +237,51 @@ class ScaleCovariance:
         return self._correlations[process]
 
     def _evaluate(self, process, lag):
+        """
+        Return the covariance of second differences at `lag`, shape (n_pairs, n_lags).
+
+        With the kernel G and the averaging times a and b of the two differences::
+
+            sum_ij c_i c_j G(lag - i a + j b) / (a b),   c = (1, -2, 1),   i, j = 0, 1, 2
+        """
+        # A correlation time is searched: its kernel is evaluated for many times at the same lags.
+        if process.time and lag is self._lag:
+            distances = self._distances
+            kernel = process.kernel(distances.distinct * self.period)
+            values = (kernel[place] for place in distances.place)
+        else:
+            values = (process.kernel(shifted * self.period) for shifted in self._shifted(lag))
+        weights = np.outer(SECOND_DIFFERENCE, SECOND_DIFFERENCE).ravel()
         total, size = np.zeros(lag.shape), np.zeros(lag.shape)
-        for i, at_short in enumerate(SECOND_DIFFERENCE):
-            for j, at_long in enumerate(SECOND_DIFFERENCE):
-                term = (
-                    at_short
-                    * at_long
-                    * process.kernel((lag + j * self._long - i * self._short) * self.period)
-                )
-                total += term
-                size += np.abs(term)
+        for weight, kernel_here in zip(weights, values):
+            term = weight * kernel_here
+            total += term
+            size += np.abs(term)
         total[np.abs(total) < DIFFERENCE_ROUNDING * size] = 0.0
         return total / (self._short * self._long * self.period**2)
+
+    def _shifted(self, lag):
+        """Yield `lag` from each of three ends of one difference to each of the other."""
+        for i in range(3):
+            for j in range(3):
+                yield lag + j * self._long - i * self._short
+
+
+class _Distances:
+    """
+    Distances between the ends of two differences, in samples.
+
+    The kernels are even functions, and most distances occur many times: each is evaluated once.
+    """
+
+    distinct: np.ndarray
+    """Sorted, shape (n,)."""
+    place: np.ndarray
+    """Index in `distinct` of each pair of ends, shape (9, n_pairs, n_lags)."""
+
+    def __init__(self, every: np.ndarray):
+        self.distinct = np.unique(every)
+        self.place = np.searchsorted(self.distinct, every).astype(np.int32)
 
 
 def _lags(short, long, length):
