@@ -15,10 +15,14 @@ ROOT = Path(__file__).resolve().parents[2]
 MAKE = """#!/bin/bash
 for goal in "$@"; do
     if [ -f "$goal.fails" ]; then cat "$goal.fails"; exit 2; fi
+    if [ -f "$goal.slow" ]; then sleep 1; fi
 done
-echo "ran $*"
+echo "$*" >>ended
 """
-"""In place of make: a goal with a file GOAL.fails prints it and fails."""
+"""
+In place of make: a goal with a file GOAL.fails prints it and fails, one with GOAL.slow takes a
+second. Calls that ended are appended to the file `ended`.
+"""
 PROBLEMS = {
     'demo-check': 'NameError: no Terminal.standard',
     'readme-check': 'E   README.md: 1 line is not listed',
@@ -57,6 +61,15 @@ def test_each_failing_stage_is_named_with_its_first_error(tmp_path, failing):
     named = re.findall(r'failed in the stage: (\w+)\nfirst error: (.*)\n', done.stderr)
     assert dict(named) == {STAGES[goal]: PROBLEMS[goal] for goal in failing}
     assert done.returncode == int(bool(failing))
+
+
+def test_the_tests_begin_after_the_last_installation(tmp_path):
+    (tmp_path / 'oracles.slow').touch()
+    assert result_of_run(tmp_path, ()).returncode == 0
+    ended = (tmp_path / 'ended').read_text().splitlines()
+    installed, tested = 'oracles lint-tools', 'test-all README_CHECKED=yes'
+    assert ended.index(installed) < ended.index(tested)
+    assert '--output-sync=target lint' in ended
 
 
 def test_the_stages_follow_the_pages():
