@@ -141,9 +141,11 @@ class CompensatorDiagnostics:
         grave = HEALTH_LEVELS[state.word] == ERROR
         self._node.complaints.now(
             'health',
-            [*[state.message] * (HEALTH_LEVELS[state.word] == WARN), *warm],
+            [state.message] * (HEALTH_LEVELS[state.word] == WARN),
             [state.message] * grave,
+            replaces=True,
         )
+        self._node.complaints.now('conditions', warm)
         return [
             make_status(
                 level,

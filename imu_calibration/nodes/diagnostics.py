@@ -144,11 +144,13 @@ class Complaints:
         errors: Iterable[str] = (),
         *,
         patience: float = REPEAT_SECONDS,
+        replaces: bool = False,
     ) -> None:
         """
         Log the present faults of `source` and the end of earlier ones.
 
-        An ended one is repeated after `patience` seconds at least.
+        An ended one is repeated after `patience` seconds at least. With `replaces` the lines of the
+        source are states of one fault, which ends when there is no line.
         """
         present = {
             kind_of(source, line): (level, line)
@@ -158,7 +160,9 @@ class Complaints:
         for kind in [
             kind for kind in self._open if kind.startswith(source + ':') and kind not in present
         ]:
-            say(self._logger, LOG_INFO, f'no longer: {self._open.pop(kind)}')
+            ended = self._open.pop(kind)
+            if not (replaces and present):
+                say(self._logger, LOG_INFO, f'no longer: {ended}')
         for kind, (level, line) in present.items():
             if self._due(kind, REMINDER if kind in self._open else patience):
                 say(self._logger, level, line)

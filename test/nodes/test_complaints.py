@@ -68,6 +68,15 @@ def test_what_comes_and_goes_is_not_said_each_time(now):
     assert sum(line == 'warning: flicker' for line in heard) == 2
 
 
+def test_a_fault_that_goes_on_with_another_text_has_not_ended(now):
+    heard = Heard()
+    complaints = Complaints(heard, lambda: now[0])
+    for lines in (['bias about x'], ['bias about y'], []):
+        complaints.now('health', lines, replaces=True)
+    assert [line.split(': ')[0] for line in heard] == ['warning', 'warning', 'info']
+    assert heard[-1].endswith('bias about y')
+
+
 def test_memory_stays_bounded_whatever_is_wrong(now):
     complaints = Complaints(Heard(), lambda: now[0])
     for number in range(3 * MOST_KINDS):
