@@ -5,7 +5,7 @@ Every reader of untrusted input reads them, with limits of memory and processor 
 
 Run: ``python test/fuzz/run.py --minutes 10`` (or ``make fuzz MINUTES=10``). An input must be read
 or refused with an `ImuCalibrationError`. Any other exception, a warning, more than 10 s of
-processor time, or more than 1 GB is a finding; its input is kept in `out/fuzz`.
+processor time, or more than 400 MB is a finding; its input is kept in `out/fuzz`.
 """
 
 import argparse
@@ -29,6 +29,8 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[k]) for k in (1, 2)]
 
 MEMORY = 1 << 30
 """Address space beyond that of the imported modules, bytes."""
+MOST_MEGABYTES = 400.0
+"""Growth of the memory at most, also by inputs that are refused for want of memory."""
 HANG = 10.0
 """Seconds of processor time for one input."""
 SLICE = 15.0
@@ -99,10 +101,15 @@ def _one(reader, data, folder, record, refusal):
     record.seconds = max(record.seconds, time.process_time() - start)
 
 
+def _megabytes():
+    """Return the largest memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
 def _child(pipe, name, seeds, seed, seconds):
     from fuzz.readers import READERS  # imported by the parent already
 
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    used = _megabytes()
     size = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (int(seconds + 60), int(seconds + 61)))
@@ -110,7 +117,10 @@ def _child(pipe, name, seeds, seed, seconds):
     reported = [time.monotonic()]
 
     def report(record):
-        record.megabytes = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - used) / 1e3
+        record.megabytes = _megabytes() - used
+        if record.megabytes > MOST_MEGABYTES:
+            found = f'{record.megabytes:.0f} MB by this input or one before', last.read_bytes()
+            record.findings.setdefault('memory', found)
         pipe.send(record)
 
     def goes_on(record):

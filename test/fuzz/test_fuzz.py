@@ -45,6 +45,12 @@ def fill_memory(data, _folder):
     bytearray(2 * run.MEMORY)
 
 
+def refuse_for_want_of_memory(data, _folder):
+    """A reader that refuses what took much memory."""
+    bytearray(60_000_000)
+    raise InputError('no')
+
+
 @pytest.mark.live  # each in a process with limits
 @pytest.mark.parametrize(
     'read, finding',
@@ -53,11 +59,13 @@ def fill_memory(data, _folder):
         (warn, 'UserWarning'),
         (read_without_end, 'signal 27'),
         (fill_memory, 'MemoryError'),
+        (refuse_for_want_of_memory, 'memory'),
     ],
 )
 def test_faults_of_a_reader_are_findings(monkeypatch, read, finding):
     monkeypatch.setattr(run, 'HANG', 0.2)
+    monkeypatch.setattr(run, 'MOST_MEGABYTES', 40.0)
     monkeypatch.setitem(readers.READERS, 'broken', readers.Reader(lambda folder: [], read))
     record = run.fuzz_slice('broken', [b'seed'], 1, 0.2)
-    assert (record.n_refused > 0) == (finding is None)
+    assert (record.n_refused > 0) == (finding in (None, 'memory'))
     assert [finding in place for place in record.findings] == ([True] if finding else [])
