@@ -24,7 +24,11 @@ from imu_calibration.core.progress import remark
 from imu_calibration.core.readings import READING_SPELLINGS, UNIT_SIZES, unit_of
 from imu_calibration.core.samples import ImuSamples, JointSamples, TemperatureSamples, stamps_of
 from imu_calibration.core.units import DEG, STANDARD_GRAVITY
-from imu_calibration.preprocessing.counter_overflow import without_overflows
+from imu_calibration.preprocessing.counter_overflow import (
+    CounterStamps,
+    longer_gaps,
+    without_overflows,
+)
 from imu_calibration.preprocessing.full_scale import relate_turns
 from imu_calibration.preprocessing.scan import ChunkSeries
 from imu_calibration.preprocessing.sensor_join import (
@@ -217,6 +221,8 @@ class CsvLog:
     """Lines that were left out, because they have too few columns."""
     n_overflows: int = 0
     """Overflows of the counter in the column of time, which are undone."""
+    counter_size_ns: int = 0
+    """Size of that counter, ns; 0 where it does not overflow."""
     joined: JoinedSensors | None = None
     """How accelerometer and gyroscope were joined, where they have stamps of their own."""
     text: LogText | None = None
@@ -276,7 +282,8 @@ def read_csv(
             key='columns',
         )
     table.load([name for each in found for name in each.names], where)
-    time, stamp_ns, n_overflows = _times(table, by_quantity['time'])
+    time, counted = _times(table, by_quantity['time'])
+    stamp_ns = counted.stamp_ns
     readings = _sensors(table, by_quantity, stamp_ns, time)
     used, temperature, joints = [time, *readings.columns], None, []
     for each in found:
@@ -298,7 +305,8 @@ def read_csv(
         temperature,
         tuple(name for name in table.names if name and name not in taken),
         table.n_dropped,
-        n_overflows,
+        counted.n_overflows,
+        counted.size_ns,
         joined=readings.joined,
         text=_text_of(table, used, stamp_ns, readings.joined),
     )
@@ -350,7 +358,7 @@ def _lacking(table, by_quantity, *, stated):
 
 
 def _times(table, columns):
-    """Return (Columns with the unit, stamps in ns, overflows of the counter, now undone)."""
+    """Return (Columns with the unit, `CounterStamps` without overflows)."""
     values = table.raw(columns.names[0])
     if len(columns.names) == 2:
         values = table.stamps(columns).view('datetime64[ns]')
@@ -362,8 +370,7 @@ def _times(table, columns):
     counter_ns = None
     if values.dtype.kind == 'f':
         counter_ns = values * tick_ns
-    stamp_ns, n_overflows = without_overflows(table.stamps(columns), tick_ns, counter_ns)
-    return columns, stamp_ns, n_overflows
+    return columns, without_overflows(table.stamps(columns), tick_ns, counter_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -491,7 +498,8 @@ def read_logs(
         temperature=None,
         unused=(),
         n_dropped=force.n_dropped + rate.n_dropped,
-        n_overflows=force.n_overflows + rate.n_overflows,
+        n_overflows=force.counted.n_overflows + rate.counted.n_overflows,
+        counter_size_ns=max(force.counted.size_ns, rate.counted.size_ns),
         joined=readings.joined,
     )
 
@@ -507,7 +515,7 @@ class _SensorLog:
     stream: SensorStream
     """Force in SI; rates as in the log."""
     n_dropped: int
-    n_overflows: int
+    counted: CounterStamps
 
 
 def _sensor_log(path, where):
@@ -519,20 +527,26 @@ def _sensor_log(path, where):
         return None
     columns = found[sensors[0]]
     table.load([*found['time'].names, *columns.names], where)
-    time, stamp_ns, n_overflows = _times(table, found['time'])
+    time, counted = _times(table, found['time'])
     values = table.values(columns.names)
     if columns.quantity == 'force':
         columns = _with_unit(columns, lambda: _force_unit(values), path)
         values = values * _size_of(columns)
-    stream = finite_stream(stamp_ns, values)
-    return _SensorLog(path, time, columns, stream, table.n_dropped, n_overflows)
+    stream = finite_stream(counted.stamp_ns, values)
+    return _SensorLog(path, time, columns, stream, table.n_dropped, counted)
 
 
+GAP_PERIODS = 5
+"""Longer steps between samples are gaps."""
 AUTOPILOT_COLUMNS = {
     'ArduPilot': ('GyrX', 'AccX'),
     'PX4': ('gyro_rad[0]', 'accelerometer_m_s2[0]'),
+    'MAVLink': ('xgyro', 'xacc'),
 }
-"""Autopilot with forward-right-down readings -> columns of its logs."""
+"""
+Autopilot (or its messages) with forward-right-down readings -> columns of its logs, without the
+name of the message before them.
+"""
 
 
 def autopilot_of(path: str | PathLike[str]) -> str:
@@ -540,9 +554,9 @@ def autopilot_of(path: str | PathLike[str]) -> str:
     path = Path(path)
     if not is_text_log(path) or not path.is_file():
         return ''
-    names = _Table(path).names
+    names = {re.split('[./: ]', name.strip())[-1] for name in _Table(path).names}
     for autopilot, columns in AUTOPILOT_COLUMNS.items():
-        if set(columns) <= set(names):
+        if set(columns) <= names:
             return autopilot
     return ''
 
@@ -1394,7 +1408,12 @@ def read_directly(path: Path, raw: Sequence[str] = (), where: Sequence[str] = ()
     if log.n_dropped:
         remark(f'{path.name}: {log.n_dropped} lines with too few columns are left out')
     if log.n_overflows:
-        remark(f'{path.name}: the counter of time overflows {log.n_overflows} times: undone')
+        steps = np.diff(log.imu.stamp_ns)
+        n_gaps = int(np.count_nonzero(steps > GAP_PERIODS * np.median(steps)))
+        longer = longer_gaps(log.counter_size_ns, n_gaps)
+        remark(
+            f'{path.name}: the counter of time overflows {log.n_overflows} times: undone{longer}'
+        )
     return log
 
 

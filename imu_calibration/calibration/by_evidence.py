@@ -26,7 +26,7 @@ from imu_calibration.calibration.table_calibration import (
 from imu_calibration.calibration.window_observations import TableResult
 from imu_calibration.core.distributions import chi2_sf
 from imu_calibration.document.calibration import one_significant
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import BARE, SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
@@ -416,7 +416,7 @@ def extended_solution(
     for question in chosen:
         model = model.with_effect(question.sensor, question.name)
     weighed = {
-        sensor: _in_trusted_band(noise[sensor], space.slow_only[sensor]) for sensor in SENSORS
+        sensor: _in_trusted_band(noise[sensor], space.slow_only[sensor]) for sensor in space.sensors
     }
     solution = solve(space.recording.accumulated(model), model, noise=weighed)
     solution = replace(solution, model=replace(model, folded_arms=None))

@@ -1,14 +1,16 @@
 """Does a calibration help on another recording, and has its error changed? For any reference."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from imu_calibration.calibration.check_result import TOO_FEW_WINDOWS, CheckResult
+from imu_calibration.core.errors import InputError
 from imu_calibration.core.exit_codes import dropped_text
 from imu_calibration.core.settings import CHANGE
 from imu_calibration.document.calibration import Calibration, never_applied, scale_questions
 from imu_calibration.document.change import changes_since
 from imu_calibration.document.proof_entry import Proof
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.preprocessing.checks import unusable
 from imu_calibration.preprocessing.recording_evidence import CheckFinding
 
@@ -35,6 +37,27 @@ class ReadingErrors:
     """Why there is no proof, where there is none."""
     notes: tuple[str, ...] = ()
     """Notes on the reference."""
+
+
+def require_sensor(calibration: Calibration, absent: Collection[str]) -> frozenset[str]:
+    """
+    Return the sensors that cannot be checked: without parameters or without readings.
+
+    Raises
+    ------
+    InputError
+        When that leaves none.
+
+    """
+    not_checked = frozenset({*calibration.absent, *absent})
+    if not_checked == set(SENSORS):
+        raise InputError(
+            'a calibration must be of a sensor that the recording has, it is of the'
+            f' {calibration.sensors[0]} only and the recording has no readings of it; give another'
+            ' recording',
+            code='absent',
+        )
+    return not_checked
 
 
 def check_errors(

@@ -14,20 +14,15 @@ import numpy as np
 
 from imu_calibration.calibration.from_solution import ModelChanges, ModelExtension
 from imu_calibration.core.documents import load_arrays
-from imu_calibration.core.errors import (
-    DocumentError,
-    ImuCalibrationError,
-    InputError,
-    shortened,
-)
+from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, SampleBlock
-from imu_calibration.effects.base import SECTIONS, SENSORS
+from imu_calibration.effects.base import SECTIONS
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.joint import JointNames
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import Preflight, unusable_sensor
+from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.stream_cleaning import NO_RANGES, Watcher
 from imu_calibration.preprocessing.window import StoredWindows, Window, WindowSettings
 from imu_calibration.preprocessing.window_finder import MotionGatherer
@@ -308,6 +303,7 @@ class Collector:
         spread: bool = False,
         judged_from: float = 0.0,
         without: np.ndarray = NO_RANGES,
+        unusable: Sequence[str] = (),
     ):
         self.table, self.model, self.session, self.windows, self.spread = (
             table,
@@ -323,6 +319,7 @@ class Collector:
             nominal=nominal,
             watchers=watchers,
             without=without,
+            unusable=unusable,
         )
         self.gathered = SessionData(judged_from=judged_from)
 
@@ -394,23 +391,6 @@ class Collector:
             self.gathered.spreads[0].add(owned_window(window))
 
 
-def _require_both_sensors(preflight: Preflight) -> None:
-    """Raise an InputError where only one sensor has readings: the other one is the reason."""
-    imu = preflight.streams.get('imu')
-    absent = () if imu is None else imu.absent
-    constant = [finding for finding in preflight.findings if finding.check == 'frozen']
-    dead = unusable_sensor(constant, absent)
-    for sensor in (*absent, *dead):
-        (other,) = (name for name in SENSORS if name != sensor)
-        why = dead.get(sensor, f'the recording has no readings of the {sensor}')
-        raise InputError(
-            f'a calibration on a table needs both sensors: {why}; calibrate the {other} by hand,'
-            ' without the description of a table',
-            key='table',
-            code='one_sensor',
-        )
-
-
 @dataclass(frozen=True)
 class GatherStep:
     """
@@ -440,7 +420,7 @@ class GatherStep:
         """
         session, source = numbered
         return naming(self.names, session)(
-            self.read, source, session, Preflight(self.table.gravity_value)
+            self.read, source, session, Preflight(self.table.gravity_value, one_sensor=True)
         )
 
     def read(
@@ -454,7 +434,8 @@ class GatherStep:
         """
         Return the SessionData of a recording, which is read once for its windows and the checks.
 
-        Where the checks find parts without readings, it is read again without them. All windows,
+        Where the checks find parts without readings, or a sensor that cannot be used, it is read
+        again without them. All windows,
         unused ones too, are appended to `windows`, which is empty before.
 
         Raises
@@ -463,18 +444,20 @@ class GatherStep:
             At the end of the recording, when it cannot give a right result (`preflight`).
 
         """
-        try:
-            gathered = self._gather(source(), session, (preflight,), windows=windows)
-        finally:
-            # Where a sensor is absent, that is also the reason why nothing could be gathered.
-            _require_both_sensors(preflight)
-        if len(preflight.without_readings):
+        gathered = self._gather(source(), session, (preflight,), windows=windows)
+        if len(preflight.without_readings) or preflight.unusable:
             if windows is not None:
                 windows.clear()
             gathered = self._gather(
-                source(), session, (), windows=windows, without=preflight.without_readings
+                source(),
+                session,
+                (),
+                windows=windows,
+                without=preflight.without_readings,
+                unusable=tuple(preflight.unusable),
             )
         gathered.findings = preflight.findings
+        gathered.unusable = preflight.unusable
         return gathered
 
     def _gather(
@@ -485,6 +468,7 @@ class GatherStep:
         *,
         windows: list | StoredWindows | None,
         without: np.ndarray = NO_RANGES,
+        unusable: Sequence[str] = (),
     ) -> SessionData:
         collector = Collector(
             self.table,
@@ -497,6 +481,7 @@ class GatherStep:
             spread=self.spread,
             judged_from=self.judged_from,
             without=without,
+            unusable=unusable,
         )
         for block in blocks:
             collector.push(block)

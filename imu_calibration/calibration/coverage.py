@@ -62,10 +62,12 @@ class GroupState:
 
 
 def group_states(result: CalibrationResult) -> list[GroupState]:
-    """Return the GroupState of every effect of a CalibrationResult, in the order of the model."""
+    """Return the GroupState of every effect of the present sensors, in the order of the model."""
     calibration, states = result.calibration, []
     names, sd = calibration.param_names, calibration.own_sd
     for effect in calibration.model.effects:
+        if effect.sensor in calibration.absent:
+            continue
         part = calibration.model.slices[effect.key]
         worst = part.start + int(np.argmax(sd[part] / result.tolerances[part]))
         status = calibration.status[part]
@@ -230,7 +232,9 @@ def table_coverage(result: TableResult, frame_id: str = '') -> Coverage:
     first, seconds = _foretold(base, left, added, motions)
     step = _next_on_table(result) if first is None else _step(first.text)
     errors = result.window_errors()
-    force = errors.true['accelerometer'][np.asarray(errors.kind) == 'static']
+    # Without an accelerometer no directions of gravity are shown.
+    force = errors.true.get('accelerometer', np.zeros((len(errors.kind), 3)))
+    force = force[(np.asarray(errors.kind) == 'static') & force.any(axis=1)]
     return Coverage(worth, unit_rows(force), None, step, seconds, False, _arms(result), frame_id)
 
 

@@ -159,12 +159,16 @@ def motions_needed(
         possible=possible_motions(table),
     )
     data_sd = observability.sd_of_data(solution, prior_sd)
+    counted = _counted(solution)
     is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
     of_known_size: set[str] = set()
     for effect in solution.model.effects:
         if effect.known_size:
             of_known_size.update(effect.param_names())
-    for name in needed:
+    for name in list(needed):
+        if name not in counted:
+            del needed[name]
+            continue
         if name in of_known_size:
             needed[name] = (PLACE_REMEDY, float('nan'))
             continue
@@ -278,14 +282,29 @@ def weak_on_table(
     The motions would help with the weak directions. The parameters are the ones that none of the
     directions names.
     """
+    names = _counted(solution)
+    present = np.isin(solution.param_names, names)
     directions = observability.weak_directions(
-        solution.covariance, tolerances, solution.param_names
+        solution.covariance[np.ix_(present, present)], tolerances[present], names
     )
     others = _besides(directions, needed, dict(zip(solution.param_names, solution.sd / tolerances)))
     return tuple(
         {'parameters': weights, 'needs': need}
         for weights, need in (*((each, _need(each, needed)) for each in directions), *others)
     )
+
+
+def _counted(solution: Solution) -> list[str]:
+    """
+    Return the parameters for which a motion can be asked.
+
+    Those of an absent sensor are nominal. The other one may not see the table and the clock: only
+    its own parameters count.
+    """
+    if not solution.absent:
+        return solution.param_names
+    present = tuple(solution.noise)
+    return [name for name in solution.param_names if name.startswith(present)]
 
 
 def gauge_of(model: SensorModel) -> dict[str, Any]:
@@ -341,8 +360,7 @@ def with_gravity_uncertainty(solution: Solution, table: Table) -> Solution:
 def statistics(solution: Solution, gathered: SessionData) -> dict:
     """Return the statistics section: noise, residuals, chi-square, windows, dropped samples."""
     result = {}
-    for sensor in SENSORS:
-        noise = solution.noise[sensor]
+    for sensor, noise in solution.noise.items():
         result[sensor] = {
             'noise_sd': noise.white_sd,
             'low_frequency_factor': noise.inflation,

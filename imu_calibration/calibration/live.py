@@ -509,10 +509,11 @@ class LiveCalibration:
         assert self.result is not None and self._collector is not None
         # Of all samples, because a lag interpolates between them.
         residuals = self.result.residuals_of(window)
+        absent = np.full((len(window), 3), np.nan)
         return ImuSamples(
             window.stamp_ns[some],
-            residuals['accelerometer'][some],
-            residuals['gyroscope'][some],
+            residuals.get('accelerometer', absent)[some],
+            residuals.get('gyroscope', absent)[some],
             self._collector.gathered.frame_id,
         )
 

@@ -21,7 +21,7 @@ from imu_calibration.calibration.proof import (
     nominal_values,
     with_reference,
 )
-from imu_calibration.effects.base import SENSORS, UNITS, Role
+from imu_calibration.effects.base import UNITS, Role
 from imu_calibration.effects.forward_equations import (
     Centre,
     applied_values,
@@ -141,7 +141,7 @@ def better_plain_fits(
         return errors.squares.sum(axis=1)
 
     better = []
-    for sensor in SENSORS:
+    for sensor in held_out.sensors:
         if sensor not in replaceable:
             continue
         of_solution = min(squares(sensor, folds), squares(sensor, described), key=np.sum)

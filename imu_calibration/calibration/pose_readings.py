@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.calibration.check import ReadingErrors
+from imu_calibration.calibration.check import ReadingErrors, require_sensor
 from imu_calibration.calibration.hand_proof import (
     TURN_ANGLE_UNIT,
     TURNS_LEAST,
@@ -14,13 +14,13 @@ from imu_calibration.calibration.hand_proof import (
 )
 from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.compensation.stream import compensate_samples
-from imu_calibration.core.errors import InputError, NotObservableError
+from imu_calibration.core.errors import NotObservableError
 from imu_calibration.core.samples import ImuSamples, TemperatureSamples
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.change import with_kinds_by_hand
 from imu_calibration.document.proof_entry import Proof, ProofEntry
-from imu_calibration.effects.base import SENSORS, UNITS
+from imu_calibration.effects.base import UNITS
 from imu_calibration.kinematics.rotations import unit_rows
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_force
@@ -88,14 +88,7 @@ def errors_by_hand(
     corrected = compensate_samples(calibration, recording.imu, warm)
 
     # Of an absent sensor either the readings or the parameters have no meaning.
-    absent = {*calibration.absent, *recording.imu.absent}
-    if absent == set(SENSORS):
-        raise InputError(
-            'a calibration must be of a sensor that the recording has, it is of the'
-            f' {calibration.sensors[0]} only and the recording has no readings of it; give another'
-            ' recording',
-            code='absent',
-        )
+    absent = require_sensor(calibration, recording.imu.absent)
     proof = prove_hand_readings(data, recording.imu, corrected, gravity=gravity, absent=absent)
     return replace(errors, proof=proof)
 

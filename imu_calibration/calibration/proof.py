@@ -60,7 +60,9 @@ def applied_folds(held_out: HeldOut, solution: Solution, *, centre: Centre) -> l
 
     """
     folds = held_out.values_without(solution)
-    return [applied_values(solution.model, values, centre) for values in folds]
+    return [
+        applied_values(solution.model, values, centre, absent=solution.absent) for values in folds
+    ]
 
 
 def prove_solution(held_out: HeldOut, solution: Solution, folds: Sequence[np.ndarray]) -> Proof:
@@ -89,7 +91,9 @@ def prove_solution(held_out: HeldOut, solution: Solution, folds: Sequence[np.nda
         before=(held_out, ([nominal], [with_reference(model, nominal, solution.values)])),
         after=(held_out, (folds, described)),
     )
-    if proof and one_attitude([block.accumulator for block in held_out.blocks], model):
+    if 'accelerometer' in proof and one_attitude(
+        [block.accumulator for block in held_out.blocks], model
+    ):
         same = replace(proof['accelerometer'], one_attitude=True)
         proof = {**proof, 'accelerometer': same}
     return proof
@@ -127,7 +131,7 @@ def prove(model: SensorModel, *, before: Side, after: Side) -> Proof:
     if not regimes:
         return {}
     proof: dict[str, ProofEntry] = {}
-    for sensor in SENSORS:
+    for sensor in before[0].sensors:
         was, now = (
             min(
                 (

@@ -38,7 +38,7 @@ from imu_calibration.calibration.result import (
 from imu_calibration.core.units import ARCMIN
 from imu_calibration.document.proof_entry import Proof
 from imu_calibration.document.trust import Uncorrected, latest_settling, uncorrected_on_table
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import (
     Centre,
     References,
@@ -207,7 +207,7 @@ def parameter_shifts(
     prior = make_prior(solution.model)
     normal = prior.root.T @ prior.root
     right = np.zeros((len(changes), len(sources), len(solution.values)))
-    for sensor in SENSORS:
+    for sensor in solution.noise:
         slope = coefficient_jacobian(solution.model, sensor, solution.values)
         noise = solution.noise[sensor]
         designs = [np.einsum('nq,qap->nap', own[sensor].columns, slope) for own in outputs]
@@ -293,7 +293,7 @@ def _outputs(
         changed, motion = change(table, source.motion)
         references.append(References(model, changed, motion, temperature_c=temperature))
     found = {}
-    for sensor in SENSORS:
+    for sensor in solution.noise:
         outputs = [
             sensor_output(model, sensor, solution.values, ref=each.at(sensor))
             for each in references
@@ -315,7 +315,6 @@ class WindowObservations:
     """The model of the gathered columns; the solved one may have fewer effects."""
 
     unit: ClassVar[str] = 'windows'
-    absent: ClassVar[tuple[str, ...]] = ()
     tested: ClassVar[tuple[str, ...]] = ()
 
     @property
@@ -323,6 +322,11 @@ class WindowObservations:
         """Short description of the table."""
         table = self.table
         return f'table with {len(table.joints)} joints ({", ".join(table.joint_names)})'
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Sensors without usable readings."""
+        return self.gathered.absent
 
     @property
     def gravity(self) -> float:
@@ -354,7 +358,11 @@ class WindowObservations:
             mount_check.mount_findings(solution, self.table),
             self.gathered.findings,
         )
-        windows = latitude_check.window_rates(self.gathered, self.model, self.table)
+        if 'gyroscope' in self.absent:
+            return mounted
+        windows = None
+        if not self.absent:
+            windows = latitude_check.window_rates(self.gathered, self.model, self.table)
         return with_findings_of(
             latitude_check.LATITUDE_CHECK,
             latitude_check.latitude_findings(solution, self.table, windows),
@@ -385,7 +393,10 @@ class WindowObservations:
 
     def statistics(self, solution: Solution) -> dict[str, Any]:
         """Return the statistics of windows, noise and residuals, and the common turn."""
-        return statistics(solution, self.gathered) | mount_check.turn_entry(solution)
+        found = statistics(solution, self.gathered) | mount_check.turn_entry(solution)
+        if self.gathered.unusable:
+            found['unusable_sensors'] = dict(self.gathered.unusable)
+        return found
 
     def needs(
         self, solution: Solution, tolerances: np.ndarray, *, quality: dict[str, Any]
@@ -436,8 +447,7 @@ class WindowObservations:
             np.array([row.kind for row in rows]),
             *({} for _ in range(5)),
         )
-        for sensor in SENSORS:
-            noise = solution.noise[sensor]
+        for sensor, noise in solution.noise.items():
             means = np.array([row.sensors[sensor].mean for row in rows])
             columns_of_means, output = means[:, :-3], means[:, -3:]
             nominal = coefficients(model, sensor, nominal_values(model))

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from imu_calibration.calibration.check import ReadingErrors
+from imu_calibration.calibration.check import ReadingErrors, require_sensor
 from imu_calibration.calibration.collector import GatherStep
 from imu_calibration.calibration.proof import prove_readings, reference_model, reference_values
 from imu_calibration.compensation.compensate import invertible
@@ -14,6 +14,7 @@ from imu_calibration.compensation.stream import CompensationStream
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import SampleBlock, TemperatureSamples
 from imu_calibration.document.calibration import Calibration
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
 from imu_calibration.preprocessing.joint_checks import check_units
@@ -70,7 +71,7 @@ def errors_on_table(
                 step.read,
                 partial(_with_corrected, source, calibration, options),
                 session,
-                Preflight(table.gravity_value),
+                Preflight(table.gravity_value, one_sensor=True),
                 windows=windows,
             )
         )
@@ -83,10 +84,12 @@ def errors_on_table(
                 after.add(reduce_window(corrected, model, table, session=session))
 
     gathered = join(parts, names, lambda part: check_units(part, model, table))
+    not_checked = require_sensor(calibration, gathered.absent)
+    proof = prove_readings(before, after, model, reference=reference_values(model, calibration))
     lost = dropped(gathered.counts)
     used = [count for reason, count in gathered.counts.items() if reason not in lost]
     return ReadingErrors(
-        proof=prove_readings(before, after, model, reference=reference_values(model, calibration)),
+        proof={sensor: entry for sensor, entry in proof.items() if sensor not in not_checked},
         stored=calibration.proof,
         findings=gathered.findings,
         lost=lost,
@@ -126,7 +129,9 @@ def _both(window: Window) -> tuple[Window, Window]:
     """
     corrected = window.corrected
     assert corrected is not None, 'the window is of corrected readings'
-    known = np.isfinite(corrected).all(axis=1)
+    # An absent sensor has no corrected readings, and its rows are not read.
+    present = np.repeat([sensor not in window.absent for sensor in SENSORS], 3)
+    known = np.isfinite(corrected[:, present]).all(axis=1)
     if not known.all():
         window, corrected = window.select(known), corrected[known]
     return window, replace(window, force_s=corrected[:, :3], rate_s=corrected[:, 3:])

@@ -50,6 +50,7 @@ from imu_calibration.document.proof_entry import ProofEntry
 from imu_calibration.document.rest_noise import moved_at_rest
 from imu_calibration.document.trust import uncorrected_lines
 from imu_calibration.effects.base import SECTIONS, SENSORS, UNITS, Role
+from imu_calibration.effects.forward_equations import without_input
 from imu_calibration.estimation.solution import (
     COMMON_SCALE,
     DETERMINED,
@@ -573,6 +574,13 @@ def _absent(calibration: Calibration) -> list[Reason]:
                 f'the recording has no readings of the {sensor}: it is not calibrated, and its'
                 ' readings are not corrected'
             )
+            lacking = [
+                effect.name
+                for effect in without_input(calibration.model, [sensor])
+                if effect.sensor != sensor and effect.compensation == 'exact'
+            ]
+            if lacking:
+                text += f'; without its readings {", ".join(lacking)} cannot be corrected'
             reasons.append(Reason(NOTE, text, '', sensors=(sensor,)))
     return reasons
 

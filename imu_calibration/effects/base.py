@@ -246,6 +246,11 @@ class Effect:
         return self.sensor, self.name
 
     @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors that the effect acts on."""
+        return (self.sensor,) if self.sensor in SENSORS else self.acts_on
+
+    @property
     def size(self) -> int:
         """Return the number of parameters."""
         return len(self.components)

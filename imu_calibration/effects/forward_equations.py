@@ -477,15 +477,37 @@ def centred(
     return moved, slope
 
 
+READ_FROM = {
+    'accelerometer': frozenset({'force'}),
+    'gyroscope': frozenset({'rate', 'angular acceleration'}),
+}
+"""Sensor -> quantities that compensation computes from its readings."""
+
+
+def without_input(model: SensorModel, absent: Sequence[str]) -> list[Effect]:
+    """Return the effects that compensation needs readings of absent sensors for."""
+    unknown: frozenset[str] = frozenset().union(*(READ_FROM[sensor] for sensor in absent))
+    found = []
+    for effect in model.effects:
+        if effect.sensor in SENSORS and any(group.uses & unknown for group in effect.groups):
+            found.append(effect)
+    return found
+
+
 def applied_values(
-    model: SensorModel, values: np.ndarray, centre: Centre | None = None
+    model: SensorModel,
+    values: np.ndarray,
+    centre: Centre | None = None,
+    *,
+    absent: Sequence[str] = (),
 ) -> np.ndarray:
     """
     Return the values with effects that compensation cannot undo fixed at the centre.
 
-    These effects are at their value in the centre, which the bias contains.
+    These effects are at their value in the centre, which the bias contains; those that need
+    readings of the sensors `absent` are zero.
     """
     applied = centred(model, values, centre or {})[0]
-    for effect in not_applied(model):
+    for effect in (*not_applied(model), *without_input(model, absent)):
         applied[model.slices[effect.key]] = effect.prior_values()
     return np.where(np.isfinite(applied), applied, 0.0)

@@ -126,8 +126,9 @@ def one_attitude(accumulators: Iterable[AccumulatedRows], model: SensorModel) ->
     part, moment = model.columns_of('accelerometer', Role.LINEAR), np.zeros((3, 3))
     for accumulator in accumulators:
         for row in accumulator.rows:
-            force = row.sensors['accelerometer'].mean[part]
-            moment += row.count * np.outer(force, force)
+            if 'accelerometer' in row.sensors:
+                force = row.sensors['accelerometer'].mean[part]
+                moment += row.count * np.outer(force, force)
         for (sensor, _), factor in accumulator.within.items():
             if sensor == 'accelerometer':
                 moment += factor[:, part].T @ factor[:, part]

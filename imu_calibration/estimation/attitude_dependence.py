@@ -45,9 +45,10 @@ def attitude_dependence(
 
     """
     still = np.flatnonzero(np.array(system.kinds) == 'static')
-    if len(still) == 0:
-        return None
     model = system.model
+    # The rows of the accelerometer contain the attitude.
+    if len(still) == 0 or 'accelerometer' not in system.sensors:
+        return None
 
     # Rows of the rests, of each axis: [design | f and its products | residual].
     means = system.means[sensor][still]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS, Effect, Role
+from imu_calibration.effects.base import Effect, Role
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_gram
 from imu_calibration.estimation.weighted_system import WeightedSystem
@@ -72,7 +72,8 @@ def implausible_parameters(
 
     """
     shift_of_misfit = {
-        sensor: _shift_of_misfit(system, sensor, values, noises[sensor]) for sensor in SENSORS
+        sensor: _shift_of_misfit(system, sensor, values, noises[sensor])
+        for sensor in system.sensors
     }
     found = np.zeros(len(values), bool)
     for effect in system.model.effects:
@@ -81,7 +82,9 @@ def implausible_parameters(
         if effect.role is Role.OFFSET or not np.isfinite(limit):
             continue
         size = np.abs(values[part] - system.prior.mean[part])
-        sensors = (effect.sensor,) if effect.sensor in SENSORS else effect.acts_on
+        sensors = [sensor for sensor in effect.sensors if sensor in shift_of_misfit]
+        if not sensors:
+            continue
         largest_shift = max(shift_of_misfit[sensor] for sensor in sensors)
         implausible = free[part] & (size > limit) & (size < sd[part] * largest_shift)
         if effect.role is Role.LINEAR:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.core.distributions import chi2_sf, f_sf
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import Role
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel, dof_factor
@@ -167,7 +167,7 @@ def _block_scores(
     block = system.accumulator.block_of(
         np.array([row.session for row in system.accumulator.rows]), system.times
     )
-    for sensor in SENSORS:
+    for sensor in system.sensors:
         own = coefficients(system.model, sensor, values)
         slope = coefficient_jacobian(system.model, sensor, values)
         noise = noises[sensor]

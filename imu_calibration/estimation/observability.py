@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.linalg
 
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.effects.sensor_model import ColumnLayout, SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
@@ -51,9 +50,9 @@ def added_information(
     session.
     """
     total = np.zeros((len(values), len(values)))
-    slopes = {sensor: coefficient_jacobian(model, sensor, values) for sensor in SENSORS}
+    slopes = {sensor: coefficient_jacobian(model, sensor, values) for sensor in noise}
     for piece in motion.make(gravity):
-        for sensor in SENSORS:
+        for sensor in noise:
             total += _piece_information(model.layout(sensor), slopes[sensor], noise[sensor], piece)
     return total
 

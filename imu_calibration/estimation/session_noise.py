@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian
 from imu_calibration.estimation.accumulated_rows import MeanRows
 from imu_calibration.estimation.noise_model import (
@@ -321,7 +320,7 @@ def first_noise(
     Fast parts have weight zero where slow parts can be fitted better.
     """
     found = {}
-    for sensor in SENSORS:
+    for sensor in system.sensors:
         noise = replace(_at_rest(system, sensor, values), known=known.get(sensor, ()))
         found[sensor] = _with_bands(system, sensor, noise)
     return found

@@ -12,6 +12,7 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from imu_calibration.core.text_enum import StrEnum
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.prior import make_prior
@@ -369,6 +370,11 @@ class Solution:
     def param_names(self) -> list[str]:
         """Names in the order of `values`."""
         return self.model.param_names
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Sensors without readings: their parameters are nominal and held."""
+        return tuple(sensor for sensor in SENSORS if sensor not in self.noise)
 
     @cached_property
     def covariance(self) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from imu_calibration.core.errors import NotObservableError
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.accumulated_rows import AccumulatedRows, not_separable
 from imu_calibration.estimation.attitude_dependence import attitude_dependence
@@ -168,7 +168,7 @@ def _with_estimated_noise(
         if not any(more.values()):
             break
         without = {}
-        for sensor in SENSORS:
+        for sensor in system.sensors:
             left_out = noises[sensor].left_out | more[sensor]
             without[sensor] = replace(noises[sensor], left_out=left_out)
         values, noises = _alternately(system, values, without, free)
@@ -190,9 +190,9 @@ def _alternately(
         values = _minimised(system, values, factors, free, enough=SMALL_STEP_OF_NOISE)
         before = noises
         noises = {}
-        for sensor in SENSORS:
+        for sensor in system.sensors:
             noises[sensor] = updated_noise(system, sensor, values, noise=before[sensor])
-        if all(noises[sensor].weighs_alike(before[sensor]) for sensor in SENSORS):
+        if all(noises[sensor].weighs_alike(before[sensor]) for sensor in system.sensors):
             break
     return values, noises
 
@@ -227,7 +227,7 @@ def start(system: WeightedSystem) -> np.ndarray:
     weight = np.sqrt(system.counts / system.counts.max())[:, None]
     nominal = np.concatenate([np.zeros((1, 3)), np.eye(3)])
     penalty = START_PENALTY * np.eye(4)
-    for sensor in SENSORS:
+    for sensor in system.sensors:
         columns = np.arange(model.layout(sensor).width)
         of_bias = columns[model.columns_of(sensor, Role.OFFSET)]
         of_matrix = columns[model.columns_of(sensor, Role.LINEAR)]
@@ -242,7 +242,7 @@ def start(system: WeightedSystem) -> np.ndarray:
 
 def _factors(system: WeightedSystem, noises: Noises) -> Factors:
     """Return the triangular factors of the whitened rows of both sensors."""
-    return {sensor: system.factors(sensor, noises[sensor]) for sensor in SENSORS}
+    return {sensor: system.factors(sensor, noises[sensor]) for sensor in system.sensors}
 
 
 def _minimised(
@@ -311,7 +311,7 @@ def _fit_quality(system: WeightedSystem, values: np.ndarray, noises: Noises) -> 
     rms = {}
     slow_over_fast = {}
     attitude = {}
-    for sensor in SENSORS:
+    for sensor in system.sensors:
         noise = noises[sensor]
         dependence = attitude_dependence(system, sensor, values, noise=noise)
         if dependence is not None:
@@ -345,7 +345,7 @@ def _session_biases(
     The best linear prediction.
     """
     found = {}
-    for sensor in SENSORS:
+    for sensor in system.sensors:
         noise = noises[sensor]
         if noise.session_variance <= 0:
             continue

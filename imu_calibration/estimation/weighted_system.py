@@ -54,11 +54,13 @@ class WeightedSystem:
         self.sessions = sessions_of(rows)
         """Indices of each recording's windows in order of time."""
 
+        self.sensors = tuple(rows[0].sensors) if rows else SENSORS
+        """Sensors with rows: those with readings."""
         self.means = {}
         """Sensor -> mean rows, shape (n_windows, p + 3)."""
         self.within: dict[str, dict[str, np.ndarray]] = {}
         """Sensor -> kind -> factor of the centred rows."""
-        for sensor in SENSORS:
+        for sensor in self.sensors:
             self.means[sensor] = np.array([row.sensors[sensor].mean for row in rows])
             self.within[sensor] = {}
         # In a fixed order, so that sums over kinds do not depend on the order of the windows.
@@ -117,7 +119,7 @@ class WeightedSystem:
         estimate, ``C (A' V^-1 B V^-1 A) C`` is the part of C due to them.
         """
         total = np.zeros((len(values),) * 2)
-        for sensor in SENSORS:
+        for sensor in self.sensors:
             # W A with W' W = V^-1, so that A' V^-1 A is its product with itself.
             slope = coefficient_jacobian(self.model, sensor, values)
             design = np.einsum('kp,paq->kaq', self.means[sensor][:, :-3], slope)
@@ -182,7 +184,7 @@ class WeightedSystem:
     def residuals(self, values: np.ndarray, factors: dict) -> np.ndarray:
         """Return the residual rows of both sensors and all axes, the prior's rows last."""
         parts = []
-        for sensor in SENSORS:
+        for sensor in self.sensors:
             of_axes = coefficients(self.model, sensor, values)
             for axis, factor in enumerate(factors[sensor]):
                 parts.append(factor[:, :-1] @ of_axes[:, axis] - factor[:, -1])
@@ -192,7 +194,7 @@ class WeightedSystem:
     def jacobian(self, values: np.ndarray, factors: dict) -> np.ndarray:
         """Return the derivative of the residual rows without the prior's."""
         parts = []
-        for sensor in SENSORS:
+        for sensor in self.sensors:
             slope = coefficient_jacobian(self.model, sensor, values)
             for axis, factor in enumerate(factors[sensor]):
                 parts.append(factor[:, :-1] @ slope[:, axis])

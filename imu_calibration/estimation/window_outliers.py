@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from imu_calibration.core.distributions import chance_of_fall
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import inverse_normal
 from imu_calibration.estimation.weighted_system import WeightedSystem
@@ -52,7 +51,7 @@ def outlier_windows(
     """
     kinds = np.array(system.kinds)
     found = {}
-    for sensor in SENSORS:
+    for sensor in system.sensors:
         fit = _MeanFit.of(system, sensor, values, noises[sensor])
         excluded = np.array([key in noises[sensor].left_out for key in system.keys])
         of_kinds = []

@@ -16,6 +16,7 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import any_within, runs_of
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.preprocessing import two_sources, value_checks
+from imu_calibration.preprocessing.counter_overflow import longer_gaps
 from imu_calibration.preprocessing.recording_evidence import (
     GOOD,
     NOTE,
@@ -128,6 +129,10 @@ def without_readings(evidence: RecordingEvidence) -> np.ndarray:
     return ranges
 
 
+JOINT_STATES = 'joints'
+"""`CheckFinding.sensor` of joint states that are constant for a time."""
+
+
 def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
     """Every sensor and every joint measures until the end."""
     joints = [part for part in evidence.frozen_parts if part.who == 'joints']
@@ -147,6 +152,7 @@ def frozen_for_a_time(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
             'joint states must follow the table, they are constant while the IMU turns,'
             f' {span_words([(part.start, part.stop) for part in joints])}; check the driver of the'
             ' table, or whether the IMU was carried; that time is left out',
+            sensor=JOINT_STATES,
             samples=sum(part.samples for part in joints),
         )
 
@@ -241,7 +247,8 @@ def stamps(evidence: RecordingEvidence) -> Iterator[CheckFinding]:
                 'stamps',
                 NOTE,
                 f'{MESSAGES[name]}: the counter of the stamps overflows'
-                f' {"once" if found.overflows == 1 else f"{found.overflows} times"}: undone',
+                f' {"once" if found.overflows == 1 else f"{found.overflows} times"}: undone'
+                f'{longer_gaps(found.counter_size_ns, found.n_gaps)}',
             )
         for reason, count in found.dropped.items():
             severity = NOTE if reason == 'spike' and count < SPIKE_SHARE * total else WARNING

@@ -1,6 +1,7 @@
 """Stamps from a counter that overflows: the steps back are undone."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,6 +34,27 @@ LEAST_EQUAL_STEPS = 2
 """Steps back of one size from which on it is the size of a counter, whatever its width and tick."""
 
 
+@dataclass(frozen=True, eq=False)
+class CounterStamps:
+    """Stamps without overflows."""
+
+    stamp_ns: np.ndarray
+    """ns, int64, shape (n,)."""
+    n_overflows: int
+    """Overflows that are undone."""
+    size_ns: int
+    """
+    Size of the counter, ns; 0 where it does not overflow. A gap may be longer by multiples of it.
+    """
+
+
+def longer_gaps(size_ns: int, n_gaps: int) -> str:
+    """Return how much longer gaps may be than they seem; '' where no gap is that long."""
+    if not n_gaps or not 0 < size_ns <= LONGEST_GAP_NS:
+        return ''
+    return f', gaps may be longer by multiples of {size_ns / 1e9:.4g} s'
+
+
 def overflow_size(step_ns: int, period_ns: float, sizes_ns: Sequence[int] = SIZES_NS) -> int:
     """
     Return the size of the counter whose overflow explains a step between stamps, ns; 0 for none.
@@ -53,6 +75,8 @@ class OverflowSearch:
         """Sizes of the steps back at an overflow, ns."""
         self.count = 0
         """Overflows until now."""
+        self.size_ns = 0
+        """Size of the counter, ns; 0 before the first overflow."""
         self._shift_ns = 0
         self._last: int | None = None
         self._first_steps = np.zeros(0, np.int64)
@@ -75,19 +99,23 @@ class OverflowSearch:
             if n_before + np.count_nonzero(is_forward[:place]) < PERIOD_STEPS:
                 continue
             size = overflow_size(int(steps[place]), period_ns, self.sizes_ns)
+            if not size and self.count >= LEAST_EQUAL_STEPS and -steps[place] < self.size_ns:
+                # The counter overflows in a gap, whose length is known up to multiples of its size.
+                size = self.size_ns
             if size:
                 stamps[place:] += size
                 self._shift_ns += size
                 self.count += 1
+                self.size_ns = size
         self._last = int(stamps[-1])
         return stamps
 
 
 def without_overflows(
     stamp_ns: np.ndarray, tick_ns: float = 1.0, counter_ns: np.ndarray | None = None
-) -> tuple[np.ndarray, int]:
+) -> CounterStamps:
     """
-    Return all stamps of a recording without overflows, and the number of overflows.
+    Return all stamps of a recording without overflows.
 
     In addition to the known widths, any step back that recurs with one size, to a few periods, is
     the overflow of a counter.
@@ -105,16 +133,28 @@ def without_overflows(
     """
     search = OverflowSearch(tick_ns)
     stamps = search.undone(stamp_ns)
-    if counter_ns is not None:
+    if search.count >= LEAST_EQUAL_STEPS:
+        # A gap of nearly the size of the counter leaves a small step back. After a late sample the
+        # stamps return, after an overflow they continue from there.
+        steps = np.diff(stamps)
+        period = np.median(steps[steps > 0])
+        back = np.flatnonzero(steps[:-1] < -LOST_PERIODS * period)
+        continues = back[stamps[back + 2] < stamps[back]]
+        shift = np.zeros(len(stamps), np.int64)
+        shift[continues + 1] = search.size_ns
+        stamps = stamps + np.cumsum(shift)
+        search.count += len(continues)
+    elif counter_ns is not None:
         for place in np.flatnonzero(np.diff(stamps) < -LEAST_STEP_NS):
             size = _size_in_gap(counter_ns[place], counter_ns[place + 1], search.sizes_ns)
             stamps[place + 1 :] += size
             search.count += bool(size)
+            search.size_ns = size or search.size_ns
     steps = np.diff(stamps)
     forward = steps[steps > 0]
     back = np.flatnonzero(steps < -LEAST_STEP_NS)
     if not len(forward) or len(back) < LEAST_EQUAL_STEPS:
-        return stamps, search.count
+        return CounterStamps(stamps, search.count, search.size_ns)
     period = np.median(forward)
     sizes = period - steps[back]
     size = np.median(sizes)
@@ -122,10 +162,10 @@ def without_overflows(
     # a counter always steps back from its end
     whole = np.abs(np.diff(stamps[back])) < LOST_PERIODS * period
     if not equal.all() or not whole.all():
-        return stamps, search.count
+        return CounterStamps(stamps, search.count, search.size_ns)
     shift = np.zeros(len(stamps), np.int64)
     shift[back + 1] = np.round(sizes).astype(np.int64)
-    return stamps + np.cumsum(shift), search.count + len(back)
+    return CounterStamps(stamps + np.cumsum(shift), search.count + len(back), round(float(size)))
 
 
 def _size_in_gap(before_ns, after_ns, sizes_ns):

@@ -235,6 +235,10 @@ class Reduced(Protocol):
         """The `references.turntable.accumulator.Accumulator` of its windows."""
 
     @property
+    def absent(self) -> tuple[str, ...]:
+        """Sensors without readings."""
+
+    @property
     def moving(self) -> list:
         """Moving windows with kept samples."""
 
@@ -259,6 +263,8 @@ def against_joints(
     """
     found = []
     for sensor in ('gyroscope', 'accelerometer'):
+        if sensor in gathered.absent:
+            continue
         moments = _moments(gathered.accumulator, model, sensor)
         if moments is not None:
             found += _rates(moments, gathered.moving, table) if sensor == 'gyroscope' else []
@@ -406,7 +412,7 @@ def check_units(gathered: Reduced, model: SensorModel, table: Table | None = Non
     """
     rows = gathered.accumulator.rows
     static = [row for row in rows if row.kind == 'static']
-    if static:
+    if static and 'accelerometer' not in gathered.absent:
         length = float(
             np.median([np.linalg.norm(row.sensors['accelerometer'].mean[-3:]) for row in static])
         )

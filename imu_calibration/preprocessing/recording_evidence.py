@@ -235,7 +235,7 @@ class CheckFinding:
     value: str = ''
     """Proposed value of the missing input."""
     sensor: str = ''
-    """The sensor that cannot be used, where the other one is not concerned."""
+    """The sensor that cannot be used, where the other one is not concerned; or the joints."""
 
     def named(self, name: str) -> 'CheckFinding':
         """Return the finding with the name of its recording before the text."""

@@ -295,6 +295,7 @@ class MotionChunks:
                 np.zeros(len(after_gap), bool),
                 joint_step[core],
                 corrected,
+                imu.absent,
             ),
             self._at_edge(imu.stamp_ns[core], limit, final),
         )

@@ -11,7 +11,11 @@ from imu_calibration.core.errors import InputError
 from imu_calibration.core.readings import RawReadings
 from imu_calibration.core.samples import ImuSamples, JointSamples, SampleBlock, TemperatureSamples
 from imu_calibration.effects.base import SENSORS
-from imu_calibration.preprocessing.absent_sensor import SensorPresence, missing_sensors
+from imu_calibration.preprocessing.absent_sensor import (
+    SensorPresence,
+    missing_sensors,
+    without_sensor,
+)
 from imu_calibration.preprocessing.counter_overflow import OverflowSearch
 from imu_calibration.preprocessing.spike_filter import SpikeFilter
 from imu_calibration.preprocessing.stamping import SampleTimes, StampLine
@@ -144,6 +148,7 @@ class StreamCheck:
             absent=self._absent(),
             n_late=0 if self.presence is None else self.presence.n_late,
             overflows=self._overflows.count,
+            counter_size_ns=self._overflows.size_ns,
         )
 
     def _absent(self):
@@ -361,6 +366,8 @@ class StreamStatistics:
     """Samples with readings of a sensor that had none at first; they are not used."""
     overflows: int = 0
     """Overflows of the counter from which the stamps are made; they are undone."""
+    counter_size_ns: int = 0
+    """Size of that counter, ns; 0 where it does not overflow."""
 
     @property
     def rate(self) -> float:
@@ -543,6 +550,8 @@ class BlockCleaner:
     without : array, shape (n, 2)
         Ranges of cleaned samples of the IMU to leave out, from an earlier pass
         (`checks.without_readings`).
+    unusable : sequence of str
+        Sensor with readings that cannot be used, one at most: it is marked as absent.
 
     """
 
@@ -554,8 +563,10 @@ class BlockCleaner:
         *,
         one_sensor: bool = False,
         without: np.ndarray = NO_RANGES,
+        unusable: Sequence[str] = (),
     ):
         self._without, self._n_imu = without, 0
+        self._unusable = unusable
         self._names, self._nominal, self._watchers = tuple(joint_names), nominal, watchers
         self._checks = {name: StreamCheck(one_sensor=one_sensor) for name in STREAMS}
         self._raw: dict[str, list] = {name: [] for name in STREAMS}
@@ -673,6 +684,9 @@ class BlockCleaner:
         self._ready = {name: [] for name in STREAMS}
         if len(self._without):
             cleaned = replace(cleaned, imu=self._readings_only(cleaned.imu))
+        for sensor in self._unusable:
+            parts = [(epoch, without_sensor(imu, sensor)) for epoch, imu in cleaned.imu]
+            cleaned = replace(cleaned, imu=parts)
         for watcher in self._watchers:
             watcher.push(cleaned)
         return cleaned

@@ -12,6 +12,7 @@ import numpy as np
 from imu_calibration.core.samples import AlignedArrays
 from imu_calibration.core.settings import setting
 from imu_calibration.core.text_enum import StrEnum
+from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.joint_motion import JointMotion
 
 
@@ -67,6 +68,8 @@ class Window:
     Steps of the encoders visible in the readings, rad, zero where none are, shape (n_joints,).
     """
     corrected: np.ndarray | None = None
+    """See `ImuSamples`."""
+    absent: tuple[str, ...] = ()
     """See `ImuSamples`."""
 
     def __len__(self) -> int:
@@ -130,6 +133,8 @@ class PhasedSamples(AlignedArrays):
     """Steps of the encoders, rad, zero where none are visible, shape (n, n_joints)."""
     corrected: np.ndarray | None = None
     """See `ImuSamples`."""
+    absent: tuple[str, ...] = ()
+    """See `ImuSamples`."""
 
     @property
     def time(self) -> np.ndarray:
@@ -157,6 +162,7 @@ def make_window(
         reason,
         samples.joint_step.max(axis=0),
         samples.corrected,
+        samples.absent,
     )
 
 
@@ -195,6 +201,11 @@ class StoredWindows:
         for window in windows:
             self._starts.append(self._file.seek(0, SEEK_END))
             pickle.dump(window, self._file, pickle.HIGHEST_PROTOCOL)
+
+
+def sensors_of(windows: Sequence[Window]) -> tuple[str, ...]:
+    """Return the sensors with readings in windows of one recording."""
+    return tuple(sensor for sensor in SENSORS if sensor not in windows[0].absent)
 
 
 WINDOW_GROUP_SAMPLES = 4096

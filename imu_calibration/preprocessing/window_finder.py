@@ -48,7 +48,7 @@ class MotionGatherer:
     keep_unused : bool
         Also return windows of kind 'unused', so that every accepted sample is in exactly one
         window, in order.
-    nominal, watchers, without
+    nominal, watchers, without, unusable
         As for the `BlockCleaner`.
 
     """
@@ -62,9 +62,15 @@ class MotionGatherer:
         nominal: RawReadings | None = None,
         watchers: Sequence[Watcher] = (),
         without: np.ndarray = NO_RANGES,
+        unusable: Sequence[str] = (),
     ):
         self.cleaner = BlockCleaner(
-            () if table is None else table.joint_names, nominal, watchers, without=without
+            () if table is None else table.joint_names,
+            nominal,
+            watchers,
+            one_sensor=True,
+            without=without,
+            unusable=unusable,
         )
         self._settings, self._noise_rad = settings, None if table is None else table.joint_noise_rad
         self._queue = {name: [] for name in STREAMS}

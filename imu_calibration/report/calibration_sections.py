@@ -17,7 +17,7 @@ from imu_calibration.core.units import for_people
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.decision import harmed
 from imu_calibration.document.trust import usage
-from imu_calibration.effects.base import PREFIXES, SENSORS, UNITS
+from imu_calibration.effects.base import PREFIXES, UNITS
 from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.report.figures import (
     AFTER,
@@ -362,16 +362,23 @@ def reading_tables(result: CalibrationResult, errors: WindowErrors) -> list[list
 
     They are the readings of three sensors in each position.
     """
+    if 'accelerometer' not in errors.true:
+        return [[], []]
     gravity = result.gravity
     true = errors.true['accelerometer']
-    chosen = (np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL_FORCE_SHARE) & (
-        errors.kind != 'dynamic'
-    )
+    chosen = np.abs(np.linalg.norm(true, axis=1) / gravity - 1) < LEVEL_FORCE_SHARE
+    if 'gyroscope' in errors.true:
+        chosen &= errors.kind != 'dynamic'
+        rate = np.linalg.norm(errors.true['gyroscope'], axis=1)
+    else:
+        # The rows of the gyroscope contain the rates: without them readings at rest only.
+        chosen &= errors.kind == 'static'
+        rate = np.zeros(len(true))
     readings = axis_readings(
         errors.measured['accelerometer'][chosen],
         (true + errors.after['accelerometer'])[chosen],
         true[chosen],
-        rate=np.linalg.norm(errors.true['gyroscope'][chosen], axis=1),
+        rate=rate[chosen],
         gravity=gravity,
     )
     return [
@@ -398,11 +405,11 @@ def calibration_report(result: CalibrationResult) -> str:
         result=result,
         usage=usage(result.calibration),
         harmed=harmed,
-        derived=[derive(result.calibration, sensor) for sensor in SENSORS],
+        derived=[derive(result.calibration, sensor) for sensor in result.calibration.sensors],
         in_paper_units=in_paper_units,
         axis_pairs=AXIS_PAIRS,
         residuals=residual_figure(result),
-        errors=[draw_windows(errors, sensor) for sensor in SENSORS],
+        errors=[draw_windows(errors, sensor) for sensor in result.calibration.sensors],
         observability=observability_section(result),
         levers=lever_figure(result.calibration),
         navigation=navigation_section(result, errors),
@@ -493,10 +500,11 @@ def autocorrelation(result: CalibrationResult) -> dict[str, tuple[np.ndarray, np
     windows = [w for w in windows if len(w) >= typical][:MOST_WINDOWS]
     period = float(np.median([w.period for w in windows]))
     n_lags = max(2, min(int(LAG_SECONDS / period), int(typical) // 2))
-    sums = {sensor: np.zeros((n_lags, 3)) for sensor in SENSORS}
+    sums = {sensor: np.zeros((n_lags, 3)) for sensor in result.calibration.sensors}
     for window in windows:
         for sensor, rest in result.residuals_of(window).items():
-            sums[sensor] += _lagged(rest - rest.mean(axis=0), n_lags)
+            if sensor in sums:
+                sums[sensor] += _lagged(rest - rest.mean(axis=0), n_lags)
     bound = 1.96 / np.sqrt(sum(len(w) for w in windows))
     return {
         sensor: (np.arange(n_lags) * period, total / np.where(total[0] > 0, total[0], 1.0), bound)

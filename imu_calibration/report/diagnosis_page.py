@@ -20,7 +20,7 @@ from imu_calibration.calibration.diagnosis.traces import Traces
 from imu_calibration.core.units import STANDARD_GRAVITY, for_people
 from imu_calibration.document.decision import DECISION, PARAMETERS
 from imu_calibration.document.verdict import judge, unexplained_text
-from imu_calibration.effects.base import AXES, SENSORS, UNITS
+from imu_calibration.effects.base import AXES, UNITS
 from imu_calibration.report.figures import AFTER, BEFORE, GREY, INK, Drawn, draw, draw_tones
 from imu_calibration.report.page import render
 from imu_calibration.selection.proposals import Proposal
@@ -245,7 +245,8 @@ def _curve(values, signal):
 
 def _over_time(figure, traces, over):
     """Size of the residual over time, before and after, one panel per sensor."""
-    for axes, sensor in zip(figure.subplots(2, 1, sharex=True), SENSORS):
+    panels = figure.subplots(len(traces.before), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, sensor in zip(panels, traces.before):
         factor, unit = for_people(UNITS[sensor])
         some = slice(None, None, max(1, len(traces.time) // 3000))
         for residual, colour, label in (
@@ -306,7 +307,9 @@ def overlay_section(
 
     """
     against = {label: values for label, (_, values) in variables(traces, joint_names).items()}
-    return [_sensor(traces, sensor, against, causes.get(sensor, 'time, s')) for sensor in SENSORS]
+    return [
+        _sensor(traces, sensor, against, causes.get(sensor, 'time, s')) for sensor in traces.before
+    ]
 
 
 def _sensor(traces, sensor, against, first):

@@ -45,6 +45,8 @@ class Growth:
 
 def navigation_section(result: CalibrationResult, errors: WindowErrors) -> dict[str, Any]:
     """Return figures and end values of dead reckoning at rest and in motion, None without it."""
+    if result.calibration.absent:  # it needs both sensors
+        return {'rest': None, 'moving': None}
     before, moving = rest_growth(errors), motion_growth(result)
     return {
         'rest': (

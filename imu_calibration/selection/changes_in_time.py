@@ -5,7 +5,6 @@ from functools import cached_property
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.whitening import Whitening
 from imu_calibration.selection.explained_share import SIGNIFICANT_REST
@@ -94,7 +93,7 @@ class WindowRows:
         """Return the rows of all windows."""
         moving, kind = space.recording.moving, space.recording.kind
         axes = []
-        for number, sensor in enumerate(SENSORS):
+        for number, sensor in enumerate(space.sensors):
             whitenings = mean_whitening(space, noise, sensor)
             for axis, (whitening, mean) in enumerate(zip(whitenings, space.mean[sensor])):
                 within = np.zeros((len(kind), mean.shape[1], mean.shape[1]))
@@ -112,7 +111,7 @@ class WindowRows:
         """Return the rows with other windows that count (mask, shape (n,))."""
         scatter = np.where(clear, 1.0, NO_WEIGHT)[:, None] * np.ones(3)
         whitenings = []
-        for sensor in SENSORS:
+        for sensor in self.space.sensors:
             whitenings += mean_whitening(self.space, self.noise, sensor, scatter=scatter)
         axes = []
         for rows, whitening in zip(self.axes, whitenings):
@@ -131,7 +130,7 @@ class WindowRows:
         recording = self.space.recording
         of_means = 3.0 * self.clear.sum()
         within = 3.0 * (recording.count - 1)[recording.moving & self.clear].sum()
-        return np.array([of_means, within] * len(SENSORS))
+        return np.array([of_means, within] * len(self.space.sensors))
 
     @cached_property
     def part_normals(self) -> np.ndarray:

@@ -11,7 +11,6 @@ from functools import cached_property
 import numpy as np
 
 from imu_calibration.core.distributions import chi2_sf, f_sf
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.noise_model import NoiseModel
 from imu_calibration.estimation.scaled_solve import (
     inverse_normal,
@@ -220,7 +219,7 @@ class WindowEvidence(Evidence):
         """Sensor -> white mean rows of each axis."""
         self._of_axis: dict[str, list[np.ndarray]] = {}
         """Sensor -> of each axis the products of means and within windows, (2, n_folds, n, n)."""
-        for sensor in SENSORS:
+        for sensor in space.sensors:
             own_scatter = None if scatter is None else scatter.get(sensor)
             self._white[sensor] = white_means(space, noise, sensor, scatter=own_scatter)
             self._of_axis[sensor] = []
@@ -228,7 +227,7 @@ class WindowEvidence(Evidence):
                 of_means = [rows[own].T @ rows[own] for own in self._folds]
                 within = self._within(space, sensor, axis)
                 self._of_axis[sensor].append(np.array([of_means, within]))
-        parts = np.sum([self._of_sensor(sensor) for sensor in SENSORS], axis=0)
+        parts = np.sum([self._of_sensor(sensor) for sensor in space.sensors], axis=0)
         total = np.sum(parts, axis=0)
         super().__init__(total, total - parts, prior_sd=space.prior_sd, prior_mean=space.prior_mean)
 
@@ -314,7 +313,7 @@ class WindowEvidence(Evidence):
         """
         whole = replace(self.space, join_within=self.space.join)
         found = {}
-        for sensor in SENSORS:
+        for sensor in self.space.sensors:
             found[sensor] = [np.array([self._within(whole, sensor, axis)]) for axis in range(3)]
         return found
 
@@ -334,7 +333,7 @@ class WindowEvidence(Evidence):
         reduced = self.space.reduced(used, values)
         kind = self.space.recording.kind
         slopes = np.zeros((len(self.fold), self.space.size + 1))
-        for sensor in SENSORS:
+        for sensor in self.space.sensors:
             of_kind = {name: self.noise[sensor].row_variance(name) for name in np.unique(kind)}
             variance = np.array([of_kind[name] for name in kind])
             for axis, means in enumerate(self._white[sensor]):

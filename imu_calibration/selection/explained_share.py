@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from imu_calibration.effects.base import SENSORS, Effect
 from imu_calibration.selection.evidence import WindowEvidence
 from imu_calibration.selection.noise_beside_effects import plausible_processes
 from imu_calibration.selection.parameter_space import scatter_of_each
@@ -151,7 +150,7 @@ class Explained:
             self.excess(chosen),
             self.excess([q for q in chosen if q is not question]),
         )
-        removed = {s: (without[s] - with_it[s]).sum(axis=1) for s in sensors_of(question.effect)}
+        removed = {s: (without[s] - with_it[s]).sum(axis=1) for s in question.effect.sensors}
         strongest = max(parts.sum() for parts in removed.values())
         # A cause in the table acts on both sensors; a sensor with a weak signal is no evidence.
         sensors = [s for s, parts in removed.items() if parts.sum() >= SHOWS * strongest > 0]
@@ -196,7 +195,7 @@ class ExplainedWindows(Explained):
         super().__init__(
             search,
             self.floor.unpredicted,
-            dict.fromkeys(SENSORS, np.array([self.n_means, self.n_within])),
+            dict.fromkeys(evidence.space.sensors, np.array([self.n_means, self.n_within])),
         )
 
 
@@ -219,8 +218,3 @@ def pruned(chosen: Sequence[Question], share: Callable) -> Sequence[Question]:
 def needed_share(question: Question) -> float:
     """Return the share of the unexplained that a finding of this effect must remove."""
     return MIN_SMOOTH_SHARE if question.effect.smooth else MIN_EXPLAINED_SHARE
-
-
-def sensors_of(effect: Effect) -> tuple[str, ...]:
-    """Return the sensors that an effect acts on."""
-    return (effect.sensor,) if effect.sensor in SENSORS else effect.acts_on

@@ -17,7 +17,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS
-from imu_calibration.selection.explained_share import ExplainedWindows, pruned, sensors_of
+from imu_calibration.selection.explained_share import ExplainedWindows, pruned
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.lag_explanations import LagExplanations, lag_explanations
 from imu_calibration.selection.linearised_problem import LinearisedProblem
@@ -484,5 +484,5 @@ def _sure_reduction(
         problem,
         [q for q in chosen if q is not question],
         chosen,
-        sensors=sensors_of(question.effect),
+        sensors=question.effect.sensors,
     ).ci95[0]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.effects.base import AXES, SENSORS
+from imu_calibration.effects.base import AXES
 from imu_calibration.estimation.noise_likelihood import NoiseLikelihood
 from imu_calibration.estimation.noise_model import (
     BiasProcess,
@@ -42,7 +42,7 @@ def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
     recording, moving = space.recording, space.recording.moving
     slow_only, slow_variance = {}, {}
     n_slow = np.maximum(recording.slow_rows - 1.0, 0.0)
-    for sensor in SENSORS:
+    for sensor in space.sensors:
         rest = white_noise(recording.windows, sensor)
         at_rest = np.zeros(3) if rest is None else rest[0] * np.maximum(rest[1], 1.0)
         slow_only[sensor], slow_variance[sensor] = np.zeros(3, bool), np.zeros(3)
@@ -123,9 +123,11 @@ def noise_beside_effects(
         )[0]
         noise = {
             sensor: _with_moving_factors(space, sensor, noise[sensor], values, look_along)
-            for sensor in SENSORS
+            for sensor in space.sensors
         }
-    return {sensor: _with_bias_process(space, sensor, noise, smooth[sensor]) for sensor in SENSORS}
+    return {
+        sensor: _with_bias_process(space, sensor, noise, smooth[sensor]) for sensor in space.sensors
+    }
 
 
 def natural_processes(noise: NoiseModel, period: float) -> tuple[BiasProcess, ...]:
@@ -163,7 +165,7 @@ def plausible_processes(
 def noise_before_fit(space: ParameterSpace) -> dict[str, NoiseModel]:
     """Return sensor -> NoiseModel before anything is fitted: the noise at rest."""
     found = {}
-    for sensor in SENSORS:
+    for sensor in space.sensors:
         white, inflation = white_noise(space.recording.windows, sensor) or (
             _white_without_rest(space, sensor),
             np.ones(3),

@@ -117,7 +117,7 @@ def find_onset(
     the sample at which the residuals of both states are least.
     """
     used, space = problem.search.indices(chosen), problem.evidence.space
-    groups = _groups(problem.recording.model)
+    groups = _groups(problem.recording.model, problem.recording.sensors)
 
     # The chosen parameters and those that may change, the chosen ones first.
     parameters = list(used)
@@ -181,7 +181,7 @@ class _Candidate:
     """Temperature that is passed at the moment only; None without one."""
 
 
-def _groups(model: SensorModel) -> list[_Group]:
+def _groups(model: SensorModel, sensors: Sequence[str]) -> list[_Group]:
     """Return the groups of parameters that may change suddenly."""
     numbers = np.arange(len(model.param_names))
     groups = [
@@ -191,10 +191,12 @@ def _groups(model: SensorModel) -> list[_Group]:
     ]
     # A shock or a new start of a sensor changes its biases, a displaced mount its matrix.
     for prefix, role in (('bias of ', Role.OFFSET), ('', Role.LINEAR)):
-        parts = [numbers[model.part(sensor, role)] for sensor in SENSORS]
-        for sensor, part in zip(SENSORS, parts):
+        parts = [numbers[model.part(sensor, role)] for sensor in sensors]
+        for sensor, part in zip(sensors, parts):
             groups.append(_Group(prefix + sensor, part, role))
-        groups.append(_Group(prefix + ' and '.join(SENSORS), np.concatenate(parts), role))
+        if len(parts) > 1:
+            name = prefix + ' and '.join(sensors)
+            groups.append(_Group(name, np.concatenate(parts), role))
     return groups
 
 
@@ -379,13 +381,13 @@ def _refined(
     state before t and the second after it.
     """
     near = [w for w in windows if w.time[-1] >= between[0] and w.time[0] <= between[1]]
-    noise = np.median([w.noise_sd for w in near], axis=0)
+    noise = dict(zip(SENSORS, np.median([w.noise_sd for w in near], axis=0)))
     found = [
         residuals(near, table, model, values=state[: len(model.param_names)]) for state in states
     ]
     squares = [
-        sum(((rest[sensor] / sd) ** 2).sum(axis=1) for sensor, sd in zip(SENSORS, noise))
-        for rest in found
+        sum(((rest / noise[sensor]) ** 2).sum(axis=1) for sensor, rest in of_sensors.items())
+        for of_sensors in found
     ]
     time, cost = np.concatenate([w.time for w in near]), np.cumsum(squares[0] - squares[1])[:-1]
     gap, weight = np.diff(time), np.exp((cost.min() - cost) / 2) * np.diff(time)

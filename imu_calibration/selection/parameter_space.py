@@ -55,6 +55,11 @@ class ParameterSpace:
     """Sensor -> variance of the white noise that then replaces the fast part, shape (3,)."""
 
     @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors with rows: those with readings."""
+        return tuple(self.index)
+
+    @property
     def size(self) -> int:
         """Number of parameters."""
         return len(self.names)
@@ -83,7 +88,7 @@ class ParameterSpace:
         index: dict[str, list[np.ndarray]] = {}
         join: dict[str, list[np.ndarray]] = {}
         join_within: dict[str, list[np.ndarray]] = {}
-        for sensor in SENSORS:
+        for sensor in self.sensors:
             index[sensor], join[sensor], join_within[sensor] = [], [], []
             for axis, acting in enumerate(self.index[sensor]):
                 own = np.isin(acting, kept)
@@ -107,7 +112,7 @@ class ParameterSpace:
     def mean(self) -> dict[str, list[np.ndarray]]:
         """Sensor -> mean rows of the windows for each axis, shape (k, q_a + 1)."""
         found = {}
-        for sensor in SENSORS:
+        for sensor in self.sensors:
             rows = self.recording.mean(sensor)
             found[sensor] = [rows @ join for join in self.join[sensor]]
         return found
@@ -220,8 +225,8 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
     names = list(model.param_names)
     smooth = [np.full(effect.size, effect.smooth) for effect in model.effects]
     sds = [prior_sd]
-    for sensor in SENSORS:
-        for entry in recording.bank[sensor]:
+    for entries in recording.bank.values():
+        for entry in entries:
             names += entry.param_names
             smooth.append(np.full(len(entry.param_names), entry.effect.smooth))
             sds.append(entry.prior_sd)
@@ -229,7 +234,7 @@ def parameter_space(recording: ReducedRecording, baseline: SensorModel) -> Param
     index: dict[str, list[np.ndarray]] = {}
     join: dict[str, list[np.ndarray]] = {}
     join_within: dict[str, list[np.ndarray]] = {}
-    for sensor in SENSORS:
+    for sensor in recording.sensors:
         jacobian = coefficient_jacobian(model, sensor, recording.values)
         index[sensor], join[sensor], join_within[sensor] = [], [], []
         for axis in range(3):
@@ -254,8 +259,8 @@ def bank_places(recording: ReducedRecording) -> dict[str, slice]:
     """Return label -> parameters of each entry of the banks."""
     places = {}
     start = len(recording.model.param_names)
-    for sensor in SENSORS:
-        for entry in recording.bank[sensor]:
+    for entries in recording.bank.values():
+        for entry in entries:
             end = start + len(entry.param_names)
             places[entry.label] = slice(start, end)
             start = end
@@ -362,7 +367,7 @@ def normal_matrix(
     Shape (q + 1, q + 1).
     """
     of_means = np.zeros((space.size + 1, space.size + 1))
-    for sensor in SENSORS:
+    for sensor in space.sensors:
         for axis, rows in enumerate(white_means(space, noise, sensor)):
             if select is not None:
                 rows = rows[select]
@@ -376,11 +381,11 @@ def within_matrix(
     noise: dict[str, NoiseModel],
     select: np.ndarray | None = None,
     *,
-    sensors: Sequence[str] = SENSORS,
+    sensors: Sequence[str] | None = None,
 ) -> np.ndarray:
     """Return the part of the normal matrix from within the windows."""
     total = np.zeros((space.size + 1, space.size + 1))
-    for sensor in sensors:
+    for sensor in space.sensors if sensors is None else sensors:
         for axis in range(3):
             at = space.places(sensor, axis)
             total[np.ix_(at, at)] += within_of_axis(
@@ -420,7 +425,7 @@ def scatter_of_each(
     recording = space.recording
     reduced = space.reduced(range(space.size), values)
     found = {}
-    for sensor in SENSORS:
+    for sensor in space.sensors:
         # Squares that the noise of the kind gives, and those of the window.
         variance = np.array([noise[sensor].row_variance(name) for name in recording.kind])
         usual = variance * np.maximum(recording.count - 1, 1)[:, None]

@@ -215,7 +215,9 @@ def _plausible(sensor: str, problem: LinearisedProblem) -> np.ndarray:
     there.
     """
     plausible = np.diag(problem.space.prior_sd)
-    other = next(each for each in SENSORS if each != sensor)
+    (other,) = (each for each in SENSORS if each != sensor)
+    if other not in problem.space.sensors:
+        return plausible
     for question in problem.questions:
         if (
             question.sensor not in SENSORS

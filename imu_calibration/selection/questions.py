@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from imu_calibration.effects.base import SECTIONS, Effect, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Effect, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.session_noise import VIBRATES
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.kinematics.signal_history import HALF_WIDTH
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.rest_detection import least_variance
-from imu_calibration.preprocessing.window import Window, WindowKind
+from imu_calibration.preprocessing.window import Window, WindowKind, sensors_of
 
 TURN = 4 * HALF_WIDTH
 """Sufficient reversal of the temperature, K."""
@@ -88,22 +88,29 @@ def testable_effects(
         lambda effect: _why_not(
             effect, have, table, kinds=kinds, span=span, turned=turned, shaken=shaken
         ),
+        sensors_of(windows),
     )
 
 
-def sort_effects(model: SensorModel, why_not: Callable) -> tuple[list[Effect], list[dict]]:
+def sort_effects(
+    model: SensorModel, why_not: Callable, sensors: Sequence[str] = SENSORS
+) -> tuple[list[Effect], list[dict]]:
     """
     Return (testable effects, list of {'effect', 'why', 'needs'}).
 
-    Both refer to the catalogue's effects that the model lacks.
+    Both refer to the catalogue's effects on the `sensors` with readings that the model lacks.
 
     ``why_not(effect)`` gives (why, needs), or None for a testable effect.
     """
     known, lacking = [], []
     have = {e.key for e in model.effects}
     for key, effect in model.catalogue.effects(model.joint_names).items():
-        if key in have:
+        acted_on = tuple(sensor for sensor in effect.sensors if sensor in sensors)
+        if key in have or not acted_on:
             continue
+        # An effect of table or clock shows in the present sensors only.
+        if acted_on != effect.sensors:
+            effect = replace(effect, acts_on=acted_on)
         why = why_not(effect)
         if why is None:
             known.append(effect)

@@ -23,7 +23,7 @@ from imu_calibration.estimation.noise_model import sessions_of
 from imu_calibration.estimation.scaled_solve import packed, unpacked
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, chunks
+from imu_calibration.preprocessing.window import Window, chunks, sensors_of
 from imu_calibration.references.turntable.accumulator import (
     Accumulator,
     restricted_window,
@@ -107,7 +107,7 @@ def make_bank(
 
     They are taken at `values` of a model for the rest of the sensor.
     """
-    bank = {sensor: [] for sensor in SENSORS}
+    bank: dict[str, list[BankEntry]] = {sensor: [] for sensor in SENSORS}
     for effect in effects:
         if effect.time_constant:
             bank[effect.sensor] += [
@@ -226,7 +226,13 @@ class ReducedRecording:
     @cached_property
     def slow_rows(self) -> np.ndarray:
         """Short pieces of each window, shape (k,)."""
-        return np.array([window.sensors['accelerometer'].slow_rows for window in self.windows])
+        (sensor, *_) = self.sensors
+        return np.array([window.sensors[sensor].slow_rows for window in self.windows])
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors with rows: those with readings."""
+        return tuple(self.windows[0].sensors)
 
     @property
     def period(self) -> float:
@@ -307,7 +313,7 @@ class ReducedRecording:
 
     @cached_property
     def _coefficients(self) -> dict[str, np.ndarray]:
-        return {sensor: coefficients(self.model, sensor, self.values) for sensor in SENSORS}
+        return {sensor: coefficients(self.model, sensor, self.values) for sensor in self.sensors}
 
     def _with_residual(self, sensor: str, rows: np.ndarray) -> np.ndarray:
         own = self._coefficients[sensor]
@@ -380,7 +386,7 @@ def reduce_recording(
     """
     reduced = []
     factors: dict[tuple[str, str], list[np.ndarray]] = {
-        (sensor, part): [] for sensor in SENSORS for part in FACTOR_PARTS
+        (sensor, part): [] for sensor in sensors_of(windows) for part in FACTOR_PARTS
     }
     for some in chunks(windows):
         for window in reduce_windows(

@@ -15,7 +15,6 @@ from imu_calibration.effects.base import AXES, SENSORS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
-from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.formulas import FormulaChoice
 from imu_calibration.selection.investigation import Investigation, investigate
 from imu_calibration.selection.proposals import Proposal, find_formulas, propose
@@ -179,9 +178,11 @@ class ResidualAnalysis(Investigation):
             self.table,
             [proposal for proposal in self.proposals.values() if proposal is not None],
         )
-        sway = find_sway(self.blocks[SENSORS[0]], self.fits(SENSORS[0]))
-        if sway is not None:
-            tones[SENSORS[0]] = (sway, *tones[SENSORS[0]])
+        accelerometer = SENSORS[0]
+        if accelerometer in self.rests:
+            sway = find_sway(self.blocks[accelerometer], self.fits(accelerometer))
+            if sway is not None:
+                tones[accelerometer] = (sway, *tones[accelerometer])
         return {
             sensor: self._unexplained(sensor, replace(rest, tones=tones[sensor]))
             for sensor, rest in self.rests.items()
@@ -327,7 +328,7 @@ def _done_without(found: ResidualAnalysis, question: Question) -> bool:
 
     The residual is that of the finding's sensors, and the substitute is in some of them.
     """
-    sensors = sensors_of(question.effect)
+    sensors = question.effect.sensors
     warm = 'temperature' in question.effect.needs
     asked = [
         sensor

@@ -20,7 +20,7 @@ from imu_calibration.estimation.session_noise import LEAST_NOISE
 from imu_calibration.kinematics.joint_motion import JointMotion
 from imu_calibration.kinematics.rotations import Reference
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.window import Window, chunks
+from imu_calibration.preprocessing.window import Window, chunks, sensors_of
 from imu_calibration.selection.explained_share import ExplainedWindows
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.noise_beside_effects import natural_processes
@@ -344,7 +344,7 @@ def residuals(
     # Columns need much memory.
     predicted = [predict_windows(group, table, model, values=values) for group in chunks(windows)]
     found = {}
-    for sensor in SENSORS:
+    for sensor in sensors_of(windows):
         readings = np.concatenate([measured(window, sensor) for window in windows])
         found[sensor] = readings - np.concatenate([part[sensor] for part in predicted])
     return found
@@ -364,15 +364,15 @@ def _block_means(
     """
     recording = problem.recording
     edges = np.append(starts, len(motion))
-    found: dict[str, list[np.ndarray]] = {sensor: [] for sensor in SENSORS}
+    found: dict[str, list[np.ndarray]] = {sensor: [] for sensor in recording.sensors}
     for first in range(0, len(starts), AT_A_TIME):
         own = edges[first : first + AT_A_TIME + 1]
         rows = slice(own[0], own[-1])
         warmth = None if temperature is None else temperature[rows]
         references = References(recording.model, table, motion.select(rows), temperature_c=warmth)
-        for sensor in SENSORS:
+        for sensor, parts in found.items():
             columns = columns_with_bank(references, sensor, recording.bank)
-            found[sensor].append(block_means(columns, own[:-1] - own[0]))
+            parts.append(block_means(columns, own[:-1] - own[0]))
     return {sensor: np.concatenate(parts) for sensor, parts in found.items()}
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from imu_calibration.estimation.scaled_solve import JITTER
-from imu_calibration.selection.explained_share import Explained, needed_share, sensors_of
+from imu_calibration.selection.explained_share import Explained, needed_share
 from imu_calibration.selection.gain import LEAST_REDUCTION, gain_in_turn
 from imu_calibration.selection.linearised_problem import LinearisedProblem
 from imu_calibration.selection.questions import Question
@@ -188,7 +188,7 @@ def simpler(
             if explained.share(instead, other) < needed_share(other):
                 continue
             # The finding stays where the residual surely falls from the simpler one to it.
-            gain = gain_in_turn(problem, instead, kept, sensors=sensors_of(question.effect))
+            gain = gain_in_turn(problem, instead, kept, sensors=question.effect.sensors)
             if gain.ci95[0] <= LEAST_REDUCTION:
                 kept = instead
                 break
@@ -208,7 +208,7 @@ def _fewer(search: Search, kept: Sequence[Question], question: Question) -> list
         for other in search.others(kept)
         if other.penalty < question.penalty
         and '@' not in other.label
-        and sensors_of(other.effect) == sensors_of(question.effect)
+        and other.effect.sensors == question.effect.sensors
     ]
     scores = [search.score(beside, other) for other in fewer]
     return sorted(

@@ -7,13 +7,12 @@ import numpy as np
 
 from imu_calibration.core.distributions import norm_sf
 from imu_calibration.core.samples import rounding_variance
-from imu_calibration.effects.base import SENSORS
 from imu_calibration.effects.forward_equations import coefficient_jacobian, coefficients, columns
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.scaled_solve import solve_normal
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.full_scale import MIN_CLIPPED_SAMPLES
-from imu_calibration.preprocessing.window import Window
+from imu_calibration.preprocessing.window import Window, sensors_of
 from imu_calibration.references.turntable.window_statistics import references_of
 from imu_calibration.selection.evidence import MIN_FOLD_WINDOWS, locked_windows
 
@@ -64,12 +63,16 @@ class Saturation:
 
 def predictions(
     windows: Sequence[Window], table: Table, model: SensorModel, *, values: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return (force, rate) that the model predicts, a list of pairs (n or 1, 3) per window."""
+) -> list[dict[str, np.ndarray]]:
+    """Return of each window sensor -> output that the model predicts, shape (n or 1, 3)."""
     references = references_of(windows, model, table)
     edges = np.cumsum([len(window.motion) for window in windows])[:-1]
-    outputs = [columns(references, s) @ coefficients(model, s, values) for s in SENSORS]
-    return list(zip(*(np.split(output, edges) for output in outputs)))
+    predicted: list[dict[str, np.ndarray]] = [{} for _ in windows]
+    for sensor in sensors_of(windows) if windows else ():
+        output = columns(references, sensor) @ coefficients(model, sensor, values)
+        for of_window, part in zip(predicted, np.split(output, edges)):
+            of_window[sensor] = part
+    return predicted
 
 
 def measured(window: Window, sensor: str) -> np.ndarray:
@@ -109,7 +112,7 @@ def simple_fit(windows: Sequence[Window], table: Table, model: SensorModel) -> n
     picked = [_thinned(window) for window in windows]
     normal = np.zeros((len(values) + 1,) * 2)
     references = references_of(picked, model, table)
-    for sensor in SENSORS:
+    for sensor in sensors_of(windows):
         design = columns(references, sensor)
         outputs = [measured(w, sensor) for w in picked]
         output = np.concatenate(
@@ -165,8 +168,8 @@ def find_saturation(
     Parameters
     ----------
     windows : sequence of Window
-    predicted : list of (force, rate)
-        Prediction of a model without limit (`predictions`).
+    predicted : list of dict
+        Sensor -> prediction of a model without limit (`predictions`).
     noise_sd : array, shape (3,)
         Standard deviation of single samples.
 
@@ -175,10 +178,7 @@ def find_saturation(
         return None
     output = np.concatenate([measured(w, sensor) for w in windows])
     expected = np.concatenate(
-        [
-            np.broadcast_to(p[SENSORS.index(sensor)], measured(w, sensor).shape)
-            for w, p in zip(windows, predicted)
-        ]
+        [np.broadcast_to(p[sensor], measured(w, sensor).shape) for w, p in zip(windows, predicted)]
     )
     level = np.abs(output).max()
     clipped = np.abs(output) >= level * (1 - 1e-12)
@@ -218,10 +218,10 @@ def without_clipped(
 
     """
     kept = []
-    for window, pair in zip(windows, predicted):
+    for window, of_sensors in zip(windows, predicted):
         good = np.ones(len(window.time), bool)
         for sensor, level in levels.items():
-            near = np.abs(pair[SENSORS.index(sensor)]) > level - CLIP_MARGIN_SDS * noise_sd[sensor]
+            near = np.abs(of_sensors[sensor]) > level - CLIP_MARGIN_SDS * noise_sd[sensor]
             at = np.abs(measured(window, sensor)) >= level * (1 - 1e-12)
             good &= ~(near | at).any(axis=1)
         if good.all():
@@ -274,7 +274,7 @@ def without_clipping(
 def _piled(windows: Sequence[Window]) -> np.ndarray:
     """Return which windows hold the largest output of a sensor, where several samples share it."""
     found = np.zeros(len(windows), bool)
-    for sensor in SENSORS:
+    for sensor in sensors_of(windows):
         if may_be_clipped(windows, sensor):
             largest = np.array([np.abs(measured(window, sensor)).max() for window in windows])
             found |= largest >= largest.max() * (1 - 1e-12)
@@ -290,14 +290,14 @@ def _limits(
     The parameters are from a simple fit without corrupted samples.
     """
     nothing = [], {}, None
-    suspects = [sensor for sensor in SENSORS if may_be_clipped(windows, sensor)]
+    suspects = [sensor for sensor in sensors_of(windows) if may_be_clipped(windows, sensor)]
     if not suspects:
         return nothing
     limits = {
         sensor: float(max(np.abs(measured(w, sensor)).max() for w in windows))
         for sensor in suspects
     }
-    noise_sd = {sensor: sample_sd_at_rest(windows, sensor) for sensor in SENSORS}
+    noise_sd = {sensor: sample_sd_at_rest(windows, sensor) for sensor in sensors_of(windows)}
     kept = windows
     for _ in range(2):
         predicted = predictions(windows, table, model, values=simple_fit(kept, table, model))

@@ -249,7 +249,8 @@ class Search:
         before, after = (self.evidence.heldout_parts(self.indices(some)) for some in (rest, chosen))
         return all(
             (after[sensor] - before[sensor]).sum() < 2 * MIN_GAIN_NATS
-            for sensor in question.effect.acts_on
+            for sensor in after
+            if sensor in question.effect.acts_on
         )
 
     def run(self, start: Sequence[Question] = ()) -> Sequence[Question]:

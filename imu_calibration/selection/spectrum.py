@@ -318,13 +318,13 @@ def find_tones(
                 )
     both = [np.concatenate(pair, axis=1) for pair in zip(*parts.values())]
     orders = [orders_of(found.used, both, joint) for joint in range(len(table.joint_names))]
-    for sensor, own in parts.items():
+    for place, (sensor, own) in enumerate(parts.items()):
         turning = (
             tone
             for joint, name in enumerate(table.joint_names)
             for tone in (
                 *of_stretches(sensor, _stretches(found.used, own, joint), name),
-                *_whole(sensor, orders[joint], name),
+                *_whole(sensor, orders[joint], name, place=place),
             )
         )
         tones[sensor] |= _significant(turning, tests)
@@ -364,16 +364,16 @@ def _without(frequency: float, time: np.ndarray, values: np.ndarray) -> np.ndarr
     return values - basis @ (basis.T @ values)
 
 
-def _whole(sensor: str, orders: Orders | None, joint: str) -> Iterator[Tone]:
+def _whole(sensor: str, orders: Orders | None, joint: str, *, place: int) -> Iterator[Tone]:
     """
     Yield the most significant Tone of each axis with a constant phase on a joint, if any.
 
-    From the orders of both sensors.
+    From the orders of all sensors with readings, of which `sensor` has the number `place`.
     """
     if orders is None:
         return
     for axis in range(3):
-        column = 3 * SENSORS.index(sensor) + axis
+        column = 3 * place + axis
         out = (orders.power[:, column] > OUT) & (orders.share[:, column] > MIN_ORDER_SHARE)
         if out.any():
             best = int(np.argmin(np.where(out, orders.p_value[:, column], np.inf)))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.distributions import f_sf
-from imu_calibration.effects.base import AXES, SENSORS, Role
+from imu_calibration.effects.base import AXES, Role
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.selection.bias_courses import LEAST_WARMING, temperature_courses
 from imu_calibration.selection.explained_share import ExplainedWindows
@@ -97,7 +97,7 @@ def unexplained(
     """Return sensor -> Unexplained for a choice of effects."""
     excess, used = explained.excess(chosen), problem.search.indices(chosen)
     values = problem.space.reduced(used, problem.evidence.fit(used)[0])
-    return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in SENSORS}
+    return {sensor: _rest(problem, explained, sensor, excess[sensor], values) for sensor in excess}
 
 
 def beyond_noise(problem: LinearisedProblem, sensor: str, rest: Unexplained) -> Unexplained:

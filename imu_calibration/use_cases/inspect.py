@@ -22,7 +22,7 @@ from imu_calibration.core.exit_codes import dropped_text, exit_code_of
 from imu_calibration.core.samples import SampleBlock
 from imu_calibration.document.outcome import STATED_CHECKS, shortcomings
 from imu_calibration.kinematics.table import Table
-from imu_calibration.preprocessing.checks import Preflight, unusable, warnings
+from imu_calibration.preprocessing.checks import JOINT_STATES, Preflight, unusable, warnings
 from imu_calibration.preprocessing.recording_evidence import NOTE, REFUSE, CheckFinding
 from imu_calibration.preprocessing.stream_cleaning import StreamStatistics
 from imu_calibration.references.gravity.hand_calibration import solve_by_hand
@@ -224,7 +224,9 @@ def _look(bag, topics, table, *, options, exclude):
     if not isinstance(bag, SampleBlock):
         recording = open_bag(bag, topics, want_joints='optional', want_temperature='optional')
         recording.close()
-    preflight, calibrated = Preflight(table and table.gravity_value, strict=table is not None), None
+    gravity = None if table is None else table.gravity_value
+    preflight = Preflight(gravity, strict=table is not None, one_sensor=table is not None)
+    calibrated = None
     by_hand = None
     error_findings: tuple[CheckFinding, ...] = ()
     if table is not None:
@@ -248,11 +250,15 @@ def _look(bag, topics, table, *, options, exclude):
         except ImuCalibrationError as error:
             calibrated = error
     if not preflight.streams:  # not read to its end: no data to calibrate from
-        preflight = Preflight(table and table.gravity_value, strict=False, one_sensor=table is None)
+        preflight = Preflight(gravity, strict=False, one_sensor=table is None)
         source = source_of(bag, topics, want_joints='optional', want_temperature='optional')
         (source,) = sources_without([source], [bag], exclude)
         by_hand = _by_hand(source, options, preflight)
-    findings = (*preflight.findings, *error_findings, *_axes_question(bag, options))
+    own_findings = preflight.findings
+    if isinstance(calibrated, ImuCalibrationError) and calibrated.code == 'on_table':
+        # Joints that rest while the IMU turns follow from the stated cause, such as two clocks.
+        own_findings = tuple(each for each in own_findings if each.sensor != JOINT_STATES)
+    findings = (*own_findings, *error_findings, *_axes_question(bag, options))
     look = RecordingSummary(
         recording, preflight.streams, findings, preflight.lost, calibrated, by_hand
     )

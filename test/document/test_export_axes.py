@@ -82,6 +82,8 @@ def test_other_programs_need_no_axes():
     [
         ('TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ', 'ArduPilot'),
         ('timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],accelerometer_m_s2[0],b,c', 'PX4'),
+        ('time_boot_ms,xacc,yacc,zacc,xgyro,ygyro,zgyro', 'MAVLink'),
+        ('timestamp,RAW_IMU.xacc,RAW_IMU.yacc,RAW_IMU.zacc,RAW_IMU.xgyro', 'MAVLink'),
         ('time,gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0],accSmooth[1],accSmooth[2]', ''),
     ],
 )

@@ -9,7 +9,11 @@ from imu_calibration.calibration.hand_recording import read_by_hand
 from imu_calibration.core.samples import ImuSamples, SampleBlock, TemperatureSamples
 from imu_calibration.document.outcome import exit_code
 from imu_calibration.preprocessing.checks import Preflight
-from imu_calibration.preprocessing.counter_overflow import OverflowSearch, without_overflows
+from imu_calibration.preprocessing.counter_overflow import (
+    OverflowSearch,
+    longer_gaps,
+    without_overflows,
+)
 from msg_adapters.csv_log import read_csv
 
 from worlds.calibrated_by_hand import calibrated
@@ -42,15 +46,16 @@ def test_other_steps_back_remain():
     stamps = regular()
     stamps[3000:] -= 17_300_000_000
     assert np.array_equal(OverflowSearch().undone(stamps), stamps)
-    assert np.array_equal(without_overflows(stamps)[0], stamps)
+    assert np.array_equal(without_overflows(stamps).stamp_ns, stamps)
 
 
 def test_a_size_that_recurs_is_that_of_a_counter():
     """A counter of seconds that begins again at each minute."""
     true = regular(10_000)
     stamps = (true + 41_000_000_000) % 60_000_000_000
-    found, count = without_overflows(stamps)
-    assert count == 3 and np.diff(found) == pytest.approx(np.diff(true), abs=20_000_000)
+    found = without_overflows(stamps)
+    assert found.n_overflows == 3
+    assert np.diff(found.stamp_ns) == pytest.approx(np.diff(true), abs=20_000_000)
 
 
 def test_stamps_of_a_bag_that_overflow_give_the_usual_result(clean, usual):
@@ -116,10 +121,33 @@ def test_an_overflow_within_a_gap_is_undone_and_a_restart_is_not(bits, tick_ns, 
     time = time[(time < 21.3) | (time > 21.3 + gap)]
     size_ns = round(2**bits * tick_ns)
     counter_ns = (np.round(time * 1e9).astype(np.int64) + size_ns - 21_500_000_000) % size_ns
-    found, count = without_overflows(10**18 + counter_ns, tick_ns, counter_ns.astype(float))
-    np.testing.assert_allclose((found - found[0]) * 1e-9, time, atol=1e-6)
-    assert count == 1
+    found = without_overflows(10**18 + counter_ns, tick_ns, counter_ns.astype(float))
+    stamp_ns = found.stamp_ns
+    np.testing.assert_allclose((stamp_ns - stamp_ns[0]) * 1e-9, time, atol=1e-6)
+    assert found.n_overflows == 1
     # The counter begins again long before its end.
     restart_ns = np.where(time < 21.3, time + 3.0, time - 21.0) * 1e9
-    _, count = without_overflows(restart_ns.astype(np.int64), tick_ns, restart_ns)
-    assert count == 0
+    restarted = without_overflows(restart_ns.astype(np.int64), tick_ns, restart_ns)
+    assert restarted.n_overflows == 0
+
+
+@pytest.mark.parametrize('gap', [0.4, 2.2, 3.6, 4.0, 4.6, 5.0])
+def test_gaps_of_a_counter_of_nanoseconds_are_known_up_to_its_size(gap):
+    """32 bits of 1 ns last 4.29 s: a gap may hide a whole turn of the counter."""
+    size_ns = 2**32
+    time = np.arange(4000) / 100.0
+    time = time[(time < 17.13) | (time > 17.13 + gap)]
+    counter_ns = (np.round(time * 1e9).astype(np.int64) + 900_000_000) % size_ns
+    late = counter_ns.copy()
+    late[[2500, 2501]] = late[[2501, 2500]]  # one late sample is no overflow
+    hidden_ns = size_ns if gap + 0.01 > size_ns * 1e-9 else 0
+    for stamps in (counter_ns, late):
+        found = without_overflows(10**18 + stamps, 1.0, stamps.astype(float))
+        assert found.size_ns == size_ns
+        true_ns = np.round(time * 1e9).astype(np.int64)
+        true_ns[time > 17.13] -= hidden_ns
+        steps = np.diff(found.stamp_ns - true_ns)
+        assert np.count_nonzero(steps) == (0 if stamps is counter_ns else 3)
+    assert '4.295 s' in longer_gaps(found.size_ns, 1)
+    assert not longer_gaps(found.size_ns, 0)
+    assert not longer_gaps(1000 * size_ns, 1)

@@ -142,23 +142,3 @@ def test_on_a_table_no_window_has_frozen_readings():
     assert not ((stamps >= start) & (stamps < stop)).any()
     assert [f.check for f in gathered.findings if f.samples] == ['frozen']
     assert gathered.counts['static'] == sum(len(w.time) for w in used if w.kind == 'static')
-
-
-@pytest.mark.parametrize(
-    ('columns', 'value', 'other'),
-    [
-        ('rate_s', 0.0, 'accelerometer'),
-        ('rate_s', np.nan, 'accelerometer'),
-        ('force_s', np.nan, 'gyroscope'),
-    ],
-)
-def test_one_sensor_on_a_table_is_the_cause_of_the_refusal(columns, value, other):
-    """Not the joints: no window was found, or the outputs never changed."""
-    session = make_session(5, profile='quick', imu_rate=25.0, joint_rate=25.0)
-    readings = getattr(session.imu, columns)
-    one_sensor = replace(session.imu, **{columns: np.full_like(readings, value)})
-    blocks = [SampleBlock(one_sensor, session.joints)]
-    step = GatherStep(Table.from_mapping(session.table), SensorModel(BASE, BASE))
-    with refused(InputError, 'one_sensor', f'calibrate the {other} by hand') as caught:
-        step.read(lambda: iter(blocks), 0, Preflight(GRAVITY))
-    assert caught.value.key == 'table'

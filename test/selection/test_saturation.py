@@ -68,7 +68,7 @@ def test_a_limit_is_where_the_motion_passes_it(where):
     else:
         force = np.clip(force, -10.0, 10.0)
     windows = windows_of(force)
-    predicted = [(part, np.zeros_like(part)) for part in np.split(expected, 10)]
+    predicted = [{'accelerometer': part} for part in np.split(expected, 10)]
     found = find_saturation(windows, predicted, np.full(3, 0.01), sensor='accelerometer')
     assert found is None if where == 'at rest' else found.level == 10.0
 
@@ -79,7 +79,7 @@ def test_samples_at_a_limit_and_those_predicted_near_it_are_left_out():
     force[:20, 2], expected[20:40, 2], force[20:40, 2] = 10.0, 9.97, 9.9
     kept = without_clipped(
         windows_of(force, 1),
-        [(expected, np.zeros((100, 3)))],
+        [{'accelerometer': expected}],
         {'accelerometer': 10.0},
         noise_sd={'accelerometer': np.full(3, 0.01), 'gyroscope': np.full(3, 0.01)},
     )

@@ -469,7 +469,7 @@ def test_within_windows_nothing_is_told_of_what_is_smooth_in_time():
     values = model.start()
     values[model.slices['accelerometer', 'accel_thermal_bias']] = 2.0
     recording = SimpleNamespace(
-        model=model, values=values, bank={'accelerometer': (), 'gyroscope': ()}
+        sensors=SENSORS, model=model, values=values, bank={'accelerometer': (), 'gyroscope': ()}
     )
     space = parameter_space(recording, SensorModel(accelerometer=('bias', 'matrix')))
     used, mean, within = (
@@ -630,6 +630,7 @@ def evidence_of(rows, noise_within, scatter=None):
     )
     still = np.zeros((count, 2))
     space = SimpleNamespace(
+        sensors=SENSORS,
         recording=recording,
         size=1,
         prior_sd=np.full(1, 1e6),
@@ -932,6 +933,7 @@ def rest_of(sigma, residual):
         },
     )
     space = SimpleNamespace(
+        sensors=SENSORS,
         mean={'accelerometer': [column[:, None] for column in residual.T]},
         recording=recording,
         places=lambda sensor, axis: np.array([0]),

@@ -8,7 +8,6 @@ import numpy as np
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
-from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import heldout_gain
 from imu_calibration.selection.investigation import investigate
 from imu_calibration.use_cases.diagnose import diagnose as diagnose_block
@@ -161,7 +160,7 @@ def oracle(recording, effect):
         return None
     search = found.problem.search
     best = min(asked, key=lambda q: search.evidence.loss(search.indices([q])))
-    sensors = sensors_of(best.effect)
+    sensors = best.effect.sensors
     pair = [
         heldout_gain(found.problem, [], choice, sensors=sensors) for choice in (found.named, [best])
     ]

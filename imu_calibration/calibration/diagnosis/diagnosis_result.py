@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from imu_calibration.core.documents import json_types
-from imu_calibration.effects.base import SENSORS, UNITS
+from imu_calibration.effects.base import UNITS
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation.solution import Solution
 from imu_calibration.selection.gain import Gain
@@ -152,7 +152,9 @@ def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
     return json_types(
         {
             'format': DIAGNOSIS_FORMAT,
-            'baseline': {sensor: _baseline(diagnosis.baseline, sensor) for sensor in SENSORS},
+            'baseline': {
+                sensor: _baseline(diagnosis.baseline, sensor) for sensor in diagnosis.unexplained
+            },
             'onset': None if diagnosis.onset is None else diagnosis.onset.to_mapping(),
             'stamp_jitter_s': diagnosis.stamp_jitter.to_mapping().get('sd_s'),
             'findings': [_finding(finding) for finding in diagnosis.findings],
@@ -165,7 +167,7 @@ def diagnosis_mapping(diagnosis: Diagnosis) -> dict[str, Any]:
                 sensor: residual_mapping(
                     sensor, diagnosis.unexplained[sensor], diagnosis.formula_gains.get(sensor)
                 )
-                for sensor in SENSORS
+                for sensor in diagnosis.unexplained
             },
             'not_testable': diagnosis.not_testable,
             'candidates': [_candidate(candidate) for candidate in diagnosis.candidates],

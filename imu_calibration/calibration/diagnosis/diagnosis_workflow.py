@@ -194,7 +194,10 @@ class StoredRecording:
         ((session, source),) = numbered
         if self._first is None:
             self._first = step.read(
-                source, session, Preflight(step.table.gravity_value), windows=self.windows
+                source,
+                session,
+                Preflight(step.table.gravity_value, one_sensor=True),
+                windows=self.windows,
             )
             return [self._first]
         windows = (self.windows[number] for number in range(len(self.windows)))

@@ -32,7 +32,6 @@ from imu_calibration.estimation.standard_motions import ALL_MOTIONS, MOTIONS, ON
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.gravity.hand_calibration import HandCalibration
 from imu_calibration.references.gravity.model_selection import HandInvestigation
-from imu_calibration.selection.explained_share import sensors_of
 from imu_calibration.selection.gain import Gain, gain_in_turn
 from imu_calibration.selection.investigation import Investigation
 from imu_calibration.selection.linearised_problem import LinearisedProblem
@@ -384,11 +383,11 @@ def build_diagnosis(
             table,
             named[:place],
             after=named[: place + 1],
-            sensors=sensors_of(named[place].effect),
+            sensors=named[place].effect.sensors,
         )
 
     def shows(place: int, mate: Question, gain: Gain) -> bool:
-        if gain.sensor not in sensors_of(mate.effect):
+        if gain.sensor not in mate.effect.sensors:
             return False
         own, other = (
             gain_in_turn(
@@ -420,7 +419,7 @@ def build_diagnosis(
         )
         for place in range(len(named))
     ]
-    sensors = sorted({s for q in named for s in sensors_of(q.effect)}) or list(SENSORS)
+    sensors = sorted({s for q in named for s in q.effect.sensors}) or list(rests)
     return Diagnosis(
         tuple(findings),
         rests,

@@ -157,8 +157,8 @@ class DistanceSums:
         self._freedom[: 2 if rest else 1] += np.bincount(place, freedom, len(BAND_EDGES) - 1)
         self._samples += n
         self._windows += 1
-        for sensor in SENSORS:
-            self._noise[sensor] += noise[sensor].low_variance / n
+        for sensor, own_noise in noise.items():
+            self._noise[sensor] += own_noise.low_variance / n
             row = [n, rest]
             for k, own in enumerate(residuals):
                 mean = own[sensor].mean(axis=0)
@@ -177,7 +177,7 @@ class DistanceSums:
     def distances(self) -> dict[str, Distance]:
         """Return sensor -> Distance of the windows up to now."""
         edge = int(np.max(np.flatnonzero(self._freedom[0]), initial=0)) + 2
-        return {sensor: self._distance(sensor, edge) for sensor in SENSORS}
+        return {sensor: self._distance(sensor, edge) for sensor, rows in self._rows.items() if rows}
 
     def _distance(self, sensor: str, edge: int) -> Distance:
         known = np.flatnonzero(self._freedom[1])
@@ -262,7 +262,8 @@ class Traces:
     dead_reckoning: dict | None
     """
     {'seconds', 'position_before', 'position_after', 'velocity_before', 'velocity_after',
-    'stretches'}: medians, m and m/s, or None when no stretch of the recording is long enough.
+    'stretches'}: medians, m and m/s, or None with one sensor, or when no stretch of the recording
+    is long enough.
     """
     segments: dict[str, list[OverlaySegment]] = field(default_factory=dict)
     """Sensor -> for each axis the segment with the largest residual before."""
@@ -294,6 +295,7 @@ def residual_traces(
 
     """
     models = [before] if after is before else [before, after]
+    sensors = tuple(before.noise)
     sums, parts, counts, warmth, spans = DistanceSums(), [], [], [], []
     for group in chunks(_used(windows, spans)):
         rest, against = (
@@ -315,7 +317,7 @@ def residual_traces(
         values = [
             np.concatenate([w.time for w in group]),
             *against[:3],
-            *(each[s] for each in (rest[0], rest[-1]) for s in SENSORS),
+            *(each[sensor] for each in (rest[0], rest[-1]) for sensor in sensors),
         ]
         parts.append([block_means(value, starts) for value in values])
         warmth.append(None if against[3] is None else block_means(against[3], starts))
@@ -328,7 +330,8 @@ def residual_traces(
     known = [each for each in warmth if each is not None]
     temperature = np.concatenate(known) if len(known) == len(warmth) else None
     time, position, force_s, rate_s, *errors = (np.concatenate(column) for column in zip(*parts))
-    old, new = (dict(zip(SENSORS, errors[k : k + 2])) for k in (0, 2))
+    old = dict(zip(sensors, errors[: len(sensors)]))
+    new = dict(zip(sensors, errors[len(sensors) :]))
     segments = {
         sensor: [
             _segment(
@@ -336,7 +339,7 @@ def residual_traces(
             )
             for axis in range(3)
         ]
-        for sensor in SENSORS
+        for sensor in sensors
     }
     return Traces(
         time,
@@ -348,7 +351,7 @@ def residual_traces(
         old,
         new,
         np.concatenate([number for number, _ in counts]),
-        _dead_reckoning(windows, spans, table, models),
+        _dead_reckoning(windows, spans, table, models) if len(sensors) == len(SENSORS) else None,
         segments,
         sums.distances(),
     )

@@ -1,6 +1,6 @@
 """Export of a calibration to a target."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
@@ -127,7 +127,8 @@ def export(
     lines = [
         *_placement_lines(applied, target, placement),
         *_worked_sample(target, numbers, placement, applied),
-        *loss_lines(target, loss),
+        *loss_lines(target, loss, applied.sensors),
+        *(f'note: the {sensor} was not calibrated' for sensor in applied.absent),
         *(f'note: {line}' for line in (*trust, *target.ignored(numbers), *unknown)),
         *(f'note: {hint}' for hint in [target.hint] if hint),
     ]
@@ -292,8 +293,8 @@ def _worked_sample(
     ]
 
 
-def loss_lines(target: Target, loss: Loss) -> list[str]:
-    """Return the losses, a line each."""
+def loss_lines(target: Target, loss: Loss, sensors: Sequence[str] = SENSORS) -> list[str]:
+    """Return the losses, a line each; the remaining error of the calibrated `sensors`."""
     if target.only_noise:
         left = ', '.join(
             f'{sensor} {error_text(value, UNITS[sensor])}' for sensor, value in loss.left.items()
@@ -323,7 +324,7 @@ def loss_lines(target: Target, loss: Loss) -> list[str]:
             f'{what}: {lost.effect.sensor} {lost.effect.name},'
             f' {error_text(lost.rms, UNITS[lost.effect.sensor])} rms'
         )
-    for sensor in SENSORS:
+    for sensor in sensors:
         left, raw = (error_text(error[sensor], UNITS[sensor]) for error in (loss.left, loss.raw))
         left = f'{left} rms' if loss.left[sensor] > ROUNDING_LOSS else 'none'
         lines.append(

@@ -39,8 +39,7 @@ class _CentredRows:
     """(sensor, kind) -> triangular factor of the slow parts of the centred rows."""
 
     def _stack_window(self, window: WindowStatistics) -> None:
-        for sensor in SENSORS:
-            statistics = window.sensors[sensor]
+        for sensor, statistics in window.sensors.items():
             stack(self.within, (sensor, window.kind), statistics.within)
             if statistics.slow is not None and statistics.slow_rows:
                 stack(self.slow, (sensor, window.kind), statistics.slow)
@@ -119,7 +118,7 @@ class Accumulator(_CentredRows):
     def add(self, window: WindowStatistics) -> None:
         """Add one window (WindowStatistics)."""
         self._stack_window(window)
-        self.slow_rows[window.kind] += window.sensors[SENSORS[0]].slow_rows
+        self.slow_rows[window.kind] += next(iter(window.sensors.values())).slow_rows
         self.samples[window.kind] += window.count
         self.windows[window.kind] += 1
         if self.in_blocks:
@@ -215,7 +214,7 @@ class Accumulator(_CentredRows):
         if self.blocks:
             (block,) = self.block_of(np.array([first.session]), np.array([first.time]))
             parts.append(self.blocks[int(block)].within)
-        for sensor in SENSORS:
+        for sensor in first.sensors:
             for factors in parts:
                 stack(factors, (sensor, first.kind), _difference(first, second, sensor))
 
@@ -244,8 +243,8 @@ def _joined(first: WindowStatistics, second: WindowStatistics) -> WindowStatisti
         return share_of_first * of_first + share_of_second * of_second
 
     sensors = {}
-    for sensor in SENSORS:
-        a, b = first.sensors[sensor], second.sensors[sensor]
+    for sensor, a in first.sensors.items():
+        b = second.sensors[sensor]
         sensors[sensor] = SensorStatistics(
             mean(a.mean, b.mean),
             a.within[:0],
@@ -299,18 +298,18 @@ def restrict(accumulator: Accumulator, wide: SensorModel, narrow: SensorModel) -
     chosen = selected_columns(wide, narrow)
     blocks = []
     for block in accumulator.blocks:
-        within, slow = (_chosen_columns(factors, chosen) for factors in (block.within, block.slow))
+        within, slow = (chosen_columns(factors, chosen) for factors in (block.within, block.slow))
         blocks.append(replace(block, within=within, slow=slow))
     return replace(
         accumulator.copy(),
         rows=[restricted_window(row, chosen) for row in accumulator.rows],
         blocks=blocks,
-        within=_chosen_columns(accumulator.within, chosen),
-        slow=_chosen_columns(accumulator.slow, chosen),
+        within=chosen_columns(accumulator.within, chosen),
+        slow=chosen_columns(accumulator.slow, chosen),
     )
 
 
-def _chosen_columns(
+def chosen_columns(
     factors: dict[tuple[str, str], np.ndarray], chosen: dict[str, np.ndarray]
 ) -> dict[tuple[str, str], np.ndarray]:
     """Return (sensor, kind) -> factor with the columns `chosen` of the sensor only."""

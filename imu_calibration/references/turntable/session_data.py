@@ -20,6 +20,7 @@ from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.window import Window
 from imu_calibration.references.turntable.accumulator import (
     Accumulator,
+    chosen_columns,
     restrict,
     selected_columns,
     stack,
@@ -130,6 +131,7 @@ def owned_window(window: Window) -> Window:
         motion,
         temperature,
         joint_step=window.joint_step,
+        absent=window.absent,
     )
 
 
@@ -160,14 +162,14 @@ class HeldOutBlock:
         """Add a window, and its pieces if it is judged."""
         self.accumulator.add(window)
         pieces = self.pieces if judged else self.earlier
-        for sensor in SENSORS:
-            for regime, rows in window.pieces[sensor].items():
+        for sensor, of_regimes in window.pieces.items():
+            for regime, rows in of_regimes.items():
                 factor = rows if len(rows) <= rows.shape[1] else triangular(rows)
                 stack(pieces, (sensor, regime), factor)
         if not judged:
             return
         self.judged += 1
-        for regime, rows in window.pieces[SENSORS[0]].items():
+        for regime, rows in next(iter(window.pieces.values())).items():
             count = count_pieces(window.duration) if window.kind == 'static' else len(rows)
             self.counts[regime] = self.counts.get(regime, 0) + count
 
@@ -200,10 +202,10 @@ class HeldOutBlock:
         }
         return HeldOutBlock(
             restrict(self.accumulator, wide, narrow),
-            {key: rows[:, chosen[key[0]]] for key, rows in self.pieces.items()},
+            chosen_columns(self.pieces, chosen),
             self.counts,
             self.judged,
-            {key: rows[:, chosen[key[0]]] for key, rows in self.earlier.items()},
+            chosen_columns(self.earlier, chosen),
         )
 
 
@@ -241,6 +243,12 @@ class HeldOut:
             if wide is narrow
             else HeldOut([block.restricted(wide, narrow) for block in self.blocks])
         )
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Sensors with pieces for judging."""
+        found = {sensor for block in self.blocks for sensor, _ in block.pieces}
+        return tuple(sensor for sensor in SENSORS if sensor in found)
 
     @property
     def n_windows(self) -> int:
@@ -287,7 +295,9 @@ def _linearised(blocks: Sequence[HeldOutBlock], solution: Solution, prior: Prior
     for block in blocks:
         if block.accumulator.rows:
             system = WeightedSystem(block.accumulator, solution.model)
-            factors = {sensor: system.factors(sensor, solution.noise[sensor]) for sensor in SENSORS}
+            factors = {
+                sensor: system.factors(sensor, solution.noise[sensor]) for sensor in solution.noise
+            }
             residuals = system.residuals(solution.values, factors)[: -len(prior.root)]
             rows.append(np.column_stack([system.jacobian(solution.values, factors), residuals]))
     return triangular(np.concatenate(rows)) if rows else np.zeros((0, n_params + 1))
@@ -379,7 +389,8 @@ class SessionData:
     """Lowest and highest temperature."""
     findings: tuple = ()
     """Findings of the checks of the recording before the estimate (`CheckFinding`)."""
-
+    unusable: dict[str, str] = field(default_factory=dict)
+    """Absent sensors with readings -> why these cannot be used."""
     judged_from: float = 0.0
     """Windows from this time on are judged by a proof, s."""
 
@@ -396,6 +407,12 @@ class SessionData:
         for window in windows:
             fresh.take(window)
         return fresh
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Sensors without usable readings, which have no rows."""
+        rows = self.accumulator.rows
+        return tuple(sensor for sensor in SENSORS if rows and sensor not in rows[0].sensors)
 
     @property
     def moving(self) -> list:
@@ -443,6 +460,7 @@ def merge(parts: Iterable[SessionData]) -> SessionData:
         total.largest_force = max(total.largest_force, part.largest_force)
         total.frame_id = total.frame_id or part.frame_id
         total.findings += part.findings
+        total.unusable = {**part.unusable, **total.unusable}
         ranges = [r for r in (total.temperature_c, part.temperature_c) if r]
         total.temperature_c = (
             (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else None
@@ -514,6 +532,13 @@ def _require_like_the_first(
         raise InputError(
             f'{name}: every recording must contain a static window, spin or dynamic segment, this'
             ' one has none; omit it'
+        )
+    if part.absent != first.absent:
+        raise InputError(
+            f'{name}: all recordings must have the same sensors, this one has no'
+            f' {" and no ".join(part.absent) or "absent sensor"}, {first_name} has no'
+            f' {" and no ".join(first.absent) or "absent sensor"}; calibrate them one by one',
+            code='other_sensors',
         )
     if part.frame_id != first.frame_id:
         raise InputError(

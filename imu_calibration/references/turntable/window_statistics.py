@@ -210,7 +210,7 @@ def reduce_windows(
     designs = {sensor: column_function(references, sensor) for sensor in SENSORS}
     edges = np.cumsum([0] + [len(window.motion) for window in windows])
     return [
-        _reduced(window, {s: designs[s][a:b] for s in SENSORS}, session)
+        _reduced(window, {sensor: design[a:b] for sensor, design in designs.items()}, session)
         for window, a, b in zip(windows, edges, edges[1:])
     ]
 
@@ -251,8 +251,10 @@ def _reduced(
     static, length = window.kind == 'static', _piece_length(window)
     duration = float(window.time[-1] - window.time[0])
     sensors, pieces = {}, {}
-    for sensor in SENSORS:
-        design, output = designs[sensor], outputs[sensor]
+    for sensor, design in designs.items():
+        if sensor in window.absent:
+            continue
+        output = outputs[sensor]
         if static:
             sensors[sensor] = _reduce_static(design, output)
         else:

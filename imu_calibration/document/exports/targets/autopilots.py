@@ -50,6 +50,21 @@ def _linear(imu: AffineImu, offset: Mapping[str, str], scale: str) -> dict[str, 
     } | _by_axis(scale, 1.0 / np.diag(imu.matrix['accelerometer']))
 
 
+OF_SENSOR = {
+    'accelerometer': ('INS_ACC', 'INS_TCAL1_ACC', 'CAL_ACC', 'TC_A'),
+    'gyroscope': ('INS_GYR', 'INS_TCAL1_GYR', 'CAL_GYRO', 'TC_G'),
+}
+"""Sensor -> beginnings of the names of its parameters."""
+
+
+def _written(page: Page) -> dict[str, Any]:
+    """Return the parameters without those of a sensor that was not calibrated."""
+    absent = tuple(prefix for sensor in page.calibration.absent for prefix in OF_SENSOR[sensor])
+    return {
+        name: value for name, value in plain(page.numbers).items() if not name.startswith(absent)
+    }
+
+
 def _matrix(found: Mapping[str, float], scale: str) -> dict[str, np.ndarray]:
     return {'accelerometer': np.diag(1.0 / vector_of(found, scale, 1.0)), 'gyroscope': np.eye(3)}
 
@@ -123,7 +138,7 @@ def imu_ardupilot(found: dict) -> AffineImu:
 def write_ardupilot(page: Page) -> str:
     """Return a parameter file, ``NAME,VALUE``."""
     return commented(page.comments) + ''.join(
-        f'{name},{value!r}\n' for name, value in plain(page.numbers).items()
+        f'{name},{value!r}\n' for name, value in _written(page).items()
     )
 
 
@@ -264,7 +279,7 @@ def write_px4(page: Page) -> str:
     """Return a parameter file: vehicle, component, name, value, type."""
     lines = [
         f'1\t1\t{name}\t{value!r}\t{INTEGER if isinstance(value, int) else REAL}'
-        for name, value in plain(page.numbers).items()
+        for name, value in _written(page).items()
     ]
     return (
         commented([*page.comments, '', 'Vehicle-Id Component-Id Name Value Type'])
