@@ -224,7 +224,8 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
     """
     step = np.diff(stamp)
     if len(step) < 2:
-        return []
+        # Without a clock of their own: a line that is continued to them may be wrong by any time.
+        return [slice(0, len(stamp))]
     # The usual step is that within a packet if it would mean more than MOST_LOST lost samples for
     # each received one.
     least_period = period / (1 + MOST_LOST)
@@ -248,7 +249,8 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
         # The earliest stamp of a part is on the line also where the computed period is wrong.
         distance = max(abs(float(off)), float(late.std()))
         limit = FIT_SDS + FIT_SDS_OF_ONE / np.sqrt(stop - start)
-        if distance > limit * scatter + MIN_REGULAR_STEP * usual:
+        # Stamps that scatter little tell a small error of the computed times.
+        if distance > limit * scatter + min(MIN_REGULAR_STEP * usual, scatter):
             found.append(slice(int(start), int(stop)))
     return found
 
