@@ -186,7 +186,7 @@ def _attempt(source, table: Table, **choices):
     warned = [
         item['text']
         for item in found.calibration.statistics['preflight']
-        if 'frozen' in item['text'] or 'stay' in item['text']
+        if item['check'] == 'frozen'
     ]
     return (
         found.verdict.text + ''.join(f'; {text}' for text in warned[:1]),
