@@ -20,6 +20,7 @@ from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.estimation import observability
 from imu_calibration.estimation.prior import make_prior
 from imu_calibration.estimation.solution import (
+    AZIMUTH_REMEDY,
     BIAS_PROCESS,
     GRAVITY,
     HELD_PRIORS,
@@ -161,6 +162,7 @@ def motions_needed(
     data_sd = observability.sd_of_data(solution, prior_sd)
     counted = _counted(solution)
     is_shown = dict(zip(solution.param_names, data_sd <= tolerances, strict=True))
+    of_place = PLACE_REMEDY if table.latitude is None else AZIMUTH_REMEDY
     of_known_size: set[str] = set()
     for effect in solution.model.effects:
         if effect.known_size:
@@ -170,7 +172,7 @@ def motions_needed(
             del needed[name]
             continue
         if name in of_known_size:
-            needed[name] = (PLACE_REMEDY, float('nan'))
+            needed[name] = (of_place, float('nan'))
             continue
         index = solution.param_names.index(name)
         section = name.partition('.')[0]

@@ -54,8 +54,11 @@ MOVED_REMEDY = 'put the IMU down in each attitude, with engines and fans off, an
 """Remedy where a sensor moved although it was held still."""
 PLACE_REMEDY = 'give latitude and azimuth_deg in the description of the table'
 """Remedy for the Earth's rate, which motions determine worse than the place gives it."""
+AZIMUTH_REMEDY = 'give azimuth_deg in the description of the table'
+"""The same where the latitude is given."""
 REMEDY_KEYS = {
     PLACE_REMEDY: 'table',
+    AZIMUTH_REMEDY: 'table',
     REMEDIES[GRAVITY,]: 'gravity',
     REMEDIES[MODEL_ERROR, DRIFT, REJECTED]: 'diagnose',
     EXCESS_REMEDY: 'diagnose',

@@ -1,6 +1,7 @@
 """The latitude of a table against the estimated Earth's rate."""
 
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 from refusal import refused
 
 from imu_calibration import calibrate
+from imu_calibration.calibration.from_solution import motions_needed
 from imu_calibration.calibration.latitude_check import WindowRates, latitude_findings
 from imu_calibration.core.errors import InputError
 from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.sensor_model import SensorModel
+from imu_calibration.estimation.solution import AZIMUTH_REMEDY, PLACE_REMEDY
 from imu_calibration.kinematics.joint import Joint
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.recording_evidence import NOTE
@@ -174,9 +177,17 @@ def test_the_earth_below_a_table_without_latitude_is_no_g_sensitivity():
             'azimuth_deg': None,
         }
     )
-    found = calibrate(session.block, nowhere).calibration
+    result = calibrate(session.block, nowhere).result
+    found = result.calibration
     assert found.model.gyroscope == ('bias', 'matrix')
     part = found.model.slices['reference', 'earth_rate']
     rate, sd = found.values[part], found.sd[part]
     np.testing.assert_allclose(rate, session.truth['values']['earth_rate'], atol=4 * sd.max())
     assert sd.max() < 0.2 * OMEGA
+
+    # What would determine it better is the place; where that is given, the azimuth.
+    none_suffices = np.full(len(found.values), 1e-12)
+    for latitude, wanted in ((None, PLACE_REMEDY), (LATITUDE, AZIMUTH_REMEDY)):
+        somewhere = replace(nowhere, latitude=latitude)
+        needed = motions_needed(result.solution, none_suffices, somewhere, quality=found.statistics)
+        assert needed['reference.earth_rate.x'][0] == wanted
