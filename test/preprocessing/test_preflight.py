@@ -16,6 +16,7 @@ from refusal import refused
 from imu_calibration.cli.main import main
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.document.calibration_text import calibration_from_text
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
 from imu_calibration.preprocessing.checks import Preflight
@@ -338,9 +339,14 @@ def test_inspect_prints_the_findings_of_a_bag(capsys, tmp_path, session, fault):
     assert code == (1 if REFUSE in {f.severity for f in found} else 3)
 
 
-# One of each check.
+# One of each check; a sensor with frozen readings does not refuse the other one.
 @pytest.mark.parametrize(
-    'fault', {check: fault for fault, check, severity, _ in FAULTS if severity == REFUSE}.values()
+    'fault',
+    {
+        check: fault
+        for fault, check, severity, _ in FAULTS
+        if severity == REFUSE and check != 'frozen'
+    }.values(),
 )
 def test_calibrate_refuses_what_would_make_the_result_wrong(
     capsys, tmp_path, session, table, fault
@@ -349,8 +355,7 @@ def test_calibrate_refuses_what_would_make_the_result_wrong(
     imu, joints, temperature = fault(session.imu, session.joints, session.temperature)
     write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
     references = [['--table', str(table)]]
-    # By hand the joints do not matter, and without a gyroscope the accelerometer is calibrated.
-    if fault not in (two_clocks, dead_gyroscope):
+    if fault is not two_clocks:  # by hand the joints do not matter
         references.append([])
     for more in references:
         capsys.readouterr()
@@ -362,6 +367,21 @@ def test_calibrate_refuses_what_would_make_the_result_wrong(
         assert printed.out == '' and len(printed.err.splitlines()) == 1
         assert ' must ' in printed.err
         assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize('by_hand', (False, True))
+def test_a_dead_gyroscope_leaves_the_accelerometer_calibrated(tmp_path, session, table, by_hand):
+    """Exit code 3; the gyroscope is absent from the file."""
+    imu, joints, temperature = dead_gyroscope(session.imu, session.joints, session.temperature)
+    write_session(str(tmp_path / 'bag'), imu, joints, temperature=temperature)
+    more = [] if by_hand else ['--table', str(table)]
+    arguments = ['calibrate', str(tmp_path / 'bag'), *more, '--no-report', '--output']
+    assert main([*arguments, str(tmp_path / 'out')]) == 3
+    found = calibration_from_text((tmp_path / 'out' / 'calibration.yaml').read_text())
+    assert found.absent == ('gyroscope',)
+    statuses = found.status_by_name
+    assert statuses['accelerometer.bias.x'] == 'determined'
+    assert not [name for name in statuses if name.startswith('gyroscope')]
 
 
 @pytest.mark.parametrize(
