@@ -1,7 +1,5 @@
 """
 The stated covariance while the slope of the rate is not known yet: at the start and after a gap.
-
-Exact truth: sums of sines give rate and angular acceleration at any time.
 """
 
 import numpy as np
@@ -16,66 +14,26 @@ from msg_adapters.write import encode_imu
 from validation.imu_messages import parse_imu
 
 from worlds.compensation_cases import random_calibration
+from worlds.exact_motion import START, exact_motion
 
-START, PERIOD_NS = 10**18, 5_000_000
 GAPS_S = (0.1, 0.3, 0.6, 1.0)
-FIRST, AFTER_GAP = 50, 12
-"""Messages at the start and after each gap over which the normalised error is averaged."""
 RUN = 300
 """Messages between two gaps."""
-
-
-def motion(time_s, rng):
-    """Return rate and angular acceleration, each (n, 3), rms about 0.5 rad/s and 2 rad/s^2."""
-    rate = np.zeros((len(time_s), 3))
-    alpha = np.zeros_like(rate)
-    for omega in 2.0 * np.pi * rng.uniform(0.2, 1.2, 4):
-        amplitude = rng.normal(0.0, 0.4, 3)
-        phase = rng.uniform(0.0, 2.0 * np.pi, 3)
-        rate += amplitude * np.sin(np.outer(time_s, omega) + phase)
-        alpha += amplitude * omega * np.cos(np.outer(time_s, omega) + phase)
-    return rate, alpha
+FIRST, AFTER_GAP = 50, 12
+"""Messages at the start and after each gap over which the normalised error is averaged."""
 
 
 def normalised_errors(arm, seed, lively=1.0, spin=False):
-    """
-    Return error / stated sd of the published force, shape (runs, RUN, 3), and the gaps, s.
-
-    Before each run but the first there is a gap. `spin` adds a constant rate.
-    """
-    rng = np.random.default_rng([seed, 60])
-    calibration = random_calibration(seed, (), (), sd=1e-9)
-    direction = rng.normal(size=3)
-    transfer = Transfer.from_pose('base', arm * direction / np.linalg.norm(direction))
-    gaps = np.repeat(rng.permutation(GAPS_S), 2)
-    steps_ns = np.full((len(gaps) + 1, RUN), PERIOD_NS)
-    steps_ns[1:, 0] += (1e9 * gaps).astype(np.int64)
-    stamps = START + np.cumsum(steps_ns.ravel())
-    rate, alpha = (lively * each for each in motion((stamps - START) * 1e-9, rng))
-    rate = rate + spin * rng.normal(0.0, 0.5, 3)
-    force_target = np.array([0.0, 0.0, 9.81]) + rng.normal(0.0, 1.0, 3)
-    r = transfer.arm_t
-    force = force_target + np.cross(alpha, r) + np.cross(rate, np.cross(rate, r))
-    noise = {sensor: calibration.noise(sensor)[0] for sensor in ('accelerometer', 'gyroscope')}
-    readings = ImuSamples(
-        stamps,
-        force @ calibration.value('accelerometer', 'matrix').T
-        + calibration.value('accelerometer', 'bias')
-        + noise['accelerometer'] * rng.normal(size=force.shape),
-        rate @ calibration.value('gyroscope', 'matrix').T
-        + calibration.value('gyroscope', 'bias')
-        + noise['gyroscope'] * rng.normal(size=rate.shape),
-        'imu_link',
-    )
-    live = LiveCompensation(calibration, transfer)
-    ratios = []
-    for k, message in enumerate(encode_imu(readings)):
-        out = parse_imu(live(message.tobytes())).doubles
-        variance = np.diag(np.reshape(out[FIELDS['force_cov']], (3, 3)))
-        ratios.append((np.array(out[FIELDS['force_s']]) - force_target) / np.sqrt(variance))
+    """Return error / stated sd of the published force, shape (runs, RUN, 3), and the gaps, s."""
+    world = exact_motion(arm, np.repeat(GAPS_S, 2), RUN, seed, lively, spin)
+    live = LiveCompensation(world.calibration, world.transfer)
+    published = []
+    for k, message in enumerate(encode_imu(world.readings)):
+        published.append(live(message.tobytes()))
         if k % 200 == 150:  # a refresh per second, as in the node
             live.refresh()
-    return np.reshape(ratios, (len(gaps) + 1, RUN, 3)), gaps
+    ratios = world.normalised_errors(published)
+    return np.reshape(ratios, (-1, RUN, 3)), world.gaps_s
 
 
 def rms(values):
