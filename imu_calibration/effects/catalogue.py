@@ -141,8 +141,7 @@ def term(
         'time_constant': time_constant,
     }
     texts = {'unit': unit, 'text': text, 'tolerance_reason': tolerance_reason}
-    declared = replace(DEFINITION, name=f"effect '{shortened(str(name))}'")
-    require({'sensor': sensor, 'column': column, **numbers, **texts}, declared)
+    require({'sensor': sensor, 'column': column, **numbers, **texts}, _definition_of(name))
     columns = (column,) if isinstance(column, str) else tuple(column)
     group = ColumnGroup(name, columns, name)
     try:
@@ -228,9 +227,13 @@ def from_definition(name: str, definition: dict[str, Any]) -> Effect:
         When something is missing, or a key is unknown.
 
     """
-    declared = replace(DEFINITION, name=f"effect '{shortened(str(name))}'")
-    require(definition, declared, mapping(_NEEDED, _FURTHER, closed=True))
+    require(definition, _definition_of(name))
     return term(name, **definition)
+
+
+def _definition_of(name: str) -> Document:
+    """Return the declaration with the name of the effect, for errors."""
+    return replace(DEFINITION, name=f"effect '{shortened(str(name))}'")
 
 
 def _reduced(effect):
@@ -372,7 +375,7 @@ class Catalogue:
             As `with_effects` and `term`; also when there are too many.
 
         """
-        require(definitions, EFFECTS, mapping())
+        require(definitions, EFFECTS)
         if len(definitions) > MOST_ADDED:
             raise InputError(
                 f'effects must be at most {MOST_ADDED}, got {len(definitions)}; remove some',
