@@ -15,6 +15,7 @@ from imu_calibration.core.errors import ImuCalibrationError, InputError
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_to_text
 from imu_calibration.document.decision import decisions_text
+from imu_calibration.document.files import REPORT
 from imu_calibration.document.outcome import exit_code, shortcomings
 from imu_calibration.effects.base import SENSORS
 from imu_calibration.estimation.solution import HELD
@@ -107,7 +108,7 @@ class FleetStep:
         texts = {'calibration.yaml': calibration_to_text(result.calibration)}
         report_of = self.report
         if report_of is not None:
-            texts['report.html'] = report_of(result)
+            texts[REPORT] = report_of(result)
         return UnitResult(
             unit.name,
             result.calibration,

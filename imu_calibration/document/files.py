@@ -27,6 +27,9 @@ from imu_calibration.kinematics.table import Table
 if TYPE_CHECKING:
     from imu_calibration.allan.figures import NoiseFigures
 
+REPORT = 'report.html'
+"""Page next to the document of a result; one name for all verbs."""
+
 
 def user_path(text: str) -> Path:
     """

@@ -117,7 +117,7 @@ class Calibrated:
             require_same_inputs(folder, lambda: self.calibration.provenance, report=report)
         files.write_texts(
             folder,
-            ({'report.html': self.report} if report else {})
+            ({files.REPORT: self.report} if report else {})
             | {'calibration.yaml': calibration_to_text(self.calibration)},
         )
 

@@ -445,10 +445,6 @@ def made_from(found: Mapping[str, Any]) -> set[str]:
     }
 
 
-REPORT = 'report.html'
-"""Page next to the document of a result; one name for all verbs."""
-
-
 def require_same_inputs(
     folder: str | PathLike,
     provenance: Callable[[], Mapping[str, Any]],
@@ -479,7 +475,7 @@ def require_same_inputs(
     """
     path = Path(folder) / name
     if not path.exists():
-        files.require_new(Path(folder) / REPORT, force=not report)
+        files.require_new(Path(folder) / files.REPORT, force=not report)
         return
     found = provenance()
     try:

@@ -118,7 +118,7 @@ class Diagnosed:
             folder,
             {
                 'diagnosis.json': json.dumps(self.document, indent=1) + '\n',
-                'report.html': self.report,
+                files.REPORT: self.report,
                 'calibration.yaml': calibration_to_text(self.calibration),
                 **(
                     {}

@@ -80,7 +80,7 @@ class IdentifiedNoise:
             )
         files.write_texts(
             folder,
-            ({'report.html': self.report} if report else {})
+            ({files.REPORT: self.report} if report else {})
             | {'noise.yaml': noise_to_text(self.figures, self.horizon)},
         )
 

@@ -41,7 +41,7 @@ from imu_calibration.planning.planner import (
 from imu_calibration.planning.planning_problem import expected_noise
 from imu_calibration.references.gravity.hand_parameters import HandModel
 from imu_calibration.report.figures import Drawn
-from imu_calibration.use_cases.choices import REPORT, calibration_options
+from imu_calibration.use_cases.choices import calibration_options
 from imu_calibration.use_cases.recordings import Stand, table_of
 
 ACCUMULATOR = '.npz'
@@ -146,7 +146,7 @@ class Planned:
         if moves_joints:
             write_trajectories(place / 'trajectory', self._messages(), storage=storage)
         if report:
-            files.write_text(place / REPORT, page)
+            files.write_text(place / files.REPORT, page)
         if moves_joints:
             files.write_text(
                 place / 'trajectory.yaml',
@@ -173,7 +173,10 @@ class Planned:
 
 def require_no_plan(folder: str | PathLike, *, report: bool, force: bool) -> None:
     """Refuse to replace an existing plan without consent; raises as `files.require_new`."""
-    for name in ('plan.yaml', *TRAJECTORIES, *[REPORT] * report):
+    names = ['plan.yaml', *TRAJECTORIES]
+    if report:
+        names.append(files.REPORT)
+    for name in names:
         files.require_new(Path(folder) / name, force=force)
 
 
