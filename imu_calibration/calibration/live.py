@@ -36,7 +36,7 @@ from imu_calibration.calibration.window_observations import TableResult, WindowO
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.progress import LiveState
 from imu_calibration.core.samples import ImuSamples, SampleBlock
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import height_setting, setting
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import gravity_of_settings
 from imu_calibration.kinematics.table import Table
@@ -181,15 +181,7 @@ class LiveByHandSettings:
         live=True,
         session=True,
     )
-    height: float = setting(
-        0.0,
-        'm',
-        'height above the ellipsoid, used with latitude',
-        (-500.0, 9000.0),
-        '3e-6 m/s^2 of gravity per metre',
-        live=True,
-        session=True,
-    )
+    height: float = height_setting(session=True)
     hand_samples: int = setting(
         800_000,
         '1',

@@ -55,6 +55,19 @@ def setting(default: Any, *declared: Any, **options: Any) -> Any:
     return field(default=default, metadata={'setting': Setting(default, *declared, **options)})
 
 
+def height_setting(**options: Any) -> Any:
+    """Declare the height of the place whose latitude is another field; as `setting`."""
+    return setting(
+        0.0,
+        'm',
+        'height above the ellipsoid, used with latitude',
+        (-500.0, 9000.0),
+        '3e-6 m/s^2 of gravity per metre',
+        live=True,
+        **options,
+    )
+
+
 def describe(group: Any) -> list[Setting]:
     """Return the Setting of each field of a settings class or instance."""
     return [replace(f.metadata['setting'], name=f.name) for f in fields(group)]

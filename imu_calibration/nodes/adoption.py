@@ -11,7 +11,7 @@ from imu_calibration.compensation.unit_gate import UnitGate
 from imu_calibration.core.documents import version_of
 from imu_calibration.core.errors import DocumentError, ImuCalibrationError, shortened
 from imu_calibration.core.readings import RawReadings
-from imu_calibration.core.settings import setting
+from imu_calibration.core.settings import height_setting, setting
 from imu_calibration.document import files, trust
 from imu_calibration.document.calibration import Calibration
 from imu_calibration.document.calibration_text import calibration_from_text
@@ -161,14 +161,7 @@ class CompensatorSettings:
         'as with a wrong gravity',
         live=True,
     )
-    height: float = setting(
-        0.0,
-        'm',
-        'height above the ellipsoid, used with latitude',
-        (-500.0, 9000.0),
-        '3e-6 m/s^2 of gravity per metre',
-        live=True,
-    )
+    height: float = height_setting()
     update_gyro_bias: bool = setting(
         False,
         '',
