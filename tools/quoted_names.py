@@ -52,18 +52,17 @@ def names_of(tree: ast.AST) -> set[str]:
     return found
 
 
-def absent_names(root: pathlib.Path) -> list[str]:
-    """Return a line for each back-quoted name below a folder that does not exist."""
-    texts = {}
+def absent_names(
+    texts: dict[pathlib.Path, str], trees: dict[pathlib.Path, ast.Module]
+) -> list[str]:
+    """Return a line for each back-quoted name in the texts that the trees do not have."""
     members: dict[str, set[str]] = {}
-    for package in PACKAGES:
-        for path in sorted((root / package).rglob('*.py')):
-            texts[path] = path.read_text(encoding='utf8')
-            names = names_of(ast.parse(texts[path]))
-            parts = path.relative_to(root).with_suffix('').parts
-            # A name belongs to its module and to each package above it.
-            for part in parts:
-                members.setdefault(part, set()).update(names, parts)
+    for path, tree in trees.items():
+        names = names_of(tree)
+        parts = path.with_suffix('').parts
+        # A name belongs to its module and to each package above it.
+        for part in parts:
+            members.setdefault(part, set()).update(names, parts)
     known = set().union(*members.values())
     lines = []
     for path, text in texts.items():
@@ -74,7 +73,7 @@ def absent_names(root: pathlib.Path) -> list[str]:
                 for home, part in zip(parts, parts[1:]):
                     exists = exists and part in members.get(home, known)
                 if not exists:
-                    lines.append(f'{path.relative_to(root)}:{number}: no such name: {quoted}')
+                    lines.append(f'{path}:{number}: no such name: {quoted}')
     return lines
 
 
@@ -90,13 +89,12 @@ def defined_in(tree: ast.Module) -> set[str]:
     return {name for name in found if not name.startswith('_')}
 
 
-def ambiguous_names(root: pathlib.Path) -> list[str]:
+def ambiguous_names(trees: dict[pathlib.Path, ast.Module]) -> list[str]:
     """Return a line for each public name that two modules define, unless its role is the same."""
-    homes: dict[str, list[str]] = {}
-    for package in PACKAGES:
-        for path in sorted((root / package).rglob('*.py')):
-            for name in defined_in(ast.parse(path.read_text(encoding='utf8'))) - set(SAME_ROLE):
-                homes.setdefault(name, []).append(str(path.relative_to(root)))
+    homes: dict[str, list[pathlib.Path]] = {}
+    for path, tree in trees.items():
+        for name in defined_in(tree) - set(SAME_ROLE):
+            homes.setdefault(name, []).append(path)
     lines = []
     for name, paths in sorted(homes.items()):
         if len(paths) > 1:
@@ -109,7 +107,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument('root', nargs='?', default='.')
     root = pathlib.Path(parser.parse_args().root)
-    lines = [*absent_names(root), *ambiguous_names(root)]
+    texts = {}
+    for package in PACKAGES:
+        for path in sorted((root / package).rglob('*.py')):
+            texts[path.relative_to(root)] = path.read_text(encoding='utf8')
+    trees = {path: ast.parse(text) for path, text in texts.items()}
+    lines = [*absent_names(texts, trees), *ambiguous_names(trees)]
     fine = 'each back-quoted name exists, and each public name is defined once'
     print('\n'.join(lines) if lines else fine)
     return int(bool(lines))

@@ -149,7 +149,7 @@ class ScaleCovariance:
 
     @cached_property
     def _distances(self) -> '_Distances':
-        return _Distances(np.stack([np.abs(shifted) for shifted in self._shifted(self._lag)]))
+        return _Distances.of(np.stack([np.abs(shifted) for shifted in self._shifted(self._lag)]))
 
     def expectation(self, process: NoiseProcess) -> np.ndarray:
         """Return the Allan variances of unit coefficient, shape (n_scales,)."""
@@ -267,6 +267,7 @@ class ScaleCovariance:
                 yield lag + j * self._long - i * self._short
 
 
+@dataclass(frozen=True, eq=False)
 class _Distances:
     """
     Distances between the ends of two differences, in samples.
@@ -279,9 +280,11 @@ class _Distances:
     place: np.ndarray
     """Index in `distinct` of each pair of ends, shape (9, n_pairs, n_lags)."""
 
-    def __init__(self, every: np.ndarray):
-        self.distinct = np.unique(every)
-        self.place = np.searchsorted(self.distinct, every).astype(np.int32)
+    @classmethod
+    def of(cls, distances: np.ndarray) -> '_Distances':
+        """Return the distinct ones of all distances, shape (9, n_pairs, n_lags)."""
+        distinct = np.unique(distances)
+        return cls(distinct, np.searchsorted(distinct, distances).astype(np.int32))
 
 
 def _lags(short, long, length):

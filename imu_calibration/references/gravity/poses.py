@@ -336,10 +336,9 @@ def _largest(signed: Callable, axis: np.ndarray, fresh: np.ndarray) -> np.ndarra
     """Return the largest values of ``signed(axis[fresh])``, block by block."""
     largest, least = np.zeros(0), -np.inf
     for start in range(0, len(axis), SAMPLES_AT_ONCE):
-        values = signed(axis[start : start + SAMPLES_AT_ONCE])
-        largest = np.append(
-            largest, values[(values > least) & fresh[start : start + SAMPLES_AT_ONCE]]
-        )
+        stop = start + SAMPLES_AT_ONCE
+        values = signed(axis[start:stop])
+        largest = np.append(largest, values[(values > least) & fresh[start:stop]])
         if len(largest) > MAX_RANGE_READINGS:
             largest = np.partition(largest, -MAX_RANGE_READINGS)[-MAX_RANGE_READINGS:]
             least = largest[0]
@@ -439,10 +438,9 @@ def _roughness(time: np.ndarray, rate: np.ndarray) -> float:
     """
     total = 0.0
     for start in range(0, len(time) - 2, SAMPLES_AT_ONCE):
-        some, own = (
-            time[start : start + SAMPLES_AT_ONCE + 2],
-            rate[start : start + SAMPLES_AT_ONCE + 2].T,
-        )
+        stop = start + SAMPLES_AT_ONCE + 2
+        some = time[start:stop]
+        own = rate[start:stop].T
         share = (some[1:-1] - some[:-2]) / (some[2:] - some[:-2])
         total += float(np.sum((own[:, 1:-1] - (1 - share) * own[:, :-2] - share * own[:, 2:]) ** 2))
     return total

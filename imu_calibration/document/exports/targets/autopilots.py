@@ -50,7 +50,7 @@ def _linear(imu: AffineImu, offset: Mapping[str, str], scale: str) -> dict[str, 
     } | _by_axis(scale, 1.0 / np.diag(imu.matrix['accelerometer']))
 
 
-OF_SENSOR = {
+PREFIXES_OF_SENSOR = {
     'accelerometer': ('INS_ACC', 'INS_TCAL1_ACC', 'CAL_ACC', 'TC_A'),
     'gyroscope': ('INS_GYR', 'INS_TCAL1_GYR', 'CAL_GYRO', 'TC_G'),
 }
@@ -59,7 +59,9 @@ OF_SENSOR = {
 
 def _written(page: Page) -> dict[str, Any]:
     """Return the parameters without those of a sensor that was not calibrated."""
-    absent = tuple(prefix for sensor in page.calibration.absent for prefix in OF_SENSOR[sensor])
+    absent = tuple(
+        prefix for sensor in page.calibration.absent for prefix in PREFIXES_OF_SENSOR[sensor]
+    )
     return {
         name: value for name, value in plain(page.numbers).items() if not name.startswith(absent)
     }
