@@ -26,6 +26,7 @@ from imu_calibration.estimation.session_noise import (
 )
 from imu_calibration.selection.bias_courses import step_places, temperature_courses
 from imu_calibration.selection.parameter_space import ParameterSpace, normal_matrix, within_matrix
+from imu_calibration.selection.reduced_recording import ReducedRecording
 
 
 def in_trusted_band(space: ParameterSpace) -> ParameterSpace:
@@ -235,10 +236,8 @@ def _with_bias_process(
     of the biases, or a temperature that acts late: one of these that beats the process is a part
     of the model too.
     """
-    recording, superfluous = (
-        space.recording,
-        sorted({k for parameters in smooth for k in parameters}),
-    )
+    recording = space.recording
+    superfluous = sorted(set().union(*smooth))
     structural = np.setdiff1d(np.concatenate(space.index[sensor]), superfluous)
     own = np.append(structural, superfluous).astype(int)
     place = {parameter: k for k, parameter in enumerate(own)}
@@ -255,74 +254,27 @@ def _with_bias_process(
             sum(process.sd**2 for process in natural_processes(noise[sensor], recording.period))
         )
     )
-    usual = max(natural, STABLE[sensor])
-    effects = _SmoothColumns(
-        [[place[k] - len(structural) for k in parameters] for parameters in smooth],
-        drift_prior(rows[:, :, len(structural) : -1], space.prior_sd[superfluous], usual),
+    smooth_columns = rows[:, :, len(structural) : -1]
+    wander = _WanderProblem(
+        recording=recording,
+        noise=noise[sensor],
+        rows=rows,
+        n_structural=len(structural),
+        white=white,
+        information=_known_otherwise(space, sensor, noise, own),
+        options=[[place[k] - len(structural) for k in parameters] for parameters in smooth],
+        prior_sd=drift_prior(
+            smooth_columns, space.prior_sd[superfluous], max(natural, STABLE[sensor])
+        ),
+        natural=natural,
+        stable=STABLE[sensor],
     )
-    information = _known_otherwise(space, sensor, noise, own)
-
-    def choice(courses: Sequence[np.ndarray], n_moments: int) -> _Choice:
-        """Return the best of the effects and courses; the last `n_moments` courses are steps."""
-        added = _columns_of_biases(courses, len(rows))
-        sd = drift_prior(added, np.full(added.shape[2], np.inf), usual)
-        likelihood = NoiseLikelihood(
-            np.concatenate([rows[:, :, :-1], added, rows[:, :, -1:]], axis=2),
-            white,
-            recording.time,
-            sessions=recording.sessions,
-            information=_with_priors(information, sd),
-            known=noise[sensor].known,
-            durations=recording.duration,
-            common=len(structural),
-        )
-        search = BiasProcessSearch(
-            likelihood, 0.0 if noise[sensor].known else natural, STABLE[sensor]
-        )
-        options = [list(option) for option in effects.options]
-        for first in range(len(effects.prior_sd), len(effects.prior_sd) + len(sd), len(AXES)):
-            options.append([first, first + 1, first + 2])
-        # Each of the moments is as likely as the other ones.
-        prices = np.zeros(len(options))
-        prices[len(options) - n_moments :] = 2 * np.log(max(n_moments, 1))
-        used = _needed_smooth(
-            search, options, prior_sd=np.append(effects.prior_sd, sd), prices=prices
-        )
-        moment = -1
-        if used:
-            moment = options.index(list(used)) - (len(options) - n_moments)
-        return _Choice(search, used, moment)
-
-    # Only within one recording: between two of them each bias may change.
-    courses = []
-    places = np.zeros(0, int)
-    if len(recording.sessions) == 1:
-        temperature = recording.describe['temperature']
-        courses = [course.values for course in temperature_courses(recording.time, temperature)]
-        places = step_places(np.arange(len(rows)), MOST_MOMENTS)
-    found = choice([*courses, *_steps(places, len(rows))], len(places))
-    if found.moment >= 0 and len(places) == MOST_MOMENTS:
-        # the windows between the neighbours of the best moment
-        first = places[max(found.moment - 1, 0)]
-        last = places[min(found.moment + 1, len(places) - 1)]
-        places = step_places(np.arange(first, last + 1), MOST_MOMENTS, least=0)
-        found = choice([*courses, *_steps(places, len(rows))], len(places))
-
+    found = _best_course(wander)
     shape = found.search.best(found.used)[0]
     middle = 0.0
     if shape[1] > PLAUSIBLE * found.search.usual:
         middle = found.search.of_middle_axis(shape, found.used)
     return replace(noise[sensor], middle_wander=middle, **found.search.polished(shape, found.used))
-
-
-@dataclass(frozen=True, eq=False)
-class _SmoothColumns:
-    """Parameters of effects that are smooth in time."""
-
-    options: Sequence[Sequence[int]]
-    """Their numbers for each effect."""
-    prior_sd: np.ndarray
-    """Of each parameter, shape (q,)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,6 +287,83 @@ class _Choice:
     """Parameters of the smooth effect or course of the biases that is needed."""
     moment: int
     """Number of the step among the steps; negative: it is none."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _WanderProblem:
+    """Rows of one sensor, of which a bias process or a course in time explains the wander."""
+
+    recording: ReducedRecording
+    noise: NoiseModel
+    """Noise of the sensor without a bias process."""
+    rows: np.ndarray
+    """Mean rows ``[structural | smooth | residual]``, shape (n, 3, q + 1)."""
+    n_structural: int
+    """Columns that every model has."""
+    white: np.ndarray
+    """Variance of the means without a bias process, shape (n, 3)."""
+    information: np.ndarray
+    """Normal matrix of what is known of the parameters otherwise, shape (q + 1, q + 1)."""
+    options: Sequence[Sequence[int]]
+    """Numbers of the parameters of each smooth effect."""
+    prior_sd: np.ndarray
+    """Prior sd of these parameters."""
+    natural: float
+    """Standard deviation of the bias processes that are known, SI."""
+    stable: float
+    """Bias variation of a stable sensor, SI."""
+
+    def choice(self, courses: Sequence[np.ndarray], steps: Sequence[np.ndarray] = ()) -> _Choice:
+        """Return the best of the smooth effects, of courses in time and of steps, or none."""
+        # Columns of the courses and steps on each axis, and their priors.
+        added = _columns_of_biases([*courses, *steps], len(self.rows))
+        usual = max(self.natural, self.stable)
+        sd = drift_prior(added, np.full(added.shape[2], np.inf), usual)
+        likelihood = NoiseLikelihood(
+            np.concatenate([self.rows[:, :, :-1], added, self.rows[:, :, -1:]], axis=2),
+            self.white,
+            self.recording.time,
+            sessions=self.recording.sessions,
+            information=_with_priors(self.information, sd),
+            known=self.noise.known,
+            durations=self.recording.duration,
+            common=self.n_structural,
+        )
+        search = BiasProcessSearch(
+            likelihood, 0.0 if self.noise.known else self.natural, self.stable
+        )
+
+        # A course has one parameter on each axis.
+        options = [list(option) for option in self.options]
+        n_smooth = len(self.prior_sd)
+        for first in range(n_smooth, n_smooth + len(sd), len(AXES)):
+            options.append([first, first + 1, first + 2])
+        first_step = len(options) - len(steps)
+        # Each of the moments is as likely as the other ones.
+        prices = np.zeros(len(options))
+        prices[first_step:] = 2 * np.log(max(len(steps), 1))
+        used = _needed_smooth(search, options, prior_sd=np.append(self.prior_sd, sd), prices=prices)
+        moment = options.index(list(used)) - first_step if used else -1
+        return _Choice(search, used, moment)
+
+
+def _best_course(wander: _WanderProblem) -> _Choice:
+    """Return the best model beside a bias process: a step is sought coarsely, then closely."""
+    recording = wander.recording
+    if len(recording.sessions) > 1:  # between two recordings each bias may change
+        return wander.choice([])
+    count = len(wander.rows)
+    temperature = recording.describe['temperature']
+    courses = [course.values for course in temperature_courses(recording.time, temperature)]
+    places = step_places(np.arange(count), MOST_MOMENTS)
+    found = wander.choice(courses, _steps(places, count))
+    if found.moment >= 0 and len(places) == MOST_MOMENTS:
+        # the windows between the neighbours of the best moment
+        first = places[max(found.moment - 1, 0)]
+        last = places[min(found.moment + 1, len(places) - 1)]
+        places = step_places(np.arange(first, last + 1), MOST_MOMENTS, least=0)
+        found = wander.choice(courses, _steps(places, count))
+    return found
 
 
 def _steps(places: np.ndarray, count: int) -> list[np.ndarray]:
