@@ -235,11 +235,8 @@ SEARCH = _of(
     (
         'gain on held-out windows not asked for',
         'Score.significant',
-        (
-            'self.allowed and self.p_value < FAMILY_WISE and (self.net > 0) and (self.gain >'
-            ' MIN_GAIN_NATS)'
-        ),
-        'self.allowed and self.p_value < FAMILY_WISE',
+        '... and ... and self.net > 0 and ...',
+        '... and ...',
         'test_search.py::test_a_finding_predicts_what_it_was_not_fitted_to',
     ),
     (
@@ -343,8 +340,8 @@ SEARCH = _of(
     (
         'what is nothing without what was taken out is named',
         '_agreed',
-        '_1.search.drop_insignificant(_that_help(_1, _3, _4) if _2 else _4)',
-        '_that_help(_1, _3, _4) if _2 else _4',
+        '_1.search.drop_insignificant(...)',
+        '...',
         'test_search.py::test_what_is_nothing_without_what_was_taken_out_is_not_named',
     ),
     (
@@ -465,8 +462,8 @@ SEARCH = _of(
     (
         'a finding need not lower the residual in its own unit',
         '_that_help',
-        '[not _1 > _needed_reduction(_2, _3, _4, _5) for _1, _5 in zip(_6, _4)]',
-        '[False for _5 in _4]',
+        'not _1 > _needed_reduction(..., ..., ..., ...)',
+        'False',
         (
             'test_search.py::test_a_finding_lowers_the_residual_in_the_sensors_own_unit'
             ' test_search.py::test_what_the_halves_disagree_on_is_denied'
@@ -533,11 +530,8 @@ BEYOND = _of(
     (
         'a line of few stretches is a tone',
         'of_stretches',
-        (
-            'np.where(_1 > MOSTLY * _2[:, None], binom_sf(_1 - 1, _2[:, None], LINE_CHANCE) * ...,'
-            ' 1.0)'
-        ),
-        'np.where(_1 > 0, 0 * binom_sf(_1 - 1, _2[:, None], LINE_CHANCE) * ..., 1.0)',
+        'np.where(_1 > ..., ..., 1.0)',
+        'np.where(_1 > 0 * ..., 0 * ..., 1.0)',
         'test_spectrum.py',
     ),
     (
@@ -550,11 +544,8 @@ BEYOND = _of(
     (
         'formulas of a temperature that stays',
         'RestBlocks.warms',
-        (
-            'self.ref.temperature_c is not None and bool(np.ptp(self.ref.temperature_c) >='
-            ' TEMPERATURE_SPAN)'
-        ),
-        'self.ref.temperature_c is not None',
+        '... and bool(...)',
+        '...',
         'test_beyond_catalogue.py::test_a_temperature_that_stays_is_no_cause',
     ),
     (
@@ -591,8 +582,8 @@ BEYOND = _of(
     (
         'scatter of one sensor passes for errors of the stamps',
         'stamp_jitter',
-        'max(min(np.average(_1, weights=1 / _2 ** 2), *(_1 + BOUND_SDS * _2)), 0.0)',
-        'max(np.average(_1, weights=1 / _2 ** 2), 0.0)',
+        'max(min(..., *...), 0.0)',
+        'max(..., 0.0)',
         'test_stamp_jitter.py::test_scatter_of_one_sensor_is_no_error_of_the_stamps',
     ),
     (
@@ -606,9 +597,9 @@ BEYOND = _of(
     (
         'a place is no reason to withdraw a name',
         '_places',
-        'np.stack([_1.get(_2, _3) for _2 in AXES], axis=1)[:, None].astype(float) if _1 else None',
+        '... if _1 else None',
         'None',
-        'test_beyond_catalogue.py',
+        'test_residual_analysis.py',
     ),
     (
         'calibrate adopts what a formula does without',
@@ -741,8 +732,8 @@ HAND = _of(
     (
         'slow turns are poses',
         '_not_turning',
-        '_1[1:-1] &= np.all(_2 <= np.maximum(_SCATTERS * _3, _4), axis=1)',
-        '_1[1:-1] |= np.all(_2 <= np.maximum(_SCATTERS * _3, _4), axis=1)',
+        '_1[1:-1] &= ...',
+        '_1[1:-1] |= ...',
         'test_hand_faults.py::test_a_slow_turn_about_the_vertical_is_no_pose',
     ),
     ('spikes stay', 'LARGE', '...', '8000000000.0', 'test_spike_filter.py'),
@@ -990,7 +981,7 @@ SIGNS = _of(
     (
         'notes about the result are not shown',
         'visible_findings',
-        'finding.severity == NOTE and finding.check not in DESCRIPTIVE',
+        '... and _1.check not in DESCRIPTIVE',
         'False',
         'test_table_errors.py',
     ),
@@ -1076,8 +1067,8 @@ LIVE = _of(
     (
         'a stop is taken by one clock alone',
         'Driver.awaits_stop',
-        'min(self._time - self._stopped[0], self._heard - self._stopped[1])',
-        'self._time - self._stopped[0]',
+        'min(..., self._heard - self._stopped[1])',
+        '...',
         'test_driving.py',
     ),
     (
@@ -1111,21 +1102,15 @@ LIVE = _of(
     (
         'silent joints are waited for without end',
         'PlannerWorker._wait_for_rest',
-        'self.driver.awaits_stop and (not self.driver.is_silent(time.monotonic()))',
-        'self.driver.awaits_stop',
+        '... and not self.driver.is_silent(time.monotonic())',
+        '...',
         'test_planner_node.py::test_the_worker_waits_until_the_joints_rest_and_not_for_ever',
     ),
     (
         'a clock set back counts as rest for ever',
         'Driver._note_rest',
-        (
-            'self._rested_at is None or self._time < self._rested_since or'
-            ' np.any(np.abs(self.position - self._rested_at) > MAX_REST_MOVEMENT * self.tolerance)'
-        ),
-        (
-            'self._rested_at is None or np.any(np.abs(self.position - self._rested_at) >'
-            ' MAX_REST_MOVEMENT * self.tolerance)'
-        ),
+        '... or self._time < self._rested_since or ...',
+        '... or ...',
         'test_driving.py',
     ),
     (
@@ -1201,11 +1186,8 @@ LIVE = _of(
     (
         'the model as asked grows live',
         'LiveCalibration.adopt',
-        (
-            '_1 is None or self.last is None or self.options.as_asked or (_2.is_nothing and'
-            ' self.extension.is_nothing)'
-        ),
-        '_1 is None or self.last is None or (_2.is_nothing and self.extension.is_nothing)',
+        '... or ... or self.options.as_asked or ...',
+        '... or ... or ...',
         'test_live_diagnosis.py::test_the_model_as_asked_stays',
     ),
     (
@@ -1232,8 +1214,8 @@ LIVE = _of(
     (
         'whoever saves does not wait for the answer',
         'DiagnosisThread.settle',
-        '_1 is not None and self.period and (_1.samples != self._answered)',
-        'False and (_1.samples != self._answered)',
+        '_1 is not None and self.period and ...',
+        'False',
         'test_live_diagnosis.py::test_who_saves_waits_for_the_answer_and_asks_the_same_once',
     ),
     (
@@ -1262,14 +1244,8 @@ BY_SENSOR = _of(
     (
         'what a refused sensor reads still corrects the other one',
         '_stays',
-        (
-            "_1.sensor == 'reference' or not any((_2.uses & READINGS[_3] for _3 in _4 for _2 in"
-            ' _1.groups))'
-        ),
-        (
-            "_1.sensor == 'reference' or True or (not any((_2.uses & READINGS[_3] for _3 in _4 for"
-            ' _2 in _1.groups)))'
-        ),
+        '... or not any(...)',
+        'True',
         'test_verdict_by_sensor.py::test_what_the_refused_sensor_would_correct_goes_as_well',
     ),
     (

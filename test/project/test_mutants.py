@@ -12,6 +12,8 @@ from mutants.declared import MUTANTS
 from mutants.mutation import NotFound, matches, mutated, path_of_test
 
 ROOT = Path(__file__).resolve().parents[2]
+LONGEST_PATTERN = 60
+"""Characters; a longer pattern quotes code, which a rewrite changes, in place of naming a node."""
 CODE = """
 LIMIT, OTHER = 3.0, 4.0
 
@@ -37,6 +39,7 @@ def test_every_fault_has_one_place_and_its_tests_exist():
     assert [mutant.name for mutant in MUTANTS if not fits_once(mutant)] == []
     assert all(path_of_test(ROOT, test) for mutant in MUTANTS for test in mutant.tests)
     assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS)
+    assert max(len(mutant.pattern) for mutant in MUTANTS) <= LONGEST_PATTERN
 
 
 @pytest.fixture

@@ -1,0 +1,49 @@
+"""A finding is withdrawn when an offset in a regime of motion takes its place."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from imu_calibration.selection.residual_analysis import superseded
+
+PLACE = np.arange(8) < 3
+"""Blocks of the regime, shape (b,)."""
+
+
+class Fits:
+    """Fits that leave `excess` without further columns, and `beside` with those of the regime."""
+
+    def __init__(self, excess, beside=0.0):
+        self.excess, self.beside = excess, beside
+
+    def fit(self, columns=None):
+        if columns is None:
+            return SimpleNamespace(excess=self.excess)
+        np.testing.assert_array_equal(columns[:, 0, 1], PLACE)
+        assert columns.shape == (8, 1, 3) and not columns[:, 0, [0, 2]].any()
+        return SimpleNamespace(excess=self.beside)
+
+
+@pytest.mark.parametrize(
+    ('offset', 'beside', 'withdrawn'), ((True, 0.4, True), (True, 0.6, False), (False, 0.4, False))
+)
+def test_an_offset_in_a_regime_replaces_a_finding_that_is_needless_beside_it(
+    offset, beside, withdrawn
+):
+    # The finding reduces the excess by 10, and beside the regime by `beside`: less than 5 % of it.
+    question = SimpleNamespace(
+        effect=SimpleNamespace(sensors=('gyroscope',), needs=()), name='gyro_quadratic'
+    )
+    fits = {True: Fits(2.0, 2.0), False: Fits(12.0, 2.0 + beside)}
+    found = SimpleNamespace(
+        named=[question],
+        rests={'gyroscope': SimpleNamespace(significant=True)},
+        proposals={'gyroscope': None},
+        blocks={'gyroscope': SimpleNamespace(time=np.arange(8.0))},
+        fits=lambda sensor, chosen: fits[bool(chosen)],
+        columns=lambda sensor, formula: None,
+        proposed=lambda sensor, left_out: None,
+        regimes=lambda sensor, chosen: [SimpleNamespace(axis='y', inside=PLACE, offset=offset)],
+    )
+    assert superseded(found) == ([question] if withdrawn else [])
