@@ -201,16 +201,21 @@ def _line(stamp_ns: np.ndarray, step: np.ndarray, period: float) -> StampLine:
     return StampLine(COUNTED, period, low - origin, high - origin, at_once if arrivals else 1.0)
 
 
-FIT_SDS, FIT_SDS_OF_ONE = 1.0, 2.0
+LOST_SCATTER = 0.6
 """
-Distance between computed times and stamps of a part, in scatters of the stamps about their own
-clock, beyond which they do not fit; the second one is that of one sample.
+Samples were lost at long steps if numbers with lost samples reduce the scatter of the stamps about
+a line to this share; jitter of more than a period makes long steps too.
 """
+MIN_PART = 3
+"""Fewest samples with a clock of their own."""
 
 
 def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bool) -> list[slice]:
     """
     Return the parts between gaps in which the stamps fit a clock better than the computed times.
+
+    The clock of a part is ``c_k = period k + offset``, through the mean of its stamps s_k or the
+    earliest one. The computed times t_k fit if ``rms(t - c) <= rms(s - c)``.
 
     Parameters
     ----------
@@ -223,8 +228,7 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
 
     """
     step = np.diff(stamp)
-    if len(step) < 2:
-        # Without a clock of their own: a line that is continued to them may be wrong by any time.
+    if len(stamp) < MIN_PART:
         return [slice(0, len(stamp))]
     # The usual step is that within a packet if it would mean more than MOST_LOST lost samples for
     # each received one.
@@ -233,26 +237,39 @@ def misfits(stamp: np.ndarray, times: np.ndarray, period: float, *, arrivals: bo
     if not least_period < usual < period:
         usual = period
     long = step > MAX_REGULAR_STEP * usual
-    # the scatter about a line through the numbers, without lost samples and with them
-    scatter = np.inf
-    for number_step in (np.ones(len(step)), np.where(long, np.rint(step / usual), 1.0)):
-        number = np.concatenate([[0.0], np.cumsum(number_step)])
-        slope, _ = np.polyfit(number, stamp, 1)
-        if slope < least_period:
-            slope = period
-        scatter = min(scatter, float(np.std(stamp - slope * number)))
+
+    # A long step is a gap where lost samples explain the stamps better than late ones.
+    if np.any(long):
+        late_scatter = _scatter(np.ones(len(step)), stamp)
+        lost_scatter = _scatter(np.where(long, np.rint(step / usual), 1.0), stamp)
+        if lost_scatter > LOST_SCATTER * late_scatter:
+            long[:] = False
     edges = [0, *(np.flatnonzero(long) + 1), len(stamp)]
+    parts = [slice(int(start), int(stop)) for start, stop in zip(edges, edges[1:])]
+
+    # The parts have one period, estimated within them. Samples of a packet have none.
+    number = np.arange(len(stamp), dtype=float)
+    numbers_apart = np.concatenate([number[part] - number[part].mean() for part in parts])
+    stamps_apart = np.concatenate([stamp[part] - stamp[part].mean() for part in parts])
+    own_period = float(numbers_apart @ stamps_apart / max(numbers_apart @ numbers_apart, 1.0))
+    if own_period < least_period:
+        own_period = period
+
     found = []
-    for start, stop in zip(edges, edges[1:]):
-        late = stamp[start:stop] - times[start:stop]
-        off = late.min() if arrivals else late.mean()
-        # The earliest stamp of a part is on the line also where the computed period is wrong.
-        distance = max(abs(float(off)), float(late.std()))
-        limit = FIT_SDS + FIT_SDS_OF_ONE / np.sqrt(stop - start)
-        # Stamps that scatter little tell a small error of the computed times.
-        if distance > limit * scatter + min(MIN_REGULAR_STEP * usual, scatter):
-            found.append(slice(int(start), int(stop)))
+    for part in parts:
+        late = stamp[part] - own_period * number[part]
+        clock = own_period * number[part] + (late.min() if arrivals else late.mean())
+        computed_error = np.linalg.norm(times[part] - clock)
+        recorded_error = np.linalg.norm(stamp[part] - clock)
+        if len(clock) < MIN_PART or computed_error > recorded_error:
+            found.append(part)
     return found
+
+
+def _scatter(number_step: np.ndarray, stamp: np.ndarray) -> float:
+    """Return the rms of stamps about a line through the numbers of their samples, ns."""
+    number = np.concatenate([[0.0], np.cumsum(number_step)])
+    return float(np.std(stamp - np.polyval(np.polyfit(number, stamp, 1), number)))
 
 
 class TimesInOrder:

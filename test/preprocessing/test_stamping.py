@@ -215,15 +215,24 @@ def test_computed_times_across_bursts_of_losses_are_no_worse_than_the_stamps(
     found = ImuSamples.concatenate(kept)
     computed = found.stamp_ns - true[found.rate_s[:, 0].astype(int)]
     recorded = imu.stamp_ns - true[imu.rate_s[:, 0].astype(int)]
-    assert computed.std() < 1.2 * recorded.std()
+    assert computed.std() < 1.1 * recorded.std()
     assert np.abs(computed).max() < 1.2 * np.abs(recorded).max()
     assert len(imu) - len(found) < 0.002 * len(imu)
 
 
-@pytest.mark.parametrize('seed', (9430, 9446))
-def test_a_few_samples_after_bursts_of_losses_keep_their_stamps(seed):
-    """Two samples without a clock of their own were up to 0.48 s wrong, on the line before them."""
-    imu, true = lossy_and_late(seed, rate_hz=50.0, lateness=4e-3, share=1.5, burst=20)
+@pytest.mark.parametrize(
+    ('seed', 'rate_hz', 'share', 'burst'),
+    (
+        # Two samples without a clock of their own were up to 0.48 s wrong, on the line before them.
+        (9430, 50.0, 1.5, 20),
+        (9446, 50.0, 1.5, 20),
+        # Parts of 18 to 43 samples were 17 to 29 ms off their clock, within the scatter of a block.
+        (9805, 100.0, 0.5, 20),
+        (9807, 100.0, 1.0, 30),
+    ),
+)
+def test_parts_between_bursts_of_losses_keep_their_clock(seed, rate_hz, share, burst):
+    imu, true = lossy_and_late(seed, rate_hz=rate_hz, lateness=4e-3, share=share, burst=burst)
     kept = [imu for part in BlockCleaner().all_of([SampleBlock(imu)]) for _, imu in part.imu]
     found = ImuSamples.concatenate(kept)
     computed = found.stamp_ns - true[found.rate_s[:, 0].astype(int)]
