@@ -2,6 +2,7 @@
 
 import sys
 import types
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -121,11 +122,11 @@ def stored_messages(path):
     """Yield (topic, data, receive time) of a plain recording."""
     from msg_adapters.rosbag2 import Rosbag2
 
-    source = Rosbag2(path)
-    for raw in source.stretches(['/imu/data_raw']):
-        packed, received_ns = raw.of(0)
-        for k, time in enumerate(received_ns()):
-            yield '/imu/data_raw', bytes(packed.message(k)), int(time)
+    with closing(Rosbag2(path)) as source:
+        for raw in source.stretches(['/imu/data_raw']):
+            packed, received_ns = raw.of(0)
+            for k, time in enumerate(received_ns()):
+                yield '/imu/data_raw', bytes(packed.message(k)), int(time)
 
 
 def test_a_packed_bag_is_read_through_rosbag2_py(session, tmp_path, monkeypatch):

@@ -260,7 +260,8 @@ def test_z5_joint_fit_without_noise(design):
     error = np.abs(np.array([fit.values[0] for fit in fits]) - TRUTH)
     arm, row = np.max(error[:, 4:]), np.max(error[:, 1:4])
     show('Z5', f'{design}: error of arms m, of matrix', [arm, row], '< 1e-12')
-    assert arm < 1e-12 and row < 1e-14
+    # Rounding: its size depends on the order of the sums, 7.6e-15 on x86-64 and 2.6e-14 on ARM 64.
+    assert arm < 1e-12 and row < 1e-13
 
 
 @pytest.mark.parametrize('design', DESIGNS)
