@@ -5,7 +5,7 @@ An effect: one physical cause of sensor output, its columns, its coefficients an
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
-from itertools import permutations
+from itertools import permutations, product
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,11 @@ SECTIONS = SENSORS + ('reference',)
 """Sections of a model and of a calibration document."""
 
 VECTOR = AXES
-OTHERS = tuple(f'{row}_{column}' for row in AXES for column in AXES if row != column)
-MATRIX = tuple(row + column for row in AXES for column in AXES)
+OTHERS = tuple(f'{row}_{column}' for row, column in permutations(AXES, 2))
+MATRIX = tuple(row + column for row, column in product(AXES, AXES))
 IMPLAUSIBLE_RATIO = 10.0
 """No instrument is known of with an effect beyond this many times the largest plausible size."""
-PRODUCTS = tuple(f'{row}_{pair}' for row in AXES for pair in ('xy', 'yz', 'xz'))
+PRODUCTS = tuple(f'{row}_{pair}' for row, pair in product(AXES, ('xy', 'yz', 'xz')))
 
 
 class Role(Enum):
@@ -267,11 +267,10 @@ class Effect:
 
     def groups_of(self, sensor: str) -> tuple:
         """Return the groups that belong to a sensor."""
-        return (
-            tuple(group for group, own in zip(self.groups, self.group_sensors) if own == sensor)
-            if self.group_sensors
-            else self.groups
-        )
+        if not self.group_sensors:  # each group belongs to all sensors that the effect acts on
+            return self.groups
+        pairs = zip(self.groups, self.group_sensors)
+        return tuple(group for group, group_sensor in pairs if group_sensor == sensor)
 
     @property
     def timed(self) -> bool:
@@ -321,10 +320,10 @@ class Effect:
         An error d of the time constant T changes ``a (1 - exp(-t / T))`` by at most ``a d / (e T)``
         (at t = T), with the prior's sd of a and the prior T.
         """
-        found = np.full(self.size, amplitude, float)
+        tolerances = np.full(self.size, amplitude, float)
         if self.time_constant:
-            found[-1] *= np.e * self.prior_values()[-1] / self.prior_sds()[0]
-        return found
+            tolerances[-1] *= np.e * self.prior_values()[-1] / self.prior_sds()[0]
+        return tolerances
 
     def amplitudes(self, values: Any) -> Any:
         """Return the values without the time constant or the time of a step."""
@@ -409,7 +408,8 @@ TRIPLES = (
 )
 TEMPERATURE_RISE = 'temperature_c - temperature_ref_c'
 INPUT = {'accelerometer': 'force', 'gyroscope': 'rate'}
-_VECTOR = {'accelerometer': [f'f_{a}' for a in AXES], 'gyroscope': [f'w_{a}' for a in AXES]}
+_VECTOR = {'accelerometer': ('f_x', 'f_y', 'f_z'), 'gyroscope': ('w_x', 'w_y', 'w_z')}
+"""Sensor -> names of the components of its true input in the text of a column."""
 
 
 def _of_input(ending, texts):
@@ -420,14 +420,24 @@ def _of_input(ending, texts):
     }
 
 
+def _products_of_places(places):
+    """Return a function of three names: the products of the names at each tuple of places."""
+
+    def texts(names):
+        columns = []
+        for factors in places:
+            columns.append(' * '.join(names[place] for place in factors))
+        return columns
+
+    return texts
+
+
 CONSTANT = ColumnGroup('one', ('1',))
 TIME = ColumnGroup('time', ('time',))
 TRUE_INPUT = _of_input('', lambda v: v)
-SQUARES = _of_input(
-    '_squares', lambda v: [' * '.join(v[k] for k in product) for product in PRODUCT_PAIRS]
-)
-CUBES = _of_input('_cubes', lambda v: [' * '.join(v[k] for k in product) for product in TRIPLES])
-SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi in v for vj in v])
+SQUARES = _of_input('_squares', _products_of_places(PRODUCT_PAIRS))
+CUBES = _of_input('_cubes', _products_of_places(TRIPLES))
+SIGNED = _of_input('_signed', lambda v: [f'sign({vi}) * {vj}' for vi, vj in product(v, v)])
 """Column 3 i + j: |u.v| for an input axis u close to axis i is sign(v_i) (u.v)."""
 THERMAL = _of_input('_temperature', lambda v: [f'{vi} * ({TEMPERATURE_RISE})' for vi in v])
 TEMPERATURE = ColumnGroup('temperature', (TEMPERATURE_RISE,))
@@ -449,13 +459,11 @@ LEVER = ColumnGroup(
     ),
 )
 """Entries of ``[alpha x] + [omega x]^2`` by rows (Zhang 2017, eq. 11)."""
-ATTITUDE = ColumnGroup('attitude', tuple(f'c_{a}{b}' for a in AXES for b in AXES))
+ATTITUDE = ColumnGroup('attitude', tuple(f'c_{entry}' for entry in MATRIX))
 LOAD = {
-    'accelerometer': ColumnGroup(
-        'load_turns_force', tuple(f'f_{AXES[j]} * f_{AXES[k]}' for j, k in PRODUCT_PAIRS)
-    ),
+    'accelerometer': ColumnGroup('load_turns_force', SQUARES['accelerometer'].text),
     'gyroscope': ColumnGroup(
-        'load_turns_rate', tuple(f'f_{a} * w_{b}' for a in AXES for b in AXES)
+        'load_turns_rate', tuple(f'f_{a} * w_{b}' for a, b in product(AXES, AXES))
     ),
 }
 """

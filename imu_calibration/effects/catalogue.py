@@ -429,10 +429,13 @@ def _check(effect, taken):
             f"effect '{effect.name}' must belong to {', '.join(SECTIONS)}, got '{effect.sensor}';"
             ' correct it'
         )
-    strange = {quantity for group in effect.groups for quantity in group.uses} - UNDONE_WITH
-    if effect.compensation == 'exact' and strange:
+    used = set()
+    for group in effect.groups:
+        used |= group.uses
+    unknown = used - UNDONE_WITH
+    if effect.compensation == 'exact' and unknown:
         raise InputError(
-            f"effect '{effect.name}' must not use {', '.join(sorted(strange))}, which are unknown"
+            f"effect '{effect.name}' must not use {', '.join(sorted(unknown))}, which are unknown"
             " during compensation; declare it with compensation 'none'",
             code='time_unavailable',
         )

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import chain, product
 from typing import Any, cast
 
 import numpy as np
@@ -24,7 +25,7 @@ QUANTITIES: dict[str, dict[str, tuple]] = {
     'rate': {f'w_{a}': ('rate_s', k) for k, a in enumerate('xyz')},
     'angular acceleration': {f'alpha_{a}': ('alpha_s', k) for k, a in enumerate('xyz')},
     'attitude': {
-        f'c_{a}{b}': ('mat_sn', i, j) for i, a in enumerate('xyz') for j, b in enumerate('xyz')
+        f'c_{"xyz"[i]}{"xyz"[j]}': ('mat_sn', i, j) for i, j in product(range(3), repeat=2)
     },
     'joint angle': {f'angle_{k + 1}': ('joint_angle', k) for k in range(MAX_COLUMN_JOINTS)},
     'joint rate': {f'joint_rate_{k + 1}': ('joint_rate', k) for k in range(MAX_COLUMN_JOINTS)},
@@ -45,8 +46,13 @@ VOCABULARY = (
     ' temperature_c, temperature_rate, thermal_branch, vibration_x .. z, temperature_ref_c, tau'
 )
 """The names, for messages."""
-PLACES = {name: place for names in QUANTITIES.values() for name, place in names.items()}
-QUANTITY_OF = {name: quantity for quantity, names in QUANTITIES.items() for name in names}
+PLACES: dict[str, tuple] = {}
+"""Name in a text -> (field of a Reference or None, indices behind the samples)."""
+QUANTITY_OF: dict[str, str] = {}
+"""Name in a text -> its quantity."""
+for _quantity, _names in QUANTITIES.items():
+    PLACES |= _names
+    QUANTITY_OF |= dict.fromkeys(_names, _quantity)
 FUNCTIONS = ('abs', 'sign', 'sqrt', 'exp', 'expm1', 'log', 'sin', 'cos', 'tanh')
 MAX_CHARACTERS, MAX_COLUMN_DEPTH, MAX_EXPONENT, MAX_PRODUCTS, MAX_COLUMN_NUMBER = (
     400,
@@ -167,20 +173,15 @@ def _checked(node, text, depth):
 
 def _folded(node, source):
     """Return the node, or the number that it is."""
-    parts = (
-        [node.left, node.right]
-        if isinstance(node, ast.BinOp)
-        else [node.operand]
-        if isinstance(node, ast.UnaryOp)
-        else node.args
-    )
-    if (
-        isinstance(node, ast.BinOp)
-        and isinstance(node.op, ast.Div)
-        and isinstance(node.right, ast.Constant)
-        and node.right.value == 0.0
-    ):
-        raise _Refused(source.col_offset, 'a division by zero')
+    match node:
+        case ast.BinOp(op=ast.Div(), right=ast.Constant(value=0.0)):
+            raise _Refused(source.col_offset, 'a division by zero')
+        case ast.BinOp():
+            parts = [node.left, node.right]
+        case ast.UnaryOp():
+            parts = [node.operand]
+        case _:
+            parts = node.args
     if not all(isinstance(part, ast.Constant) for part in parts):
         return ast.copy_location(node, source)
     with np.errstate(all='ignore'):
@@ -277,17 +278,11 @@ def products(tree: ast.expr, known: dict[str, Sum]) -> Sum:
             )
         case ast.Call():
             argument = as_text(products(node.args[0], known))
+            factor = f'{called(node)}({argument})'
             # A call costs more than all the arithmetic.
-            inline = called(node) == 'sign' and argument.isidentifier()
-            return {
-                (
-                    (
-                        f'(({argument} > 0) - ({argument} < 0))'
-                        if inline
-                        else f'{called(node)}({argument})'
-                    ),
-                ): 1.0
-            }
+            if called(node) == 'sign' and argument.isidentifier():
+                factor = f'(({argument} > 0) - ({argument} < 0))'
+            return {(factor,): 1.0}
         case ast.BinOp():
             return _of_two(node, known)
     raise TypeError(f'{ast.dump(tree):.60} is no arithmetic')  # `read` accepts none
@@ -306,11 +301,9 @@ def _of_two(node: ast.BinOp, known: dict[str, Sum]) -> Sum:
         return _multiplied(left, right)
     if isinstance(node.op, ast.Div):
         divisor = right[()] if right.keys() == {()} else 0.0
-        return (
-            scaled(left, 1.0 / divisor)
-            if divisor
-            else {(f'divided({as_text(left)}, {as_text(right)})',): 1.0}
-        )
+        if divisor:  # a constant
+            return scaled(left, 1.0 / divisor)
+        return {(f'divided({as_text(left)}, {as_text(right)})',): 1.0}
     return added(left, right if isinstance(node.op, ast.Add) else scaled(right, -1.0))
 
 
@@ -339,10 +332,9 @@ def _multiplied(left, right):
             ' one has more; write it shorter',
             code='column_expands',
         )
-    result = added(
-        *({tuple(sorted(a + b)): x * y} for a, x in left.items() for b, y in right.items())
-    )
-    if sum(len(factor) for factors in result for factor in factors) > LONGEST_EXPANDED:
+    pairs = product(left.items(), right.items())
+    result = added(*({tuple(sorted(a + b)): x * y} for (a, x), (b, y) in pairs))
+    if sum(map(len, chain.from_iterable(result))) > LONGEST_EXPANDED:
         raise InputError(
             f'a column must have at most {LONGEST_EXPANDED} characters when it is multiplied out,'
             ' this one has more; write it without powers inside of powers',
@@ -367,12 +359,11 @@ def as_text(terms: dict[tuple[str, ...], float]) -> str:
             ' overflows; correct the values of the calibration',
             code='column_overflows',
         )
-    texts = [
-        ' * '.join(
-            [*([repr(float(coefficient))] if coefficient != 1.0 or not factors else []), *factors]
-        )
-        for factors, coefficient in terms.items()
-    ]
+    texts = []
+    for factors, coefficient in terms.items():
+        if coefficient != 1.0 or not factors:
+            factors = (repr(float(coefficient)), *factors)
+        texts.append(' * '.join(factors))
     return ' + '.join(texts) or '0.0'
 
 
@@ -449,12 +440,12 @@ class ColumnGroup:
 
     @cached_property
     def _places(self):
-        return [
-            (name, field, (slice(None), *index))
-            for name in sorted(self.names)
-            for field, *index in [PLACES[name]]
-            if field
-        ]
+        places = []
+        for name in sorted(self.names):
+            field, *index = PLACES[name]
+            if field:  # the others do not belong to a Reference
+                places.append((name, field, (slice(None), *index)))
+        return places
 
     def columns(self, ref: Reference, point: dict[str, Any]) -> np.ndarray:
         """
@@ -482,8 +473,10 @@ class ColumnGroup:
                 f' {", ".join(self.text)}; correct them'
             ) from error
         values['temperature_ref_c'] = np.float64(point.get('temperature_ref_c', 25.0))
-        result, count = np.empty((len(ref), self.width)), len(self.text)
+        result = np.empty((len(ref), self.width))
+        count = len(self.text)
         if 'tau' in self.names:
+            # Complex step: d column / d tau = Im(column(tau + i h)) / h, without cancellation.
             values['tau'] = point[self.owner][-1] + 1j * COMPLEX_STEP
         with np.errstate(all='ignore'):
             for k, column in enumerate(self._function(values)):

@@ -1,7 +1,8 @@
 """The columns of a model over a motion, predicted readings, and the model applied to samples."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,16 +16,39 @@ from imu_calibration.kinematics.rotations import Reference, lever_matrix
 from imu_calibration.kinematics.table import Table
 
 
+@dataclass(frozen=True, eq=False)
+class _ActingWarp:
+    """An effect with a warp, and the values at which it acts."""
+
+    effect: Effect
+    values: np.ndarray
+    """Values of the effect, shape (size,)."""
+
+    @property
+    def key(self):
+        """Name and values; the key of a cache."""
+        return self.effect.name, *self.values
+
+    @property
+    def is_lag(self):
+        """Whether it shifts the motion in time."""
+        return isinstance(self.effect.warp, Lag)
+
+
 def _shifted_by(lags, motion, roughly):
     """
-    Return (weight, motion) pairs.
+    Return (weight, motion) pairs: the motion at each sum of the delays of several lags.
 
-    The motion at each sum of the delays of (name, Lag, values) triples.
+    A lag is ``x -> sum_k w_k x(t - d_k)``; the weights of lags in series are multiplied, and their
+    delays added.
     """
     delays = [(1.0, np.zeros(()))]
-    for _, lag, at in lags:
-        some = (lag.single if roughly else lag).delays(motion.time, at)
-        delays = [(weight * w, delay + d) for weight, delay in delays for w, d in some]
+    for acting in lags:
+        lag = acting.effect.warp
+        if roughly:
+            lag = lag.single
+        added = lag.delays(motion.time, acting.values)
+        delays = [(weight * w, delay + d) for (weight, delay), (w, d) in product(delays, added)]
     return [(weight, shifted(motion, delay)) for weight, delay in delays]
 
 
@@ -33,10 +57,10 @@ def _mean_reference(weighted, motion):
     if len(weighted) == 1:
         return weighted[0][1]
     total = sum(weight for weight, _ in weighted)
-    mean: dict[str, Any] = {
-        name: sum(weight * getattr(ref, name) for weight, ref in weighted) / total
-        for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn')
-    }
+    mean: dict[str, Any] = {}
+    for name in ('force_s', 'rate_s', 'alpha_s', 'mat_sn'):
+        weighted_sum = sum(weight * getattr(ref, name) for weight, ref in weighted)
+        mean[name] = weighted_sum / total
     return replace(weighted[0][1], motion=motion, **mean)
 
 
@@ -58,20 +82,16 @@ class References:
         *,
         temperature_c: np.ndarray | None = None,
     ):
-        self.model, self.table, self.motion, self.temperature_c = (
-            model,
-            table,
-            motion,
-            temperature_c,
-        )
-        self._warps = {
-            sensor: [
-                (each, model.point_of(each))
-                for each in model.concerning(sensor)
-                if each.warp is not None
-            ]
-            for sensor in SENSORS
-        }
+        self.model = model
+        self.table = table
+        self.motion = motion
+        self.temperature_c = temperature_c
+        self._warps: dict[str, list[_ActingWarp]] = {}
+        for sensor in SENSORS:
+            self._warps[sensor] = []
+            for effect in model.concerning(sensor):
+                if effect.warp is not None:
+                    self._warps[sensor].append(_ActingWarp(effect, model.point_of(effect)))
         self._known: dict[tuple, Reference] = {}
         self._shifts: dict[tuple, list] = {}
 
@@ -101,7 +121,7 @@ class References:
             delays and costs as many times more.
 
         """
-        acting: list[tuple[str, Any, Any]] = []
+        acting = []
         moved = None
         if (
             effect is not None
@@ -109,29 +129,29 @@ class References:
             and np.any(values != self.model.point_of(effect))
         ):
             moved = effect.key
-        for each, point in self._warps[sensor]:
-            at = values if each.key == moved else point
-            if np.any(at):
-                acting.append((each.name, each.warp, at))
-        key = (roughly, moved, *((name, *at) for name, _, at in acting))
+        for each in self._warps[sensor]:
+            if values is not None and each.effect.key == moved:
+                each = _ActingWarp(each.effect, values)
+            if np.any(each.values):  # a warp of zero changes nothing
+                acting.append(each)
+        key = (roughly, moved, *(each.key for each in acting))
         if key not in self._known:
             self._known[key] = self._warped(acting, roughly, attitude=moved is None)
         return self._known[key]
 
     def _warped(self, acting, roughly, attitude):
-        lags = [(name, warp, at) for name, warp, at in acting if isinstance(warp, Lag)]
-        key = (roughly, *((name, *at) for name, _, at in lags))
+        lags = [each for each in acting if each.is_lag]
+        key = (roughly, *(lag.key for lag in lags))
         if key not in self._shifts:
             self._shifts[key] = _shifted_by(lags, self.motion, roughly)
         references = []
         for weight, felt in self._shifts[key]:
             table = self.table
-            for _, warp, at in acting:
-                if not isinstance(warp, Lag):
-                    table, felt = warp(table, felt, at)
-            references.append(
-                (weight, reference_motion(table, felt, self.temperature_c, attitude=attitude))
-            )
+            for each in acting:
+                if not each.is_lag:
+                    table, felt = each.effect.warp(table, felt, each.values)
+            reference = reference_motion(table, felt, self.temperature_c, attitude=attitude)
+            references.append((weight, reference))
         return _mean_reference(references, self.motion)
 
 
@@ -145,7 +165,8 @@ def columns(references: References, sensor: str) -> np.ndarray:
     (`force_s` or `rate_s`); its coefficients are matrix times parameter. The derivative is a
     difference of the exact kinematics.
     """
-    model, ref, parts = references.model, references.at(sensor), []
+    model = references.model
+    ref = references.at(sensor)
     layout = model.layout(sensor)
     if ref.temperature_c is None and any(
         group.uses & {'temperature', 'temperature rate'} for group in layout.groups.values()
@@ -157,6 +178,7 @@ def columns(references: References, sensor: str) -> np.ndarray:
             code='temperature_missing',
         )
     warps = {WARP + e.name: e for e in layout.effects if e.warp is not None}
+    parts = []
     for name in layout.rows:
         if name in warps:
             parts += _warp_columns(references, warps[name], sensor)
@@ -180,30 +202,30 @@ def _warp_columns(references, effect, sensor):
     clock = model.find('reference', Role.DELAY)
     if clock is not None and effect.sensor == sensor and not np.any(model.point_of(effect)):
         effect = clock  # a lag of zero is a delay to first order
-    inputs, levers = [], []
     # A search folds the arms and needs many warps: forward differences halve the references, with
     # an error of the curvature over a step. Candidate effects are evaluated with a delay in place
     # of a filter.
-    asking = model.folded_arms is not None
-    for above, below, width in _steps(effect, model.point_of(effect), forward=asking):
-        ends = [
-            references.at(sensor, effect, at, roughly=asking and not np.any(model.point_of(effect)))
-            for at in (above, below)
-        ]
-        change = getattr(ends[0], INPUT_OF[sensor]) - getattr(ends[1], INPUT_OF[sensor])
-        if (
-            sensor == 'accelerometer'
-            and model.arms
-            and (model.folded_arms is None or model.folded_arms.any())
-        ):
-            turned = lever_matrix(ends[0].rate_s, ends[0].alpha_s) - lever_matrix(
-                ends[1].rate_s, ends[1].alpha_s
-            )
-            if model.folded_arms is None:
-                levers.append(turned.reshape(-1, 9) / width)
+    in_search = model.folded_arms is not None
+    roughly = in_search and not np.any(model.point_of(effect))
+    with_arms = sensor == 'accelerometer' and bool(model.arms)
+    if in_search and not model.folded_arms.any():
+        with_arms = False
+    inputs, levers = [], []
+    for values_above, values_below, distance in _steps(
+        effect, model.point_of(effect), forward=in_search
+    ):
+        above = references.at(sensor, effect, values_above, roughly=roughly)
+        below = references.at(sensor, effect, values_below, roughly=roughly)
+        change = getattr(above, INPUT_OF[sensor]) - getattr(below, INPUT_OF[sensor])
+        if with_arms:
+            # Force at a sensitive point: force_s + lever_matrix @ arm.
+            lever_above = lever_matrix(above.rate_s, above.alpha_s)
+            lever_change = lever_above - lever_matrix(below.rate_s, below.alpha_s)
+            if in_search:
+                change = change + np.einsum('nij,ij->ni', lever_change, model.folded_arms)
             else:
-                change = change + np.einsum('nij,ij->ni', turned, model.folded_arms)
-        inputs.append(change / width)
+                levers.append(lever_change.reshape(-1, 9) / distance)
+        inputs.append(change / distance)
     return [np.concatenate(part, axis=1) for part in (inputs, levers) if part]
 
 
@@ -462,18 +484,19 @@ def centred(
     centre : mapping
 
     """
-    moved, slope = values.copy(), np.eye(len(values))
-    for sensor, group in (
-        (effect.sensor, group)
-        for effect in not_applied(model)
-        for group in effect.groups
-        if group.name in centre
-    ):
-        bias, rows = model.part(sensor, Role.OFFSET), model.layout(sensor).rows[group.name]
-        moved[bias] += centre[group.name] @ coefficients(model, sensor, values)[rows]
-        slope[bias] += np.einsum(
-            'q,qan->an', centre[group.name], coefficient_jacobian(model, sensor, values)[rows]
-        )
+    moved = values.copy()
+    slope = np.eye(len(values))
+    for effect in not_applied(model):
+        sensor = effect.sensor
+        bias = model.part(sensor, Role.OFFSET)
+        for group in effect.groups:
+            if group.name not in centre:
+                continue
+            at_centre = centre[group.name]
+            rows = model.layout(sensor).rows[group.name]
+            moved[bias] += at_centre @ coefficients(model, sensor, values)[rows]
+            slopes = coefficient_jacobian(model, sensor, values)[rows]
+            slope[bias] += np.einsum('q,qan->an', at_centre, slopes)
     return moved, slope
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import permutations, product
 from typing import Any
 
 import numpy as np
@@ -103,7 +104,7 @@ derivative.
 
 
 def _lag_effect(sensor, ending):
-    component, pairs, does = _LAG_FORMS[ending]
+    component, pairs, description = _LAG_FORMS[ending]
     return Effect(
         name=lag_name(sensor, ending),
         sensor=sensor,
@@ -112,7 +113,7 @@ def _lag_effect(sensor, ending):
         unit='s',
         nonnegative=True,
         in_reference=True,
-        explanation=f'The {sensor} {does}.',
+        explanation=f'The {sensor} {description}.',
         tolerance=1e-4,
         prior_sd=0.1,
         plausible=('consumer', 0.05, 'field catalogue 6.3: 5-250 Hz'),
@@ -135,7 +136,7 @@ def lag_name(sensor: str, ending: str) -> str:
     return f'{PREFIXES[sensor]}_{ending}'
 
 
-LAGS = tuple(_lag_effect(sensor, ending) for ending in _LAG_FORMS for sensor in SENSORS)
+LAGS = tuple(_lag_effect(sensor, ending) for ending, sensor in product(_LAG_FORMS, SENSORS))
 """
 First-order filter, pure delay and second-order filter of each sensor; collinear where small,
 separable where large.
@@ -165,27 +166,21 @@ def total_lags(
     values, covariance : array, shape (n,) and (n, n)
 
     """
-    found = {}
+    total_lag = {}
     for sensor in SENSORS:
-        own = np.array(
-            [
-                part[1] in FAMILY and part[0] in (sensor, 'reference')
-                for part in (name.split('.') for name in names)
-            ],
-            float,
-        )
-        if own.any():
-            found[sensor] = (float(own @ values), float(np.sqrt(own @ covariance @ own)))
-    return found
+        # weights @ values is the sum of the lags of this sensor.
+        weights = np.zeros(len(names))
+        for index, name in enumerate(names):
+            section, effect, *_ = name.split('.')
+            if effect in FAMILY and section in (sensor, 'reference'):
+                weights[index] = 1.0
+        if weights.any():
+            sd = float(np.sqrt(weights @ covariance @ weights))
+            total_lag[sensor] = (float(weights @ values), sd)
+    return total_lag
 
 
-EVEN_AND_ODD = [
-    (i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0)
-    for i in range(3)
-    for j in range(3)
-    for k in range(3)
-    if len({i, j, k}) == 3
-]
+EVEN_AND_ODD = [(i, j, k, 1.0 if (j - i) % 3 == 1 else -1.0) for i, j, k in permutations(range(3))]
 """Axes i, j, k of a cross product with their sign."""
 _PAIR = {pair: place for place, pair in enumerate(PRODUCT_PAIRS)}
 ENCODER_ORDERS = (1, 2)
@@ -276,14 +271,18 @@ def _bent(effect, values, point):
     The frame of the sensor turns, so that ``f' = f + f x theta`` and ``w' = w + w x theta + d theta
     / dt`` with df/dt = f x w where gravity is the load.
     """
-    matrix, turn = values['matrix'].reshape(3, 3), values['load_compliance'].reshape(3, 3)
-    force, rate = np.zeros((6, 3), turn.dtype), np.zeros((9, 3), turn.dtype)
+    matrix = values['matrix'].reshape(3, 3)
+    compliance = values['load_compliance'].reshape(3, 3)
+    force = np.zeros((6, 3), compliance.dtype)  # rows f_j f_m
+    rate = np.zeros((9, 3), compliance.dtype)  # rows f_m w_j
     for i, j, k, sign in EVEN_AND_ODD:
         for m in range(3):
-            # (f x theta)_i = f_j theta_k.
-            force[_PAIR[min(j, m), max(j, m)], i] += sign * turn[k, m]
-            rate[3 * m + j, i] += sign * turn[k, m]  # (w x theta)_i = w_j theta_k
-            rate[3 * j + k, m] += sign * turn[m, i]  # K (f x w): (f x w)_i = f_j w_k
+            # (f x theta)_i = f_j theta_k and theta_k = K_km f_m.
+            force[_PAIR[min(j, m), max(j, m)], i] += sign * compliance[k, m]
+            # (w x theta)_i = w_j theta_k.
+            rate[3 * m + j, i] += sign * compliance[k, m]
+            # K (f x w): (f x w)_i = f_j w_k.
+            rate[3 * j + k, m] += sign * compliance[m, i]
     return {LOAD['accelerometer'].name: force @ matrix.T, LOAD['gyroscope'].name: rate @ matrix.T}
 
 
@@ -371,9 +370,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             shape=(len(names.turning), len(ENCODER_ORDERS), 2),
             components=tuple(
                 f'{name}_{kind}{order}'
-                for name in names.turning
-                for order in ENCODER_ORDERS
-                for kind in ('cos', 'sin')
+                for name, order, kind in product(names.turning, ENCODER_ORDERS, ('cos', 'sin'))
             ),
             explanation=(
                 'The encoder reads an angle that is wrong by harmonics of the turn (eccentricity of'
@@ -412,9 +409,7 @@ def reference_effects(joint_names: JointNames) -> tuple[Effect, ...]:
             shape=(len(names.turning), len(WOBBLES), 2),
             components=tuple(
                 f'{name}_{kind}{order:+d}'
-                for name in names.turning
-                for order in WOBBLES
-                for kind in ('cos', 'sin')
+                for name, order, kind in product(names.turning, WOBBLES, ('cos', 'sin'))
             ),
             explanation=(
                 'An axis wobbles: it leans another way at every angle of its turn, as a bearing out'

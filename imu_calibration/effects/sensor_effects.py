@@ -5,6 +5,7 @@ Accelerometer and gyroscope share the mechanisms, so each is declared for both a
 """
 
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -452,7 +453,7 @@ GYROSCOPE = _pair('gyroscope') + (
         name='gyro_force_squared',
         sensor='gyroscope',
         components=tuple(
-            f'{a}_{pair}' for a in AXES for pair in ('xx', 'yy', 'zz', 'xy', 'yz', 'xz')
+            f'{a}_{pair}' for a, pair in product(AXES, ('xx', 'yy', 'zz', 'xy', 'yz', 'xz'))
         ),
         shape=(3, 6),
         unit='(rad/s)/(m/s^2)^2',

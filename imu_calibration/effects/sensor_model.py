@@ -159,16 +159,19 @@ class SensorModel:
     @cached_property
     def effects(self) -> list[Effect]:
         """Effects in parameter order."""
-        return [
-            self.catalogue.find(sensor, name, self.joint_names)
-            for sensor in SECTIONS
-            for name in getattr(self, sensor)
-        ]
+        effects = []
+        for section in SECTIONS:
+            for name in getattr(self, section):
+                effects.append(self.catalogue.find(section, name, self.joint_names))
+        return effects
 
     @cached_property
     def param_names(self) -> list[str]:
         """Names in parameter order."""
-        return [name for effect in self.effects for name in effect.param_names()]
+        names = []
+        for effect in self.effects:
+            names += effect.param_names()
+        return names
 
     @cached_property
     def slices(self) -> dict[tuple[str, str], slice]:
@@ -182,17 +185,15 @@ class SensorModel:
 
         The same effects, linearised at the same point.
         """
-        same = all(
-            tuple(getattr(self, name)) == tuple(getattr(other, name)) for name in SECTIONS
-        ) and all(
-            getattr(self, name) == getattr(other, name)
-            for name in ('joint_names', 'temperature_ref_c', 'definitions')
-        )
-        return (
-            same
-            and self.point.keys() == other.point.keys()
-            and all(np.array_equal(self.point[name], other.point[name]) for name in self.point)
-        )
+        for section in SECTIONS:
+            if tuple(getattr(self, section)) != tuple(getattr(other, section)):
+                return False
+        for name in ('joint_names', 'temperature_ref_c', 'definitions'):
+            if getattr(self, name) != getattr(other, name):
+                return False
+        if self.point.keys() != other.point.keys():
+            return False
+        return all(np.array_equal(self.point[name], other.point[name]) for name in self.point)
 
     def find(self, sensor: str, role: Role) -> Effect | None:
         """Return the effect of a sensor in a place of its equation, or None."""
@@ -247,7 +248,10 @@ class SensorModel:
 
     def uses(self, quantity: str) -> bool:
         """Return whether a column is made of a quantity of `expressions.QUANTITIES`."""
-        return any(quantity in group.uses for effect in self.effects for group in effect.groups)
+        for effect in self.effects:
+            if any(quantity in group.uses for group in effect.groups):
+                return True
+        return False
 
     @cached_property
     def requested(self) -> np.ndarray:
@@ -264,15 +268,14 @@ class SensorModel:
 
         The prior time of a step is that of its columns.
         """
-        values = [
-            (
-                np.append(e.prior_values()[:-1], self.point_of(e)[-1])
-                if e.located
-                else e.prior_values()
-            )
-            for e in self.effects
-        ]
-        return np.concatenate(values), np.concatenate([e.prior_sds() for e in self.effects])
+        values, sds = [], []
+        for effect in self.effects:
+            effect_values = effect.prior_values()
+            if effect.located:
+                effect_values[-1] = self.point_of(effect)[-1]
+            values.append(effect_values)
+            sds.append(effect.prior_sds())
+        return np.concatenate(values), np.concatenate(sds)
 
     def start(self) -> np.ndarray:
         """Return the values to start from: the prior's, or the point of the columns."""
@@ -377,12 +380,10 @@ class SensorModel:
                     widths[group.name] = group.width
                 if effect.warp is not None:
                     widths[WARP + effect.name] = 3 * effect.size
-                    if (
-                        sensor == SENSORS[0]
-                        and effect.derivative is None
-                        and self.arms
-                        and self.folded_arms is None
-                    ):
+                    # A warp also changes the lever-arm terms of the accelerometer. A closed
+                    # derivative has none, and folded arms are part of the first columns.
+                    separate_lever = effect.derivative is None and self.folded_arms is None
+                    if sensor == SENSORS[0] and self.arms and separate_lever:
                         widths[WARP_LEVER + effect.name] = 9 * effect.size
             ends = np.cumsum([0, *widths.values()])
             rows = {name: slice(int(a), int(b)) for name, a, b in zip(widths, ends, ends[1:])}
