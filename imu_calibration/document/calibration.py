@@ -297,29 +297,21 @@ class Calibration:
     def __str__(self) -> str:
         rows = [PARAMETER_HEADINGS, *parameter_rows(self)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        aligned = (
-            '  '.join(
-                cell.rjust(width) if heading in NUMBER_COLUMNS else cell.ljust(width)
-                for cell, width, heading in zip(row, widths, PARAMETER_HEADINGS)
-            )
-            for row in rows
-        )
-        return '\n'.join([repr(self), *map(str.rstrip, aligned)])
+        lines = [repr(self)]
+        for row in rows:
+            cells = []
+            for cell, width, heading in zip(row, widths, PARAMETER_HEADINGS):
+                cells.append(cell.rjust(width) if heading in NUMBER_COLUMNS else cell.ljust(width))
+            lines.append('  '.join(cells).rstrip())
+        return '\n'.join(lines)
 
     def _repr_html_(self) -> str:
         def row(cells: tuple[str, ...], tag: str) -> str:
-            style = [
-                f' style="text-align:{"right" if heading in NUMBER_COLUMNS else "left"}"'
-                for heading in PARAMETER_HEADINGS
-            ]
-            return (
-                '<tr>'
-                + ''.join(
-                    f'<{tag}{s}>{escape(cell)}</{tag}>'
-                    for cell, s in zip(cells, style, strict=True)
-                )
-                + '</tr>'
-            )
+            row_html = ''
+            for cell, heading in zip(cells, PARAMETER_HEADINGS, strict=True):
+                side = 'right' if heading in NUMBER_COLUMNS else 'left'
+                row_html += f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
+            return f'<tr>{row_html}</tr>'
 
         body = ''.join(row(cells, 'td') for cells in parameter_rows(self))
         head = row(PARAMETER_HEADINGS, 'th')
@@ -364,14 +356,10 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
     the force of a refused accelerometer, lever arms by the rate of a refused gyroscope.
     """
     model = calibration.model
-    names = {
-        section: tuple(
-            effect.name
-            for effect in model.effects
-            if effect.sensor == section and _stays(effect, sensors)
-        )
-        for section in SECTIONS
-    }
+    names: dict[str, tuple[str, ...]] = {section: () for section in SECTIONS}
+    for effect in model.effects:
+        if _stays(effect, sensors):
+            names[effect.sensor] += (effect.name,)
     small = replace(
         model,
         accelerometer=names['accelerometer'],
@@ -403,9 +391,11 @@ def with_nominal(calibration: Calibration, sensors: Sequence[str]) -> Calibratio
 def _stays(effect: Effect, sensors: Sequence[str]) -> bool:
     if effect.sensor in sensors:
         return effect.role in (Role.OFFSET, Role.LINEAR, Role.LIMIT)
-    return effect.sensor == 'reference' or not any(
-        group.uses & READINGS[sensor] for sensor in sensors for group in effect.groups
-    )
+    if effect.sensor == 'reference':
+        return True
+    # A correction that needs readings of a sensor without correction is removed too.
+    used = frozenset().union(*(group.uses for group in effect.groups))
+    return not any(used & READINGS[sensor] for sensor in sensors)
 
 
 SHOWN_NAMES = 6

@@ -261,7 +261,8 @@ def _compared(
     parameters that cannot be turned (`_errors_of_turn`); those in error by a standard deviation
     are not compared.
     """
-    a, b = ([c.param_names.index(name) for name in common] for c in (first, second))
+    a = [first.param_names.index(name) for name in common]
+    b = [second.param_names.index(name) for name in common]
     difference = second.values[b] - first.values[a]
     parts = [
         c.covariance[np.ix_(at, at)] for c, at in ((first, a), (second, b)) if c.uncertainty_known
@@ -274,11 +275,10 @@ def _compared(
 
     in_other_axes = np.array([errors.get(name, 0.0) for name in common]) > sd
     held |= in_other_axes
-    units = {
-        name: effect.unit_of(k)
-        for effect in first.model.effects
-        for k, name in enumerate(effect.param_names())
-    }
+    units = {}
+    for effect in first.model.effects:
+        for k, name in enumerate(effect.param_names()):
+            units[name] = effect.unit_of(k)
     rows = tuple(
         Row(
             name,

@@ -347,18 +347,14 @@ def refused_sensors(
 
 def _mostly_undetermined(calibration: Calibration, sensor: str) -> str:
     """Return why an unproven sensor is not applied even with consent; '' where it may be."""
-    status = [
-        known
-        for effect in calibration.model.effects
-        if effect.sensor == sensor
-        for known in calibration.status[calibration.model.slices[effect.key]]
-    ]
+    status: list[str] = []
+    for effect in calibration.model.effects:
+        if effect.sensor == sensor:
+            status += calibration.status[calibration.model.slices[effect.key]]
     missing = sum(each in LACKING for each in status)
-    return (
-        f'unproven, and {missing} of {len(status)} parameters are not determined'
-        if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status)
-        else ''
-    )
+    if calibration.decisions[sensor] is UNPROVEN and 2 * missing > len(status):
+        return f'unproven, and {missing} of {len(status)} parameters are not determined'
+    return ''
 
 
 def _text(calibration: Calibration, sensor: str) -> str:

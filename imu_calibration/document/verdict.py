@@ -108,11 +108,14 @@ def _doubtful_scales(calibration: Calibration) -> list[Reason]:
 
 
 def _worse(calibration: Calibration) -> list[Reason]:
-    return [
-        Reason(WARNING, f'{sensor}: {line}', 'find the cause', key='diagnose', sensors=(sensor,))
-        for sensor, entry in calibration.proof.items()
-        for line in worse_regimes(entry)
-    ]
+    reasons = []
+    for sensor, entry in calibration.proof.items():
+        for line in worse_regimes(entry):
+            text = f'{sensor}: {line}'
+            reasons.append(
+                Reason(WARNING, text, 'find the cause', key='diagnose', sensors=(sensor,))
+            )
+    return reasons
 
 
 def _unused_rests(calibration: Calibration) -> list[Reason]:
@@ -714,16 +717,13 @@ def _parameters(count: ParameterCount, limiting: tuple[str, float], *, complete:
 
 
 def _implausible(calibration: Calibration) -> list[Reason]:
-    return [
-        Reason(
-            WARNING,
-            line.partition(': check')[0],
-            'check the units of the recording and the axes in the table description',
-            sensors=_whose([section]),
-        )
-        for section in SECTIONS
-        for line in implausible(calibration, section)
-    ]
+    check = 'check the units of the recording and the axes in the table description'
+    reasons = []
+    for section in SECTIONS:
+        for line in implausible(calibration, section):
+            text, _, _ = line.partition(': check')
+            reasons.append(Reason(WARNING, text, check, sensors=_whose([section])))
+    return reasons
 
 
 def _whose(sections: Iterable[str]) -> tuple[str, ...]:
@@ -832,18 +832,22 @@ def _by_need(calibration: Calibration, names: Sequence[str]) -> dict[str, list[s
     """
     Return {motion: names}: each name with the motion of the weak direction in which it weighs most.
     """
-    found = {}
+    by_need: dict[str, list[str]] = {}
     for name in names:
-        weights = [
-            (abs(d['parameters'].get(name, 0.0)), d['needs']) for d in calibration.undetermined
-        ]
-        best = max(weights, default=(0.0, ''), key=lambda pair: pair[0])
-        if best[0] == 0.0:
-            same = [
-                d['needs']
-                for d in calibration.undetermined
-                if any(n.rpartition('.')[0] == name.rpartition('.')[0] for n in d['parameters'])
-            ]
-            best = (1.0, same[0] if same else 'record the same motion for longer')
-        found.setdefault(best[1], []).append(name)
-    return found
+        need, largest_weight = '', 0.0
+        for direction in calibration.undetermined:
+            weight = abs(direction['parameters'].get(name, 0.0))
+            if weight > largest_weight:
+                need, largest_weight = direction['needs'], weight
+        if largest_weight == 0.0:  # in no direction: that of another component of its effect
+            need = _need_of_effect(calibration, name.rpartition('.')[0])
+        by_need.setdefault(need, []).append(name)
+    return by_need
+
+
+def _need_of_effect(calibration: Calibration, effect: str) -> str:
+    """Return the motion of the first weak direction that contains a component of an effect."""
+    for direction in calibration.undetermined:
+        if any(name.rpartition('.')[0] == effect for name in direction['parameters']):
+            return direction['needs']
+    return 'record the same motion for longer'

@@ -443,7 +443,7 @@ class ColumnGroup:
         places = []
         for name in sorted(self.names):
             field, *index = PLACES[name]
-            if field:  # the others do not belong to a Reference
+            if field:  # not a field of a Reference otherwise
                 places.append((name, field, (slice(None), *index)))
         return places
 

@@ -207,15 +207,11 @@ def calibration_moved(imu: AffineImu, to: Placement) -> AffineImu:
     gyroscope's response to specific force (a product of two small terms) is omitted.
     """
     turned = {sensor: to.mat_readings @ imu.matrix[sensor] @ to.mat_ts.T for sensor in SENSORS}
-    arms = (
-        np.abs(to.mat_readings) @ ((imu.arms - to.origin_s) @ to.mat_ts.T)
-        if np.any(imu.arms)
-        else imu.arms
-    )
-    bias, thermal = (
-        {sensor: to.mat_readings @ part[sensor] for sensor in SENSORS}
-        for part in (imu.bias, imu.thermal)
-    )
+    arms = imu.arms
+    if np.any(arms):
+        arms = np.abs(to.mat_readings) @ ((arms - to.origin_s) @ to.mat_ts.T)
+    bias = {sensor: to.mat_readings @ imu.bias[sensor] for sensor in SENSORS}
+    thermal = {sensor: to.mat_readings @ imu.thermal[sensor] for sensor in SENSORS}
     return replace(
         imu,
         bias=bias,

@@ -217,12 +217,8 @@ def _noise_of(
 ) -> Noise | None:
     if figures is not None:
         figures.require_both_sensors('record both sensors, or export without it')
-        accelerometer, gyroscope = (figures.densities(sensor) for sensor in SENSORS)
-        unbounded = [
-            sensor
-            for sensor, found in zip(SENSORS, (accelerometer, gyroscope))
-            if not np.isfinite(found.walk)
-        ]
+        densities = {sensor: figures.densities(sensor) for sensor in SENSORS}
+        unbounded = [sensor for sensor in SENSORS if not np.isfinite(densities[sensor].walk)]
         if unbounded:
             raise InputError(
                 'the noise document must bound the random walk of both sensors, that of the'
@@ -230,13 +226,14 @@ def _noise_of(
                 key='noise',
                 code='walk_unbounded',
             )
-        return Noise(accelerometer, gyroscope, rate or figures.rate)
+        return Noise(densities['accelerometer'], densities['gyroscope'], rate or figures.rate)
     white = {sensor: float(calibration.noise(sensor)[0].max()) for sensor in SENSORS}
     if rate is None or not all(white.values()):
         return None
-    accelerometer, gyroscope = (
-        Densities(white[sensor] / float(np.sqrt(rate)), 0.0, 'bound') for sensor in SENSORS
-    )
+    # Density of white noise: sd of a sample / sqrt(rate).
+    root = float(np.sqrt(rate))
+    accelerometer = Densities(white['accelerometer'] / root, 0.0, 'bound')
+    gyroscope = Densities(white['gyroscope'] / root, 0.0, 'bound')
     return Noise(accelerometer, gyroscope, rate, walk_known=False)
 
 
@@ -286,10 +283,12 @@ def _worked_sample(
     raw = np.array([[0.5, -0.3, 9.7]]), np.array([[0.1, -0.2, 0.3]])
     force, rate = placement.readings(*raw)
     made = target.corrected(numbers, Readings(force, rate, np.zeros((1, 3)), temperature))
-    shown = [', '.join(f'{value:.9g}' for value in values[0]) for values in (force, rate, *made)]
+    shown = []
+    for values in (force, rate, *made):
+        numbers = ', '.join(f'{value:.9g}' for value in values[0])
+        shown.append(f'[{numbers}]')
     return [
-        f'worked sample: readings [{shown[0]}] m/s^2, [{shown[1]}] rad/s become [{shown[2]}],'
-        f' [{shown[3]}]'
+        f'worked sample: readings {shown[0]} m/s^2, {shown[1]} rad/s become {shown[2]}, {shown[3]}'
     ]
 
 
@@ -325,8 +324,10 @@ def loss_lines(target: Target, loss: Loss, sensors: Sequence[str] = SENSORS) -> 
             f' {error_text(lost.rms, UNITS[lost.effect.sensor])} rms'
         )
     for sensor in sensors:
-        left, raw = (error_text(error[sensor], UNITS[sensor]) for error in (loss.left, loss.raw))
-        left = f'{left} rms' if loss.left[sensor] > ROUNDING_LOSS else 'none'
+        left = 'none'
+        if loss.left[sensor] > ROUNDING_LOSS:
+            left = f'{error_text(loss.left[sensor], UNITS[sensor])} rms'
+        raw = error_text(loss.raw[sensor], UNITS[sensor])
         lines.append(
             f'remaining error of the {sensor}: {left} (raw readings: {raw}), on {loss.motion}'
         )
@@ -339,13 +340,12 @@ def holds_in_words(target: Target) -> str:
         return 'everything'
     parts: dict[str, list[str]] = {}
     for capability in target.holds:
-        name = (
-            'scale factors'
-            if capability.own_axis
-            else 'matrix'
-            if capability.role is Role.LINEAR
-            else capability.effect.heading
-        )
+        if capability.own_axis:
+            name = 'scale factors'
+        elif capability.role is Role.LINEAR:
+            name = 'matrix'
+        else:
+            name = capability.effect.heading
         name = name.split(' (')[0].split(':')[0]
         for sensor in SENSORS:  # a heading may begin with its sensor
             name = name.removeprefix('accel ' if sensor == SENSORS[0] else 'gyro ')
@@ -362,16 +362,11 @@ def holds_in_words(target: Target) -> str:
 @cache
 def all_targets() -> dict[str, Target]:
     """Return every target by name, in alphabetical order."""
-    modules = [
-        import_module(f'{targets.__name__}.{found.name}')
-        for found in iter_modules(targets.__path__)
-    ]
-    return {
-        target.name: target
-        for target in sorted(
-            (t for module in modules for t in module.TARGETS), key=lambda t: t.name
-        )
-    }
+    by_name = {}
+    for found in iter_modules(targets.__path__):
+        module = import_module(f'{targets.__name__}.{found.name}')
+        by_name |= {target.name: target for target in module.TARGETS}
+    return dict(sorted(by_name.items()))
 
 
 def find_target(name: str, *, read: bool = False) -> Target:

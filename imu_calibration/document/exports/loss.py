@@ -330,11 +330,14 @@ def _document(
         *affine.MATRICES,
         *(capability for capability in holds if np.any(imu.value(capability))),
     ]
-    accelerometer, gyroscope = (
-        tuple(dict.fromkeys(each.effect.name for each in affine.of(sensor, named)))
-        for sensor in SENSORS
+    names: dict[str, tuple[str, ...]] = {sensor: () for sensor in SENSORS}
+    for capability in named:  # an effect may hold several capabilities
+        effect_name = capability.effect.name
+        if effect_name not in names[capability.sensor]:
+            names[capability.sensor] += (effect_name,)
+    model = SensorModel(
+        names['accelerometer'], names['gyroscope'], temperature_ref_c=imu.temperature_ref_c
     )
-    model = SensorModel(accelerometer, gyroscope, temperature_ref_c=imu.temperature_ref_c)
     values, sd = model.prior()
     status = np.full(len(values), HELD, dtype=object)
     for effect in model.effects:

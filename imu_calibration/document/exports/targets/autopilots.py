@@ -5,6 +5,7 @@ Parameter files with offsets, scale factors and linear temperature calibration o
 """
 
 from collections.abc import Iterable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from imu_calibration.document.exports.affine import (
     SCALES,
     THERMAL_OFFSETS,
     AffineImu,
+    Capability,
     of,
 )
 from imu_calibration.document.exports.target import (
@@ -43,11 +45,10 @@ def _has(found: Mapping[str, float], pattern: str) -> bool:
 
 def _linear(imu: AffineImu, offset: Mapping[str, str], scale: str) -> dict[str, float]:
     """Return the offsets of both sensors, and the scale factors of the accelerometer."""
-    return {
-        name: value
-        for sensor in SENSORS
-        for name, value in _by_axis(offset[sensor], imu.bias[sensor]).items()
-    } | _by_axis(scale, 1.0 / np.diag(imu.matrix['accelerometer']))
+    parameters = {}
+    for sensor in SENSORS:
+        parameters |= _by_axis(offset[sensor], imu.bias[sensor])
+    return parameters | _by_axis(scale, 1.0 / np.diag(imu.matrix['accelerometer']))
 
 
 PREFIXES_OF_SENSOR = {
@@ -59,9 +60,9 @@ PREFIXES_OF_SENSOR = {
 
 def _written(page: Page) -> dict[str, Any]:
     """Return the parameters without those of a sensor that was not calibrated."""
-    absent = tuple(
-        prefix for sensor in page.calibration.absent for prefix in PREFIXES_OF_SENSOR[sensor]
-    )
+    absent: tuple[str, ...] = ()
+    for sensor in page.calibration.absent:
+        absent += PREFIXES_OF_SENSOR[sensor]
     return {
         name: value for name, value in plain(page.numbers).items() if not name.startswith(absent)
     }
@@ -79,7 +80,9 @@ PER_PARAMETER = 1e-6
 """Unit of the coefficients of the polynomials."""
 ARDUPILOT_RANGE_C = (0.0, 70.0)
 NO_TEMPERATURE = -300.0
-LARGEST_OFFSET, SCALES_ALLOWED = 3.5, (0.8, 1.2)
+LARGEST_OFFSET = 3.5
+"""m/s^2; ArduPilot refuses to arm with a larger offset of the accelerometer."""
+SCALES_ALLOWED = (0.8, 1.2)
 
 
 def numbers_ardupilot(imu: AffineImu) -> dict:
@@ -88,46 +91,42 @@ def numbers_ardupilot(imu: AffineImu) -> dict:
 
     Offsets count at the temperature CALTEMP, polynomials without constant are about 35 C.
     """
-    found = _linear(imu, OFFSET, SCALE)
-    if any(np.any(imu.thermal[sensor]) for sensor in SENSORS):
-        low, high = imu.temperature_range_c or ARDUPILOT_RANGE_C
-        found |= {f'{TCAL}_ENABLE': 1, f'{TCAL}_TMIN': low, f'{TCAL}_TMAX': high}
-        for sensor in SENSORS:
-            found[CALTEMP[sensor]] = imu.temperature_ref_c
-            found |= {
-                f'{TCAL}_{TCAL_SENSORS[sensor]}{power}_{a}': (
-                    float(value) / PER_PARAMETER if power == 1 else 0.0
-                )
-                for power in (1, 2, 3)
-                for a, value in zip(AXIS_LETTERS, imu.thermal[sensor])
-            }
-    return found
+    parameters = _linear(imu, OFFSET, SCALE)
+    if not any(np.any(imu.thermal[sensor]) for sensor in SENSORS):
+        return parameters
+
+    low, high = imu.temperature_range_c or ARDUPILOT_RANGE_C
+    parameters |= {f'{TCAL}_ENABLE': 1, f'{TCAL}_TMIN': low, f'{TCAL}_TMAX': high}
+    for sensor in SENSORS:
+        parameters[CALTEMP[sensor]] = imu.temperature_ref_c
+        # The calibration is linear in temperature: the powers 2 and 3 are zero.
+        linear = [float(value) / PER_PARAMETER for value in imu.thermal[sensor]]
+        polynomial = f'{TCAL}_{TCAL_SENSORS[sensor]}'
+        parameters |= _by_axis(f'{polynomial}1_*', linear)
+        parameters |= _by_axis(f'{polynomial}2_*', np.zeros(3).tolist())
+        parameters |= _by_axis(f'{polynomial}3_*', np.zeros(3).tolist())
+    return parameters
 
 
 def imu_ardupilot(found: dict) -> AffineImu:
     """Return the IMU of such parameters."""
-    on = found.get(f'{TCAL}_ENABLE') == 1
-    limits = (
-        (
+    bias, thermal = {}, {}
+    for sensor in SENSORS:
+        bias[sensor] = vector_of(found, OFFSET[sensor])
+        thermal[sensor] = np.zeros(3)
+    ref, limits = 25.0, None
+    if found.get(f'{TCAL}_ENABLE') == 1:
+        for sensor in SENSORS:
+            linear = vector_of(found, f'{TCAL}_{TCAL_SENSORS[sensor]}1_*')
+            thermal[sensor] = linear * PER_PARAMETER
+        limits = (
             found.get(f'{TCAL}_TMIN', ARDUPILOT_RANGE_C[0]),
             found.get(f'{TCAL}_TMAX', ARDUPILOT_RANGE_C[1]),
         )
-        if on
-        else None
-    )
-    ref = (
-        float(np.clip(found.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits))
-        if limits
-        else 25.0
-    )
-    thermal = {
-        s: vector_of(found, f'{TCAL}_{TCAL_SENSORS[s]}1_*') * PER_PARAMETER * on for s in SENSORS
-    }
-    bias = {s: vector_of(found, OFFSET[s]) for s in SENSORS}
-    # Both sensors may have been calibrated at temperatures of their own; the document has one.
-    if limits:
-        there = float(np.clip(found.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
-        bias['gyroscope'] = bias['gyroscope'] + thermal['gyroscope'] * (ref - there)
+        ref = float(np.clip(found.get(CALTEMP['accelerometer'], NO_TEMPERATURE), *limits))
+        # The offsets of the gyroscopes count at another temperature; the document has only one.
+        gyro_ref = float(np.clip(found.get(CALTEMP['gyroscope'], NO_TEMPERATURE), *limits))
+        bias['gyroscope'] = bias['gyroscope'] + thermal['gyroscope'] * (ref - gyro_ref)
     return AffineImu(
         bias=bias,
         matrix=_matrix(found, SCALE),
@@ -152,18 +151,25 @@ def read_ardupilot(content: bytes, _path: str | Path) -> Read:
             'the ArduPilot parameter file must hold INS_ACCOFFS, INS_ACCSCAL or INS_GYROFFS, it'
             ' holds none of them; give another file'
         )
+    lacks: tuple[Capability, ...] = ()
+    curved = []
+    for sensor in SENSORS:
+        if not _has(found, OFFSET[sensor]):
+            lacks += of(sensor, OFFSETS)
+        polynomial = f'{TCAL}_{TCAL_SENSORS[sensor]}'
+        curved += [f'{polynomial}2', f'{polynomial}3']
+    if not _has(found, SCALE):
+        lacks += of('accelerometer', SCALES)
     if found.get(f'{TCAL}_ENABLE') == 1:
-        refuse_curved(
-            found, [f'{TCAL}_{short}{power}' for short in TCAL_SENSORS.values() for power in (2, 3)]
-        )
-    lacks = tuple(h for s in SENSORS for h in of(s, OFFSETS) if not _has(found, OFFSET[s]))
-    return Read(found, lacks if _has(found, SCALE) else lacks + of('accelerometer', SCALES))
+        refuse_curved(found, curved)
+    return Read(found, lacks)
 
 
 def ignored_ardupilot(found: dict) -> list[str]:
     """Return the values outside the ranges of ArduPilot."""
     lines = []
-    offset, scale = vector_of(found, OFFSET['accelerometer']), vector_of(found, SCALE, 1.0)
+    offset = vector_of(found, OFFSET['accelerometer'])
+    scale = vector_of(found, SCALE, 1.0)
     if np.any(np.abs(offset) > LARGEST_OFFSET):
         lines.append(
             f'ArduPilot accepts INS_ACCOFFS to {LARGEST_OFFSET:g} m/s^2, here'
@@ -236,11 +242,10 @@ def numbers_px4(imu: AffineImu) -> dict:
                 f'{short}0_TMIN': low,
                 f'{short}0_TMAX': high,
             }
-            found |= {
-                f'{short}0_X{power}_{axis}': float(value) if power == 1 else 0.0
-                for power in range(4)
-                for axis, value in enumerate(imu.thermal[sensor])
-            }
+            # The calibration is linear in temperature: the other powers are zero.
+            for power, axis in product(range(4), range(3)):
+                value = float(imu.thermal[sensor][axis]) if power == 1 else 0.0
+                found[f'{short}0_X{power}_{axis}'] = value
     return found
 
 
@@ -250,18 +255,18 @@ def imu_px4(found: dict) -> AffineImu:
 
     Thermal offsets beyond the first power are refused by `read_px4`.
     """
-    bias, thermal, ref, limits = {}, {}, PX4_REFERENCE_C, None
+    bias, thermal = {}, {}
+    ref, limits = PX4_REFERENCE_C, None
     for sensor in SENSORS:
         short = f'{TC[sensor]}0'
-        on = bool(found.get(f'{TC[sensor]}_ENABLE'))
         bias[sensor] = vector_of(found, CAL_OFFSET[sensor])
-        thermal[sensor] = np.array(
-            [found.get(f'{short}_X1_{axis}', 0.0) if on else 0.0 for axis in range(3)]
-        )
-        if on:
-            bias[sensor] = bias[sensor] + [
-                found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)
-            ]
+        thermal[sensor] = np.zeros(3)
+        if found.get(f'{TC[sensor]}_ENABLE'):
+            # thermal correction = X0 + X1 (T - TREF): X0 is a part of the bias.
+            constant = [found.get(f'{short}_X0_{axis}', 0.0) for axis in range(3)]
+            linear = [found.get(f'{short}_X1_{axis}', 0.0) for axis in range(3)]
+            bias[sensor] = bias[sensor] + constant
+            thermal[sensor] = np.array(linear)
             # Parameter files omit parameters that have the autopilot's default.
             ref = found.get(f'{short}_TREF', PX4_REFERENCE_C)
             limits = (
@@ -300,16 +305,14 @@ def read_px4(content: bytes, _path: str | Path) -> Read:
             'the PX4 parameter file must hold CAL_ACC0 or CAL_GYRO0, it holds none of them; give'
             ' another file'
         )
-    refuse_curved(found, [f'{short}0_X{power}' for short in TC.values() for power in (2, 3)])
-    return Read(
-        found,
-        tuple(
-            lacking
-            for sensor in SENSORS
-            if not present[sensor]
-            for lacking in of(sensor, OFFSETS + SCALES)
-        ),
-    )
+    curved = []
+    lacks: tuple[Capability, ...] = ()
+    for sensor in SENSORS:
+        curved += [f'{TC[sensor]}0_X2', f'{TC[sensor]}0_X3']
+        if not present[sensor]:
+            lacks += of(sensor, OFFSETS + SCALES)
+    refuse_curved(found, curved)
+    return Read(found, lacks)
 
 
 def ignored_px4(found: dict) -> list[str]:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from imu_calibration.core.units import STANDARD_GRAVITY
 from imu_calibration.document.exports.affine import SLOW_OFFSETS
 from imu_calibration.document.exports.target import Noise, Page, Target, yaml_file
@@ -66,14 +68,11 @@ def orb_slam3(found: Noise) -> dict:
 
 def covariances(found: Noise) -> dict:
     """Return the covariances of messages, by rows."""
+    gyro = found.gyroscope.sample_sd(found.rate) ** 2
+    accel = found.accelerometer.sample_sd(found.rate) ** 2
     return {
-        f'{name}_covariance': [
-            densities.sample_sd(found.rate) ** 2 if k % 4 == 0 else 0.0 for k in range(9)
-        ]
-        for name, densities in (
-            ('angular_velocity', found.gyroscope),
-            ('linear_acceleration', found.accelerometer),
-        )
+        'angular_velocity_covariance': np.diag([gyro] * 3).ravel().tolist(),
+        'linear_acceleration_covariance': np.diag([accel] * 3).ravel().tolist(),
     }
 
 

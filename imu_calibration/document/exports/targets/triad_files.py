@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from imu_calibration.core.errors import InputError, shortened
-from imu_calibration.document.exports.affine import MATRICES, OFFSETS, SCALES, AffineImu, of, undone
+from imu_calibration.document.exports.affine import (
+    MATRICES,
+    OFFSETS,
+    SCALES,
+    AffineImu,
+    Capability,
+    of,
+    undone,
+)
 from imu_calibration.document.exports.target import (
     Noise,
     Page,
@@ -80,12 +88,13 @@ COUNT = 21
 
 def imu_imu_tk(found: dict) -> AffineImu:
     """Return the IMU of such numbers; a sensor without a file is perfect."""
-    parts = {sensor: np.asarray(values, float) for sensor, values in found.items()}
-    turns = {
-        sensor: values[:9].reshape(3, 3) @ values[9:18].reshape(3, 3)
-        for sensor, values in parts.items()
-    }
-    return undone({sensor: (turn, turn @ parts[sensor][18:]) for sensor, turn in turns.items()})
+    # calibrated = T K raw - T K B.
+    corrections = {}
+    for sensor, values in found.items():
+        numbers = np.asarray(values, float)
+        matrix = numbers[:9].reshape(3, 3) @ numbers[9:18].reshape(3, 3)
+        corrections[sensor] = (matrix, matrix @ numbers[18:])
+    return undone(corrections)
 
 
 def read_imu_tk(content: bytes, path: str | Path) -> Read:
@@ -99,12 +108,11 @@ def read_imu_tk(content: bytes, path: str | Path) -> Read:
         beside = path.with_suffix(ending)
         if sensor != own and beside.is_file():
             found[sensor] = _numbers(beside.read_bytes())
-    return Read(
-        found,
-        tuple(
-            h for sensor in ENDINGS if sensor not in found for h in of(sensor, OFFSETS + MATRICES)
-        ),
-    )
+    lacks: tuple[Capability, ...] = ()
+    for sensor in ENDINGS:
+        if sensor not in found:
+            lacks += of(sensor, OFFSETS + MATRICES)
+    return Read(found, lacks)
 
 
 def _numbers(content: bytes) -> list[float] | None:
@@ -113,13 +121,11 @@ def _numbers(content: bytes) -> list[float] | None:
         values = [float(word) for word in words]
     except ValueError:
         values = []
-    if (
-        len(values) != COUNT
-        or not np.all(np.isfinite(values))
-        or not all(
-            abs(np.linalg.det(np.reshape(part, (3, 3)))) > 0 for part in (values[:9], values[9:18])
-        )
-    ):
+    usable = len(values) == COUNT and bool(np.all(np.isfinite(values)))
+    if usable:
+        misalignment, scale = np.reshape(values[:18], (2, 3, 3))
+        usable = all(abs(np.linalg.det(matrix)) > 0 for matrix in (misalignment, scale))
+    if not usable:
         raise InputError(
             f'an imu_tk file must have {COUNT} numbers, misalignment and scale matrices that can be'
             f' inverted and a bias, got {len(words)} entries; give a different file'
@@ -205,10 +211,10 @@ def read_autoware(content: bytes, _path: str | Path) -> Read:
     """Read a parameter file; scale factors only from the comment that `write_autoware` makes."""
     what = 'imu_corrector parameter file'
     found = section(section(read_yaml(content, what), '/**', what), 'ros__parameters', what)
-    offsets = {
-        name: float(numbers_at(found, name, (), what=what))
-        for name in (f'angular_velocity_offset_{a}' for a in AXES)
-    }
+    offsets = {}
+    for axis in AXES:
+        name = f'angular_velocity_offset_{axis}'
+        offsets[name] = float(numbers_at(found, name, (), what=what))
     scale = re.search(
         rf'^#.*{SCALE_KEY} .*\{{x: (\S+), y: (\S+), z: ([^}}\s]+)\}}', content.decode(), flags=re.M
     )

@@ -5,6 +5,7 @@ import json
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,14 +40,10 @@ def write_mat(page: Page) -> bytes:
     from scipy.io import savemat
 
     calibration = page.calibration
-    sensors = {
-        sensor: {
-            effect.name: calibration.value(*effect.key)
-            for effect in calibration.model.effects
-            if effect.section == sensor
-        }
-        for sensor in SENSORS
-    }
+    sensors: dict[str, dict[str, Any]] = {sensor: {} for sensor in SENSORS}
+    for effect in calibration.model.effects:
+        if effect.section in sensors:
+            sensors[effect.section][effect.name] = calibration.value(*effect.key)
     stream = io.BytesIO()
     savemat(
         stream,
