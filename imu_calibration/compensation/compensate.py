@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import SENSORS, Role
+from imu_calibration.effects.base import SECTIONS, SENSORS, Role
 from imu_calibration.effects.forward_equations import sensor_output
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.rotations import Reference, lever_matrix, rotation_from_rpy
@@ -175,14 +175,12 @@ class Transfer:
 
 def invertible(model: SensorModel) -> SensorModel:
     """Return the model with only those effects that compensation inverts."""
-    keep = {
-        sensor: tuple(
-            e.name for e in model.effects if e.sensor == sensor and e.compensation == 'exact'
-        )
-        for sensor in SENSORS
-    }
+    exact: dict[str, tuple[str, ...]] = {section: () for section in SECTIONS}
+    for effect in model.effects:
+        if effect.compensation == 'exact':
+            exact[effect.sensor] += (effect.name,)
     return replace(
-        model, accelerometer=keep['accelerometer'], gyroscope=keep['gyroscope'], reference=()
+        model, accelerometer=exact['accelerometer'], gyroscope=exact['gyroscope'], reference=()
     )
 
 

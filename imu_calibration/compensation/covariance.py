@@ -112,16 +112,13 @@ class Uncertainty:
         )
         self._covariance = calibration.covariance[np.ix_(index, index)]
         # Complex steps give d(coefficients) / d(parameters), shape (n_params, n_columns, 3).
-        steps = 1e-30j * np.eye(len(self._values))
-        self._slopes = [
-            np.stack(
-                [
-                    coefficients_at_point(self._model, sensor, self._values + step).imag / 1e-30
-                    for step in steps
-                ]
-            )
-            for sensor in SENSORS
-        ]
+        self._slopes = []
+        for sensor in SENSORS:
+            slopes = []
+            for step in 1e-30j * np.eye(len(self._values)):
+                moved = coefficients_at_point(self._model, sensor, self._values + step)
+                slopes.append(moved.imag / 1e-30)
+            self._slopes.append(np.stack(slopes))
         self._calibration = calibration
         self.use(None)
 

@@ -11,6 +11,7 @@ import ast
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from itertools import chain
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from imu_calibration.compensation.compensate import (
     invertible_values,
 )
 from imu_calibration.core.errors import InputError
-from imu_calibration.effects.base import AXES, LEVER, SENSORS, Role
+from imu_calibration.effects.base import AXES, LEVER, Role
 from imu_calibration.effects.expressions import SCALAR_FUNCTIONS, added, as_text, scaled
 from imu_calibration.effects.forward_equations import coefficients_at_point
 
@@ -66,7 +67,8 @@ def make_kernel(calibration: FittedErrors, transfer: Transfer | None = None) -> 
         effects need more than `MAX_OPERATIONS`.
 
     """
-    namespace, text = dict(SCALAR_FUNCTIONS), kernel_text(calibration, transfer)
+    namespace = dict(SCALAR_FUNCTIONS)
+    text = kernel_text(calibration, transfer)
     if len(text) > MAX_KERNEL_CHARACTERS:
         raise InputError(
             f'the effects of a calibration must expand to at most {MAX_KERNEL_CHARACTERS}'
@@ -111,37 +113,42 @@ def kernel_text(calibration: FittedErrors, transfer: Transfer | None = None) -> 
     """
     Return the Python text of the function that `make_kernel` compiles.
 
-    Measured f, w, a to true force u, rate v and slope g.
+    Measured f, w, a to true force u, rate v and slope g. With the arm r and the rotation of a
+    transfer, and the lever matrix L::
+
+        g = inverse gyroscope matrix @ a
+        output = mat_ts (u - L(v, g) r), mat_ts v
     """
     model, values = invertible_values(calibration)
     known = _known(model.temperature_ref_c)
-    accel, gyro = (_Part(model, sensor, values, known) for sensor in SENSORS)
-    turn, arm = (
-        (np.eye(3), np.zeros(3))
-        if transfer is None
-        else (transfer.mat_ts, transfer.mat_ts.T @ transfer.arm_t)
-    )
-    products = LEVER.products(known)
-    at_arm = [_sum(arm, products[start : start + 3]) for start in (0, 3, 6)]
+    accel = _Part(model, 'accelerometer', values, known)
+    gyro = _Part(model, 'gyroscope', values, known)
+
+    mat_ts, arm_s = np.eye(3), np.zeros(3)
+    if transfer is not None:
+        mat_ts, arm_s = transfer.mat_ts, transfer.mat_ts.T @ transfer.arm_t
+    lever = LEVER.products(known)
+    force_of_arm = [_sum(arm_s, lever[start : start + 3]) for start in (0, 3, 6)]
+
     slope = _turned(gyro.inverse, _vector('a'))
     lines = [
         'def kernel(fx, fy, fz, wx, wy, wz, ax, ay, az, warming,'
         ' branch=0.0, sx=0.0, sy=0.0, sz=0.0):'
     ]
-    if (
-        gyro.uses <= BEFOREHAND
-        and accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'}
-        and not accel.bends
-    ):
-        # No iteration is needed: the rate follows from the readings, and the disturbance of the
-        # force follows from the rate.
+    # No iteration where the rate follows from its readings only, and the disturbance of the force
+    # from the rate and, linearly, from the slope.
+    rate_is_explicit = gyro.uses <= BEFOREHAND
+    force_is_explicit = accel.uses <= BEFOREHAND | {'rate', 'angular acceleration'}
+    if rate_is_explicit and force_is_explicit and not accel.bends:
         lines += _assigned('v', _less(gyro.alone, gyro.rest), '    ')
-        force = [_with_slope(row, slope) for row in _less(_less(accel.alone, accel.rest), at_arm)]
+        force = _less(_less(accel.alone, accel.rest), force_of_arm)
+        force = [_with_slope(row, slope) for row in force]
     else:
         lines += _assigned('g', slope, '    ') + _iteration(accel, gyro)
-        force = _less(_vector('u'), at_arm)
-    more, texts = _worked_out(_turned(turn, force) + _turned(turn, _vector('v')), '    ')
-    return '\n'.join([*lines, *more, f'    return ({", ".join(texts)})']) + '\n'
+        force = _less(_vector('u'), force_of_arm)
+    outputs = _turned(mat_ts, force) + _turned(mat_ts, _vector('v'))
+    assignments, texts = _worked_out(outputs, '    ')
+    return '\n'.join([*lines, *assignments, f'    return ({", ".join(texts)})']) + '\n'
 
 
 class _Part:
@@ -152,43 +159,47 @@ class _Part:
     """
 
     def __init__(self, model, sensor, values, known):
-        matrix, bias = (model.value(sensor, role, values) for role in (Role.LINEAR, Role.OFFSET))
+        matrix = model.value(sensor, Role.LINEAR, values)
+        bias = model.value(sensor, Role.OFFSET, values)
         self.inverse = np.linalg.inv(matrix)
-        measured = _turned(self.inverse, _vector('f' if sensor == 'accelerometer' else 'w'))
-        self.alone = [
-            added(row, {(): -constant}) for row, constant in zip(measured, self.inverse @ bias)
-        ]
-        layout, total = model.layout(sensor), coefficients_at_point(model, sensor, values)
-        total[model.columns_of(sensor, Role.OFFSET)] -= bias
-        total[model.columns_of(sensor, Role.LINEAR)] -= matrix.T
-        total, self.rest, self.uses = total @ self.inverse.T, [{}, {}, {}], set()
+        # reading = bias + matrix @ true + further; true = inverse @ (reading - bias - further).
+        readings = _turned(self.inverse, _vector('f' if sensor == 'accelerometer' else 'w'))
+        constants = self.inverse @ bias
+        self.alone = [added(row, {(): -constant}) for row, constant in zip(readings, constants)]
+
+        further = coefficients_at_point(model, sensor, values)
+        further[model.columns_of(sensor, Role.OFFSET)] -= bias
+        further[model.columns_of(sensor, Role.LINEAR)] -= matrix.T
+        further = further @ self.inverse.T
+        self.rest = [{}, {}, {}]
+        self.uses = set()
+        layout = model.layout(sensor)
         for name, group in layout.groups.items():
-            block = total[layout.rows[name]]
+            block = further[layout.rows[name]]
             if np.any(block):
                 columns = group.products(known)
-                self.rest = [
-                    added(row, _sum(block[:, axis], columns)) for axis, row in enumerate(self.rest)
-                ]
+                for axis in range(3):
+                    self.rest[axis] = added(self.rest[axis], _sum(block[:, axis], columns))
                 self.uses |= group.uses
 
     @property
     def bends(self):
         """Whether the angular acceleration enters the rest in a product or a function."""
-        return any(
-            re.search(r'\bg[xyz]\b', ' '.join(factors)) and len(' '.join(factors)) > 2
-            for row in self.rest
-            for factors in row
-        )
+        for factors in chain.from_iterable(self.rest):
+            product_text = ' '.join(factors)
+            # Longer than the name alone, e.g. 'gx'.
+            if re.search(r'\bg[xyz]\b', product_text) and len(product_text) > 2:
+                return True
+        return False
 
 
 def _known(temperature_ref_c):
     """Return name in a column -> the sum of products that replaces it in the function."""
     letters = {'f': 'u', 'w': 'v', 'alpha': 'g', 'vibration': 's'}
-    vectors = {
-        f'{name}_{k}': {(f'{variable}{k}',): 1.0}
-        for name, variable in letters.items()
-        for k in AXES
-    }
+    vectors = {}
+    for name, variable in letters.items():
+        for k in AXES:
+            vectors[f'{name}_{k}'] = {(f'{variable}{k}',): 1.0}
     return vectors | {
         'temperature_c': {('warming',): 1.0, (): temperature_ref_c},
         'temperature_ref_c': {(): temperature_ref_c},
@@ -212,7 +223,10 @@ def _iteration(accel, gyro):
     for part, true, alone in ((gyro, 'v', 'b'), (accel, 'u', 'a')):
         if any(part.rest):
             lines += _assigned(true, _less(_vector(alone), part.rest), '        ')
-    change = ' + '.join(f'abs({a}{k} - {b}{k})' for a, b in (('u', 'p'), ('v', 'q')) for k in AXES)
+    # p and q are the force u and the rate v of the previous step.
+    components = ('ux', 'uy', 'uz', 'vx', 'vy', 'vz')
+    previous = ('px', 'py', 'pz', 'qx', 'qy', 'qz')
+    change = ' + '.join(f'abs({new} - {old})' for new, old in zip(components, previous))
     return lines + [
         f'        change = {change}',
         f'        if change < {CONVERGED_CHANGE}:',
@@ -245,13 +259,14 @@ def _with_slope(row, slope):
 
     The derivative replaces the angular acceleration, which enters as it is.
     """
-    places = {(f'g{axis}',): measured for axis, measured in zip(AXES, slope)}
-    return added(
-        *(
-            scaled(places[factors], c) if factors in places else {factors: c}
-            for factors, c in row.items()
-        )
-    )
+    slope_of = {(f'g{axis}',): measured for axis, measured in zip(AXES, slope)}
+    terms = []
+    for factors, coefficient in row.items():
+        if factors in slope_of:
+            terms.append(scaled(slope_of[factors], coefficient))
+        else:
+            terms.append({factors: coefficient})
+    return added(*terms)
 
 
 def _assigned(letter, rows, indent):
@@ -271,13 +286,15 @@ def _worked_out(rows, indent):
         return names[text]
 
     for row in rows:
-        factors = {key: [f if f.isidentifier() else name_of(f) for f in key] for key in row}
+        # Functions are named before all products of the sum.
+        named = []
+        for factors in row:
+            named.append([f if f.isidentifier() else name_of(f) for f in factors])
         # A product of several factors becomes one name; the constant has none.
         terms: dict[tuple[str, ...], float] = {}
-        for key, names_of_key in factors.items():
-            if len(names_of_key) > 1:
-                terms[(name_of(' * '.join(names_of_key)),)] = row[key]
-            else:
-                terms[tuple(names_of_key)] = row[key]
+        for factors, coefficient in zip(named, row.values()):
+            if len(factors) > 1:
+                factors = [name_of(' * '.join(factors))]
+            terms[tuple(factors)] = coefficient
         sums.append(terms)
     return lines, [as_text(terms) for terms in sums]

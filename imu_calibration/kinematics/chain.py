@@ -148,12 +148,10 @@ def with_wobble(table: Table, amplitudes: np.ndarray) -> Table:
 
     """
     parts = np.reshape(amplitudes, (len(table.joint_names.turning), len(WOBBLES), 2))
-    of_joint = {
-        name: tuple(
-            (order, complex(*each)) for order, each in zip(WOBBLES, part, strict=True) if each.any()
-        )
-        for name, part in zip(table.joint_names.turning, parts, strict=True)
-    }
+    of_joint = {}
+    for name, amplitudes_of_joint in zip(table.joint_names.turning, parts, strict=True):
+        pairs = zip(WOBBLES, amplitudes_of_joint, strict=True)
+        of_joint[name] = tuple((order, complex(*each)) for order, each in pairs if each.any())
     return replace(
         table,
         joints=tuple(
@@ -378,12 +376,11 @@ def _constants(table):
     constants = _Constants(
         _base_columns(table), tuple(links), mount_xyz, table.mat_sl, table.gravity_value
     )
-    for array in (
-        constants.base,
-        constants.mount_xyz,
-        constants.mat_sl,
-        *(part for link in links for part in (*link[1:4], link.across)),
-    ):
+    # The constants are shared by all motions of the table.
+    shared = [constants.base, constants.mount_xyz, constants.mat_sl]
+    for link in links:
+        shared += [*link[1:4], link.across]
+    for array in shared:
         array.flags.writeable = False
     return constants
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -279,7 +280,7 @@ class JointNames(Sequence):
 
 def place_names(turning: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the places of all axes but the first: two directions across each."""
-    return tuple(f'{name}_{letter}' for name in turning[1:] for letter in 'uv')
+    return tuple(f'{name}_{letter}' for name, letter in product(turning[1:], 'uv'))
 
 
 LIMIT_KEYS = {

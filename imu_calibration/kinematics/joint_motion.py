@@ -5,7 +5,6 @@ The motion at given instants is angles and three derivatives.
 """
 
 from dataclasses import dataclass, replace
-from math import factorial
 
 import numpy as np
 
@@ -187,10 +186,16 @@ def _taylor(derivatives, by):
     )
 
 
+_EXPONENTS = np.arange(4, 8)
 _POWERS = np.array(
-    [[factorial(power) / factorial(power - order) for power in range(4, 8)] for order in range(4)]
+    [
+        np.ones(4),
+        _EXPONENTS,
+        _EXPONENTS * (_EXPONENTS - 1),
+        _EXPONENTS * (_EXPONENTS - 1) * (_EXPONENTS - 2),
+    ]
 )
-"""Derivatives of u^4 ... u^7 at u = 1."""
+"""Derivatives of order 0 ... 3 of u^4 ... u^7 at u = 1, shape (4, 4)."""
 _FROM_ENDS = np.linalg.inv(_POWERS)
 
 

@@ -200,15 +200,14 @@ class Table:
         # A zero that affects only the first or the last axis is the azimuth, or belongs to the
         # mount.
         apart = [name for name in turning[:1] + turning[-1:] if turning.count(name) == 1]
-        read, turning = (
-            tuple(dict.fromkeys(names))
-            for names in ((joint.source for joint in self.joints), turning)
-        )
+        # A mimic joint is read from the same source as another one.
+        read = tuple(dict.fromkeys(joint.source for joint in self.joints))
+        turning = list(dict.fromkeys(turning))
         angles = tuple(angle.name for angle in axis_angles(self.joints))
         places = place_names([joint.name for joint in self.joints if joint.turns])
         return JointNames(
             read,
-            turning,
+            tuple(turning),
             tuple(name for name in turning if name not in apart),
             angles,
             places,
