@@ -9,7 +9,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import pytest  # noqa: E402
 from blank_canvas import BlankCanvas  # noqa: E402
-from few_candidates import FEW, restricted  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The same examples every time, and no failure because the machine is busy.
@@ -30,32 +29,6 @@ def recordings():
     if not folder.is_dir():
         pytest.skip(f'real recordings not found at {folder}; set IMU_CALIBRATION_DATA')
     return folder
-
-
-@pytest.fixture(scope='module')
-def few_candidates(request):
-    """
-    Restrict the candidates of each search on a table to a few effects.
-
-    These are effects of users and `FEW` of the module or of `few_candidates.py`, and this needs a
-    third of the time.
-    """
-    with restricted(getattr(request.module, 'FEW', FEW)):
-        yield
-
-
-@pytest.fixture(scope='module', autouse=True)
-def few_repetitions():
-    """
-    Repeat a search by hand four times on parts of the poses, not twelve times.
-
-    Every pose is held out once as before; the repetitions are three quarters of a search.
-    """
-    from imu_calibration.selection import row_search
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(row_search, 'OUTER', 4)
-        yield
 
 
 @pytest.fixture(scope='module', autouse=True)

@@ -242,7 +242,7 @@ class OneLineParser(argparse.ArgumentParser):
         """
         Add the options of a calibration.
 
-        Local gravity, recording, labels of the result, and model (`add_model`).
+        Local gravity, recording, labels of the result, model (`add_model`) and candidates.
         """
         self.add_gravity()
         self.add_recording('without it: by hand')
@@ -255,6 +255,11 @@ class OneLineParser(argparse.ArgumentParser):
         self.common('--operator', metavar='TEXT', help='name of the operator, likewise')
         self.add_force()
         self.add_model(searched=searched)
+        self.expert(
+            '--candidates',
+            metavar='EFFECT',
+            help="effects under test, joined by +; 'none'",
+        )
 
     def add_model(self, *, searched: bool = True) -> None:
         """

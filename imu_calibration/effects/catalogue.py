@@ -284,10 +284,37 @@ class Catalogue:
 
     added: tuple = field(default=())
     """Effects in addition to the package's own."""
+    candidates: frozenset[str] | None = None
+    """Names of the package's effects that a search tests; None: all."""
 
     def __reduce__(self):
-        """Pickle the added effects only."""
-        return Catalogue, (self.added,)
+        """Pickle the added effects and the names of the candidates only."""
+        return Catalogue, (self.added, self.candidates)
+
+    def is_candidate(self, effect: Effect) -> bool:
+        """Return whether a search tests an effect; added effects are always tested."""
+        if self.candidates is None or effect.name in self.candidates:
+            return True
+        return any(effect is added for added in self.added)
+
+    def with_candidates(self, text: str | None) -> 'Catalogue':
+        """
+        Return a catalogue whose search tests only some of the package's effects.
+
+        `text`: names joined by +, or 'none'; None: all effects.
+
+        Raises
+        ------
+        InputError
+            When an effect does not exist.
+
+        """
+        if text is None:
+            return replace(self, candidates=None)
+        names = frozenset() if text == 'none' else frozenset(text.split('+'))
+        for name in sorted(names):
+            self.owner_of(name)
+        return replace(self, candidates=names)
 
     def effects(self, joint_names: Sequence[str] = JOINTS) -> dict[tuple[str, str], Effect]:
         """Return every effect by (sensor, name) for a table with these joints."""

@@ -98,7 +98,7 @@ def sort_effects(
     """
     Return (testable effects, list of {'effect', 'why', 'needs'}).
 
-    Both refer to the catalogue's effects on the `sensors` with readings that the model lacks.
+    Both refer to the catalogue's candidates on the `sensors` with readings that the model lacks.
 
     ``why_not(effect)`` gives (why, needs), or None for a testable effect.
     """
@@ -106,7 +106,7 @@ def sort_effects(
     have = {e.key for e in model.effects}
     for key, effect in model.catalogue.effects(model.joint_names).items():
         acted_on = tuple(sensor for sensor in effect.sensors if sensor in sensors)
-        if key in have or not acted_on:
+        if key in have or not acted_on or not model.catalogue.is_candidate(effect):
             continue
         # An effect of table or clock shows in the present sensors only.
         if acted_on != effect.sensors:

@@ -87,6 +87,11 @@ class Choices(TypedDict, total=False):
     """Geodetic latitude, degrees, from which gravity follows (WGS 84) where it is not given."""
     height: float | None
     """Height above the ellipsoid, m; default 0."""
+    candidates: str | None
+    """
+    Effects of the package that the search tests, joined by +, or 'none'; default all. Those of
+    `catalogue` are always tested.
+    """
     model_as_asked: bool
     """Whether the model is used without additions, even where the data support them; default no."""
     tolerances: str | PathLike | Mapping | None
@@ -196,6 +201,8 @@ def topics_of(choices: Mapping[str, Any]) -> Topics:
 def calibration_options(choices: Mapping[str, Any]) -> CalibrationOptions:
     """Return the options of estimation and validation."""
     catalogue = catalogue_of(choices.get('catalogue'))
+    if choices.get('candidates') is not None:
+        catalogue = catalogue.with_candidates(choices['candidates'])
     tolerances = choices.get('tolerances') or config_file('tolerances.yaml')
     read = checked_tolerances if isinstance(tolerances, Mapping) else files.read_tolerances
     gravity, gravity_sd = local_gravity(

@@ -37,8 +37,6 @@ from msg_adapters.write import write_session
 from worlds.compensation_cases import random_calibration
 from worlds.noise_worlds import random_walk, white
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 PERIOD = 0.02
 SIZES = np.array([2e-3] * 3 + [1e-4] * 3)
 WALK = 0.03

@@ -38,10 +38,9 @@ from msg_adapters.imu import FIELDS
 from validation.imu_messages import parse_imu
 
 from worlds import physics
+from worlds.candidates import FEW
 from worlds.compensation_cases import random_calibration
 from worlds.noise_worlds import flicker
-
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 BAG = Path(__file__).parents[2] / 'bags' / 'sample_session'
 
@@ -166,6 +165,8 @@ def calibrated(noise_file, tmp_path_factory):
                 str(noise_file),
                 '--output',
                 str(folder),
+                '--candidates',
+                FEW,
             ]
         )
         == 0

@@ -15,8 +15,6 @@ from imu_calibration.core.errors import InputError, NotObservableError
 from imu_calibration.core.samples import ImuSamples
 from imu_calibration.kinematics.rotations import lever_matrix
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 ARM = np.array([0.012, -0.019, 0.004])
 AXES = np.array([[4.1, 0.9], [3.6, 1.3], [3.9, 0.7]])
 

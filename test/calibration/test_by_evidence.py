@@ -17,9 +17,11 @@ from imu_calibration.calibration.by_evidence import _moves, extended_solution, s
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.from_solution import ModelExtension
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.effects.forward_equations import predict
 from imu_calibration.effects.sensor_model import SensorModel
 from imu_calibration.kinematics.table import Table
+from imu_calibration.references.options import CalibrationOptions
 from imu_calibration.references.turntable.session_data import DecimatedWindows
 from imu_calibration.report.diagnosis_page import diagnosis_report
 from imu_calibration.selection import investigation, questions
@@ -29,6 +31,7 @@ from imu_calibration.selection.residual_analysis import ResidualAnalysis
 from imu_calibration.selection.rivals import Rival, same_questions, settle_rivals
 from imu_calibration.selection.unexplained import Unexplained, biases_off
 
+from worlds.candidates import FEW, with_candidates
 from worlds.misfit_coverage import calibrated
 from worlds.misfit_worlds import make_pair
 from worlds.moments import Wander
@@ -40,7 +43,6 @@ NAMES = tuple(TABLE.joint_names)
 OFFSET = 'reference.time_offset.offset'
 COARSE = {'imu_rate': 50.0, 'joint_rate': 50.0}
 SHAFT = {'table': 'shaft', 'profile': 'sweeps'}
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
 @pytest.fixture(scope='module')
@@ -52,7 +54,7 @@ def late():
 
 @pytest.fixture(scope='module')
 def asked(late):
-    return imu.calibrate(late[0].block, late[1])
+    return imu.calibrate(late[0].block, late[1], candidates=FEW)
 
 
 def test_a_lag_is_taken_into_the_model_and_said_in_one_line(late, asked):
@@ -76,7 +78,7 @@ def test_a_lag_is_taken_into_the_model_and_said_in_one_line(late, asked):
 
 
 def test_diagnose_hands_over_what_calibrate_does(late, asked):
-    found = imu.diagnose(late[0].block, late[1])
+    found = imu.diagnose(late[0].block, late[1], candidates=FEW)
     assert found.calibration.param_names == asked.calibration.param_names
     np.testing.assert_array_equal(found.calibration.values, asked.calibration.values)
     np.testing.assert_array_equal(found.calibration.sd, asked.calibration.sd)
@@ -89,7 +91,7 @@ def test_diagnose_hands_over_what_calibrate_does(late, asked):
 
 def test_a_clean_session_adds_nothing():
     pair = make_pair(None, 12, **COARSE)
-    found = imu.calibrate(pair.first.block, Table.from_mapping(pair.table))
+    found = imu.calibrate(pair.first.block, Table.from_mapping(pair.table), candidates=FEW)
     assert not set(found.calibration.statistics) & {'added', 'denied'}
 
 
@@ -118,7 +120,7 @@ def test_an_effect_of_one_half_is_not_adopted_and_widens_the_standard_deviations
             made.append(replace(window, force_s=outputs[0], rate_s=outputs[1]))
         return made
 
-    bare = SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES)
+    bare = with_candidates(SensorModel(accelerometer=('bias', 'matrix'), joint_names=NAMES))
     whole, half = (
         ResidualAnalysis.of(investigate(measured(share), TABLE, bare), TABLE)
         for share in (0.0, 0.5)
@@ -197,6 +199,7 @@ def _disagreement(found, names):
 def investigated(late):
     """Return what the search finds in the session beyond biases and matrices."""
     model = SensorModel(accelerometer=('bias', 'matrix'), joint_names=tuple(late[1].joint_names))
+    model = with_candidates(model)
     return ResidualAnalysis.of(investigate(calibrated(late[0]).windows, late[1], model), late[1])
 
 
@@ -294,7 +297,7 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
     assert not stands_out(of([6.0, 1.0], 0.0, sd=10 * question.effect.largest), pair)
     monkeypatch.undo()
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
-    faint = imu.calibrate(late[0].block, late[1]).calibration
+    faint = imu.calibrate(late[0].block, late[1], candidates=FEW).calibration
     assert (
         'time_offset' in faint.statistics['denied']
         and 'added' not in faint.statistics
@@ -311,7 +314,9 @@ def test_an_effect_that_is_no_more_than_chance_with_honest_standard_deviations_i
 def test_an_effect_that_is_removed_as_faint_leaves_an_unexplained_residual(monkeypatch):
     monkeypatch.setattr(by_evidence, 'stands_out', lambda *_: False)
     session = make_session(5, {'accel_quadratic': 2e-4}, 'realistic', **COARSE)
-    found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration.statistics
+    found = imu.calibrate(
+        session.block, Table.from_mapping(session.table), candidates=FEW
+    ).calibration.statistics
     assert (
         found['denied'] == ['accel_quadratic']
         and 2e-3 < found['unexplained']['accelerometer']['rms'] < 2e-2
@@ -329,7 +334,9 @@ def test_calibrate_does_not_adopt_what_diagnose_withdraws(monkeypatch):
     session = make_session(
         141, None, 'realistic', cause=Beyond('force_cubed_in_gyro', 141), **COARSE
     )
-    found = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
+    found = imu.calibrate(
+        session.block, Table.from_mapping(session.table), candidates=FEW
+    ).calibration
     assert not {'added', 'denied'} & set(found.statistics)
     bias = [found.param_names.index(f'gyroscope.bias.{axis}') for axis in 'xyz']
     assert np.all(np.abs(found.values[bias] - session.truth['gyroscope'].bias) < 4 * found.sd[bias])
@@ -343,7 +350,9 @@ def test_a_bias_is_not_known_better_than_windows_agree_on_it():
     """
     cause = Beyond('backlash', 2)
     session = make_session(2, None, 'realistic', cause=cause, **COARSE)
-    calibration = imu.calibrate(session.block, Table.from_mapping(session.table)).calibration
+    calibration = imu.calibrate(
+        session.block, Table.from_mapping(session.table), candidates=FEW
+    ).calibration
     (axis,) = cause.axes
     places = {name: calibration.param_names.index(f'accelerometer.bias.{name}') for name in 'xyz'}
     errors = {
@@ -377,11 +386,19 @@ def test_what_a_rest_may_move_biases_by():
     ]
 
 
+def diagnosed(session):
+    return diagnose_recording(
+        lambda: iter([session.block]),
+        Table.from_mapping(session.table),
+        CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW)),
+    )
+
+
 @pytest.mark.long
 def test_a_bias_that_steps_on_every_axis_is_found_with_its_size():
     """A wander of all axes alike would follow the step, which passed for noise."""
     session = make_session(7, {'knock_step': 0.05}, 'realistic', **COARSE)
-    result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))
+    result = diagnosed(session)
     onset = result.diagnosis.onset
     assert onset.what == 'bias of accelerometer' and not result.diagnosis.findings
     assert abs(onset.time - session.truth['knock']) < 0.04  # two samples
@@ -393,7 +410,7 @@ def test_a_bias_that_steps_on_every_axis_is_found_with_its_size():
 @pytest.mark.long
 def test_a_wander_of_every_axis_passes_for_noise_and_is_told():
     session = make_session(7, None, 'realistic', cause=Wander(sd=(0.02, 0.0)), **COARSE)
-    result = diagnose_recording(lambda: iter([session.block]), Table.from_mapping(session.table))
+    result = diagnosed(session)
     assert (
         not result.diagnosis.findings
         and result.diagnosis.onset is None
@@ -407,6 +424,4 @@ def test_a_wander_of_every_axis_passes_for_noise_and_is_told():
     )
     assert result.document['notes'] == [note]
     plain = make_session(7, None, 'realistic', **COARSE)
-    assert not diagnose_recording(
-        lambda: iter([plain.block]), Table.from_mapping(plain.table)
-    ).notes
+    assert not diagnosed(plain).notes

@@ -43,7 +43,6 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 from worlds.hand_sessions import GRAVITY
 from worlds.person import Person
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
 ROOT = Path(__file__).resolve().parents[2]
 OPTIONS = HandOptions(gravity=GRAVITY)
 

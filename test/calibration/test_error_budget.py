@@ -32,7 +32,6 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 
 from worlds.tables import three_axis_table
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
 TABLE = three_axis_table(gravity=9.81)
 NO_TILT = CalibrationOptions(
     accelerometer_model='bias+matrix+accel_size_effect', reference_model='none'

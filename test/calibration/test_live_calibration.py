@@ -27,8 +27,6 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 
 from worlds.tables import three_axis_table
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 TABLE = three_axis_table(height=150.0, mount={'rpy_deg': [0, 0, 0], 'xyz': None})
 SD = 1e-6
 """Live and offline agree to this share of the standard deviation."""

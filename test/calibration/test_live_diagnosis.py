@@ -23,10 +23,12 @@ from imu_calibration.calibration.live import LiveCalibration, LiveSettings
 from imu_calibration.core.errors import DocumentError
 from imu_calibration.core.progress import LiveState, report
 from imu_calibration.core.samples import SampleBlock
+from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 from imu_calibration.references.options import CalibrationOptions
 
 from worlds import physics
+from worlds.candidates import FEW
 from worlds.misfit_worlds import make_pair
 
 pytest.importorskip('rclpy')
@@ -36,8 +38,8 @@ from imu_calibration.nodes.diagnosis_thread import DiagnosisThread  # noqa: E402
 
 from ros.threads import until  # noqa: E402
 
+OPTIONS = CalibrationOptions(catalogue=CATALOGUE.with_candidates(FEW))
 QUICK = {'profile': 'quick', 'imu_rate': 50.0, 'joint_rate': 50.0}
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
 class Station:
@@ -45,7 +47,7 @@ class Station:
 
     def __init__(self, session, **settings):
         self.live = LiveCalibration(
-            Table.from_mapping(session.table), settings=LiveSettings(**settings)
+            Table.from_mapping(session.table), OPTIONS, settings=LiveSettings(**settings)
         )
         for block in blocks(session.imu, session.joints):
             self.live.push(block)
@@ -66,7 +68,9 @@ def hidden():
 def expected(hidden):
     """What the verb diagnose says of it, and hands over."""
     return diagnose_recording(
-        lambda: iter([SampleBlock(hidden.imu, hidden.joints)]), Table.from_mapping(hidden.table)
+        lambda: iter([SampleBlock(hidden.imu, hidden.joints)]),
+        Table.from_mapping(hidden.table),
+        OPTIONS,
     )
 
 
@@ -117,7 +121,7 @@ def test_what_is_found_joins_the_model_and_the_live_result_is_that_of_calibrate(
 
 @pytest.mark.long
 def test_windows_after_the_adoption_count_like_those_before(hidden, expected):
-    live = LiveCalibration(Table.from_mapping(hidden.table))
+    live = LiveCalibration(Table.from_mapping(hidden.table), OPTIONS)
     every = list(blocks(hidden.imu, hidden.joints))
     for block in every[: 3 * len(every) // 4]:
         live.push(block)
@@ -139,19 +143,19 @@ def test_a_delay_is_taken_at_its_size_like_offline():
     """
     pair = make_pair('driver_lag', 31, table='shaft', profile='sweeps')
     table = Table.from_mapping(pair.table)
-    live = LiveCalibration(table)
+    live = LiveCalibration(table, OPTIONS)
     for block in blocks(pair.first.imu, pair.first.joints):
         live.push(block)
     live.solve(pending=True)
     assert live.adopt(question_about(live).answer().extension)
-    expected = calibrate_by_evidence([lambda: iter([pair.first.block])], table).calibration
+    expected = calibrate_by_evidence([lambda: iter([pair.first.block])], table, OPTIONS).calibration
     found = live.solve(pending=True).calibration
     assert 'time_offset' in found.statistics['added']
     assert_same(found, expected)
 
 
 def test_the_model_as_asked_stays(hidden):
-    live = LiveCalibration(Table.from_mapping(hidden.table), CalibrationOptions(as_asked=True))
+    live = LiveCalibration(Table.from_mapping(hidden.table), replace(OPTIONS, as_asked=True))
     for block in blocks(hidden.imu, hidden.joints):
         live.push(block)
     before = live.solve(pending=True).calibration
@@ -189,7 +193,7 @@ def test_a_resumed_session_keeps_what_joined(station, hidden):
     station.live.solve(pending=True)
     saved = station.live.saved(pending=True)
     table = Table.from_mapping(hidden.table)
-    resumed = LiveCalibration(table, saved=saved)
+    resumed = LiveCalibration(table, OPTIONS, saved=saved)
     assert resumed.extension.added == station.live.extension.added and resumed.model.has_columns_of(
         station.live.model
     )
@@ -217,7 +221,7 @@ def test_a_resumed_session_keeps_what_joined(station, hidden):
         and not answer.extension.changes.lacking
     )
     with refused(DocumentError, 'other_model', 'accel_quadratic'):
-        LiveCalibration(table, CalibrationOptions(as_asked=True), saved=saved)
+        LiveCalibration(table, replace(OPTIONS, as_asked=True), saved=saved)
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
@@ -229,7 +233,7 @@ def test_nothing_is_found_where_nothing_is_hidden():
 
 
 def test_without_windows_nothing_is_asked(hidden):
-    live = LiveCalibration(Table.from_mapping(hidden.table))
+    live = LiveCalibration(Table.from_mapping(hidden.table), OPTIONS)
     assert question_about(live) is None and question_about(None) is None
 
 
@@ -350,7 +354,7 @@ def test_what_stays_unexplained_is_said(expected):
 
 def test_a_session_is_solved_before_the_next_rest_when_its_columns_were_extended(hidden):
     """Rests had no centred rows, of the former width: a solution before the next rest failed."""
-    live = LiveCalibration(Table.from_mapping(hidden.table))
+    live = LiveCalibration(Table.from_mapping(hidden.table), OPTIONS)
     every = list(blocks(hidden.imu, hidden.joints))
     for block in every[: len(every) // 2]:
         live.push(block)

@@ -12,6 +12,7 @@ from imu_calibration.document.decision import HELPS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.use_cases.calibrate import calibrate_recordings, check_recording
 
+from worlds.candidates import FEW
 from worlds.misfit_worlds import make_pair
 
 WORSE = 1.05
@@ -19,7 +20,6 @@ WORSE = 1.05
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures('few_candidates')
 @pytest.mark.parametrize(
     ('cause', 'world'),
     [
@@ -33,7 +33,7 @@ def test_what_is_handed_over_helps_in_another_session(cause, world):
     pair = make_pair(cause, 21, **world)
     table = Table.from_mapping(pair.table)
     try:
-        found = calibrate_recordings(pair.first.block, table)
+        found = calibrate_recordings(pair.first.block, table, candidates=FEW)
     except ImuCalibrationError as refused:
         assert '\n' not in str(refused)
         return

@@ -18,15 +18,16 @@ from imu_calibration.references.turntable.session_data import TABLE_FOLDS, HeldO
 from imu_calibration.references.turntable.window_statistics import Regime, moving_pieces
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
+from worlds.candidates import FEW
 from worlds.misfit_worlds import make_pair
-
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 SENSORS = ('accelerometer', 'gyroscope')
 
 
 def calibrated(pair, **choices):
-    return calibrate_recordings(pair.first.block, Table.from_mapping(pair.table), **choices)
+    return calibrate_recordings(
+        pair.first.block, Table.from_mapping(pair.table), **choices, candidates=FEW
+    )
 
 
 @pytest.fixture(scope='module')

@@ -18,7 +18,7 @@ from imu_calibration.references.options import CalibrationOptions
 from worlds.physics import make_session
 from worlds.physics_hand import hold_and_turn
 
-pytestmark = [pytest.mark.long, pytest.mark.usefixtures('few_candidates')]
+pytestmark = pytest.mark.long
 MODEL = 'bias+matrix+gyro_bias_drift'
 TRUE = np.array([0.01, -0.02, 0.015, 15.0])
 

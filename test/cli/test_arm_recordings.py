@@ -24,8 +24,7 @@ from msg_adapters.bag import DESCRIPTION_TOPIC, STATIC_TOPIC
 from msg_adapters.write import write_session
 
 from worlds.arms import SIX_AXES, joint, robot
-
-pytestmark = pytest.mark.usefixtures('few_candidates')
+from worlds.candidates import FEW
 
 TWO_AXES = robot(
     joint('tilt', 'base_link', 'frame', '0 0 0.5', axis='0 1 0'),
@@ -221,6 +220,8 @@ def test_an_arm_calibrates_as_a_table_does(session, tmp_path):
             str(folder / 'site.yaml'),
             '--output',
             str(tmp_path),
+            '--candidates',
+            FEW,
         ]
     )
     found = read_calibration(tmp_path / 'calibration.yaml')

@@ -13,7 +13,7 @@ from imu_calibration.cli import parser, watch
 from imu_calibration.cli.main import json_text, main
 from imu_calibration.cli.watch import NodeStatus
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
+from worlds.candidates import searching_few
 
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
 SESSION, TABLE, TRUTH = (
@@ -76,7 +76,7 @@ def folder(tmp_path_factory):
 
 def document_of(arguments, capsys):
     """Return the document that a verb prints; it must follow the schema."""
-    code = main([*arguments, '--json'])
+    code = main([*searching_few(arguments), '--json'])
     document = json.loads(capsys.readouterr().out)
     VALIDATOR.validate(document)
     assert document['exit_code'] == code and code in (0, 3)

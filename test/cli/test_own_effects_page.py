@@ -10,12 +10,13 @@ import yaml
 from imu_calibration.cli.main import main
 from imu_calibration.document.files import read_calibration
 
+from worlds.candidates import searching_few
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / 'docs' / 'own-effects.md'
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures('few_candidates')
 def test_the_commands_of_the_page_run_in_its_order(tmp_path, monkeypatch, capsys):
     pytest.importorskip('foxglove')
     (tmp_path / 'my_effects.yaml').write_bytes(
@@ -30,7 +31,7 @@ def test_the_commands_of_the_page_run_in_its_order(tmp_path, monkeypatch, capsys
     for line in lines:
         program, *arguments = shlex.split(line)
         assert program == 'imu_calibration'
-        assert main(arguments) in (0, 3), line
+        assert main(searching_few(arguments)) in (0, 3), line
         printed[line] = capsys.readouterr().out
     result = read_calibration(tmp_path / 'result')
     assert (result.provenance['serial'], result.provenance['operator']) == ('A-17', 'Kim')

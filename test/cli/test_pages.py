@@ -22,10 +22,10 @@ from imu_calibration.core.samples import ImuSamples
 from imu_calibration.report import figures
 from msg_adapters.write import write_session
 
+from worlds.candidates import searching_few
 from worlds.hand_sessions import simulate
 
 LAID_OUT = True  # the commands of the README draw what users see
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / 'bags' / 'sample_session'
@@ -157,7 +157,7 @@ def test_commands_run_as_printed(page, least, folder, monkeypatch, tmp_path, cap
     found = commands(page)
     assert len(found) >= least
     for command in found:
-        code = main(shlex.split(command)[1:])
+        code = main(searching_few(shlex.split(command)[1:]))
         assert code in (0, 3), f'{command}\n{capsys.readouterr().err}'
 
 

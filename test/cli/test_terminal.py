@@ -26,8 +26,6 @@ from imu_calibration.cli import parser, show
 from imu_calibration.cli.main import ProgressBars, main
 from imu_calibration.cli.terminal import Terminal
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 ROOT = parser.__file__.rsplit('/imu_calibration/', 1)[0]
 SESSION, TABLE, TRUTH = (
     f'{ROOT}/bags/sample_session{name}' for name in ('', '/table.yaml', '/truth.yaml')

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from imu_calibration.cli.main import main
 from imu_calibration.core.readings import RawReadings
@@ -14,7 +13,6 @@ from msg_adapters.write import write_session
 
 from worlds.hand_sessions import simulate
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
 PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'units-axes-files.md'
 
 

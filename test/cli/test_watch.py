@@ -20,8 +20,6 @@ from imu_calibration.cli.terminal import Terminal
 from imu_calibration.cli.watch import BAR, NodeStatus, bar, ratio_of, screen
 from imu_calibration.core.errors import InputError
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 STATUSES = {
     'streams': NodeStatus(0, 'Imu messages come', {}),
     'calibration': NodeStatus(1, 'weak; accelerometer.bias.x: 3 mg', {}),

@@ -14,8 +14,6 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings, check_reco
 
 from worlds.physics import make_session
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 
 def proof(unit='m/s^2', **regimes):
     """Return a proof of one sensor: regime -> (after, low, high of after / before)."""

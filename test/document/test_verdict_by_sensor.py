@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from few_candidates import restricted
 
 import imu_calibration as imu
 from imu_calibration.cli.main import main
@@ -25,11 +24,10 @@ from imu_calibration.kinematics.table import Table
 from msg_adapters.bag import open_recording
 from msg_adapters.write import write_session
 
+from worlds.candidates import FEW
 from worlds.compensation_cases import random_calibration
 from worlds.misfit_worlds import SHAFT, sweeps
 from worlds.physics import make_session
-
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 VERTICAL = SHAFT | {'joints': [{'name': 'shaft', 'axis': [0, 0, 1]}], 'up': [0, 0, 1]}
 PROOF = {
@@ -222,7 +220,6 @@ def test_check_says_which_sensor_it_helps(yaw, block):
 
 @pytest.mark.long
 @pytest.mark.real_data
-@restricted()
 def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
     """
     A vertical shaft.
@@ -243,7 +240,7 @@ def test_half_a_yaw_recording_helps_the_gyroscope_on_the_other_half(recordings):
         SampleBlock(*(each.select((each.stamp_ns < middle) == early) for each in whole))
         for early in (True, False)
     )
-    found = imu.calibrate(first, table)
+    found = imu.calibrate(first, table, candidates=FEW)
     assert (
         found.calibration.decisions['gyroscope'] is HELPS
         and found.calibration.decisions['accelerometer'] is UNPROVEN

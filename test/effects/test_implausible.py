@@ -11,8 +11,7 @@ from imu_calibration.effects.catalogue import CATALOGUE
 from imu_calibration.kinematics.table import Table
 
 from worlds import physics
-
-pytestmark = pytest.mark.usefixtures('few_candidates')
+from worlds.candidates import FEW
 
 CUBIC = np.array([8e-3, -6e-3, 7e-3]) / G**2
 """8 mg at 1 g: what saturates looks like that, and no accelerometer is."""
@@ -28,7 +27,7 @@ def strange():
 
 @pytest.fixture(scope='module')
 def diagnosed(strange):
-    return imu.diagnose(*strange)
+    return imu.diagnose(*strange, candidates=FEW)
 
 
 def test_it_is_named_with_its_size_and_a_mark(diagnosed):
@@ -59,7 +58,9 @@ def test_live_it_is_said_too(diagnosed):
 
 @pytest.fixture(scope='module')
 def asked_for(strange):
-    return imu.calibrate(*strange, accelerometer_model='bias+matrix+accel_cubic').calibration
+    return imu.calibrate(
+        *strange, accelerometer_model='bias+matrix+accel_cubic', candidates=FEW
+    ).calibration
 
 
 def test_it_is_in_no_model_and_widens(diagnosed, strange, asked_for):

@@ -35,9 +35,8 @@ from imu_calibration.simulation.session import (
 )
 from imu_calibration.use_cases.calibrate import calibrate_recordings
 
+from worlds.candidates import FEW
 from worlds.stands import stand
-
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 MINE = """
 effects:
@@ -403,7 +402,9 @@ def test_the_example_file_is_a_catalogue_whose_effects_are_found():
         options=SimulationOptions(noise=GRADES['industrial'].noise),
         seed=3,
     )
-    found = calibrate_recordings(SampleBlock(*samples), table, catalogue=example).calibration
+    found = calibrate_recordings(
+        SampleBlock(*samples), table, catalogue=example, candidates=FEW
+    ).calibration
     for name, sensor in names.items():
         where = found.model.slices[sensor, name]
         np.testing.assert_allclose(

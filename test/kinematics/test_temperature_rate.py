@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from few_candidates import restricted
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.table_calibration import calibrate_on_table
@@ -108,11 +107,12 @@ def test_formulas_with_a_temperature_contain_its_slope():
     assert slope.unit('rad/s') == 'rad/s/(K/s)' and slope.smooth
 
 
-@restricted(('gyro_thermal_bias', 'gyro_bias_drift', 'gyro_bias_trend'))
 def test_the_diagnosis_names_the_slope_of_the_temperature():
     # A wander of all axes alike followed it, and nothing was found.
     block, table = session_that_warms()
-    diagnosis = diagnose_recording(lambda: iter([block]), table).diagnosis
+    catalogue = CATALOGUE.with_candidates('gyro_thermal_bias+gyro_bias_drift+gyro_bias_trend')
+    options = CalibrationOptions(catalogue=catalogue)
+    diagnosis = diagnose_recording(lambda: iter([block]), table, options).diagnosis
     assert not diagnosis.findings
     rest = diagnosis.unexplained['gyroscope']
     assert rest.significant and rest.correlates_with == 'temperature rate' and rest.share > 0.5

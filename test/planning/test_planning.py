@@ -40,6 +40,7 @@ from imu_calibration.use_cases.resources import config_file
 from msg_adapters.joint_state import JOINT_TRAJECTORY_TYPE
 
 from worlds.arms import SEVEN_AXES
+from worlds.candidates import FEW
 from worlds.live_sessions import TABLE, make_session
 from worlds.random_tables import random_table
 
@@ -83,7 +84,6 @@ def test_the_same_is_planned_again():
     ]
 
 
-@pytest.mark.usefixtures('few_candidates')
 def test_what_is_promised_is_what_a_calibration_of_the_motion_comes_to(plan, table):
     profile = Profile(
         'plan', tuple(segment for one in plan.segments for segment in one), tuple(table.joint_names)
@@ -100,7 +100,7 @@ def test_what_is_promised_is_what_a_calibration_of_the_motion_comes_to(plan, tab
             options=SimulationOptions(noise=GRADES['industrial'].noise),
             seed=seed,
         )
-        found = calibrate_recordings(SampleBlock(*samples), table).calibration
+        found = calibrate_recordings(SampleBlock(*samples), table, candidates=FEW).calibration
         errors += [
             (found.values[found.param_names.index(name)] - value)
             / plan.sd[plan.model.param_names.index(name)]
@@ -160,7 +160,6 @@ def test_spins_in_both_senses_follow_from_the_criterion_where_the_bias_wanders()
     assert {1.0, -1.0} <= senses
 
 
-@pytest.mark.usefixtures('few_candidates')
 def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_diagnosed(table):
     """
     It needed 8 s with two windows, of which no proof can hold out any.
@@ -180,7 +179,7 @@ def test_a_plan_at_the_default_tolerances_has_windows_enough_to_be_proven_and_di
         samples = simulate_session(
             model, random_values(model, 'industrial', seed), table, profile=profile, seed=seed
         )
-        found = calibrate_recordings(SampleBlock(*samples), table).calibration
+        found = calibrate_recordings(SampleBlock(*samples), table, candidates=FEW).calibration
         status = dict(zip(found.param_names, found.status, strict=True))
         assert {
             status[name]

@@ -16,7 +16,7 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 from imu_calibration.use_cases.resources import config_file
 from msg_adapters.write import write_session
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
+from worlds.candidates import FEW
 
 TABLE_FILE = config_file('table_simulated.yaml')
 TABLE = Table.from_mapping(yaml.safe_load(TABLE_FILE.read_text(encoding='utf-8')))
@@ -51,9 +51,8 @@ def storage_file(bag):
 
 def calibrate(bag, output):
     """Return (exit code, calibration document)."""
-    code = main(
-        ['calibrate', str(bag), '--table', str(TABLE_FILE), '--output', str(output), '--no-report']
-    )
+    arguments = ['calibrate', str(bag), '--table', str(TABLE_FILE), '--output', str(output)]
+    code = main([*arguments, '--no-report', '--candidates', FEW])
     return code, yaml.safe_load((output / 'calibration.yaml').read_text())
 
 

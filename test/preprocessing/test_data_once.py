@@ -24,8 +24,6 @@ from imu_calibration.use_cases.inspect import inspect_recording
 from imu_calibration.use_cases.recordings import Topics, source_of
 from msg_adapters.bag import Recording
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'sample_session'
 PLAIN = CalibrationOptions(reference_model='none')
 """Nothing is linearised anew, which would take another pass."""

@@ -52,7 +52,6 @@ def test_zeros_of_a_gyroscope_without_an_accelerometer_pass():
     assert len(zeros.push(imu)) == len(imu) and zeros.finish() == 0
 
 
-@pytest.mark.usefixtures('few_candidates')
 def test_zeros_in_turns_do_not_reach_the_matrix():
     """Each run lies in a turn: 0.2 to 0.5 s of its rate would be lost (1 to 20 % of its angle)."""
     imu, ranges, truth = simulate(12, n_poses=16, still=2.0, force_sd=0.004, rate_sd=4e-4)

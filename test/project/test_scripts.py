@@ -11,8 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import few_candidates
 import pytest
+import without_search
 
 from validation import run
 from validation.recordings import VARIABLE
@@ -21,8 +21,6 @@ pytestmark = pytest.mark.live
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ('examples', 'benchmarks', 'tools', 'validation')
-FEW = ()
-"""The sections are run without the candidates of the search for effects."""
 RUN = {
     'benchmarks/noise_records.py': ('--smallest',),
     'benchmarks/run.py': ('--smallest',),
@@ -36,9 +34,9 @@ RUN = {
 }
 """Script -> arguments of its smallest size."""
 CANDIDATES = {
-    'validation/separating_worlds.py': ('accel_quadratic', 'accel_scale_asymmetry'),
+    'validation/separating_worlds.py': 'accel_quadratic+accel_scale_asymmetry',
 }
-"""Script -> candidates of its search for effects; `FEW` for the others."""
+"""Script -> candidates of its search for effects; none for the others."""
 RUN_ELSEWHERE = {
     'benchmarks/bench_calibrate.py': 'benchmarks/run.py',
     'benchmarks/bench_compensator.py': 'benchmarks/run.py',
@@ -116,10 +114,10 @@ def test_a_script_runs(tree, script):
         pytest.importorskip('rclpy')
     environment = os.environ | {'PYTHONPATH': f'{tree}{os.pathsep}{tree / "test"}'}
     environment |= {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1', 'MPLBACKEND': 'agg'}
-    candidates = ','.join(CANDIDATES.get(script, few_candidates.FEW))
+    candidates = CANDIDATES.get(script, 'none')
     module = script.removesuffix('.py').replace('/', '.')
     done = subprocess.run(
-        [sys.executable, '-m', 'few_candidates', candidates, module, *RUN[script]],
+        [sys.executable, '-m', 'without_search', candidates, module, *RUN[script]],
         cwd=tree,
         env=environment,
         capture_output=True,
@@ -132,13 +130,13 @@ def test_a_script_runs(tree, script):
 
 @pytest.mark.long
 @pytest.mark.real_data
-@pytest.mark.usefixtures('few_candidates')
 @pytest.mark.filterwarnings('default')  # figures of one recording have no spread
 @pytest.mark.parametrize('section', sorted(set(run.SECTIONS) - set(SECTION_ELSEWHERE)))
 def test_a_section_of_the_validation_runs(section, recordings, tmp_path, monkeypatch, capsys):
     """At its smallest size, and without candidates in the search for effects."""
     monkeypatch.setenv(VARIABLE, str(recordings))
-    code = run.main(['--smallest', '--only', section, '--output', str(tmp_path)])
+    with without_search.candidates_in_scripts('none'):
+        code = run.main(['--smallest', '--only', section, '--output', str(tmp_path)])
     shown = capsys.readouterr()
     assert code == 0 and 'Traceback' not in shown.err, shown.out + shown.err
     for line in shown.out.splitlines():

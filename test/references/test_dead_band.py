@@ -11,7 +11,6 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY, simulate, unpack
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
 BAND = 0.015
 """rad/s"""
 

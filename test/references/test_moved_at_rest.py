@@ -14,7 +14,6 @@ from imu_calibration.use_cases.calibrate import calibrate_recordings
 
 from worlds.hand_sessions import GRAVITY, simulate
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
 PERIOD_S = 0.01
 
 

@@ -40,8 +40,6 @@ from imu_calibration.simulation.session import SimulationOptions, random_values,
 
 from worlds.tables import three_axis_table
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 TABLE = three_axis_table(height=150.0)
 MODEL = SensorModel(accelerometer=('bias', 'matrix', 'accel_size_effect'))
 PROVENANCE = {'bags': [{'name': 'session <1>', 'sha256': '0123456789abcdef'}]}

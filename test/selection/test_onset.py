@@ -12,24 +12,18 @@ from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.effects.base import Role
 from imu_calibration.selection.investigation import investigate
 
+from worlds.candidates import with_candidates
 from worlds.hiding import record
 from worlds.moments import Clock, Moment, Wander
 
-FEW = (
-    'time_offset',
-    'clock_rate',
-    'clock_step',
-    'encoder_zero',
-    'table_tilt',
-    'gyro_g_sensitivity',
-)
+FEW = 'time_offset+clock_rate+clock_step+encoder_zero+table_tilt+gyro_g_sensitivity'
 SEED = 6
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 
 def investigated(cause):
     recording = record(SEED, None, 'realistic', through_bag=False, cause=cause)
-    return recording, investigate(recording.windows, recording.table, recording.model)
+    model = with_candidates(recording.model, FEW)
+    return recording, investigate(recording.windows, recording.table, model)
 
 
 def moment_of(recording, share):

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from few_candidates import restricted
 
 import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.findings import build_diagnosis
@@ -23,6 +22,7 @@ from imu_calibration.selection.spectrum import (
 )
 from imu_calibration.selection.unexplained import IN_MOTION
 
+from worlds.candidates import FEW, with_candidates
 from worlds.hiding import record
 from worlds.physics import make_session
 from worlds.physics_beyond import Machine
@@ -113,10 +113,9 @@ def test_a_fixed_frequency_is_removed_before_orders_are_searched():
     assert np.std(left - other) < 0.05 and abs(left @ line) / len(time) < 1e-3
 
 
-@restricted()
 def test_a_hum_stays_in_seconds_and_teeth_stay_in_turns():
     recording = record(5, None, 'realistic', through_bag=False, cause=Machine())
-    found = investigate(recording.windows, recording.table, recording.model)
+    found = investigate(recording.windows, recording.table, with_candidates(recording.model))
     tones = find_tones(found, recording.table)
     (hum,), (teeth,) = tones['accelerometer'], tones['gyroscope']
     assert (hum.joint, hum.axis) == (None, 'z') and hum.frequency == pytest.approx(
@@ -183,7 +182,6 @@ class Loud(Cause):
         return [outputs[0] + np.outer(tone, [0, 0, 1]), outputs[1] + np.outer(noise, [0, 1, 0])]
 
 
-@pytest.mark.usefixtures('few_candidates')
 @pytest.mark.parametrize('size', [1.0, 0.0])
 def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size):
     """
@@ -192,8 +190,9 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
     The diagnosis of either was "nothing found".
     """
     recording = record(5, None, 'realistic', through_bag=False, cause=Loud(size))
+    model = with_candidates(recording.model)
     found = build_diagnosis(
-        recording.table, investigate(recording.windows, recording.table, recording.model)
+        recording.table, investigate(recording.windows, recording.table, model)
     ).unexplained
     assert [found[sensor].significant for sensor in ('accelerometer', 'gyroscope')] == [
         size > 0
@@ -210,15 +209,14 @@ def test_a_loud_tone_and_the_scatter_of_one_axis_in_motion_are_unexplained(size)
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures('few_candidates')
 def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
     """Tones and the scatter of one axis were tested by `diagnose` only."""
     session = make_session(5, None, 'realistic', cause=Loud(1.0), imu_rate=50.0, joint_rate=50.0)
     reported = imu.calibrate(
-        session.block, Table.from_mapping(session.table)
+        session.block, Table.from_mapping(session.table), candidates=FEW
     ).calibration.statistics['unexplained']
     found = imu.diagnose(
-        session.block, Table.from_mapping(session.table)
+        session.block, Table.from_mapping(session.table), candidates=FEW
     ).result.diagnosis.unexplained
     assert reported == {
         sensor: {'rms': pytest.approx(rest.rms), 'axes': list(rest.axes)}
@@ -232,7 +230,9 @@ def test_calibrate_reports_the_same_unexplained_residuals_as_diagnose():
     empty = make_session(5, None, 'realistic', imu_rate=50.0, joint_rate=50.0)
     assert (
         'unexplained'
-        not in imu.calibrate(empty.block, Table.from_mapping(empty.table)).calibration.statistics
+        not in imu.calibrate(
+            empty.block, Table.from_mapping(empty.table), candidates=FEW
+        ).calibration.statistics
     )
 
 
@@ -251,10 +251,9 @@ class Sway(Cause):
         return -world.to_sensor(np.cross(tilt, world.force_n)), world.to_sensor(rate)
 
 
-@pytest.mark.usefixtures('few_candidates')
 def test_a_sway_of_the_floor_is_named_with_its_period_and_size():
     recording = record(7461, None, 'realistic', through_bag=False, cause=Sway(1.0))
-    found = investigate(recording.windows, recording.table, recording.model)
+    found = investigate(recording.windows, recording.table, with_candidates(recording.model))
     tones = ResidualAnalysis.of(found, recording.table).unexplained['accelerometer'].tones
     (sway,) = [tone for tone in tones if tone.tilts]
     assert 1 / sway.frequency == pytest.approx(Sway.PERIOD, rel=0.03)

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from few_candidates import restricted
 
 import imu_calibration as imu
 from imu_calibration.calibration.diagnosis.diagnosis_result import diagnosis_mapping
@@ -19,6 +18,7 @@ from imu_calibration.effects.base import SENSORS
 from imu_calibration.kinematics.table import Table
 from imu_calibration.selection.stamp_jitter import jitter_ratio, stamp_jitter
 
+from worlds.candidates import FEW
 from worlds.diagnosing import diagnose
 from worlds.hiding import record
 from worlds.physics import make_session
@@ -70,20 +70,18 @@ def test_no_jitter_changes_nothing():
     assert np.all(jitter_ratio(rough[0], slope[0], 0.0) == 1.0)
 
 
-@restricted()
 def test_a_navigation_grade_session_with_irregular_stamps_has_no_regime():
     """Independent errors of 50 us at 1 rad/s are 0.5 mm/s^2, six times the noise of this grade."""
     recording = record(5, None, 'realistic@navigation', through_bag=False)
-    diagnosis = diagnose(recording.windows, recording.table, recording.model)
+    diagnosis = diagnose(recording.windows, recording.table, recording.model, candidates=FEW)
     assert not any(rest.significant for rest in diagnosis.unexplained.values())
     assert diagnosis_mapping(diagnosis)['stamp_jitter_s'] == pytest.approx(50e-6, rel=0.1)
     assert timing_lines(diagnosis) == diagnosis.stamp_jitter.lines != []
 
 
-@restricted()
 def test_a_calibration_does_not_call_scatter_by_the_stamps_an_incomplete_model():
     session = make_session(6, None, 'realistic', grade='navigation')
-    result = imu.calibrate(session.block, Table.from_mapping(session.table))
+    result = imu.calibrate(session.block, Table.from_mapping(session.table), candidates=FEW)
     entry = result.calibration.statistics['stamp_jitter']
     assert (
         entry['sd_s'] == pytest.approx(50e-6, rel=0.1)

@@ -21,8 +21,6 @@ from msg_adapters.write import write_session
 from worlds.compensation_cases import random_calibration
 from worlds.hand_sessions import simulate as hand_session
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
-
 PERIOD_NS, COUNT = 10_000_000, 12_000
 
 

@@ -26,15 +26,9 @@ from imu_calibration.document import files
 from msg_adapters.bag import open_recording
 
 FEW = (
-    'accel_quadratic',
-    'accel_size_effect',
-    'gyro_bandwidth',
-    'gyro_bias_drift',
-    'gyro_g_sensitivity',
-    'lever_arm',
-    'time_offset',
+    'accel_quadratic+accel_size_effect+gyro_bandwidth+gyro_bias_drift+gyro_g_sensitivity+'
+    'lever_arm+time_offset'
 )
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 ROOT = Path(__file__).resolve().parents[2]
 SESSION = ROOT / 'bags' / 'sample_session'
@@ -56,7 +50,7 @@ HEAVY = {
 @pytest.fixture(scope='module')
 def found():
     """The sample session, calibrated."""
-    return imu.calibrate(SESSION, TABLE)
+    return imu.calibrate(SESSION, TABLE, candidates=FEW)
 
 
 @pytest.fixture(scope='module')
@@ -139,7 +133,18 @@ def test_the_page_of_contents_lists_every_package():
 def test_two_lines_give_what_the_command_line_writes(found, tmp_path):
     found.save(tmp_path / 'notebook')
     assert (
-        main(['calibrate', str(SESSION), '--table', str(TABLE), '--output', str(tmp_path / 'verb')])
+        main(
+            [
+                'calibrate',
+                str(SESSION),
+                '--table',
+                str(TABLE),
+                '--output',
+                str(tmp_path / 'verb'),
+                '--candidates',
+                FEW,
+            ]
+        )
         == found.exit_code
         == 0
     )
@@ -150,7 +155,7 @@ def test_two_lines_give_what_the_command_line_writes(found, tmp_path):
 
 
 def test_samples_in_memory_are_as_good_as_a_bag(found, samples):
-    again = imu.calibrate(samples, files.read_table(TABLE))
+    again = imu.calibrate(samples, files.read_table(TABLE), candidates=FEW)
     np.testing.assert_allclose(
         again.calibration.values, found.calibration.values, atol=1e-9 * found.calibration.sd.min()
     )

@@ -16,7 +16,7 @@ from imu_calibration.use_cases.choices import made_from, provenance_with, requir
 from imu_calibration.use_cases.recordings import Arm
 from imu_calibration.use_cases.resources import config_file
 
-pytestmark = pytest.mark.usefixtures('few_candidates')
+from worlds.candidates import FEW
 
 ROOT = Path(__file__).resolve().parents[2]
 SESSION, TABLE = ROOT / 'bags/sample_session', ROOT / 'bags/sample_session/table.yaml'
@@ -27,7 +27,9 @@ def place(tmp_path_factory):
     """A folder with the result of the sample session, with serial number and operator."""
     folder = tmp_path_factory.mktemp('place')
     (folder / 'table.yaml').write_bytes(TABLE.read_bytes())
-    assert main(calibrate(folder, '--serial', 'A-17', '--operator', 'Ada')) == 0
+    assert (
+        main(calibrate(folder, '--serial', 'A-17', '--operator', 'Ada', '--candidates', FEW)) == 0
+    )
     return folder
 
 
@@ -48,6 +50,7 @@ def test_a_result_names_verb_options_files_serial_number_and_operator(place):
     found = yaml.safe_load((place / 'out/calibration.yaml').read_text())['provenance']
     assert (found['verb'], found['serial'], found['operator']) == ('calibrate', 'A-17', 'Ada')
     assert found['options'] == {
+        'candidates': FEW,
         'table': {'name': 'table.yaml', 'sha256': files.hash_of(TABLE)},
         'tolerances': {
             'name': 'tolerances.yaml',

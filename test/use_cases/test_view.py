@@ -34,9 +34,8 @@ from imu_calibration.use_cases.view import (
     view,
 )
 
+from worlds.candidates import FEW
 from worlds.hand_sessions import GRAVITY, simulate
-
-pytestmark = pytest.mark.usefixtures('few_candidates')
 
 ROOT = Path(__file__).resolve().parents[2]
 SESSION, TABLE = str(ROOT / 'bags/sample_session'), str(ROOT / 'bags/sample_session/table.yaml')
@@ -239,7 +238,7 @@ def test_the_overlay_of_a_diagnosis_contains_its_segments_residuals_spectra_and_
     tmp_path,
 ):
     pytest.importorskip('foxglove', reason='the extra view is not installed')
-    found = diagnose(SESSION, TABLE)
+    found = diagnose(SESSION, TABLE, candidates=FEW)
     found.save_overlay(tmp_path / 'overlay.mcap')
     written, traces = read(tmp_path / 'overlay.mcap'), found.result.diagnosis.traces
     segment = traces.segments['gyroscope'][2]

@@ -6,13 +6,16 @@ from imu_calibration.calibration.diagnosis.findings import build_diagnosis
 from imu_calibration.calibration.diagnosis.traces import residual_traces
 from imu_calibration.selection.residual_analysis import inquire
 
+from worlds.candidates import with_candidates
 
-def diagnose(windows, table, model, *, bias_processes=None):
+
+def diagnose(windows, table, model, *, bias_processes=None, candidates=None):
     """
     Return the Diagnosis of the errors of a model on the windows of one recording, in order.
 
-    Unused ones serve dead reckoning.
+    Unused ones serve dead reckoning. `candidates` as for `use_cases.diagnose.diagnose`.
     """
+    model = with_candidates(model, candidates)
     found = build_diagnosis(table, inquire(windows, table, model, bias_processes=bias_processes))
     return replace(
         found, traces=residual_traces(windows, table, found.baseline, after=found.solution)
