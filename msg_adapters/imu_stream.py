@@ -192,7 +192,8 @@ class ImuHeads:
                 return
         self._frame_ids[self._frame_id] += 1
         stamp_ns, _ = self._stream.read(data)
-        self._age += [(received_ns - stamp_ns) * 1e-9] * bool(stamp_ns and received_ns)
+        if stamp_ns and received_ns:
+            self._age.append((received_ns - stamp_ns) * 1e-9)
         self._last = data
 
     def evidence(self) -> MessageEvidence:

@@ -273,5 +273,8 @@ def summary(result: CalibrationResult[Any], hints: dict[str, str] | None = None)
 
     `hints` as for `errors.with_hint`.
     """
+    lines = list(result.verdict.lines(hints))
     hint = usage(result.calibration)
-    return [*result.verdict.lines(hints), *[hint] * bool(hint)]
+    if hint:
+        lines.append(hint)
+    return lines

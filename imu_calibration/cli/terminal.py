@@ -81,7 +81,8 @@ class Terminal:
         """Replace the last `drawn` lines; return the number of lines that can be replaced next."""
         if not self.moves:
             return 0
-        self.stream.write(f'\x1b[{drawn}A\x1b[J' * bool(drawn))
+        if drawn:
+            self.stream.write(f'\x1b[{drawn}A\x1b[J')
         self.write(lines)
         self.stream.flush()
         return len(lines)

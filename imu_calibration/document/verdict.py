@@ -193,7 +193,8 @@ def _adopted(calibration: Calibration) -> list[Reason]:
         names['not_believed'] = [f'{name} ({value:.3g})' for name, value in held.items()][
             :SHOWN_NAMES
         ]
-        names['not_believed'] += ['...'] * (len(held) > SHOWN_NAMES)
+        if len(held) > SHOWN_NAMES:
+            names['not_believed'].append('...')
     reasons = []
     for change, (text, step, key) in CHANGES.items():
         if change == 'not_believed':
@@ -212,7 +213,7 @@ def _unexplained(calibration: Calibration) -> list[Reason]:
         Reason(
             NOTE,
             unexplained_text(sensor, rest['rms'], rest.get('unit'))
-            + f' ({", ".join(rest["axes"])})' * bool(rest['axes']),
+            + (f' ({", ".join(rest["axes"])})' if rest['axes'] else ''),
             'find the cause',
             key='diagnose',
             sensors=(sensor,),

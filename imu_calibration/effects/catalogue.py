@@ -163,9 +163,15 @@ def term(
         del definition['time_constant']
     spread = PRIOR_TOLERANCES * tolerance if prior_sd is None else prior_sd
     thermal |= 'temperature rate' in group.uses
-    needs = ('temperature',) * (thermal or turns) + ('cooling',) * turns
-    needs += ('vibration',) * ('vibration' in group.uses)
-    needs += ('rotation',) * bool(group.uses & {'rate', 'angular acceleration', 'joint rate'})
+    needs: tuple[str, ...] = ()
+    if thermal or turns:
+        needs += ('temperature',)
+    if turns:
+        needs += ('cooling',)
+    if 'vibration' in group.uses:
+        needs += ('vibration',)
+    if group.uses & {'rate', 'angular acceleration', 'joint rate'}:
+        needs += ('rotation',)
     shape: dict[str, Any] = {
         'components': VECTOR,
         'shape': (3,),

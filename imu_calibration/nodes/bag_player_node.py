@@ -83,7 +83,7 @@ class BagPlayerNode(Node):
         announce(
             self,
             [],
-            [*self._topics, *['/clock'] * self.settings.clock],
+            [*self._topics, '/clock'] if self.settings.clock else self._topics,
             note=f'from the bag {files.user_path(self.settings.bag)}',
         )
         self._players = [self._publisher(name) for name in self._topics]

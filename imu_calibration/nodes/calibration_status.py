@@ -233,12 +233,10 @@ def statuses_of(state: WorkerState, stream_faults: list[str] = []) -> list:
                 values=state.streams.values,
             )
         )
-    parts = [
-        state.judged or state.verdict or 'waiting for motion',
-        *state.lines[:3],
-        *[state.trouble] * bool(state.trouble),
-        *state.faults,
-    ]
+    parts = [state.judged or state.verdict or 'waiting for motion', *state.lines[:3]]
+    if state.trouble:
+        parts.append(state.trouble)
+    parts += state.faults
     incomplete = WARN if state.verdict and (state.trouble or not state.complete) else OK
     level = ERROR if state.faults else max(STATUS_LEVELS[state.verdict], incomplete)
     found.append(

@@ -161,9 +161,9 @@ class SessionFiles:
                 )
         if not failed:
             self.note_saved(live.n_windows)
-        lines = [f'written: {" and ".join(done)}'] * bool(done) + [
-            f'not written: {line}' for line in failed
-        ]
+        lines = [f'not written: {line}' for line in failed]
+        if done:
+            lines.insert(0, f'written: {" and ".join(done)}')
         return not failed, '; '.join(lines)
 
     def autosave(self, live: LiveSession, period: float) -> bool:

@@ -139,12 +139,9 @@ class CompensatorDiagnostics:
         )
         level = max(HEALTH_LEVELS[state.word], WARN if warm else OK)
         grave = HEALTH_LEVELS[state.word] == ERROR
-        self._node.complaints.now(
-            'health',
-            [state.message] * (HEALTH_LEVELS[state.word] == WARN),
-            [state.message] * grave,
-            replaces=True,
-        )
+        doubts = [state.message] if HEALTH_LEVELS[state.word] == WARN else []
+        faults = [state.message] if grave else []
+        self._node.complaints.now('health', doubts, faults, replaces=True)
         self._node.complaints.now('conditions', warm)
         return [
             make_status(

@@ -112,9 +112,11 @@ def parameter_descriptor(item: Setting) -> ParameterDescriptor:
     """
     text = f'{item.text} [{item.unit}]' if item.unit else item.text
     descriptor = ParameterDescriptor(name=item.name, description=text, read_only=item.path)
-    notes = [f'When wrong: {item.symptom}.'] * bool(item.symptom) + [
-        f'Fixed while the node runs: {item.fixed}.'
-    ] * (not item.live)
+    notes = []
+    if item.symptom:
+        notes.append(f'When wrong: {item.symptom}.')
+    if not item.live:
+        notes.append(f'Fixed while the node runs: {item.fixed}.')
     descriptor.additional_constraints = ' '.join(notes)
     if isinstance(item.default, bool) or item.bounds == (None, None):
         return descriptor

@@ -196,17 +196,13 @@ class SimulatorNode(Node):
         super().__init__('simulator_node')
         self.settings = settings = declare_parameters(self, SimulatorSettings)
         self._controller = declare_parameters(self, ControllerSettings)
-        announce(
-            self,
-            ['joint_trajectory'],
-            [
-                'imu/data_raw',
-                'joint_states',
-                *['imu/temperature'] * settings.temperature,
-                *['imu/truth'] * settings.truth,
-                *['/clock'] * settings.clock,
-            ],
-        )
+        kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
+        if settings.temperature:
+            kinds.append((Temperature, 'imu/temperature'))
+        if settings.truth:
+            kinds.append((Imu, 'imu/truth'))
+        topics = [topic for _, topic in kinds]
+        announce(self, ['joint_trajectory'], [*topics, '/clock'] if settings.clock else topics)
         self._table, self._motion = self._make_table()
         imu_seed = settings.seed if settings.imu_seed < 0 else settings.imu_seed
         truth = (
@@ -237,14 +233,10 @@ class SimulatorNode(Node):
         self._trajectories = queue.Queue()
         self._driven: dict[str, Any] = {'followed': 0, 'refused': 0, 'why refused': ''}
         self._publish_truth(model, values)
-        kinds = [(Imu, 'imu/data_raw'), (JointState, 'joint_states')]
-        kinds += [(Temperature, 'imu/temperature')] * settings.temperature + [
-            (Imu, 'imu/truth')
-        ] * settings.truth
         publishers = [
             self.create_publisher(kind, topic, output_qos(PLAYBACK_DEPTH)) for kind, topic in kinds
         ]
-        self._to = dict(zip([topic for _, topic in kinds], publishers, strict=True))
+        self._to = dict(zip(topics, publishers, strict=True))
         pace = Pace(
             settings.time_factor, 100.0 if settings.clock else 0.0, settings.wait_for_subscribers
         )

@@ -195,9 +195,9 @@ def _turn(joint: int, order: int, before: str = '') -> tuple[str, str, str]:
 def _harmonics(n_joints: int, thermal: bool) -> Iterator[Formula]:
     joints = range(1, n_joints + 1)
     for joint, order in product(joints, JOINT_ORDERS):
-        befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))] + [
-            (f'{TEMPERATURE_FACTOR} * ', ('temperature',))
-        ] * thermal
+        befores = [('', ()), (f'joint_rate_{joint} * ', ('joint rate',))]
+        if thermal:
+            befores.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
         if order in FEW_ORDERS:
             befores += [(f'{text} * ', own) for text, own in _atoms('f', 'w')]
         for before, factors in befores:
@@ -227,7 +227,9 @@ def _with_the_table(n_joints: int, thermal: bool) -> Iterator[Formula]:
     """Yield vectors fixed to the level frame while the sensor turns."""
     joints = range(1, n_joints + 1)
     vectors = [[f'c_{axis}{level}' for axis in AXES] for level in AXES]
-    befores = [('', ())] + [(f'{TEMPERATURE_FACTOR} * ', ('temperature',))] * thermal
+    befores: list[tuple[str, tuple[str, ...]]] = [('', ())]
+    if thermal:
+        befores.append((f'{TEMPERATURE_FACTOR} * ', ('temperature',)))
     befores += [(f'joint_rate_{joint} * ', ('joint rate',)) for joint in joints]
     for before, factors in befores:
         yield Formula(tuple(tuple(before + text for text in vector) for vector in vectors), factors)

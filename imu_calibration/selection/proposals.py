@@ -108,9 +108,8 @@ class Proposal:
                 f'; it is not in the catalogue: {self.nearest[0]}, the closest effect, '
                 f'would remove {100 * max(self.nearest[1], 0.0):.0f} %'
             )
-            text += ' here, but the remaining axes or sensor contradict it' * (
-                self.nearest[1] > MIN_FORMULA_SHARE
-            )
+            if self.nearest[1] > MIN_FORMULA_SHARE:
+                text += ' here, but the remaining axes or sensor contradict it'
         if self.alike:
             text += f'; collinear in this recording: {" or ".join(self.alike)}'
         return text
@@ -264,7 +263,7 @@ def _proposal_of(
     after = fits.fit(columns)
     share = share_removed(plain, after)
     alike = [
-        _joined_text(f.columns[0]) + ' in any phase' * (len(f.columns) > 1)
+        _joined_text(f.columns[0]) + (' in any phase' if len(f.columns) > 1 else '')
         for f in choices[0].alike[:SHOWN_ALIKE]
     ]
     taken = {name for _, name in problem.baseline.catalogue.effects(problem.baseline.joint_names)}

@@ -41,7 +41,7 @@ class StampJitter:
     @property
     def lines(self) -> list[str]:
         """Description, empty where they are not significant."""
-        return [jitter_text(self.sd)] * self.significant
+        return [jitter_text(self.sd)] if self.significant else []
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the entry of a calibration document, empty where they are not significant."""

@@ -113,7 +113,7 @@ class DiagnosisResult:
             f'the {sensor} by {1e3 * value:.4g} +- {1e3 * sd:.2g} ms'
             for sensor, (value, sd) in self.lags.items()
         ]
-        lag = [f'total lag: {", ".join(words)}'] * bool(words)
+        lag = [f'total lag: {", ".join(words)}'] if words else []
         return [
             *diagnosis_lines(self.diagnosis),
             *(f'note: {note}' for note in (*self.notes, *self.session_terms)),

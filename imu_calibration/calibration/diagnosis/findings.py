@@ -97,7 +97,9 @@ def motions_of_one_joint(question: Question, mate: Question) -> str:
     """Return the same of a table that turns about one axis only, which cannot do most of them."""
     own = dict.fromkeys(question.effect.motion + mate.effect.motion)
     found = [ONE_JOINT[name] for name in own if name in ONE_JOINT]
-    return '; '.join(found + [OTHER_MOUNT] * (len(found) < len(own)))
+    if len(found) < len(own):
+        found.append(OTHER_MOUNT)
+    return '; '.join(found)
 
 
 LEAVES_MOST = 'rejected: most of the residual would remain'
