@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from refusal import refused
-from test_adapters_copy import raw_messages
+from test_copying import raw_messages
 from test_live_calibration import blocks
 
 from imu_calibration.allan.document import noise_to_text, position_budget

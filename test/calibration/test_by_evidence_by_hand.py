@@ -6,7 +6,7 @@ As `diagnose` finds it, and nothing else.
 
 import numpy as np
 import pytest
-from test_diagnosis_by_hand import HIDDEN, NOTHING
+from test_diagnosis_workflow_by_hand import HIDDEN, NOTHING
 from test_live_by_hand import assert_same, make_live, run
 
 import imu_calibration as imu

@@ -6,7 +6,7 @@ from shutil import rmtree
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_adapters_copy import raw_messages
+from test_copying import raw_messages
 
 from imu_calibration.cli.main import main
 from imu_calibration.compensation.covariance import Uncertainty

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from test_by_hand import GRAVITY, simulate
+from test_hand_calibration import GRAVITY, simulate
 
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import diagnose_recording
 from imu_calibration.calibration.table_calibration import calibrate_on_table

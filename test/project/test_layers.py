@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 FRONT_DOOR = ROOT / 'imu_calibration/__init__.py'
 """
-Imports the names for notebooks when they are asked for; test_front_door sees to it that it imports
+Imports the names for notebooks when they are asked for; test_notebook sees to it that it imports
 nothing by itself.
 """
 EDGE = {'cli', 'nodes', 'use_cases', '__main__'}

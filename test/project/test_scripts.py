@@ -49,7 +49,7 @@ RUN_ELSEWHERE = {
     'examples/demo.py': 'make demo-check',
     'examples/downstream_nav.py': 'test/papers/test_reproduce_examples.py',
     'examples/live_demo.py': 'test/nodes/test_live_demo.py',
-    'examples/notebook.py': 'test/use_cases/test_front_door.py runs its cells',
+    'examples/notebook.py': 'test/use_cases/test_notebook.py runs its cells',
     'examples/reproduce_avrutov2017.py': 'test/papers/test_reproduce_examples.py',
     'examples/reproduce_zhang2017.py': 'test/papers/test_reproduce_examples.py',
     'tools/demo_figures.py': 'make demo-check',

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from refusal import refused
 from scipy.spatial.transform import Rotation
-from test_by_hand import GRAVITY, load, simulate
+from test_hand_calibration import GRAVITY, load, simulate
 
 from imu_calibration.calibration.advice import missing_motion
 from imu_calibration.calibration.hand_workflow import calibrate_without_table

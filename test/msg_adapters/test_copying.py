@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusal import refused
 from rosbags.highlevel import AnyReader
-from test_adapters_bag import make_session
+from test_bag import make_session
 
 from imu_calibration.core.errors import InputError
 from msg_adapters.copying import copy_with_corrected

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from refusal import refused
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from test_adapters_bag import make_session
+from test_bag import make_session
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from fuzz.attacks import overlapping_chunks, ros1_with_entries, rows_that_share_pages
-from test_adapters_mcap import chunk, message, prefixed_string, record, write_file
+from test_mcap_file import chunk, message, prefixed_string, record, write_file
 
 from imu_calibration.core.documents import parsed
 from imu_calibration.core.errors import InputError

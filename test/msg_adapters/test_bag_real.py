@@ -8,7 +8,7 @@ from refusal import refused
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.typesys import Stores, get_typestore
-from test_adapters_bag import make_session
+from test_bag import make_session
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import ImuSamples, JointSamples

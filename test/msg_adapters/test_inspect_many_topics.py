@@ -6,7 +6,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 from refusal import refused
-from test_adapters_mcap import message, topic_records, write_file
+from test_mcap_file import message, topic_records, write_file
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.use_cases import inspect

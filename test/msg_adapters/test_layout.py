@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusal import refused
 from rosbags.typesys import Stores, get_typestore
-from test_adapters_bag import make_session
+from test_bag import make_session
 
 from imu_calibration.core.errors import InputError
 from imu_calibration.core.samples import JointSamples

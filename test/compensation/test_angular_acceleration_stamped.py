@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_differentiation import slopes
+from test_angular_acceleration import slopes
 
 from imu_calibration.compensation.angular_acceleration import (
     CausalDerivative,

@@ -3,7 +3,7 @@
 import os
 
 import pytest
-from test_adapters_bag import make_session
+from test_bag import make_session
 
 from imu_calibration.core.errors import InputError
 from msg_adapters.bag_writer import make_partial_folder

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_adapters_bag import make_session
+from test_bag import make_session
 
 from imu_calibration.core.samples import ImuSamples
 from msg_adapters.bag import open_recording
