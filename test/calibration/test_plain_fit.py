@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 
 from imu_calibration.calibration.calibrate import conclude
 from imu_calibration.calibration.diagnosis.diagnosis_workflow import (
+    ProposedExtension,
     _with_proposals,
     helpful_formulas,
 )
@@ -202,16 +203,9 @@ def test_a_formula_is_applied_where_a_second_session_confirms_it(kind, seed, col
     pair, table, solved, options = world(kind, seed)
     effect = formula('bend', column, unit)
     result = conclude(with_changes(solved, unexplained=UNEXPLAINED), options)
-    extended = _with_proposals(
-        source(pair.first),
-        table,
-        options,
-        result,
-        SimpleNamespace(unexplained={}),
-        None,
-        map,
-        effects=[effect],
-    )
+    recordings = TableRecordings.of([source(pair.first)], table)
+    extension = ProposedExtension(result, SimpleNamespace(unexplained={}), options)
+    extended = _with_proposals(recordings, extension, [effect])
     applied = helpful_formulas([effect], extended, result.calibration)
     assert applied == [effect] * helps
     plain = with_plain_values(result.calibration, kind, seed)

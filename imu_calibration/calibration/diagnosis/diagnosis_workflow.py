@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -240,18 +239,19 @@ def diagnose_recording(
     if result.found is None:
         raise too_few_windows(len(result.gathered.spreads[0].windows))
     diagnosis = build_diagnosis(table, result.found, calibrated=result.solution)
-    calibrate_with = partial(
-        _with_proposals, source, table, options, result, diagnosis, provenance, reader
-    )
+
+    # The formulas of the residual join the model; a second pass reduces the stored windows.
+    recordings = TableRecordings.of([source], table, mapper=reader)
+    extension = ProposedExtension(result, diagnosis, options, provenance)
     effects = _proposed_effects(diagnosis)
-    proposed = calibrate_with(effects=effects)
+    proposed = _with_proposals(recordings, extension, effects)
     transferable = proposed
     transferable_effects = [effect for effect in effects if _is_transferable(effect)]
     if len(transferable_effects) < len(effects):
-        transferable = calibrate_with(effects=transferable_effects)
+        transferable = _with_proposals(recordings, extension, transferable_effects)
     helpful = helpful_formulas(transferable_effects, transferable, result.calibration)
     if len(helpful) < len(transferable_effects):
-        transferable = calibrate_with(effects=helpful)
+        transferable = _with_proposals(recordings, extension, helpful)
     unhelpful = [effect for effect in transferable_effects if effect not in helpful]
     traces = residual_traces(
         reader.windows, table, diagnosis.baseline, after=proposed or diagnosis.solution
@@ -320,16 +320,22 @@ def _is_transferable(effect: Effect) -> bool:
     return effect.compensation == 'exact'
 
 
+@dataclass(frozen=True, eq=False)
+class ProposedExtension:
+    """A diagnosed calibration whose model formulas of the residual extend."""
+
+    result: TableResult
+    """The calibration without formulas."""
+    diagnosis: Diagnosis
+    """Its unexplained residuals, which the biases may contain."""
+    options: CalibrationOptions
+    """Options of the requested model."""
+    provenance: dict[str, Any] | None = None
+    """Names, hashes and options for the document."""
+
+
 def _with_proposals(
-    source: Callable,
-    table: Table,
-    options: CalibrationOptions,
-    result: TableResult,
-    diagnosis: Diagnosis,
-    provenance: dict[str, Any] | None,
-    reader: StoredRecording,
-    *,
-    effects: Sequence[Effect],
+    recordings: TableRecordings, extension: ProposedExtension, effects: Sequence[Effect]
 ) -> Calibration | None:
     """
     Return the calibration of the extended model with the proposed formulas `effects`.
@@ -338,7 +344,7 @@ def _with_proposals(
     """
     if not effects:
         return None
-    model = result.calibration.model
+    model = extension.result.calibration.model
     catalogue = model.catalogue.with_effects(*effects)
     texts = {
         sensor: '+'.join(
@@ -350,23 +356,23 @@ def _with_proposals(
         for sensor in (*SENSORS, 'reference')
     }
     chosen = replace(
-        options,
+        extension.options,
         accelerometer_model=texts['accelerometer'],
         gyroscope_model=texts['gyroscope'],
         reference_model=texts['reference'] or 'none',
         catalogue=catalogue,
         as_asked=True,
     )
-    solved = TableRecordings.of([source], table, mapper=reader).solved(chosen)
+    solved = recordings.solved(chosen)
     # A formula determines changes of the output, not its zero: biases of the affected axes keep the
     # uncertainty.
     unsure = ModelExtension(
-        moves=tuple((moved, 1.0) for moved in biases_off(model, diagnosis.unexplained))
+        moves=tuple((moved, 1.0) for moved in biases_off(model, extension.diagnosis.unexplained))
     )
     return conclude(
         replace(solved, solution=unsure.applied(solved.solution)),
         chosen,
-        provenance=provenance,
+        provenance=extension.provenance,
         under_test={effect.sensor for effect in effects},
     ).calibration
 
