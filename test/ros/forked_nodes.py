@@ -8,11 +8,9 @@ the import of a node, or the end of the interpreter after its main function, is 
 import importlib
 import multiprocessing
 import os
-import re
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 from examples.processes import NodeProcesses, node_command
 
@@ -61,20 +59,6 @@ def _run(command, folder, environment, output):
     sys.exit(importlib.import_module(module).main())
 
 
-_servers = set()
-"""Process ids of the servers, of which there is one."""
-
-
-def processor_seconds():
-    """Return the processor time of the server and of the nodes that have ended."""
-    total = 0
-    for server in _servers:
-        # utime, stime and those of ended children; the name before may contain spaces.
-        fields = Path(f'/proc/{server}/stat').read_text().rpartition(')')[2].split()
-        total += sum(map(int, fields[11:15]))
-    return total / os.sysconf('SC_CLK_TCK')
-
-
 class ForkedNode:
     """A forked process with the methods of `subprocess.Popen` that tests use."""
 
@@ -85,8 +69,6 @@ class ForkedNode:
         )
         self._process.start()
         self.pid = self._process.pid
-        status = Path(f'/proc/{self.pid}/status').read_text()
-        _servers.add(int(re.search(r'PPid:\s+(\d+)', status)[1]))
 
     @property
     def returncode(self):
