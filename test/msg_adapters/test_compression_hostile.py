@@ -21,7 +21,13 @@ from test_mcap_file import chunk, message, prefixed_string, record, write_file
 from imu_calibration.core.documents import parsed
 from imu_calibration.core.errors import InputError
 from msg_adapters.bag import Ros1File, list_topics
-from msg_adapters.compression import LARGEST_CHUNK, decompress_message, zstd
+from msg_adapters.compression import (
+    LARGEST_CHUNK,
+    MOST_FRAMES,
+    decompress,
+    decompress_message,
+    zstd,
+)
 from msg_adapters.decode import Decoder, JointDecoder
 from msg_adapters.definitions import deserializer, is_standard
 from msg_adapters.imu import IMU_TYPE
@@ -96,9 +102,15 @@ def test_a_compressed_file_is_not_written_out_without_end(tmp_path, name):
 
 
 def test_frames_without_content_do_not_take_quadratic_time(tmp_path):
-    (tmp_path / 'x.mcap.zstd').write_bytes(zstd().compress(b'') * 300_000)
-    refused('inspect', tmp_path / 'x.mcap.zstd')
-    packed = zstd().compress(b'') * 300_000
+    """Each frame costs a copy of what follows it: what comes after `MOST_FRAMES` is not read."""
+    empty = zstd().compress(b'')
+    (tmp_path / 'x.mcap.zstd').write_bytes(empty * (2 * MOST_FRAMES))
+    ended = refused('inspect', tmp_path / 'x.mcap.zstd')
+    assert f' {MOST_FRAMES} ' in ended.err
+    last = zstd().compress(b'x')
+    assert decompress('zstd', empty * (MOST_FRAMES - 1) + last, 1000) == b'x'
+    assert decompress('zstd', empty * MOST_FRAMES + last, 1000) == b''
+    packed = empty * (2 * MOST_FRAMES)
     content = (
         struct.pack('<QQQI', 0, 1, 1000, 0)
         + prefixed_string('zstd')
